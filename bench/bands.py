@@ -169,10 +169,10 @@ def judge(name: str, data: Measurements, fold: Fold) -> dict[str, float | str]:
     start = time.process_time()
     method.fit(data, fold, FitContext(Path()))
     fitted = time.process_time()
-    mean, one, asked = method.predict(batch).mean, data.batch(fold.test[:1]), time.process_time()
+    mean, one, query_start = method.predict(batch).mean, data.batch(fold.test[:1]), time.process_time()
     for _ in range(10):
         method.predict(one)
-    query_ms = (time.process_time() - asked) / 10 * 1e3
+    query_ms = (time.process_time() - query_start) / 10 * 1e3
     return {
         "method": name,
         **score(mean, batch.target),
@@ -186,8 +186,8 @@ def ceiling(truth: Path, data: Measurements, fold: Fold) -> dict[str, float | st
     beam, batch = DirectBeam(), data.batch(fold.test)
     beam.fit(data, fold, FitContext(Path()))
     with np.load(truth) as paths:
-        known = (torch.from_numpy(paths[name][fold.test]) for name in ("direction", "power"))
-        images = beam.expect_paths(*known)
+        arrays = (torch.from_numpy(paths[name][fold.test]) for name in ("direction", "power"))
+        images = beam.expect_paths(*arrays)
     return {"method": "true_paths", **score(beam.answer_images(images, batch), batch.target)}
 
 

@@ -48,16 +48,16 @@ def measured() -> Iterator[Case]:
         still = np.append(city["station_position"][station], 10.0)
         yield f"city_{station}", 300.0, moving | {"rx_position": still}
     for hall, station in ((1, 0), (1, 6), (2, 3), (2, 9)):
-        own = read(f"real/ble-hall-{hall}")
-        ends = {"tx_position": own["mobile_position"], "rx_position": own["station_position"][station]}
-        yield f"hall_{hall}_{station}", 4.0, ends | {"rssi_db": own["rssi_db"][:, station]}
+        npz = read(f"real/ble-hall-{hall}")
+        ends = {"tx_position": npz["mobile_position"], "rx_position": npz["station_position"][station]}
+        yield f"hall_{hall}_{station}", 4.0, ends | {"rssi_db": npz["rssi_db"][:, station]}
     plane = read("real/techtile-power-reci-rf-1")
     yield "plane", 0.3, {name: plane[name][plane["rssi_db"] > -75] for name in ("rx_position", "rssi_db")}
     for name, side in (("rss-lib1", 3.0), ("rss-tut3", 10.0), ("wifine-floor4", 5.0)):
-        own = read(f"locate/{name}")
+        npz = read(f"locate/{name}")
         for most in (0, 5):  # access points, the most heard first
-            level = own["rss_dbm"][:, np.argsort(-np.isfinite(own["rss_dbm"]).sum(0))[most]]
-            yield f"{name.replace('-', '_')}_{most}", side, {"rx_position": own["position"], "rssi_db": level}
+            level = npz["rss_dbm"][:, np.argsort(-np.isfinite(npz["rss_dbm"]).sum(0))[most]]
+            yield f"{name.replace('-', '_')}_{most}", side, {"rx_position": npz["position"], "rssi_db": level}
     garage = read("change/garage-rounds")
     first = garage["round"] == 1
     for beacon in (2, 11):
@@ -181,7 +181,7 @@ def main() -> None:
             cut = {"choose": ["split=blocks", f"split.side_m={side}"], "draws": 1, "datasets": names}
             config["splits"][f"squares_{side:g}m"] = cut
         wanted = {*plain_methods(), "gsparc"}
-        config["methods"] = {name: own for name, own in config["methods"].items() if name in wanted}
+        config["methods"] = {name: method for name, method in config["methods"].items() if name in wanted}
         config["only"] = [f"{name}*" for name in words if "=" not in name]
         filled = run_jobs(plan_jobs(config, Path(folder) / "cells"), train_job, True, None)
     rows = average_cells(filled)
@@ -202,8 +202,8 @@ def write_table(rows: pd.DataFrame, file: Path) -> None:
     table.to_csv(file, index=False, lineterminator="\n", float_format="%.4g")
     for at_random, those in table.groupby(table.split == "random"):
         worst = those.loc[those.ratio.idxmax()]
-        said = f"{len(those)} cases, ratio {those.ratio.mean():.3f}, {worst.ratio:.3f} at most ({worst.case})"
-        sys.stdout.write(f"{'random' if at_random else 'squares'}: {said}\n")
+        text = f"{len(those)} cases, ratio {those.ratio.mean():.3f}, {worst.ratio:.3f} at most ({worst.case})"
+        sys.stdout.write(f"{'random' if at_random else 'squares'}: {text}\n")
 
 
 if __name__ == "__main__":

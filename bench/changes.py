@@ -70,8 +70,8 @@ def network(places, seed, later):
         shift[:4] = rng.normal(0, 8, 4)
         posts[4:7], fields[4:7] = rng.uniform(0, SIDE, (3, 2)), fields[4:7] + 500
         shift[7] = -60
-    apart = np.linalg.norm(places[:, None, :2] - posts, axis=2)
-    level = -40 - 30 * np.log10(np.maximum(apart, 1)) + np.stack([field(places, s) for s in fields], 1)
+    distance = np.linalg.norm(places[:, None, :2] - posts, axis=2)
+    level = -40 - 30 * np.log10(np.maximum(distance, 1)) + np.stack([field(places, s) for s in fields], 1)
     level += shift - 3 * later + np.random.default_rng(seed + 7 + later).normal(0, 2.5, level.shape)
     return np.where(level > -95, level, np.nan)
 
@@ -112,9 +112,9 @@ def judge(name, model, places, levels, told, alone=None):
         if alone is not None:
             trained = gsparc.fit(rx=places[new], rssi=levels[new], **alone)
             ways["trained on the places told"] = trained.rssi(rx=places)
-        for way, said in ways.items():
+        for way, prediction in ways.items():
             spent = round(seconds, 3) if way == "updated" else ""
-            yield name, f"{count} places", way, rmse(said[~new], levels[~new]), spent
+            yield name, f"{count} places", way, rmse(prediction[~new], levels[~new]), spent
         model.undo()
 
 
@@ -136,9 +136,9 @@ def was_and_is(level, *places):
 
 def disc():
     """A smooth field, then a screen of 12 dB in a disc of 4 m; rows are in and around it."""
-    asked, near = draw(3000, 11, 20.0), draw(4000, 6, 20.0)
+    probes, near = draw(3000, 11, 20.0), draw(4000, 6, 20.0)
     near = near[np.linalg.norm(near[:, :2] - 5, axis=1) < 6]
-    return "room", [9.0, 9.0, 2.6], *was_and_is(screened, draw(300, 0, 20.0), near, asked)
+    return "room", [9.0, 9.0, 2.6], *was_and_is(screened, draw(300, 0, 20.0), near, probes)
 
 
 def traced(name, moved, effects, counts, apart_m, **facts):
@@ -192,28 +192,30 @@ def space_time(before, heard, new, told, asked):
 
 def rooms():
     """One transmitter, 300 rows with 1 dB of noise; then something is moved, and rows in and around tell."""
-    for name, post, (before, was, now), (near, _, told), (asked, static, truth) in (one() for one in ROOMS):
+    for name, post, (before, was, now), (near, _, values), (probes, static, truth) in (
+        one() for one in ROOMS
+    ):
         heard = was + np.random.default_rng(2).normal(size=len(before))
-        told = told + np.random.default_rng(3).normal(size=len(near))
+        values = values + np.random.default_rng(3).normal(size=len(near))
         changed, right = np.abs(truth - static) > 3, np.abs(now - was) > 3
         fixed = {"tx": post, "model": "gp"}
         model = gsparc.fit(rx=before, rssi=heard, **fixed)
         for count in (5, 10, 20, 50):
-            new, levels, ways = near[:count], told[:count], {"old map": model.rssi(rx=asked)[:, 0]}
+            new, levels, ways = near[:count], values[:count], {"old map": model.rssi(rx=probes)[:, 0]}
             for way, refit in (("updated", False), ("updated, refit=true", True)):
                 began = time.process_time()
                 model.update(rx=new, rssi=levels, refit=refit)
                 seconds = round(time.process_time() - began, 3)
-                ways[way] = model.rssi(rx=asked)[:, 0], seconds
+                ways[way] = model.rssi(rx=probes)[:, 0], seconds
                 model.undo()
             sets = {"all": slice(None), "the right rows": ~right, "a window of 300": slice(count, None)}
-            for way, kept in sets.items():
-                part = {"rx": np.r_[before[kept], new], "rssi": np.r_[heard[kept], levels]}
-                ways[f"retrained on {way}"] = gsparc.fit(**part, **fixed).rssi(rx=asked)[:, 0]
-            ways["retrained on the new rows"] = gsparc.fit(rx=new, rssi=levels, **fixed).rssi(rx=asked)[:, 0]
-            ways["space and time"] = space_time(before, heard, new, levels, asked)
-            for way, said in ways.items():
-                answer, seconds = said if isinstance(said, tuple) else (said, "")
+            for way, rows in sets.items():
+                part = {"rx": np.r_[before[rows], new], "rssi": np.r_[heard[rows], levels]}
+                ways[f"retrained on {way}"] = gsparc.fit(**part, **fixed).rssi(rx=probes)[:, 0]
+            ways["retrained on the new rows"] = gsparc.fit(rx=new, rssi=levels, **fixed).rssi(rx=probes)[:, 0]
+            ways["space and time"] = space_time(before, heard, new, levels, probes)
+            for way, result in ways.items():
+                answer, seconds = result if isinstance(result, tuple) else (result, "")
                 for part, where in (("where it changed", changed), ("elsewhere", ~changed)):
                     yield f"{name}, {part}", f"{count} rows", way, rmse(answer[where], truth[where]), seconds
 
@@ -285,9 +287,9 @@ def measured(file, epoch):
     first = {"rx": places[of == 1], "rssi": levels[of == 1], "station_position": unknown}
     model = gsparc.fit(**first, model="gp")
     for number in np.unique(of)[1:]:
-        own = of == number
-        fifth = len(np.unique(places[own], axis=0)) // 5
-        yield from judge(f"{epoch} {number}", model, places[own], levels[own], (5, fifth))
+        in_epoch = of == number
+        fifth = len(np.unique(places[in_epoch], axis=0)) // 5
+        yield from judge(f"{epoch} {number}", model, places[in_epoch], levels[in_epoch], (5, fifth))
 
 
 def campaigns():
@@ -341,12 +343,12 @@ def priors():
         places = draw(count + 400, 100 + town, 600.0) + np.array([50, 50, 0])
         level = planned(places, town) + 0.75 * field(places, town + 20, 30.0)
         level += np.random.default_rng(town).normal(0, 1, len(places))
-        known = {"rx": places[:count], "tx": [0.0, 0, 20], "rssi": level[:count]}
+        survey = {"rx": places[:count], "tx": [0.0, 0, 20], "rssi": level[:count]}
         maps = {
             "misses shadowing": planned(squares, town), "6 dB too low": planned(squares, town) - 6,
             "30 m off": planned(squares - [30, 0], town), "another town's": planned(squares, town + 50),
         }  # fmt: skip
-        return known, places[count:], level[count:, None], [""], {n: one[:, None] for n, one in maps.items()}
+        return survey, places[count:], level[count:, None], [""], {n: one[:, None] for n, one in maps.items()}
 
     for count in (5, 10, 20, 50, 100):
         for name, *figures in judge_maps(axis, (case(town, count) for town in range(1, 7))):
@@ -399,29 +401,29 @@ def matern(distance, length):
 def solve(belief, rows, level, doubt, apart, among, middle, seen):
     """Level [dB] at a place, at distances `apart` (n,) and `among` (n, n) [m]: one plain solve a kind."""
     weight, added = (np.asarray(part) for part in belief.of(0))
-    kept, result, near = weight >= LEAST, 0.0, matern(apart.min(), belief.extent * AWAY)
+    mask, result, near = weight >= LEAST, 0.0, matern(apart.min(), belief.extent * AWAY)
     for share, kind in zip(weight, KINDS, strict=True):
         if share < LEAST:
             continue
-        own = [
+        covariances = [
             kind.keeps * np.sqrt(variance * rows.doubt.numpy()) * matern(distance, belief.extent * ERRORS)
             + kind.offset**2 + kind.local**2 * matern(distance, belief.extent * kind.size)
             for variance, distance in ((doubt, apart), (rows.doubt.numpy()[:, None], among))
         ]  # fmt: skip
         noise = added + (rows.noise + rows.faded).numpy() + TINY
-        told = rows.missed.numpy() + (1 - kind.keeps) * rows.level.numpy() - (1 - kind.keeps) * middle
-        mean = own[0] @ np.linalg.solve(own[1] + np.diag(noise), told)
+        values = rows.missed.numpy() + (1 - kind.keeps) * rows.level.numpy() - (1 - kind.keeps) * middle
+        mean = covariances[0] @ np.linalg.solve(covariances[1] + np.diag(noise), values)
         away = 0.0 if kind.keeps else near + (1 - near) * seen
         mean = (kind.keeps + away) * mean + (1 - away) * level + away * middle
-        result += share / weight[kept].sum() * mean
+        result += share / weight[mask].sum() * mean
     return result
 
 
 def updates():
     """A row at a time, many of them: differences to fresh solves, memory and seconds."""
     model, measure = world()
-    places, asked = draw(UPDATES, 6, 20.0), torch.from_numpy(draw(20, 11, 20.0))
-    levels, query = measure(np.arange(UPDATES), places), asked - torch.from_numpy(model.site.origin)
+    places, probes = draw(UPDATES, 6, 20.0), torch.from_numpy(draw(20, 11, 20.0))
+    levels, query = measure(np.arange(UPDATES), places), probes - torch.from_numpy(model.site.origin)
     before = map_level(
         model.method, model.predict_query(Query.from_places(model.site, query.float())), model.site
     )
@@ -433,11 +435,11 @@ def updates():
         if number % EACH != EACH - 1:
             continue
         rows, extent = model.versions[-1].changes.stations[0], model.versions[-1].changes.belief.extent
-        said = correct(model.versions[-1].changes.belief, 0, rows, query, before.mean, before.doubt).mean
-        belief, apart = learn({0: rows}, extent), torch.cdist(query, rows.places).numpy()
+        means = correct(model.versions[-1].changes.belief, 0, rows, query, before.mean, before.doubt).mean
+        belief, distances = learn({0: rows}, extent), torch.cdist(query, rows.places).numpy()
         seen = min(np.linalg.norm(np.ptp(rows.places.numpy(), axis=0)) / extent, 1.0) ** WHOLE
         for count in worst if number % (5 * EACH) == 5 * EACH - 1 else (NEAR,):
-            for one, distance in enumerate(apart):
+            for one, distance in enumerate(distances):
                 near = np.argsort(distance)[:count]
                 part = rows[torch.from_numpy(near)]
                 among = torch.cdist(part.places, part.places).numpy()
@@ -445,10 +447,10 @@ def updates():
                     belief, part, float(before.mean[one]), float(before.doubt[one]), distance[near], among,
                     rows.middle.item(), seen,
                 )  # fmt: skip
-                worst[count] = max(worst[count], abs(fresh - float(said[one])))
+                worst[count] = max(worst[count], abs(fresh - float(means[one])))
         memory = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
         few.append(memory)
-    name, told = "a row at a time, 1,000 kept", f"{UPDATES} updates"
+    name, amount = "a row at a time, 1,000 kept", f"{UPDATES} updates"
     figures = {
         "from a fresh solve of the 64 nearest rows, at most [dB]": worst[NEAR],
         "from a fresh solve of all rows kept, at most [dB]": worst[1000],
@@ -457,15 +459,15 @@ def updates():
         "of the last 1,000, median [ms]": 1e3 * np.median(seconds[-EACH:]),
     }  # fmt: skip
     for way, figure in figures.items():
-        yield name, told, way, float(f"{figure:.3g}"), round(sum(seconds)) if way.startswith("an") else ""
+        yield name, amount, way, float(f"{figure:.3g}"), round(sum(seconds)) if way.startswith("an") else ""
     states = []
     for turn in range(10):
-        states.append(model.predict(rx=asked.numpy()))
+        states.append(model.predict(rx=probes.numpy()))
         model.update(rx=places[[turn]], rssi=levels[[turn]])
     same = 0
     for state in states[::-1]:
         model.undo()
-        now = model.predict(rx=asked.numpy())
+        now = model.predict(rx=probes.numpy())
         same += bool((now.mean == state.mean).all() and (now.variance == state.variance).all())
     yield name, "10 updates, then 10 undos", "bit-identical", same, ""
 
@@ -473,10 +475,10 @@ def updates():
 def kills():
     """A process that updates a file, killed at random moments: the file holds the state before, or after."""
     model, measure = world()
-    places, asked, rng = draw(2000, 6, 20.0), draw(20, 11, 20.0), np.random.default_rng(0)
-    levels, whole, lost, writes = measure(np.arange(2000), places), 0, 0, 0
+    places, probes, rng = draw(2000, 6, 20.0), draw(20, 11, 20.0), np.random.default_rng(0)
+    levels, whole, losses, writes = measure(np.arange(2000), places), 0, 0, 0
     with tempfile.TemporaryDirectory() as folder:
-        file, known = Path(folder) / "model.ckpt", [model.rssi(rx=asked)]
+        file, maps = Path(folder) / "model.ckpt", [model.rssi(rx=probes)]
         checkpoint.save(file, model.method)
         for _ in range(KILLS):
             begins, (heard, says) = len(gsparc.load(file).rows), os.pipe()
@@ -493,17 +495,17 @@ def kills():
             os.close(says)
             done, after = begins + len(os.read(heard, 2**16)), gsparc.load(file)
             os.close(heard)
-            for number in range(len(known) - 1, len(after.rows)):
+            for number in range(len(maps) - 1, len(after.rows)):
                 model.update(rx=places[[number]], rssi=levels[[number]], window=len(places))
-                known.append(model.rssi(rx=asked))
-            writes, lost = len(after.rows), lost + (len(after.rows) < done)
+                maps.append(model.rssi(rx=probes))
+            writes, losses = len(after.rows), losses + (len(after.rows) < done)
             whole += (
-                len(after.rows) in (done, done + 1) and (after.rssi(rx=asked) == known[len(after.rows)]).all()
+                len(after.rows) in (done, done + 1) and (after.rssi(rx=probes) == maps[len(after.rows)]).all()
             )
-        left = len(list(Path(folder).iterdir())) - 1
+        leftovers = len(list(Path(folder).iterdir())) - 1
     figures = {
         "the state before, or after, bit for bit": int(whole),
-        "updates lost that were said to be stored": lost, "partial files left": left,
+        "updates lost that were said to be stored": losses, "partial files left": leftovers,
     }  # fmt: skip
     for way, figure in figures.items():
         yield "killed at random", f"{KILLS} kills, {writes} writes", way, figure, ""

@@ -18,10 +18,10 @@ QUANTITIES = {
 
 def draw(tables: Path, pictures: Path) -> None:
     """Save a picture of powers for each source that was measured; slopes of seconds stand in its legend."""
-    for source, own in pd.read_csv(tables / "powers.csv").groupby("source", sort=False):
+    for source, table in pd.read_csv(tables / "powers.csv").groupby("source", sort=False):
         figure, places = panels(9.0, 6.4, 2, 2)
         for place, (quantity, title) in zip(places.flat, QUANTITIES.items(), strict=True):
-            for name, lines in own.sort_values("rows", kind="stable").groupby("method", sort=False):
+            for name, lines in table.sort_values("rows", kind="stable").groupby("method", sort=False):
                 # Two standard errors, about 95 %.
                 errors = 2 * lines["rmse_error"] if quantity == "rmse" else None
                 many, label = lines[lines["rows"] >= MANY], str(name)

@@ -58,17 +58,17 @@ def city(count: int) -> Measurements:
     """
     with np.load(CITY) as stored:
         heard = np.flatnonzero(np.isfinite(stored["rssi_db"][:, STATION_USED]))
-        known = np.pad(stored["mobile_position"][heard].astype(float), ((0, 0), (0, 1)))
+        points = np.pad(stored["mobile_position"][heard].astype(float), ((0, 0), (0, 1)))
         powers = stored["rssi_db"][heard, STATION_USED].astype(float)
         station = np.append(stored["station_position"][STATION_USED], 0.0)
     rng, parts = np.random.default_rng([0, count]), []
     for part, number in ((rng, count), (np.random.default_rng(2), TESTED)):
-        place = known[part.integers(len(known), size=number)]
+        place = points[part.integers(len(points), size=number)]
         place[:, :2] += JITTER_M * part.normal(size=(number, 2))
         parts.append(place)
     places = np.concatenate(parts)
     prior = Prior(Kernel.from_lengths((80.0, 500.0), (0.3, 0.7), 0.2, 60.0), Trend(float(powers.mean())))
-    process = condition_on_nearest(prior, PlaceValues.from_rows(known, torch.from_numpy(powers)[:, None]), 0)
+    process = condition_on_nearest(prior, PlaceValues.from_rows(points, torch.from_numpy(powers)[:, None]), 0)
     with torch.no_grad():
         decibels = process.mean_at(torch.from_numpy(places))[:, 0].numpy()
     decibels += CITY_NOISE_DB * rng.standard_normal(len(places))

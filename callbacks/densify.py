@@ -100,8 +100,8 @@ class Densify(Checked, L.Callback):
             if module.batch.rx.batched:
                 if not module.batch.share:  # another process has these rows
                     visible = torch.zeros_like(visible)
-                own = torch.stack([(gradient.norm(dim=-1) * visible).sum(0), visible.sum(0)])
-                result, seen = process_sum(own)
+                sums = torch.stack([(gradient.norm(dim=-1) * visible).sum(0), visible.sum(0)])
+                result, seen = process_sum(sums)
             else:  # of one pose the gradient is the sum over rows, and every process sees the same
                 result, seen = (process_sum(gradient.clone()).norm(dim=-1) * visible).sum(0), visible.sum(0)
             self.statistics["gradient"] += result
@@ -180,9 +180,9 @@ class Densify(Checked, L.Callback):
         parents = torch.cat([clones, splits])
         if in_place:
             # N layers of opacity b let through (1 - b)^N, which is to be 1 - a of the parent.
-            apart = -torch.expm1(torch.log1p(-gaussians.opacities[splits]) / self.children)
+            opacities = -torch.expm1(torch.log1p(-gaussians.opacities[splits]) / self.children)
             return edit.Edit(
-                ~(prune | split), parents, {"gaussians.opacity_logits": torch.logit(apart, LEAST)}
+                ~(prune | split), parents, {"gaussians.opacity_logits": torch.logit(opacities, LEAST)}
             )
         # Two children are 1 / 1.6 of their parent, as in B. Kerbl et al., 3D Gaussian splatting (2023).
         smaller = gaussians.log_scales[splits] - math.log(self.shrink * self.children)

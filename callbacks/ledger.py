@@ -84,12 +84,12 @@ class CostLedger(L.Callback):
 
     def _log_seconds(self, trainer: L.Trainer, module: Any) -> None:
         step, loss = trainer.global_step, trainer.callback_metrics.get("train/task_loss")
-        shown = {name: value for name, value in module.figures.items() if name in curve.FIGURES}
+        figures = {name: value for name, value in module.figures.items() if name in curve.FIGURES}
         # What was solved before the first step is part of what an accuracy costs.
         row = curve.curve_row(
             module.prepared_seconds + self.seconds, f"step {step}" if step else module.start,
             module.figures["val/error"], step, num_gaussians=module.count,
-            **shown, **({} if loss is None else {"train/task_loss": float(loss)}),
+            **figures, **({} if loss is None else {"train/task_loss": float(loss)}),
         )  # fmt: skip
         self._rows.append(row)
         curve.write_curve(module.run_dir, self._rows)

@@ -57,8 +57,8 @@ class Pictures(Checked, L.Callback):
             title = f"validation, step {step}"
             title += "" if ledger is None else f", {ledger.elapsed():.0f} s of training"
             path = module.run_dir / "pictures" / f"step_{step:06d}.png"
-            true, own = batch.target.cpu().numpy(), {"predicted": predicted.cpu().numpy()}
+            true, predictions = batch.target.cpu().numpy(), {"predicted": predicted.cpu().numpy()}
             unknown = np.full(len(rows), np.nan)
-            shown = Examples(rows, np.array(module.site.grid.edges()), true, unknown, own)
-            save(draw_spectra(shown, title), path, 100)
+            examples = Examples(rows, np.array(module.site.grid.edges()), true, unknown, predictions)
+            save(draw_spectra(examples, title), path, 100)
             log_picture(trainer.loggers, "predictions", path, step)

@@ -61,10 +61,10 @@ class StepProgress(L.Callback):
             now = time.perf_counter()
             each, self._began = (now - self._began[1]) / since, (step, now)
             other = self._told_s is None or not 1 / CHANGED < each / self._told_s < CHANGED
-            if other and (left := each * (trainer.max_steps - step)) > LONG_S:
+            if other and (rest_s := each * (trainer.max_steps - step)) > LONG_S:
                 self._told_s = each
                 pace = f"{trainer.max_steps:,} steps, {1000 * each:.0f} ms each here"
-                self._bar.console.print(f"{pace}: about {left / 60:.0f} min to go", highlight=False)
+                self._bar.console.print(f"{pace}: about {rest_s / 60:.0f} min to go", highlight=False)
         if step % 20 == 0 or step == trainer.max_steps:
             result = {form: trainer.callback_metrics.get(key) for key, form in SHOWN.items()}
             figures = [form.format(float(value)) for form, value in result.items() if value is not None]

@@ -59,8 +59,8 @@ class OpacityReset(Checked, L.Callback):
         if not acts_at_step(step, 1, self.stop, self.interval, module.total_steps):
             return
         if step + interval > module.total_steps:
-            left = module.total_steps - step
-            log.info("no opacity reset at step %d: %d steps are too few to recover in", step, left)
+            rest = module.total_steps - step
+            log.info("no opacity reset at step %d: %d steps are too few to recover in", step, rest)
             return
         # The logit of the ceiling: opacities are stored as logits.
         field, ceiling = module.model.gaussians, math.log(self.ceiling / (1 - self.ceiling))

@@ -152,13 +152,13 @@ def build(path: Path, *architectures: str) -> None:
 def arch_option(nvcc: str, arch: str) -> str:
     """Return nvcc's option for a GPU: native code, or PTX for one newer than nvcc."""
     listed = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True, check=False).stdout
-    known = sorted({int(number) for number in re.findall(r"compute_(\d+)\b", listed)})
-    if not known or int(arch) in known:
+    archs = sorted({int(number) for number in re.findall(r"compute_(\d+)\b", listed)})
+    if not archs or int(arch) in archs:
         return f"-gencode=arch=compute_{arch},code=sm_{arch}"
-    older = [number for number in known if number < int(arch)]
+    older = [number for number in archs if number < int(arch)]
     if not older:
         raise LibraryUnavailable(
-            f"this GPU is sm_{arch} and {nvcc} builds for sm_{known[0]} and newer; "
+            f"this GPU is sm_{arch} and {nvcc} builds for sm_{archs[0]} and newer; "
             "set CUDA_HOME to an older CUDA toolkit"
         )
     # PTX of the newest GPU that nvcc knows: the driver compiles it for this one.

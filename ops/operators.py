@@ -67,8 +67,8 @@ def run_kernel(name: str, like: Tensor, out: Any, *values: Any) -> Any:
     """Fill the empty outputs `out` of operator `name` on the device of `like`, given its arguments."""
     if like.is_meta:
         return out  # shapes alone
-    own = KERNELS[like.device.type][name](out, *values)
-    return out if own is None else own
+    result = KERNELS[like.device.type][name](out, *values)
+    return out if result is None else result
 
 
 class _Gradient(torch.autograd.Function):

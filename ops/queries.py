@@ -72,12 +72,12 @@ def nearest_weights(
         rows: (B, k) int64, the near ones.
         lengths, shares: of one or two Matern-3/2, of Matern-1/2 where the length is negative [m].
     """
-    weights, known = queries.new_empty(rows.shape), queries.new_empty(len(queries))
+    weights, gains = queries.new_empty(rows.shape), queries.new_empty(len(queries))
     # The kernel sums two: of a single one the second has no share.
     two = [*shares, 0.0][:2] + [*lengths, 1.0][:2]
     inputs = contiguous((queries, places, noise, rows))
     sizes = (*queries.shape, rows.shape[1])
     numbers = (*two, float(len(lengths)))
-    failed = calls.launch("nearest_weights", queries, *inputs, weights, known, sizes=sizes, numbers=numbers)
+    failed = calls.launch("nearest_weights", queries, *inputs, weights, gains, sizes=sizes, numbers=numbers)
     # -1 where every covariance has a factor.
-    return None if failed >= 0 else (weights, known)
+    return None if failed >= 0 else (weights, gains)

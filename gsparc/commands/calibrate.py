@@ -27,7 +27,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     run_dir, settings = begin_run(config)
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     opened = [Unseen.open(path, settings["dataset"], settings["split"]) for path in paths]
-    evidence, known = Evidence.join([one.evidence for one in opened]), opened[0].facts
+    evidence, run_facts = Evidence.join([one.evidence for one in opened]), opened[0].facts
     promise = Guarantee(float(config.limit_db), float(config.alpha), float(config.delta))
     draws = int(config.draws), config.confidence, int(config.seed)
     divisions = [run_trials(evidence, promise, False, *draws)]
@@ -36,10 +36,10 @@ def task(config: DictConfig) -> dict[str, Any]:
     except ValueError:
         # With fewer patches than parts no division by whole cells exists.
         log.warning("the positions lie in too few patches of the plane: tried on random divisions alone")
-    facts = known | calibration_facts(evidence, divisions, promise) | {"seed": config.seed}
+    facts = run_facts | calibration_facts(evidence, divisions, promise) | {"seed": config.seed}
     # Written before a threshold is stored: where storing fails, these figures are there.
     write_summary(run_dir / "summary.json", facts)
-    title = f"{known['dataset/name']}, {known['model/name']}"
+    title = f"{run_facts['dataset/name']}, {run_facts['model/name']}"
     draw_calibration(evidence, divisions, promise, title, run_dir / "confidence.png")
     few = explain_too_few(len(evidence), promise)
     stored_lines = [] if few is None or config.store else [few]

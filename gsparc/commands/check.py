@@ -109,9 +109,9 @@ def read_settings(words: Sequence[str]) -> dict[str, Any]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; exit status 0 when everything given is good, else 1."""
     own = files("gsparc.conf").joinpath("dataset/own.yaml").read_text(encoding="utf-8")
-    told = f"settings dataset.KEY=VALUE, as training takes them:\n\n{own[own.index('stations: ') :]}"
+    epilog = f"settings dataset.KEY=VALUE, as training takes them:\n\n{own[own.index('stations: ') :]}"
     parser = argparse.ArgumentParser(
-        prog="gsparc check", description=__doc__, epilog=told,
+        prog="gsparc check", description=__doc__, epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     add = parser.add_argument
@@ -131,13 +131,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from gsparc.evaluation.console import error_in_one_line
 
         try:
-            said = read_settings(words)
+            dataset_settings = read_settings(words)
         except (HydraException, OmegaConfBaseException) as error:
             _line(Console(stderr=True), f"error: {error_in_one_line(error)}")
             return 1
-        paths += [said["file"]] if said["file"] else []
-        said["stations_file"] = said["stations_file"] or args.stations_file
-        settings = {name: value for name, value in said.items() if name not in UNUSED}
+        paths += [dataset_settings["file"]] if dataset_settings["file"] else []
+        dataset_settings["stations_file"] = dataset_settings["stations_file"] or args.stations_file
+        settings = {name: value for name, value in dataset_settings.items() if name not in UNUSED}
     if not paths:
         parser.error("name a file or a folder, too")
     if args.draw is not None and (len(paths) > 1 or not args.draw.lower().endswith(".png")):

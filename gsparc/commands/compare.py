@@ -91,6 +91,6 @@ def write_comparison(
             save(draw_spectra(examples, title), run_dir / f"{stem}-rows.png", 100, figures)
     best = {f"{title_of(block)}/first": block.method.iloc[0] for block in blocks}
     write_summary(run_dir / "summary.json", {"cells": len(filled), **best, **provenance()})
-    shown: list[Any] = [part for block in blocks for part in (table_of(block, ours), *remarks(block, ours))]
-    show_result(run_dir, *shown)
+    parts: list[Any] = [part for block in blocks for part in (table_of(block, ours), *remarks(block, ours))]
+    show_result(run_dir, *parts)
     return rows

@@ -80,6 +80,6 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
     title = f"{data.site.name}, split {split.title}, {config.eval_on}"
     # Who opened the files has warned of it, and warnings are repeated below the table.
-    said = remarks({**facts, "split/foreign": None}, config.eval_on)
+    notes = remarks({**facts, "split/foreign": None}, config.eval_on)
     tables = tables_of(facts, title, config.eval_on, evaluation.stations)
-    return finish_run(run_dir, facts, *tables, lines=said)
+    return finish_run(run_dir, facts, *tables, lines=notes)

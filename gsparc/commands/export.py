@@ -88,9 +88,9 @@ def _impulses(predictor: Predictor, config: DictConfig, folder: Path, out: Path)
 
 def _scenario(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
     place = _places(predictor, config)
-    paths, left = deepmimo.write_scenario(folder, predictor, place)
-    facts = {"deepmimo/places": len(place), "deepmimo/paths": paths, "deepmimo/left_out": left}
-    return facts, [f"{len(place)} places, at most {paths} paths; beyond these {left:.2g} of the power: {out}"]
+    paths, rest = deepmimo.write_scenario(folder, predictor, place)
+    facts = {"deepmimo/places": len(place), "deepmimo/paths": paths, "deepmimo/left_out": rest}
+    return facts, [f"{len(place)} places, at most {paths} paths; beyond these {rest:.2g} of the power: {out}"]
 
 
 WRITERS = {"c": _library, "taps": _impulses, "deepmimo": _scenario}

@@ -52,14 +52,14 @@ def task(config: DictConfig) -> dict[str, Any]:
     title = f"{run.data.site.name}, {study.method.name}"
     points = {name: values for name, values in settings["pusch"]["ebno_db"].items() if values}
     errors, surest = {}, {}
-    rates, own = study.rates()
-    facts |= own | {"time/mcs_s": time.perf_counter() - started}
+    rates, results = study.rates()
+    facts |= results | {"time/mcs_s": time.perf_counter() - started}
     draw_rates(rates, study.confidence, study.least, title, run_dir / "mcs.png")
     write_summary(run_dir / "summary.json", facts)  # hours of PUSCH may follow
     for modulation, ebno_db in points.items():
         log.info("PUSCH, %s", modulation)
-        errors[modulation], surest[modulation], own = study.send(modulation, ebno_db)
-        facts |= own
+        errors[modulation], surest[modulation], results = study.send(modulation, ebno_db)
+        facts |= results
         write_summary(run_dir / "summary.json", facts)
     if errors:
         draw_errors(errors, title, run_dir / "bler.png")

@@ -53,8 +53,8 @@ def _pictures(config: DictConfig, field: FieldMap) -> list[str]:
     save = [] if config.save is None else [str(config.save)]
     names = [file_name(layer, suffix) for layer in _layers(field) for suffix in SUFFIXES]
     if save and not any(fnmatch(name, save[0]) for name in names):
-        said = ", ".join(name for name in names if name.endswith(".pdf"))
-        raise DataError(f"save={save[0]}: no layer's file is called so; there are *.pdf, *.svg, {said}")
+        pdf_names = ", ".join(name for name in names if name.endswith(".pdf"))
+        raise DataError(f"save={save[0]}: no layer's file is called so; there are *.pdf, *.svg, {pdf_names}")
     return [*(["*.png"] if config.pictures else []), *save]
 
 

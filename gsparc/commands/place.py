@@ -53,7 +53,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
     }  # fmt: skip
     next_one = ", {nearest_m:.4g} m from the next" * (best["nearest_m"] is not None)  # at a known place
-    told = "with a station at " + at + next_one + ": {coverage:.1%}, gaining "
+    sentence = "with a station at " + at + next_one + ": {coverage:.1%}, gaining "
     interval = "no interval is known: no station could be left out, or promised=false, left_out=0"
     if best["low"] is not None:
         low, high = found.between[:, 2:].T
@@ -65,6 +65,6 @@ def task(config: DictConfig) -> dict[str, Any]:
         placing.assumption(predictor.site, found.places[0, 2], where["antenna"]),
         f"now {found.before:.1%} of the area, {found.grid.step:.3g} m squares, with {level:g} {unit} or more"
         + (f"; {found.refused:.0%} of it was never tested, and is left out here" if found.refused else ""),
-        told.format(**best) + f"{100 * found.gain[0]:.1f} points", interval.format(**best),
+        sentence.format(**best) + f"{100 * found.gain[0]:.1f} points", interval.format(**best),
     ]  # fmt: skip
     return finish_run(run_dir, facts, lines=lines, before=f"{len(found.places)} candidates; ")

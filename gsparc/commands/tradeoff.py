@@ -57,9 +57,9 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     clock = replace(BLOCKS, rounds=config.rounds, rounds_s=config.rounds_s)
     how = data, run.split, config.eval_on, clock
     points, beside = tradeoff.measure_points(candidates, threads, config.baselines, *how)
-    kept = points[points.kept_with_model == 1]
+    model_points = points[points.kept_with_model == 1]
     if config.store:
-        operating_point.store_points(Path(config.ckpt), kept.to_dict("records"), inputs)
+        operating_point.store_points(Path(config.ckpt), model_points.to_dict("records"), inputs)
     write_samples(run_dir / "tradeoff.csv", points.drop(columns=tradeoff.MADE).to_dict("list"))
     title = f"{data.site.name}, split {run.split.title}, {config.eval_on}: {method.name}"
     save(draw_front(points, beside, method.name, title), run_dir / "tradeoff.png")
@@ -68,7 +68,7 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
         **peak_memory(), **run.facts(),
         "ckpt": str(config.ckpt), "seed": run.stored[0].configuration.get("seed"),
         "time/includes": "one query end to end: world position in, physical units out; warm",
-        "tradeoff/stored": len(kept) if config.store else 0,
+        "tradeoff/stored": len(model_points) if config.store else 0,
     }  # fmt: skip
     best = points[points.front == 1].to_dict("records")
     sheet = Table.from_rows(title, [*tradeoff.POINT, Column(best[0]["figure"], of="value")], best)

@@ -86,8 +86,8 @@ def train(
             facts = {**evaluation.facts, **summary.provenance(), **fits.facts(), "run_id": run_id}
             facts |= {"seed": int(config.seed), "options/unused": unused}
             if in_full:
-                shown = facts, evaluation.examples, config.eval_on
-                draw_run(fits.methods[0], data, split, inputs.walls, *shown, run_dir, loggers)
+                results = facts, evaluation.examples, config.eval_on
+                draw_run(fits.methods[0], data, split, inputs.walls, *results, run_dir, loggers)
         evaluation.write(run_dir, run_id=run_id)
         summary.write_summary(run_dir / SUMMARY, facts)
         return facts, TrainedRun(fits.methods, folds.checkpoints(contexts), data, split, evaluation)
@@ -99,15 +99,15 @@ def train_job(job: Job, left: str | None) -> None:
     forget_vectors()  # solved for another job, they would be missing from this one's processor seconds
     config.ckpt_path = config.ckpt_path or left  # what the settings name to go on from wins
     inputs = replace(read_inputs(config, job.data), split=job.split, learned=job.learned)
-    _, made = train(config, job.folder, inputs, in_full=False)
-    for file in () if job.keeps_models else made.checkpoints:
+    _, trained_run = train(config, job.folder, inputs, in_full=False)
+    for file in () if job.keeps_models else trained_run.checkpoints:
         file.unlink()
 
 
 def train_and_show(config: DictConfig, run_dir: Path, inputs: RunInputs) -> None:
     """Train, and show the table."""
-    facts, made = train(config, run_dir, inputs)
-    show_training(config, run_dir, facts, made.split, made.evaluation.stations)
+    facts, trained_run = train(config, run_dir, inputs)
+    show_training(config, run_dir, facts, trained_run.split, trained_run.evaluation.stations)
 
 
 def task(config: DictConfig) -> float:

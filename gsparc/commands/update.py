@@ -40,7 +40,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         raise DataError("gsparc update: say data=FILE to add rows, or undo=COUNT to take updates back")
     stored = checkpoint.read(config.ckpt)
     predictor = load(config.ckpt)
-    known, watch, told, skipped = len(predictor.alarms), Stopwatch(), 0, 0
+    alarms_before, watch, row_count, skipped = len(predictor.alarms), Stopwatch(), 0, 0
     if config.undo:
         predictor.undo(config.undo)
     else:
@@ -53,7 +53,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         for start in range(0, len(rows), size):
             refit = config.refit and start + size >= len(rows)
             found = predictor.update(rows.subset(slice(start, start + size)), refit=refit, **how)
-            told, skipped = told + len(found.rows), skipped + found.skipped
+            row_count, skipped = row_count + len(found.rows), skipped + found.skipped
     seconds, out = watch.seconds, config.out or config.ckpt
     checkpoint.update_extra(config.ckpt, versions_extra(predictor.versions), out)
     table = alarm_rows(predictor)
@@ -64,14 +64,14 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_whole(run_dir / "changes.csv", text.getvalue())
     facts = {
         "ckpt": str(config.ckpt), "out": str(out), "model/name": predictor.method.name,
-        "update/rows_kept": len(predictor.rows), "update/alarms": len(table) - known,
+        "update/rows_kept": len(predictor.rows), "update/alarms": len(table) - alarms_before,
         "update/versions": len(predictor.versions), "time/update_s": seconds,
     }  # fmt: skip
     silent = f", {skipped} others tell nothing" if skipped else ""
-    said = f"{told} rows added{silent}, {len(table) - known} alarm(s)"
-    said = f"back by {config.undo}: {len(predictor.rows)} rows kept" if config.undo else said
-    said += f", {seconds:.2g} s"
-    before = f"update: {said}; model in {out}; summary "
+    message = f"{row_count} rows added{silent}, {len(table) - alarms_before} alarm(s)"
+    message = f"back by {config.undo}: {len(predictor.rows)} rows kept" if config.undo else message
+    message += f", {seconds:.2g} s"
+    before = f"update: {message}; model in {out}; summary "
     return finish_run(run_dir, facts, *[changes_table(table)] * bool(table), before=before)
 
 
@@ -82,8 +82,8 @@ def alarm_rows(predictor: Predictor) -> list[dict[str, Any]]:
         name = "all" if one.station < 0 else (predictor.stations or ["the station"])[one.station]
         where = coordinates(np.array([[*one.place, 0.0]]), predictor)
         place = {axis: float(value[0].round(7)) for axis, value in where.items() if axis != "z"}
-        told = name, one.kind, one.since, one.at, round(one.change_db, 2)
-        rows.append({**dict(zip(COLUMNS, told, strict=False)), **place})
+        values = name, one.kind, one.since, one.at, round(one.change_db, 2)
+        rows.append({**dict(zip(COLUMNS, values, strict=False)), **place})
     return rows
 
 

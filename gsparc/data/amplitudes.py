@@ -57,7 +57,7 @@ def amplitudes_to_levels(raw: Raw) -> Raw:
     arrays |= {"rssi_db": level if several else level[:, 0]}
     if np.isfinite(tones).all():
         arrays.setdefault("carrier_hz", tones if several else tones[0])
-    said = "csi: absolute values, no phases: taken as levels"
+    note = "csi: absolute values, no phases: taken as levels"
     if several:
         place = np.full(3, np.nan)
         for end in still:
@@ -69,5 +69,5 @@ def amplitudes_to_levels(raw: Raw) -> Raw:
         words = ("tone",) if csi.ndim == 2 else ("antenna", "tone")
         names = [" ".join(f"{w} {i}" for w, i in zip(words, index, strict=True)) for index in named]
         arrays["station_name"] = np.array(names)[heard]
-        said += f" of {heard.sum()} stations, one for each {' and '.join(words)}"
-    return replace(raw, arrays=arrays, notes=(*raw.notes, f"{said}; with phases write complex numbers"))
+        note += f" of {heard.sum()} stations, one for each {' and '.join(words)}"
+    return replace(raw, arrays=arrays, notes=(*raw.notes, f"{note}; with phases write complex numbers"))

@@ -60,8 +60,8 @@ class OnDisk(np.memmap):
         """For a process that is being started: a duplicate of the open file, which may have no name."""
         if self.file is None or context.get_spawning_popen() is None:
             return super().__reduce__()
-        own = reduction.DupFd(self.file.fileno())
-        return _opened, (own, self.dtype, self.shape, self.offset)
+        duplicate = reduction.DupFd(self.file.fileno())
+        return _opened, (duplicate, self.dtype, self.shape, self.offset)
 
 
 def _opened(handle: Any, dtype: Any, shape: tuple[int, ...], offset: int) -> OnDisk:

@@ -63,7 +63,7 @@ def traits(data: Measurements) -> set[str]:
         plain = grid in (SphereGrid.hemisphere(*shape), SphereGrid.hemisphere(*shape[::-1]))
         holds = {"spectra": True, "above": grid.first_elevation >= 0, "hemisphere": plain}
     turned = {"turned": data.site.kind != "rssi" and bool((data.rx_rotation != np.eye(3)).any())}
-    return {name for name, held in {**holds, **placed, **turned}.items() if held}
+    return {name for name, flag in {**holds, **placed, **turned}.items() if flag}
 
 
 def _values(change: Callable[[np.ndarray], np.ndarray]) -> Change:

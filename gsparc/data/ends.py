@@ -64,5 +64,5 @@ def stations_at(known: Tensor, places: Tensor) -> Tensor:
 
 def station_distances(known: Tensor, places: Tensor) -> Tensor:
     """Return distances (n, T) [m]; of an unknown place 0 to unknown stations, and infinity to others."""
-    lost = places.isnan().any(1)[:, None] & known.isnan().any(1)
-    return torch.cdist(places.detach(), known).nan_to_num(math.inf).masked_fill(lost, 0.0)
+    both_unknown = places.isnan().any(1)[:, None] & known.isnan().any(1)
+    return torch.cdist(places.detach(), known).nan_to_num(math.inf).masked_fill(both_unknown, 0.0)

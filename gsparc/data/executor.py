@@ -97,7 +97,7 @@ def run_each(
         BrokenProcessPool, ray.exceptions.RayError: a piece ended its process `TRIES` times.
     """
     costs = [cost(piece) for piece in pieces]
-    left, spent = Counter(costs), defaultdict[float, list[float]](list)
+    backlog, spent = Counter(costs), defaultdict[float, list[float]](list)
     numbers = (number for number, piece in enumerate(pieces) if wanted(piece))
     logged = before = time.monotonic()
     if not uses_other_processes() and threads == 1:
@@ -112,9 +112,9 @@ def run_each(
             if isinstance(result, Exception):
                 raise result
             now = time.monotonic()
-            left[costs[number]] -= 1
+            backlog[costs[number]] -= 1
             spent[costs[number]].append(now - before)
-            before, to_come = now, _time_left(left, spent)
+            before, to_come = now, _time_left(backlog, spent)
             whole = to_come + sum(map(sum, spent.values()))
             if what and count < len(pieces) and now - logged > max(SAY_S, whole / LINES):
                 logged = now
@@ -131,8 +131,8 @@ def run_all(work: Callable[[_Piece], _Result], pieces: Sequence[_Piece], what: s
 def _time_left(left: Mapping[float, int], spent: Mapping[float, Sequence[float]]) -> float:
     """Seconds that pieces `left` by cost take, as those of the same cost took, else in proportion to it."""
     # Costs are guesses: some take a hundredth of theirs, others several times theirs.
-    rate = sum(map(sum, spent.values())) / max(sum(cost * len(own) for cost, own in spent.items()), 1e-9)
-    mean = {cost: sum(own) / len(own) for cost, own in spent.items()}
+    rate = sum(map(sum, spent.values())) / max(sum(cost * len(times) for cost, times in spent.items()), 1e-9)
+    mean = {cost: sum(times) / len(times) for cost, times in spent.items()}
     return sum(count * mean.get(cost, rate * cost) for cost, count in left.items())
 
 
@@ -174,7 +174,7 @@ def _jobs(calls: Iterable[Any], workers: int) -> Results:
 
 def _in_processes(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Results:
     workers = _chosen.workers or max(joblib.cpu_count() // torch.get_num_threads(), 1)
-    lost, begun = Counter[int](), dict[int, None]()
+    failures, begun = Counter[int](), dict[int, None]()
 
     def calls(where: str) -> Iterator[tuple[Any, ...]]:
         for number in chain(numbers, list(begun)):
@@ -191,8 +191,8 @@ def _in_processes(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) ->
                     yield number, result
                 return
             except BrokenProcessPool as error:
-                lost.update(list(begun))
-                if max(lost.values(), default=TRIES) >= TRIES:
+                failures.update(list(begun))
+                if max(failures.values(), default=TRIES) >= TRIES:
                     raise
                 log.warning("a process died, its work starts again (%s)", explain_error(error).split(". ")[0])
 

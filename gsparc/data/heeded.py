@@ -115,8 +115,8 @@ def return_with_reads(work: Callable[[Any], Any]) -> Callable[[Any], tuple[Any, 
     options = () if _reads is None else _reads.options
 
     def there(piece: Any) -> tuple[Any, set[str]]:
-        with record_reads(own := Reads(options)):
-            return work(piece), own.noted
+        with record_reads(reads := Reads(options)):
+            return work(piece), reads.noted
 
     return there
 

@@ -73,11 +73,11 @@ def inner_folds(
     Raises:
         DataError: fewer than 2 places to cut.
     """
-    known = np.sort(fold.learned())
+    rows = np.sort(fold.learned())
     positions, place = positions - positions.min(axis=0), spacing.group_visits(positions, place)
-    number = np.arange(len(known)) if place is None else np.unique(place[known], return_inverse=True)[1]
+    number = np.arange(len(rows)) if place is None else np.unique(place[rows], return_inverse=True)[1]
     _, first, which = np.unique(number, return_index=True, return_inverse=True)
-    which, where = which.reshape(-1), positions[known][first]
+    which, where = which.reshape(-1), positions[rows][first]
     if len(where) < 2:
         raise DataError(f"{len(where)} training places are too few to leave any out; measure more")
     settings = _inside(positions, fold, split)
@@ -85,17 +85,17 @@ def inner_folds(
     cut = None
     if settings.name in WHOLE:
         if station is not None:
-            unit = np.unique(station[known], return_inverse=True)[1].reshape(-1)
+            unit = np.unique(station[rows], return_inverse=True)[1].reshape(-1)
             cut = _stations(unit, settings, count, rng)
         settings = replace(settings, name="random", leave_out=())
     if cut is None:
         cut = _cut(where, settings, count, rng)
     else:
-        which = np.arange(len(known))  # folds of rows, not of places
-    folds = tuple(one.map(lambda part: known[np.isin(which, part)]) for one in cut.folds)
+        which = np.arange(len(rows))  # folds of rows, not of places
+    folds = tuple(one.map(lambda part: rows[np.isin(which, part)]) for one in cut.folds)
     units = np.full(len(positions), NOT_TESTED)
-    tested = np.isin(known, np.concatenate([one.test for one in folds]))
-    units[known[tested]] = cut.unit[which][tested]
+    tested = np.isin(rows, np.concatenate([one.test for one in folds]))
+    units[rows[tested]] = cut.unit[which][tested]
     return InnerFolds(cut.name, folds, units)
 
 
@@ -148,8 +148,8 @@ def _like_a_file(positions: np.ndarray, fold: Fold) -> SplitSettings:
     gap = float(np.median(cKDTree(places).query(positions[fold.val])[0]))
     if not gap > FARTHER * (neighbour_distance(places) or gap):
         return settings
-    known = np.sort(fold.learned())
-    where = positions[known]
+    rows = np.sort(fold.learned())
+    where = positions[rows]
     best, nearest = settings, np.inf
     for side in gap * SIDES:
         squares = SplitSettings("blocks", side_m=float(side), share=share, val_fraction=share)
@@ -158,9 +158,9 @@ def _like_a_file(positions: np.ndarray, fold: Fold) -> SplitSettings:
         except DataError:
             break
         learned = where[cut.learned()]
-        apart = float(np.median(cKDTree(learned).query(where[cut.test])[0]))
-        if abs(np.log(max(apart, 1e-12) / gap)) < nearest:
-            best, nearest = squares, abs(np.log(max(apart, 1e-12) / gap))
+        distance = float(np.median(cKDTree(learned).query(where[cut.test])[0]))
+        if abs(np.log(max(distance, 1e-12) / gap)) < nearest:
+            best, nearest = squares, abs(np.log(max(distance, 1e-12) / gap))
     return best
 
 

@@ -30,10 +30,10 @@ def from_settings(kind: type[_Kind], config: Mapping[str, Any], group: str, noun
     Raises:
         DataError: a key that is no field (a `noun`), or, a `SettingError`, a value that cannot be.
     """
-    known = {field.name for field in fields(kind)}  # type: ignore[arg-type]
+    names = {field.name for field in fields(kind)}  # type: ignore[arg-type]
     for key in config:
-        if key not in known:
-            raise DataError(f"{group}.{key}: no such {noun}; there are {', '.join(sorted(known))}")
+        if key not in names:
+            raise DataError(f"{group}.{key}: no such {noun}; there are {', '.join(sorted(names))}")
     try:
         return kind(**config)
     except SettingError as error:
@@ -95,8 +95,8 @@ def config_node(kind: type) -> dict[str, Any]:
     Dataclasses of settings are nodes of their own. Left out are defaults that no configuration can hold.
     """
     plain = {name: _plain(default) for name, default in accepted_arguments(kind).items()}
-    held = {name: default for name, default in plain.items() if default is not _OTHER}
-    return {"_target_": f"{kind.__module__}.{kind.__qualname__}", **held}
+    defaults = {name: default for name, default in plain.items() if default is not _OTHER}
+    return {"_target_": f"{kind.__module__}.{kind.__qualname__}", **defaults}
 
 
 _OTHER = object()
@@ -109,10 +109,10 @@ def accepted_arguments(kind: Any) -> dict[str, Any]:
     if kind is object:
         return {}
     of_class = isinstance(kind, type)
-    own, base = [*inspect.signature(kind.__init__ if of_class else kind).parameters.values()][of_class:], {}
-    if of_class and any(p.kind is p.VAR_KEYWORD for p in own):
+    args, base = [*inspect.signature(kind.__init__ if of_class else kind).parameters.values()][of_class:], {}
+    if of_class and any(p.kind is p.VAR_KEYWORD for p in args):
         base = accepted_arguments(vars(kind).get("hands_on", kind.__mro__[1]))
-    named = {p.name: p.default for p in own if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
+    named = {p.name: p.default for p in args if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}
     return {**named, **{name: default for name, default in base.items() if name not in named}}
 
 

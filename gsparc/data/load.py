@@ -53,10 +53,10 @@ def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule
         for path in instantiate.iterate_targets(settings):
             instantiate.refuse_foreign(path)
     target, name = settings["_target_"], settings.get("name")
-    own = [key for key, node in choices.items() if node["_target_"] == target]
-    if own and name is not None and name not in own:
+    keys = [key for key, node in choices.items() if node["_target_"] == target]
+    if keys and name is not None and name not in keys:
         _choice(name, choices)
-        raise DataError(f"dataset.name={name}: this is dataset={own[0]}; say dataset={name}")
+        raise DataError(f"dataset.name={name}: this is dataset={keys[0]}; say dataset={name}")
     kind = instantiate.import_target(str(target))
     if not callable(kind) or (isinstance(kind, type) and not issubclass(kind, DataModule)):
         only = "; only gsparc locate takes it" if name == "fingerprints" else ""
@@ -117,24 +117,24 @@ def answerable(split: Split, data: Measurements, learned: tuple[Measurements, Sp
         split, data: what is tested.
         learned: what was learned from, and its folds, where it is other data with the same stations.
     """
-    own, before = learned or (data, split)
-    if data.station is None or own.station is None:
+    source, before = learned or (data, split)
+    if data.station is None or source.station is None:
         return split
     places, folds = data.site.every_station.position, list[splits.Fold]()
     for fold, old in zip(split.folds, before.folds, strict=True):
-        heard = old.train[own.censored_side(old.train) <= 0]
-        told, asked = (np.bincount(own.station[rows], minlength=len(places)) for rows in (heard, old.test))
-        known = (told >= splits.LEAST_ROWS) | ((asked > 0) & np.isfinite(places).all(1))
-        kept = fold.test[known[data.station[fold.test]]]
-        folds.append(replace(fold, test=kept) if len(kept) else fold)
+        heard = old.train[source.censored_side(old.train) <= 0]
+        train, test = (np.bincount(source.station[rows], minlength=len(places)) for rows in (heard, old.test))
+        usable = (train >= splits.LEAST_ROWS) | ((test > 0) & np.isfinite(places).all(1))
+        test_rows = fold.test[usable[data.station[fold.test]]]
+        folds.append(replace(fold, test=test_rows) if len(test_rows) else fold)
     pairs = zip(split.folds, folds, strict=True)
-    left = np.concatenate([np.setdiff1d(old.test, new.test) for old, new in pairs])
-    if len(left):
-        new, rows = np.unique(data.station[left[data.censored_side(left) <= 0]], return_counts=True)
+    rejects = np.concatenate([np.setdiff1d(old.test, new.test) for old, new in pairs])
+    if len(rejects):
+        new, rows = np.unique(data.station[rejects[data.censored_side(rejects) <= 0]], return_counts=True)
         names = [f"{data.site.every_station.shown[t]} (in {n} rows)" for t, n in zip(new, rows, strict=True)]
-        said = "split: %d test rows are left out, of stations with under %d training rows%s"
+        message = "split: %d test rows are left out, of stations with under %d training rows%s"
         heard_now = f"; heard now: {list_first(names, 12)}" * bool(names)
-        log.warning(said, len(left), splits.LEAST_ROWS, heard_now)
+        log.warning(message, len(rejects), splits.LEAST_ROWS, heard_now)
     return replace(split, folds=tuple(folds))
 
 
@@ -173,30 +173,30 @@ def _choice(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
 
 def _parameters(kind: Any) -> dict[str, Any]:
     """What `kind` takes, with defaults; what a dataset hands on by keyword is what its reader takes."""
-    reader, taken = getattr(kind, "reader", lambda path: path), instantiate.accepted_arguments
-    _, *read = taken(reader).items()
-    return {**dict.fromkeys(getattr(kind, "switches", ())), **dict(read), **taken(kind)}
+    reader, arguments_of = getattr(kind, "reader", lambda path: path), instantiate.accepted_arguments
+    _, *read = arguments_of(reader).items()
+    return {**dict.fromkeys(getattr(kind, "switches", ())), **dict(read), **arguments_of(kind)}
 
 
 def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
     """The settings that `kind` takes, none unknown or missing; an unknown one that is null was not said."""
-    own = inspect.signature(kind).parameters.values()
-    if any(p.kind is p.VAR_KEYWORD for p in own) and not hasattr(kind, "reader"):
+    parameters = inspect.signature(kind).parameters.values()
+    if any(p.kind is p.VAR_KEYWORD for p in parameters) and not hasattr(kind, "reader"):
         return settings  # it checks them itself
-    known, accepted, name = _parameters(kind), dict[str, Any](), settings.get("name")
-    needed = {key for key, default in known.items() if default is inspect.Parameter.empty}
+    defaults, accepted, name = _parameters(kind), dict[str, Any](), settings.get("name")
+    needed = {key for key, default in defaults.items() if default is inspect.Parameter.empty}
     for key, value in settings.items():
-        if value == "???" and key in known and key not in needed:
+        if value == "???" and key in defaults and key not in needed:
             continue
-        if key in known or key.startswith("_"):
+        if key in defaults or key.startswith("_"):
             accepted[key] = value
         elif value is not None:
             other = PATHS.get(key)
-            if other in known:
+            if other in defaults:
                 raise DataError(f"dataset.{key} is not a setting of dataset={name}; say dataset.{other}=...")
-            hint = instantiate.suggest_or_list(key, known)
+            hint = instantiate.suggest_or_list(key, defaults)
             raise DataError(f"dataset.{key}: no such setting of dataset={name}{hint}")
-    for key in known:
+    for key in defaults:
         if key in needed and accepted.get(key) in (None, "", "???"):
             say = f"{MADE.get(str(name), '')}say dataset.{key}={key.upper()} for dataset={name}"
             raise DataError(f"dataset.{key} is not set; {say}")

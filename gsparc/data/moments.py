@@ -44,8 +44,8 @@ class Snapshots:
             target = np.where(data.mask[rows], target, 0)
         names, column = np.unique(station, return_inverse=True)
         tones = data.site.subcarriers_hz
-        known = tones is not None and len(tones) == target.shape[2]
-        tones = np.asarray(tones, float) if known else np.zeros(target.shape[2])
+        has_tones = tones is not None and len(tones) == target.shape[2]
+        tones = np.asarray(tones, float) if has_tones else np.zeros(target.shape[2])
         run = data.runs_of(rows[first])
         empty = np.zeros((len(first), len(names) * target.shape[1], target.shape[2]), np.complex128)
         antenna, places = column * target.shape[1], data.moving[rows[first]]

@@ -56,9 +56,9 @@ def name_arrays(raw: Raw) -> Raw:
     raw, names = _joined(raw), dict[str, str]()
     for name, array in raw.arrays.items():
         field = FIELD_OF.get(_plain(name), name)
-        taken = {*raw.arrays, *names.values()}
+        used_names = {*raw.arrays, *names.values()}
         channel = array.dtype.kind == "c" or _parts(array) or re.search("amp|mag|abs", name)
-        if name not in FIELDS and field not in taken and (field != "csi" or channel):
+        if name not in FIELDS and field not in used_names and (field != "csi" or channel):
             names[name] = field
     arrays, notes = rename_arrays(raw, names).arrays, [f"{name}: taken as {names[name]}" for name in names]
     csi = arrays.get("csi", np.zeros(0))

@@ -81,9 +81,9 @@ def write_own(path: str | Path, arrays: Arrays, attributes: Mapping[str, Any] | 
     Raises:
         DataError: what `load_own` would refuse.
     """
-    known = {name: np.asarray(array) for name, array in arrays.items()}
-    units = {name: FIELDS[name].unit for name in known if name in FIELDS and FIELDS[name].unit != "1"}
-    raw = Raw(known, dict(attributes or {}), units)
+    contents = {name: np.asarray(array) for name, array in arrays.items()}
+    units = {name: FIELDS[name].unit for name in contents if name in FIELDS and FIELDS[name].unit != "1"}
+    raw = Raw(contents, dict(attributes or {}), units)
     data = interpret(raw, path).data
     write_raw(path, raw)
     return data
@@ -126,9 +126,9 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     assert measured is not None and links is not None
     raw = check.raw
     # Only places that the file leaves open may be NaN; `check.position` refuses all others.
-    lost = links.stations is not None and np.isnan(links.stations.position).any()
-    lost |= links.unknown_transmitter
-    check.unknown = f"{links.static_end}_position" if lost else None
+    has_unknown = links.stations is not None and np.isnan(links.stations.position).any()
+    has_unknown |= links.unknown_transmitter
+    check.unknown = f"{links.static_end}_position" if has_unknown else None
     values, kind = _measured(check, measured)
     if values is None:
         # Positions are checked all the same, so that one message lists everything that is wrong.

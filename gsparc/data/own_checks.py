@@ -78,7 +78,7 @@ class Checker:
                 sound &= self.read_array(name, *shapes) is not None
                 continue
             # A name that the file holds, too, cannot be what the misspelt one was to be.
-            if hint := suggest_name(name, [known for known in FIELDS if known not in arrays], 0.6):
+            if hint := suggest_name(name, [other for other in FIELDS if other not in arrays], 0.6):
                 self.refuse(name, f"unknown name{hint}")
             else:
                 self.notes.append(f"{name}: not part of the schema, ignored")
@@ -106,8 +106,8 @@ class Checker:
         if "row_name" in arrays and self.has_shape("row_name", arrays["row_name"], (rows,)):
             named = [str(name) for name in arrays["row_name"]]
         if stations is not None:  # a place alone would name several rows
-            shown, pairs = stations.shown, zip(named, arrays["station"], strict=True)
-            named = [f"{row}, station {shown[t]}" for row, t in pairs]
+            labels, pairs = stations.shown, zip(named, arrays["station"], strict=True)
+            named = [f"{row}, station {labels[t]}" for row, t in pairs]
         self.row_names = named
         return named
 
@@ -136,9 +136,9 @@ class Checker:
         turned = array.ndim > 1 and (len(array) == 3 or any(_fits(array.shape[::-1], s) for s in wanted))
         here = " or ".join(map(str, wanted))
         here = f", here {here}" if any(wanted) and "None" not in here else ""
-        known = FIELDS[name].shape if name in FIELDS else " or ".join(map(str, shapes)).replace("'", "")
+        layout = FIELDS[name].shape if name in FIELDS else " or ".join(map(str, shapes)).replace("'", "")
         fault = f"found {array.shape}{'; transposed?' if turned else ''}"
-        self.refuse(name, f"expected shape {known}{here}, {fault}")
+        self.refuse(name, f"expected shape {layout}{here}, {fault}")
         return False
 
     def read_positions(self, name: str, rows: int | None) -> np.ndarray | None:
@@ -234,11 +234,11 @@ class Checker:
 
     def fits_exchanged(self, antennas: int, tones: int) -> bool:
         """Tell whether frequencies and antennas fit channels with exchanged axes alone."""
-        given = {name: array.shape for name, array in self.raw.arrays.items()}
+        shapes = {name: array.shape for name, array in self.raw.arrays.items()}
 
         def fits(antennas: int, tones: int) -> bool:
-            places = given.get("array_position", (antennas, 3))
-            return given.get("frequency_hz", ()) in ((), (tones,)) and places == (antennas, 3)
+            places = shapes.get("array_position", (antennas, 3))
+            return shapes.get("frequency_hz", ()) in ((), (tones,)) and places == (antennas, 3)
 
         return fits(tones, antennas) and not fits(antennas, tones)
 

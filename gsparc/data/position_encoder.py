@@ -17,9 +17,9 @@ def encode_positions(uplink: np.ndarray, rows: np.ndarray) -> np.ndarray:
     from sklearn.decomposition import PCA  # here, as it takes a second
 
     # As they are: scaled to one deviation, what is mostly noise would count like the logarithmic power.
-    known = features(uplink).astype(np.float64)
-    code = PCA(3, svd_solver="full").fit(known[rows])
-    return np.asarray(code.transform(known) * (SIZE_M / 4 / np.sqrt(code.explained_variance_[0])))
+    inputs = features(uplink).astype(np.float64)
+    code = PCA(3, svd_solver="full").fit(inputs[rows])
+    return np.asarray(code.transform(inputs) * (SIZE_M / 4 / np.sqrt(code.explained_variance_[0])))
 
 
 ANTENNA_PAIRS = 64  # pairs of antennas that are compared, at most; drawn with a fixed seed

@@ -39,10 +39,10 @@ def read_prior_levels(
         )
     read = _read_raster if path.suffix in (".tif", ".tiff") else _read_rows
     points, level = read(path, data, station)
-    known = np.isfinite(level) & np.isfinite(points).all(1)
-    if not known.any():
+    finite = np.isfinite(level) & np.isfinite(points).all(1)
+    if not finite.any():
         raise DataError(f"model.prior={path}: no level is known in it")
-    points, level = points[known], level[known]
+    points, level = points[finite], level[finite]
     at = data.moving[:, :2] + data.site.origin[:2]
     if not ((at >= points.min(0) - 1) & (at <= points.max(0) + 1)).all(1).any():
         box, rows = (
@@ -81,13 +81,13 @@ def _read_raster(path: Path, data: Measurements, station: str | None) -> tuple[n
         raise DataError(f"model.prior={path}: needs rasterio; pip install 'gsparc[maps]'") from None
     with rasterio.open(path) as file:
         titles = [str(title or "") for title in file.descriptions]
-        own = {
+        bands = {
             title.removeprefix(f"{BAND} "): k
             for k, title in enumerate(titles)
             if title.startswith(f"{BAND} ")
         }
         band = titles.index(BAND) if BAND in titles else 0
-        band = own[list(own)[_number(list(own), station, path)]] if own else band
+        band = bands[list(bands)[_number(list(bands), station, path)]] if bands else band
         level = file.read(band + 1, masked=True).astype(float).filled(np.nan).ravel()
         row, column = np.mgrid[: file.height, : file.width]
         x, y = file.transform @ (column.ravel() + 0.5, row.ravel() + 0.5)
@@ -105,9 +105,9 @@ def _read_rows(path: Path, data: Measurements, station: str | None) -> tuple[np.
     rows = interpret(read_own(path), path).data
     if not rows.site.maps_levels:
         raise DataError(f"model.prior={path}: no powers of one end that moves")
-    kept = rows.stations_of() == _number(rows.site.every_station.shown, station, path)
-    points = (rows.moving + rows.site.origin)[kept, :2]
+    of_station = rows.stations_of() == _number(rows.site.every_station.shown, station, path)
+    points = (rows.moving + rows.site.origin)[of_station, :2]
     theirs, ours = rows.site.georeference, data.site.georeference
     if theirs is not None and ours is not None:
         points = ours.from_degrees(*theirs.to_degrees(points))
-    return points, rows.site.target.to_real(rows.target[kept])[:, 0].astype(float)
+    return points, rows.site.target.to_real(rows.target[of_station])[:, 0].astype(float)

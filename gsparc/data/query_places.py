@@ -91,10 +91,10 @@ def read_times(path: str | Path) -> np.ndarray | None:
 
 
 def _of_sheet(sheet: Sheet, moving: Sequence[End], columns: Mapping[str, object]) -> QueryPlaces:
-    said = {key: value for key, value in columns.items() if value is not None}
+    settings = {key: value for key, value in columns.items() if value is not None}
     if "device" in sheet.heads:  # a head that a table of measurements would not be taken at its word for
-        said.setdefault("device", "device")
-    chosen = choose_columns(sheet, said, only=GUESSED)
+        settings.setdefault("device", "device")
+    chosen = choose_columns(sheet, settings, only=GUESSED)
     sheet.problems.raise_if_any()
     rest = read_ends(sheet, chosen)
     sheet.problems.raise_if_any()

@@ -79,8 +79,8 @@ def read_raw(path: str | Path) -> Raw:
     readers = {".npz": _read_npz, ".mat": _read_mat}
     readers |= dict.fromkeys(HDF5_SUFFIXES, _read_hdf5) | dict.fromkeys(NETCDF_SUFFIXES, _read_netcdf)
     if path.suffix.lower() not in readers:
-        suffix, known = path.suffix or "no ending", ", ".join(readers)
-        raise DataError(f"{path}: expected a name ending in one of {known}; found {suffix}")
+        suffix, endings = path.suffix or "no ending", ", ".join(readers)
+        raise DataError(f"{path}: expected a name ending in one of {endings}; found {suffix}")
     check_fetched(path)
     return readers[path.suffix.lower()](path)
 
@@ -239,9 +239,9 @@ def _datasets(path: Path, to_disk: bool = False) -> Iterator[tuple[h5py.File, di
     with h5py.File(path, "r") as file:
         # h5py hands out bytes when a name is not UTF-8
         items = {str(_plain(name)): one for name, one in file.items() if isinstance(one, h5py.Dataset)}
-        known = {name: one for name, one in items.items() if one.size is not None}
+        arrays = {name: one for name, one in items.items() if one.size is not None}
         # What lies in one piece takes nothing that is not in the file.
-        stated = {name: (d.shape, 0 if d.id.get_offset() else d.nbytes) for name, d in known.items()}
+        stated = {name: (d.shape, 0 if d.id.get_offset() else d.nbytes) for name, d in arrays.items()}
         check_array_sizes(path, stated, to_disk)
         yield file, items
 
@@ -321,12 +321,12 @@ def check_array_sizes(path: Path, stated: Stated, to_disk: bool = False) -> None
     total, packed, disk = sum(one for _, one in stated.values()), path.stat().st_size, tempfile.gettempdir()
     copied = sum(one for _, one in stated.values() if one >= BIG) * to_disk
     most, room = min(max(BIG, MOST_PACKED * packed), LARGEST), max(BIG, machine_memory() / 2)
-    held = total - copied
+    memory = total - copied
     faults = {
         f"a file of {packed:,} bytes does not hold that": total > most,
         f"no other array has {shape[:1]} rows": size >= BIG and rows[shape[0]] < 2 and name[:5] != "path_",
         f"{disk} has no room; set TMPDIR to a larger disk": copied > max(disk_usage(disk).free - SPARE, 0),
-        f"too little memory for {held:,}; HDF5 without a mask may stay on disk": held > room,
+        f"too little memory for {memory:,}; HDF5 without a mask may stay on disk": memory > room,
     }
     for fault in (text for text, holds in faults.items() if holds):
         raise DataError(f"{path}, {name}: shape {shape}, {size:,} bytes: {fault}")

@@ -28,9 +28,9 @@ def hash_rows(*arrays: np.ndarray | None) -> np.ndarray:
     >>> one == again, one == two
     (True, False)
     """
-    known = [array for array in arrays if array is not None]
-    draws, result = np.random.default_rng(0), np.zeros(len(known[0]), np.uint64)
-    for array in known:
+    inputs = [array for array in arrays if array is not None]
+    draws, result = np.random.default_rng(0), np.zeros(len(inputs[0]), np.uint64)
+    for array in inputs:
         width = -(-array[:1].nbytes // 4)
         factors = draws.integers(1, 2**63, width, np.uint64) * 2 + 1
         for part in row_blocks(array):
@@ -77,8 +77,8 @@ def order_rows(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
     """
     if not (_LAST and _LAST[0][0]() is data):
         order = content_order(data)
-        taken = order if data.sequence is None else data.sequence[order]
-        ordered, rank = replace(data.subset(order), sequence=taken), np.argsort(order)
+        sequence = order if data.sequence is None else data.sequence[order]
+        ordered, rank = replace(data.subset(order), sequence=sequence), np.argsort(order)
         if ordered.place is not None:
             ordered = replace(ordered, place=number_places(ordered.place[:, None]))
         _LAST[:] = [(weakref.ref(data), ordered, rank)]

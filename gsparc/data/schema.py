@@ -38,7 +38,7 @@ TrainTest = tuple[np.ndarray, np.ndarray]  # rows (n,) to train and to test on
 def show_names(names: Sequence[str], labels: Sequence[str] | None) -> tuple[str, ...]:
     """Return names (T,) of stations as people read them, `W03-2 (150)` of one that a list of cells labels."""
     pairs = zip(names if labels is None else labels, names, strict=True)
-    return tuple(name if own == name else f"{own} ({name})" for own, name in pairs)
+    return tuple(name if label == name else f"{label} ({name})" for label, name in pairs)
 
 
 @dataclass(frozen=True)

@@ -152,10 +152,10 @@ def _copies(arrays: Arrays, measured: str) -> np.ndarray:
     if not places:  # one that repeats is no row's own
         return np.zeros(rows, bool)
     place, whole = hash_rows(*places), np.hstack(places)
-    known = np.flatnonzero((np.abs(whole) <= FARTHEST).all(axis=1))
+    valid = np.flatnonzero((np.abs(whole) <= FARTHEST).all(axis=1))
     # The position of a packet that is logged twice may jitter; real visits differ in their levels.
-    if len(known) > 1 and (near := group_visits(whole[known])) is not None:
-        place[known] = near
+    if len(valid) > 1 and (near := group_visits(whole[valid])) is not None:
+        place[valid] = near
     # Two devices that read the same level at one place are two measurements.
     if device is not None:
         alike = np.unique(device.astype(str), return_inverse=True)[1].reshape(-1)

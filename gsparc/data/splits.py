@@ -214,8 +214,8 @@ def make_split(
     Raises:
         DataError: a fold would have no training, or no test rows; a row to leave out that there is not.
     """
-    rows, left = len(positions), settings.leave_out
-    absent = np.zeros(0, np.int64) if isinstance(left, int) else rows_to_leave_out(left, outliers, rows)
+    rows, rule = len(positions), settings.leave_out
+    absent = np.zeros(0, np.int64) if isinstance(rule, int) else rows_to_leave_out(rule, outliers, rows)
     rows_left = np.setdiff1d(np.arange(rows), absent)
     # Files of the release are its published split; `redraw` draws another one instead.
     named = None if settings.name != "random" or release_split is None or settings.redraw else release_split
@@ -232,8 +232,8 @@ def make_split(
             # One row stands for each place: splits are made of places, so that no visit is on both sides.
             _, first, which = np.unique(place[rows_left], return_index=True, return_inverse=True)
         where = positions[rows_left][first]
-        taken = np.arange(len(first)) if order is None else np.argsort(order[rows_left][first], kind="stable")
-        pairs = [named] if named is not None else _pairs(where, taken, settings)
+        queue = np.arange(len(first)) if order is None else np.argsort(order[rows_left][first], kind="stable")
+        pairs = [named] if named is not None else _pairs(where, queue, settings)
         local_folds = tuple(_finish(i, *pair, where, settings) for i, pair in enumerate(pairs))
     folds = tuple(fold.map(lambda part: rows_left[np.isin(which.reshape(-1), part)]) for fold in local_folds)
     return Split(settings.name, folds, named is not None)

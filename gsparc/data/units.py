@@ -90,12 +90,12 @@ class PowerUnit:
         """
         if name in (None, level_unit) or (name == LINEAR and not levels):
             return cls(name or level_unit, name != LINEAR, scale)
-        unit, own = UNITS.get(str(name).lower()), WATTS.get(level_unit)
+        unit, watt = UNITS.get(str(name).lower()), WATTS.get(level_unit)
         decibels = unit is not None and unit.kind == "level"
-        if unit is None or unit.name not in WATTS or (not decibels and (levels or own is None)):
-            powers = "" if levels else f", {LINEAR}" if own is None else f", {LINEAR}, {list_units('power')}"
+        if unit is None or unit.name not in WATTS or (not decibels and (levels or watt is None)):
+            powers = "" if levels else f", {LINEAR}" if watt is None else f", {LINEAR}, {list_units('power')}"
             raise ValueError(f"unit={name}: of powers in {level_unit} expected dBm, dBW{powers}")
-        return cls(unit.name, decibels, scale if own is None else scale * own / WATTS[unit.name])
+        return cls(unit.name, decibels, scale if watt is None else scale * watt / WATTS[unit.name])
 
     @property
     def raised_db(self) -> float:

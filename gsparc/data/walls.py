@@ -93,10 +93,10 @@ def _table(path: Path, problems: Problems) -> SceneWalls:
     for key in content:
         if key not in SIMULATED | {"walls", "room"}:
             problems.add(path, f"{key}: no such key{suggest_or_list(str(key), ['walls', 'room'])}")
-    told = {} if content.get("room") is None else content["room"]
-    if not isinstance(told, dict):
-        told = problems.add(path, "room: expected size_m and boxes_m") or {}
-    room = problems.attempt(lambda: from_settings(RoomSettings, told, f"{path}: room")) or RoomSettings()
+    settings = {} if content.get("room") is None else content["room"]
+    if not isinstance(settings, dict):
+        settings = problems.add(path, "room: expected size_m and boxes_m") or {}
+    room = problems.attempt(lambda: from_settings(RoomSettings, settings, f"{path}: room")) or RoomSettings()
     faces = [] if room.size_m is None else box_faces(np.zeros(3), finite_array(room.size_m))
     walls = content.get("walls") or []
     if not isinstance(walls, list):

@@ -27,30 +27,30 @@ def align_to_site(data: Measurements, site: Site, *, whole: bool = False) -> Mea
     Raises:
         ValueError: another kind, grid, moving end or static place, or no station that the model knows.
     """
-    own = data.site
+    ours = data.site
     for what in ("kind", "static_end", "grid"):
-        here, there = getattr(own, what), getattr(site, what)
+        here, there = getattr(ours, what), getattr(site, what)
         if here != there:
-            raise ValueError(f"the model was trained with {what} {there}, {own.name} has {here}")
+            raise ValueError(f"the model was trained with {what} {there}, {ours.name} has {here}")
     data = _about(data, site)
     if site.freedom != "none":  # few rows of another file may not tell
         data = replace(data, site=replace(data.site, freedom=site.freedom))
-    own = data.site
-    shift = own.origin - site.origin
-    if own.static_position is not None and site.static_position is not None:
-        gap = float(np.linalg.norm(own.static_position + shift - site.static_position))
+    ours = data.site
+    shift = ours.origin - site.origin
+    if ours.static_position is not None and site.static_position is not None:
+        gap = float(np.linalg.norm(ours.static_position + shift - site.static_position))
         if gap > SAME_PLACE_M:
-            raise ValueError(f"the static {own.static_end} of {own.name} is {gap:.3g} m from the model's")
+            raise ValueError(f"the static {ours.static_end} of {ours.name} is {gap:.3g} m from the model's")
     data = _renumbered(data, site, shift, whole)
-    own = data.site
-    units, rescale = (own.level_unit, site.level_unit), own.target_scale / site.target_scale
+    ours = data.site
+    units, rescale = (ours.level_unit, site.level_unit), ours.target_scale / site.target_scale
     if set(units) <= set(WATTS):  # what is called dB may be either
         rescale *= WATTS[units[0]] / WATTS[units[1]]
-    known = own.level_unit == site.level_unit and own.target_scale == site.target_scale
-    if known and not shift.any() and rescale == 1:
+    same_units = ours.level_unit == site.level_unit and ours.target_scale == site.target_scale
+    if same_units and not shift.any() and rescale == 1:
         return data
     there = replace(
-        own, origin=site.origin, box=own.box + shift, static_position=site.static_position,
+        ours, origin=site.origin, box=ours.box + shift, static_position=site.static_position,
         target_scale=site.target_scale, level_unit=site.level_unit, unit=site.unit,
     )  # fmt: skip
     return replace(
@@ -63,16 +63,16 @@ def align_to_site(data: Measurements, site: Site, *, whole: bool = False) -> Mea
 
 def _about(data: Measurements, site: Site) -> Measurements:
     """`data` in metres about the place on Earth that those of `site` are about, where both say which."""
-    own, there = data.site.georeference, site.georeference
-    if own is None or there is None or own == there:
+    reference, there = data.site.georeference, site.georeference
+    if reference is None or there is None or reference == there:
         return data
 
     def moved(local: np.ndarray) -> np.ndarray:
         world = local + data.site.origin
         # Stations may be at unknown places, NaN, which no projection takes.
-        known = np.isfinite(world).all(axis=1)
+        finite = np.isfinite(world).all(axis=1)
         # Through degrees: metres about two origins differ by scale and rotation, not by a shift alone.
-        world[known, :2] = there.from_degrees(*own.to_degrees(world[known, :2]))
+        world[finite, :2] = there.from_degrees(*reference.to_degrees(world[finite, :2]))
         return world - data.site.origin
 
     still, stations = data.site.static_position, data.site.stations
@@ -102,17 +102,17 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray, whole: bool) 
     number = np.full(len(ours), -1)
     for t, names in enumerate(called):
         # Sectors of one mast share a place: there the name decides, as it does where nobody knows the place.
-        alike = [i for i, own in enumerate(learned) if names & own and not gap[t, i] > SAME_PLACE_M]
+        alike = [i for i, labels in enumerate(learned) if names & labels and not gap[t, i] > SAME_PLACE_M]
         near = np.flatnonzero(gap[t] <= SAME_PLACE_M).tolist()
         if alike or len(near) == 1:
             number[t] = (alike or near)[0]
-    known = number[data.stations_of()] >= 0
-    if not known.all():
-        told = _explain_unknown(data.site.name, ours, theirs, number < 0)
-        if whole or not known.any():
-            raise ValueError(told + "; dataset.stations=[NAME,...] keeps the others" * bool(known.any()))
-        log.warning("%s: %d of %d rows are left out", told, (~known).sum(), len(known))
-        data = data.subset(np.flatnonzero(known))
+    is_known = number[data.stations_of()] >= 0
+    if not is_known.all():
+        fault = _explain_unknown(data.site.name, ours, theirs, number < 0)
+        if whole or not is_known.any():
+            raise ValueError(fault + "; dataset.stations=[NAME,...] keeps the others" * bool(is_known.any()))
+        log.warning("%s: %d of %d rows are left out", fault, (~is_known).sum(), len(is_known))
+        data = data.subset(np.flatnonzero(is_known))
     facts = replace(data.site, stations=theirs, static_position=site.static_position)
     end = facts.still_end
     station = number[data.stations_of()]
@@ -124,8 +124,8 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray, whole: bool) 
 
 def _explain_unknown(source: str, ours: Stations, theirs: Stations, unknown: np.ndarray) -> str:
     """Which stations of a file a model does not know, and what to do where it knows none."""
-    lost = [ours.name[t] for t in np.flatnonzero(unknown)]
-    fault = f"stations {list_first(lost)} of {source} are none of the model's, {list_first(theirs.name)}"
+    names = [ours.name[t] for t in np.flatnonzero(unknown)]
+    fault = f"stations {list_first(names)} of {source} are none of the model's, {list_first(theirs.name)}"
     if not {*all_names(ours)} & {*all_names(theirs)}:
         way = "dataset.columns.station=COLUMN takes another column, dataset.stations_file=FILE a list"
         return f"{fault}: no name in common; {way} that has both"

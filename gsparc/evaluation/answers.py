@@ -124,7 +124,7 @@ def predict_file(
     }  # fmt: skip
     # A power of 0 is -inf dB, which would be the lowest of every file and no number of a summary.
     mean = predictions.said.mean.numpy()
-    known = mean[np.isfinite(mean)]
+    values = mean[np.isfinite(mean)]
     empty = ~np.isfinite(mean.reshape(len(mean), -1)).all(axis=1)
     facts["predict/empty"] = int(empty.sum())
     if empty.any():
@@ -132,8 +132,8 @@ def predict_file(
         first = queries.rows[predictions.place[int(np.argmax(empty))]]
         log.warning("%s: %d of %d predictions are empty (%s), the first in %s", places, empty.sum(),
                     len(mean), why, first)  # fmt: skip
-    if power is not None and len(known):
-        ends = {"lowest": float(known.min()), "highest": float(known.max())}
+    if power is not None and len(values):
+        ends = {"lowest": float(values.min()), "highest": float(values.max())}
         facts |= {f"predict/{name}_{unit_suffix(power)}": value for name, value in ends.items()}
     return facts
 
@@ -142,15 +142,15 @@ def _with_tested(answers: Answers, local: np.ndarray, power: PowerUnit, tested: 
     """Answers whose deviations are the tested ones; the model's own where they are refused."""
     assert answers.said.variance is not None
     mean = answers.said.mean[:, 0].double().numpy()
-    spread = own = answers.said.variance.double().sqrt().numpy()
+    spread = deviation = answers.said.variance.double().sqrt().numpy()
     if not power.decibels:
         with np.errstate(divide="ignore", invalid="ignore"):  # of no power, which has no decibels
-            spread = power_in_decibels(mean, own**2)[1]
+            spread = power_in_decibels(mean, deviation**2)[1]
     error = tested(local, answers.station, spread)
     ratio = np.where(np.isnan(error), 1.0, error / np.where(spread > 0, spread, np.nan))
-    scaled = torch.from_numpy(own * ratio)
-    said = replace(answers.said, variance=scaled.square())
-    return replace(answers, said=said, refused=np.isnan(error))
+    scaled = torch.from_numpy(deviation * ratio)
+    prediction = replace(answers.said, variance=scaled.square())
+    return replace(answers, said=prediction, refused=np.isnan(error))
 
 
 def _notes(queries: QueryPlaces, site: Site) -> list[str]:
@@ -187,7 +187,7 @@ def predict_places(
     for one in np.unique(number):
         chosen = np.flatnonzero(number == one)
         try:
-            own = predictor.ask_station(int(one))
+            model = predictor.ask_station(int(one))
         except ValueError as error:
             if named:
                 raise DataError(f"{queries.source}, {queries.rows[row[chosen[0]]]}: {error}") from None
@@ -195,15 +195,15 @@ def predict_places(
             continue
         of = np.full(len(chosen), "") if queries.device is None else queries.device[row[chosen]]
         for device in np.unique(of):
-            asked, rows = _select_device(own, str(device), queries.source), chosen[of == device]
-            blocks += [(asked, some) for some in np.split(rows, range(CHUNK, len(rows), CHUNK))]
+            device_model, rows = _select_device(model, str(device), queries.source), chosen[of == device]
+            blocks += [(device_model, some) for some in np.split(rows, range(CHUNK, len(rows), CHUNK))]
     if not blocks:
         raise DataError(silent[0])
 
     def predicted(block: int) -> Prediction:
-        own, rows = blocks[block]
+        model, rows = blocks[block]
         ends: dict[str, Any] = {end: places[row[rows]] for end, places in world.items()}
-        return own.predict(**ends)
+        return model.predict(**ends)
 
     parts: dict[int, Prediction] = {}
     # Blocks may end in any order in other processes.
@@ -215,10 +215,10 @@ def predict_places(
         log.warning(line)
     rows = np.concatenate([blocks[block][1] for block in parts])
     # Blocks are of stations, answers are wanted in the order of places.
-    said = Prediction.joined([*parts.values()], torch.from_numpy(np.argsort(rows, kind="stable")))
+    result = Prediction.joined([*parts.values()], torch.from_numpy(np.argsort(rows, kind="stable")))
     rows.sort()
     of_row, called = number[rows], predictor.site.every_station.named.items()
-    return Answers(row[rows], of_row, {head: np.array(of)[of_row] for head, of in called}, said)
+    return Answers(row[rows], of_row, {head: np.array(of)[of_row] for head, of in called}, result)
 
 
 def _select_device(predictor: Predictor, device: str, source: str) -> Predictor:
@@ -272,15 +272,15 @@ def write_answers(
     """Write all predictions, whole or not at all; NaN for the level of no power."""
     archive = path.suffix.lower() == ".npz"
     columns, name = _places(queries, predictions), kind if power is None else f"{kind}_{unit_suffix(power)}"
-    said, mean = predictions.said, predictions.said.mean.numpy()
+    outputs, mean = predictions.said, predictions.said.mean.numpy()
     if power is not None:
         columns[name] = np.where(np.isfinite(mean[:, 0]), mean[:, 0], np.float32(np.nan))
-    if said.variance is not None:
+    if outputs.variance is not None:
         # Stored as a variance because those of independent parts add; a reader wants it in the level's unit.
-        columns[f"{name}_std"] = said.variance.sqrt().float().numpy()
+        columns[f"{name}_std"] = outputs.variance.sqrt().float().numpy()
     if power is None:
         columns |= {kind: mean} if archive else _entries(mean)
-    columns |= {} if said.confidence is None else {"confidence": said.confidence.numpy()}
+    columns |= {} if outputs.confidence is None else {"confidence": outputs.confidence.numpy()}
     columns |= {} if predictions.refused is None else {"refused": predictions.refused.astype(np.int8)}
     if not archive:
         columns = _in_order(columns, queries, predictions)
@@ -306,20 +306,20 @@ def _in_order(
 ) -> dict[str, np.ndarray]:
     """The columns of a table of places in its order, those that were not read as they are, then the rest."""
     ordered: dict[str, np.ndarray] = {}
-    taken: list[str] = []
+    used_names: list[str] = []
     for head, role, words in queries.table:
         # With one end that moves columns have no prefix; "^$" takes nothing away.
         axis = re.sub("^(rx|tx)_" if len(queries.ends) == 1 else "^$", "", role or "")
-        known = [name for name in (axis, axis.replace("z", "height")) if name in {*columns} - {*taken}]
-        if role is not None and known:
+        names = [name for name in (axis, axis.replace("z", "height")) if name in {*columns} - {*used_names}]
+        if role is not None and names:
             # As they were written: 48.191910 is no 48.19191 to a join. Names of stations under any other head
             # are repeated: which columns there are depends on the model alone.
-            taken.append(head if role == "station" else known[0])
+            used_names.append(head if role == "station" else names[0])
             ordered[head] = words[predictions.place]
         elif role is None:
             # A user's own column called like one of ours keeps its words under another head.
             ordered[f"{head} (given)" if head in columns else head] = words[predictions.place]
-    rest = {name: values for name, values in columns.items() if name not in taken}
+    rest = {name: values for name, values in columns.items() if name not in used_names}
     return {**ordered, **rest}
 
 

@@ -66,7 +66,7 @@ def fit_baseline(
         eval_on: `train`, `val` or `test`.
         learned: other measurements to learn from, and the folds of these; None: `data` and `split`.
     """
-    own, before = learned or (data, split)
+    learned_data, before = learned or (data, split)
     if eval_on == "val" and learned is None:  # learned from as methods do, but where they are scored
         before = replace(before, folds=tuple(replace(fold, val=fold.val[:0]) for fold in before.folds))
 
@@ -75,6 +75,6 @@ def fit_baseline(
             log.info("fold %d: %s", number, note)
 
     contexts = [FitContext(Path())] * len(before.folds)
-    fits = fit_folds(method_class(name)(), own, before, contexts, keep=say)
+    fits = fit_folds(method_class(name)(), learned_data, before, contexts, keep=say)
     scores = score_methods(fits.methods, data, split, eval_on, learned)
     return FittedBaseline(fits.methods, scores, fits.train_s)

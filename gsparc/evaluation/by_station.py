@@ -29,8 +29,8 @@ def rmse_after_constants(scores: Scores, station: np.ndarray) -> float | None:
     Stations that nobody calibrated differ by constants which nothing tells of a station never heard.
     """
     error = pd.Series(scores.samples["error_db"])
-    left = error - error.groupby(station[scores.row]).transform("mean")
-    return float((left**2).mean() ** 0.5) if left.notna().any() else None
+    residual = error - error.groupby(station[scores.row]).transform("mean")
+    return float((residual**2).mean() ** 0.5) if residual.notna().any() else None
 
 
 def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
@@ -42,14 +42,14 @@ def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
     """
     row, place = scores.row, np.arange(len(data)) if data.place is None else data.place
     if "strongest_told" in scores.samples:
-        told = pd.Series(scores.samples["strongest_told"]).groupby([scores.fold, place[row]]).first()
-        return {BEST_SERVER: float(told.mean())}
+        answers = pd.Series(scores.samples["strongest_told"]).groupby([scores.fold, place[row]]).first()
+        return {BEST_SERVER: float(answers.mean())}
     # A receiver in saturation reports its most: what is at least that has no target, but is the strongest.
     most = np.where(data.censored_side(row) < 0, data.powers(row)[:, 0], np.nan)
-    told = scores.samples.get("served", scores.samples["prediction"])
+    answers = scores.samples.get("served", scores.samples["prediction"])
     every = pd.DataFrame({
         "fold": scores.fold, "place": place[row], "station": data.stations_of(row),
-        "predicted": told, "measured": np.fmax(scores.samples["target"], most),
+        "predicted": answers, "measured": np.fmax(scores.samples["target"], most),
     })  # fmt: skip
     # A station's rows of one place, of several visits, are one by their strongest.
     links = every.groupby(["fold", "place", "station"]).max()
@@ -92,14 +92,14 @@ def newly_listed(old: Measurements, new: Measurements) -> pd.DataFrame:
         return pd.DataFrame(columns=["lists", "expected", "chance"])
     gap, near = cKDTree(now.place).query(before.place)
     pairs = np.flatnonzero(gap <= NEAR_M)
-    held, listed, later = np.isfinite(before.level)[pairs], np.isfinite(now.level), near[pairs]
-    known = np.isfinite(before.level).any(0)
-    fresh = np.flatnonzero(listed.any(0) & ~known)
+    was_listed, listed, later = np.isfinite(before.level)[pairs], np.isfinite(now.level), near[pairs]
+    is_known = np.isfinite(before.level).any(0)
+    fresh = np.flatnonzero(listed.any(0) & ~is_known)
     # Equal levels keep the order of the stations, on any processor.
     order = np.argsort(np.where(listed, -now.level, np.inf), 1, kind="stable")
     rank = np.argsort(order, 1)[later]
-    links = pd.DataFrame({"rank": rank[:, known][listed[later][:, known]]})
-    links["held"] = held[:, known][listed[later][:, known]]
+    links = pd.DataFrame({"rank": rank[:, is_known][listed[later][:, is_known]]})
+    links["held"] = was_listed[:, is_known][listed[later][:, is_known]]
     again = links.groupby("rank").held.mean().reindex(range(listed.shape[1])).fillna(0.0).to_numpy()
     share = np.where(listed[later], again[rank], 0.0)[:, fresh]
     missed = np.ones((0, len(fresh)))
@@ -117,9 +117,9 @@ def describe_new(old: Measurements, new: Measurements) -> str | None:
         return None
     names = np.array(new.site.every_station.shown)[found.index]
     surely = np.where(found.chance < BY_CHANCE, "new", "new, or out of its reach before")
-    said = zip(names, found.lists, found.expected, surely, found.chance, strict=True)
+    rows = zip(names, found.lists, found.expected, surely, found.chance, strict=True)
     return ", ".join(
-        f"{n} (in {k} lists, for {e:.0f} of the earlier drive: {s}; chance {c:.0e})" for n, k, e, s, c in said
+        f"{n} (in {k} lists, for {e:.0f} of the earlier drive: {s}; chance {c:.0e})" for n, k, e, s, c in rows
     )
 
 
@@ -129,8 +129,8 @@ def describe_never_listed(scores: Scores, data: Measurements) -> str | None:
     if not len(found):
         return None
     names = np.array(data.site.every_station.shown)[found.index.astype(int)]
-    said = zip(names, found.expected, found.moments, found.chance, strict=True)
-    return ", ".join(f"{n} (in {e:.0f} of {r:.0f} lists; chance {c:.0e})" for n, e, r, c in said)
+    rows = zip(names, found.expected, found.moments, found.chance, strict=True)
+    return ", ".join(f"{n} (in {e:.0f} of {r:.0f} lists; chance {c:.0e})" for n, e, r, c in rows)
 
 
 def station_columns(methods: Mapping[str, Scores], data: Measurements) -> dict[str, Any]:
@@ -161,8 +161,8 @@ def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
     # Among the baselines may be the method itself.
     names = [one for one in columns if one.endswith("/rmse_db") and one.split("/")[1] not in ("zero", method)]
     heads = {"rmse_db": method, "bias_db": "its bias_db", **{name: name.split("/")[1] for name in names}}
-    shown = [Column("station", "", of="station"), Column("rows", ".0f", of="rows")]
-    shown += [Column(head, number_format("rmse_db"), of=name) for name, head in heads.items()]
+    table_columns = [Column("station", "", of="station"), Column("rows", ".0f", of="rows")]
+    table_columns += [Column(head, number_format("rmse_db"), of=name) for name, head in heads.items()]
     every = pd.DataFrame(columns, columns=None if columns else ["rows", "rmse_db"])
     rows = every[every["rows"] >= FEW].sort_values("rmse_db", ascending=False, kind="stable")
     if len(rows) < 2:
@@ -177,4 +177,4 @@ def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
         those = ", ".join(f"{one.station} ({-one.bias_db:+.1f} dB)" for one in offset[:WORST].itertuples())
         note += f"{'; ' * bool(note)}measured levels differ from predicted by one offset: {those}"
         note += ": of a later log, gsparc update learns that"
-    return [Table.from_rows(title, shown, named[:WORST].to_dict("records"), note=note)]
+    return [Table.from_rows(title, table_columns, named[:WORST].to_dict("records"), note=note)]

@@ -47,13 +47,13 @@ def _label(row: Row) -> str:
 
 def _loss(row: Row) -> np.ndarray:
     """What a test row costs (n,): the paper's of spectra, |e|^2 / |h|^2 of channels, |decibels| of powers."""
-    own = row["run"].samples
-    if "error_db" in own:
-        return np.abs(own["error_db"])
-    if "error_power" in own:
-        return bounded_loss(own["error_power"] / np.maximum(own["target_power"], 1e-300))
+    samples = row["run"].samples
+    if "error_db" in samples:
+        return np.abs(samples["error_db"])
+    if "error_power" in samples:
+        return bounded_loss(samples["error_power"] / np.maximum(samples["target_power"], 1e-300))
     # Images smaller than the window have no SSIM: the absolute error alone tells.
-    return weigh_losses(own["mae"], np.nan_to_num(own["ssim_gauss"], nan=1.0))
+    return weigh_losses(samples["mae"], np.nan_to_num(samples["ssim_gauss"], nan=1.0))
 
 
 def _draw_over_loss(runs: list[Row]) -> Figure:
@@ -61,8 +61,8 @@ def _draw_over_loss(runs: list[Row]) -> Figure:
     figure, grid = panels(3 * WIDE, TALL * len(runs) + 0.3, len(runs), 3)
     for (both, fifths, scatter), row in zip(grid, runs, strict=True):
         loss = _loss(row)
-        known = np.isfinite(loss)  # rows where nothing was heard have no error
-        sure, loss = row["run"].samples["confidence"][known], loss[known]
+        finite = np.isfinite(loss)  # rows where nothing was heard have no error
+        sure, loss = row["run"].samples["confidence"][finite], loss[finite]
         high = loss > np.median(loss)
         bins = np.linspace(sure.min(), sure.max(), 25)
         for name, part, colour in (("low", ~high, PALETTE[2]), ("high", high, PALETTE[1])):
@@ -76,7 +76,7 @@ def _draw_over_loss(runs: list[Row]) -> Figure:
         fifths.boxplot([sure[part == number] for number in range(5)], tick_labels=names)
         fifths.set(xlabel="fifth of the loss", ylabel="confidence C")
         spectra = "ssim_gauss" in row["run"].samples
-        error = row["run"].samples["mae"][known] if spectra else loss
+        error = row["run"].samples["mae"][finite] if spectra else loss
         scatter.plot(error, sure, ".", markersize=4, alpha=0.5, color=PALETTE[0])
         scatter.set(xlabel="MAE of a test row" if spectra else "loss of a test row", ylabel="confidence C")
         alike = rank_correlation(sure, error)
@@ -89,8 +89,8 @@ def _draw_coverage(runs: list[Row]) -> Figure:
     figure, ((places, curve),) = panels(2.4 * WIDE, TALL + 0.6, 1, 2)
     taus = np.linspace(0, 1, 201)
     for number, row in enumerate(runs):
-        own = row["run"].samples
-        sure, style = own["confidence"], numbered_style(number)
+        samples = row["run"].samples
+        sure, style = samples["confidence"], numbered_style(number)
         # The paper's normalisation is relative to the rows that are tested: nowhere else is it used.
         relative = (sure - sure.min()) / max(np.ptp(sure), 1e-30)
         for values, line, end in ((sure, "-", ""), (relative, "--", " (paper: min-max over the test rows)")):
@@ -100,7 +100,9 @@ def _draw_coverage(runs: list[Row]) -> Figure:
             above = relative >= PAPER_TAU
             for part, colour, what in ((above, PALETTE[2], "above"), (~above, GREY, "below")):
                 label = f"{what} {PAPER_TAU} (paper), {part.mean():.0%}"
-                places.plot(own["x_m"][part], own["y_m"][part], ".", color=colour, markersize=4, label=label)
+                places.plot(
+                    samples["x_m"][part], samples["y_m"][part], ".", color=colour, markersize=4, label=label
+                )
     places.set(
         xlabel="x [m]", ylabel="y [m]", aspect="equal", title="test rows, confidence by min-max over them"
     )
@@ -115,21 +117,21 @@ def _draw_brackets(runs: list[Row]) -> Figure:
     """Boxes of rows' ratios to their error, methods beside each other, and the confidence by bracket."""
     figure, grid = panels(2.2 * WIDE, TALL * len(runs) + 0.3, len(runs), 2)
     for (left, right), row in zip(grid, runs, strict=True):
-        own, name = row["run"].samples, OF_KIND[row["kind"]].of_sample
+        data, name = row["run"].samples, OF_KIND[row["kind"]].of_sample
         stem, end = "baseline/", f"/{name}"
-        beside = {k[len(stem) : -len(end)]: own[k] for k in own if k.startswith(stem) and k.endswith(end)}
-        every = {k: v[np.isfinite(v)] for k, v in {**beside, _label(row): own[name]}.items()}
+        beside = {k[len(stem) : -len(end)]: data[k] for k in data if k.startswith(stem) and k.endswith(end)}
+        every = {k: v[np.isfinite(v)] for k, v in {**beside, _label(row): data[name]}.items()}
         how = {"tick_labels": list(every), "showfliers": False, "patch_artist": True}
         boxes = left.boxplot(list(every.values()), **how)
         for box, method in zip(boxes["boxes"], [*beside, row["method"]], strict=True):
             box.set(facecolor=style_of(method).colour, alpha=0.5)
         left.tick_params(axis="x", labelrotation=30)
         left.set(ylabel=f"{axis_of(name)} of a test row")
-        known = np.isfinite(own[name])
-        low, high = np.quantile(own[name][known], OUTER)
-        begin = BRACKET_DB * np.floor(np.clip(own[name][known], low, high) / BRACKET_DB)  # outermost are open
+        mask = np.isfinite(data[name])
+        low, high = np.quantile(data[name][mask], OUTER)
+        begin = BRACKET_DB * np.floor(np.clip(data[name][mask], low, high) / BRACKET_DB)  # outermost are open
         starts, counts = np.unique(begin, return_counts=True)
-        sure = [own["confidence"][known][begin == start].mean() for start in starts]
+        sure = [data["confidence"][mask][begin == start].mean() for start in starts]
         names = [f"{a:.0f}–{a + BRACKET_DB:.0f}" for a in starts]
         names[0], names[-1] = f"< {starts[0] + BRACKET_DB:.0f}", f"≥ {starts[-1]:.0f}"
         names = [f"{name}\n{count}" for name, count in zip(names, counts, strict=True)]

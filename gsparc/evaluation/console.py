@@ -35,8 +35,8 @@ def open_console() -> Console:
     Without markup: square brackets of a path or a title are no style.
     """
     terminal = Console(soft_wrap=True, markup=False)
-    known = terminal.is_terminal or "COLUMNS" in os.environ  # a log has no width: 80 cut headings short
-    return terminal if known else Console(soft_wrap=True, markup=False, width=WIDE)
+    has_width = terminal.is_terminal or "COLUMNS" in os.environ  # a log has no width: 80 cut headings short
+    return terminal if has_width else Console(soft_wrap=True, markup=False, width=WIDE)
 
 
 class ConsoleHandler(logging.StreamHandler):  # type: ignore[type-arg]
@@ -61,9 +61,9 @@ class ConsoleHandler(logging.StreamHandler):  # type: ignore[type-arg]
         """Return whether a record is shown; counts warnings."""
         message = record.getMessage()
         if record.levelno < logging.WARNING:
-            told = re.sub(r"^\S*/", "", message) if record.name.startswith(READERS) else ""
-            again = told in self.read
-            self.read.update({told} - {""})
+            text = re.sub(r"^\S*/", "", message) if record.name.startswith(READERS) else ""
+            again = text in self.read
+            self.read.update({text} - {""})
             return not again and not f"{record.name}.".startswith(self.quiet)
         if isinstance(record.args, tuple) and any(isinstance(part, Severe) for part in record.args):
             self.severe.append(f"this may change the figures above: {message}")
@@ -136,9 +136,9 @@ def config_folder() -> Path:
 def list_choices(group: str) -> list[str]:
     """List every choice of a config group, those in its folders as `folder/choice`, and those of plugins."""
     folder = config_folder() / group
-    own = {str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml")}
+    names = {str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml")}
     stored = ConfigStore.instance().repo.get(group, {})
-    return sorted(own.union(name.removesuffix(".yaml") for name in stored))
+    return sorted(names.union(name.removesuffix(".yaml") for name in stored))
 
 
 def _override(error: Exception, cause: OmegaConfBaseException) -> str:
@@ -146,13 +146,13 @@ def _override(error: Exception, cause: OmegaConfBaseException) -> str:
     full = str(cause.full_key or (named.group(1) if named else ""))
     if not full or cause.parent_node is None or "not" not in str(cause):
         return f"{_first(error)} {_first(cause)}"
-    known = [str(k) for k in cause.parent_node if str(k) != "hydra"]
+    names = [str(k) for k in cause.parent_node if str(k) != "hydra"]
     prefix, dot, key = full.rpartition(".")
     groups = cause.parent_node.items_ex(resolve=False) if OmegaConf.is_dict(cause.parent_node) else ()
     for group in [k for k, node in groups if OmegaConf.is_dict(node) and key in node]:
         # Such as a column's quantity, which is no setting of the dataset.
         return f"{full}: no such setting; did you mean '{prefix}{dot}{group}.{key}'?"
-    hint = suggest_or_list(key, known).replace("did you mean '", f"did you mean '{prefix}{dot}")
+    hint = suggest_or_list(key, names).replace("did you mean '", f"did you mean '{prefix}{dot}")
     hint = "; say hydra/launcher=joblib, too, or ray" if prefix == "hydra.launcher" else hint
     return f"{full}: no such setting{hint}"
 

@@ -82,9 +82,9 @@ PUBLISHED = "published_"  # begins the name of one at its published size
 
 def style_of(method: str) -> MethodStyle:
     """Return how a method is drawn; one without an entry by its name."""
-    own = method.removesuffix(TOGETHER).removeprefix(PUBLISHED)
-    if own != method:
-        return style_of(own)._replace(second=True)
+    base = method.removesuffix(TOGETHER).removeprefix(PUBLISHED)
+    if base != method:
+        return style_of(base)._replace(second=True)
     number = zlib.crc32(method.encode())
     mark = OTHERS[number // len(PALETTE) % len(OTHERS)]
     return METHODS.get(method, MethodStyle(PALETTE[number % len(PALETTE)], mark, True))

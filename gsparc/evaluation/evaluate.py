@@ -138,8 +138,8 @@ def evaluate(
         contenders[FIELD] = fields[0]
     nearest = every.get("baseline/nearest")
     for room, one in every.items():
-        own = {**pool_figures(one, data, split), "skill": _skill(one, nearest)}
-        facts |= {f"{room}/{figure}": value for figure, value in own.items()}
+        figures = {**pool_figures(one, data, split), "skill": _skill(one, nearest)}
+        facts |= {f"{room}/{figure}": value for figure, value in figures.items()}
     judged = judged_by({**facts, "dataset/kind": data.site.scored}, eval_on)
     for (room, other), (ahead, figure) in product(others.items(), judged.items()):
         lead = lead_over_rows(other.scores.samples, scores.samples, figure)
@@ -162,9 +162,9 @@ def evaluate(
     for stem, one in beside.items():
         columns |= {f"{stem}{name}": values for name, values in paired_values(one.samples).items()}
     beside_it = {name: fit.methods[0] for name, fit in fits.items() if fit is not same}
-    shown = beside_it | {methods[0].name: methods[0]}
+    example_methods = beside_it | {methods[0].name: methods[0]}
     rows = rows_to_score(split.folds[0], eval_on)
-    examples = Examples.of_methods(shown, data, rows) if data.site.target.is_image else None
+    examples = Examples.of_methods(example_methods, data, rows) if data.site.target.is_image else None
     return Evaluation(facts, columns, station_columns({"": scores, **beside}, data), examples)
 
 
@@ -176,11 +176,11 @@ def _about(
     Steps are means over folds, the rest of `model/*` is of the first.
     """
     first, every = methods[0], [method.facts() for method in methods]
-    told = [k for k in ("model/steps", "model/steps_taken") if len(every) > 1 and every[0].get(k) is not None]
-    own = every[0] | {key: np.mean([facts[key] for facts in every]) for key in told}
+    keys = [k for k in ("model/steps", "model/steps_taken") if len(every) > 1 and every[0].get(k) is not None]
+    model_facts = every[0] | {key: np.mean([facts[key] for facts in every]) for key in keys}
     return {
         "model/name": first.name, "model/label": common_label(first.name, methods),
-        "model/effects": first.effects, **own,
+        "model/effects": first.effects, **model_facts,
         "time/train_s": None if seconds is None else float(np.mean(seconds)),
         "time/train_total_s": None if seconds is None else float(sum(seconds)),
         **dataset_facts(data), **split_facts(split), **timing.machine_facts(), **timing.peak_memory(),
@@ -243,8 +243,8 @@ def _skill(scores: Scores, nearest: Scores | None) -> float | None:
         return None
     # Rows without a target are NaN in both, so that the means are over the same rows.
     every = (one.samples for one in (scores, nearest))
-    own, bar = (float(np.nanmean(one["error_db"] ** 2 if "error_db" in one else one["mse"])) for one in every)
-    return 1 - own / bar if bar > 0 else None
+    mse, bar = (float(np.nanmean(one["error_db"] ** 2 if "error_db" in one else one["mse"])) for one in every)
+    return 1 - mse / bar if bar > 0 else None
 
 
 def _columns(scores: Scores, data: Measurements) -> dict[str, Any]:

@@ -43,10 +43,10 @@ class Examples:
         """Ask fitted methods, the run's own last, about a few of `rows` (n,)."""
         assert data.site.grid is not None
         few = rows[evenly_spaced(len(rows), MOST)]
-        said = {name: predict_rows(method, data, few) for name, method in methods.items()}
-        own = [*said.values()][-1].confidence
-        sure = np.full(len(few), np.nan) if own is None else own.numpy()
-        means = {name: one.mean.numpy() for name, one in said.items()}
+        predictions = {name: predict_rows(method, data, few) for name, method in methods.items()}
+        confidence = [*predictions.values()][-1].confidence
+        sure = np.full(len(few), np.nan) if confidence is None else confidence.numpy()
+        means = {name: one.mean.numpy() for name, one in predictions.items()}
         return cls(few, np.array(data.site.grid.edges()), data.targets(few).numpy(), sure, means)
 
     def write(self, path: Path) -> None:
@@ -63,19 +63,21 @@ class Examples:
             return None
         with np.load(path) as stored:
             arrays = {name: stored[name].astype(float) for name in stored.files}
-        own = {name[3:]: arrays.pop(name) for name in list(arrays) if name.startswith("of ")}
-        return cls(arrays.pop("rows").astype(int), predicted=own, **arrays)
+        predictions = {name[3:]: arrays.pop(name) for name in list(arrays) if name.startswith("of ")}
+        return cls(arrays.pop("rows").astype(int), predicted=predictions, **arrays)
 
 
 def join_examples(rows: pd.DataFrame) -> Examples | None:
     """Return what all runs of a frame kept of the rows that the first kept, baselines first; None without."""
-    own = rows[~rows.baseline].drop_duplicates("setting")
-    kept = [(name, Examples.read(run.folder / FILE)) for name, run in zip(own.setting, own.run, strict=True)]
-    there = [(name, one) for name, one in kept if one is not None]
+    firsts = rows[~rows.baseline].drop_duplicates("setting")
+    examples = [
+        (name, Examples.read(run.folder / FILE)) for name, run in zip(firsts.setting, firsts.run, strict=True)
+    ]
+    there = [(name, one) for name, one in examples if one is not None]
     same = [(name, one) for name, one in there if np.array_equal(one.rows, there[0][1].rows)]
     if not same:
         return None
-    beside = set(distinct_baselines(rows).method) - set(own.method)
+    beside = set(distinct_baselines(rows).method) - set(firsts.method)
     plain = {m: v for _, one in reversed(same) for m, v in one.predicted.items() if m in beside}
     runs = {name: [*one.predicted.values()][-1] for name, one in same}
     return replace(same[-1][1], predicted=plain | runs)

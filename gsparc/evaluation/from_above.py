@@ -41,8 +41,8 @@ def frame_of(places: np.ndarray, share: float = 0.06) -> tuple[np.ndarray, np.nd
     """Return corners (2,) of a map: the known ones of places
     (n, 2) and a share of their extent around them.
     """
-    known = places[np.isfinite(places).all(axis=1)]
-    low, high = known.min(axis=0), known.max(axis=0)
+    finite_places = places[np.isfinite(places).all(axis=1)]
+    low, high = finite_places.min(axis=0), finite_places.max(axis=0)
     # 1 mm: a single place, or places at one point, have a frame all the same.
     margin = max(float((high - low).max()), 1e-3) * share
     return low - margin, high + margin
@@ -100,10 +100,10 @@ def draw_walls(axis: Any, triangles: np.ndarray) -> None:
 def annotate(axis: Any, text: str, where: np.ndarray, colour: str = "black", above: bool = True) -> None:
     """Write beside a point: above to its right, or below to its left, where the map does not end there."""
     low, high = axis.get_xlim()
-    left = where[0] > low + (0.75 if above else 0.25) * (high - low)
+    to_left = where[0] > low + (0.75 if above else 0.25) * (high - low)
     note = axis.annotate(
-        text, where, xytext=(-7 if left else 7, 5 if above else -12), textcoords="offset points",
-        ha="right" if left else "left", fontsize="small", color=colour, path_effects=OUTLINE, zorder=5,
+        text, where, xytext=(-7 if to_left else 7, 5 if above else -12), textcoords="offset points",
+        ha="right" if to_left else "left", fontsize="small", color=colour, path_effects=OUTLINE, zorder=5,
     )  # fmt: skip
     # Text at the rim would otherwise take width from the axes, whose scales are equal.
     note.set_in_layout(False)

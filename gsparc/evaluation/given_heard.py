@@ -43,13 +43,13 @@ def levels_given_heard(
     """
     level = levels_db(learned, np.arange(len(learned)))
     silent = learned.censored_side() > 0
-    mine, own = asked.stations_of(), learned.stations_of()
-    told = method.uses_censored and (spread_db > 0).any()
-    others = _draw_others(method, lists, asked, mine) if told and lists is not None else None
+    mine, learned_station = asked.stations_of(), learned.stations_of()
+    uses_silence = method.uses_censored and (spread_db > 0).any()
+    others = _draw_others(method, lists, asked, mine) if uses_silence and lists is not None else None
     chance, mean, spread = np.full(len(asked), np.nan), mean_db.copy(), spread_db.copy()
-    for station in np.intersect1d(mine, own[silent]):
+    for station in np.intersect1d(mine, learned_station[silent]):
         at = np.flatnonzero((mine == station) & (spread_db > 0))
-        rows = np.flatnonzero(silent & (own == station))
+        rows = np.flatnonzero(silent & (learned_station == station))
         if others is None:
             near = cKDTree(learned.moving[rows]).query(
                 asked.moving[at], range(1, min(NEAREST, len(rows)) + 1)
@@ -61,10 +61,10 @@ def levels_given_heard(
         chance[at] = torch.special.ndtr(above).mean(1)
         # Each limit counts by how probable it makes that the row is heard.
         weight = torch.softmax(torch.special.log_ndtr(above), 1)
-        shift, lost = truncated_moments(above)
+        shift, variance_loss = truncated_moments(above)
         middle = (weight * shift).sum(1)
         mean[at] += spread[at] * middle.numpy()
-        spread[at] *= ((weight * (1 - lost + shift**2)).sum(1) - middle**2).sqrt().numpy()
+        spread[at] *= ((weight * (1 - variance_loss + shift**2)).sum(1) - middle**2).sqrt().numpy()
     return {"heard_share": chance, "heard_db": mean, "heard_std_db": spread}
 
 
@@ -77,10 +77,10 @@ def _draw_others(method: Method, lists: StrongestLists, asked: Measurements, min
         asked, mine: n rows, and their stations (n,).
     """
     places, which = np.unique(asked.moving, axis=0, return_inverse=True)
-    result, kept = np.empty((len(asked), DRAWS)), -lists.length
+    result, rank = np.empty((len(asked), DRAWS)), -lists.length
     for place, drawn in enumerate(_draw_levels(_levels_near(method, lists, asked.site, places))):
         rows = which.reshape(-1) == place
-        beyond, last = np.partition(drawn, (kept - 1, kept), axis=0)[[kept - 1, kept]]
+        beyond, last = np.partition(drawn, (rank - 1, rank), axis=0)[[rank - 1, rank]]
         # One that has a place itself leaves the others one less.
         result[rows] = np.where(drawn[mine[rows]] >= last, beyond, last)
     return result
@@ -95,16 +95,16 @@ def _draw_levels(level: np.ndarray) -> Iterator[np.ndarray]:
 
 def _levels_near(method: Method, lists: StrongestLists, site: Site, places: np.ndarray) -> np.ndarray:
     """Levels and deviations (2, M, T) [dB] of stations listed near places (M, 3); -inf of others."""
-    known = {number for number, _ in method} if isinstance(method, PerStation) else {UNHEARD}
-    answered = np.array([t in known or UNHEARD in known for t in range(lists.level.shape[1])])
+    stations = {number for number, _ in method} if isinstance(method, PerStation) else {UNHEARD}
+    answered = np.array([t in stations or UNHEARD in stations for t in range(lists.level.shape[1])])
     station, at = np.nonzero((lists.listed_near(places) & answered).T)
     level = np.full((2, len(places), len(answered)), -np.inf)
     if not len(at):
         return level
     query = Query.from_places(site, torch.from_numpy(places[at]).float(), torch.from_numpy(station))
-    said = method.predict(query)
-    variance = torch.zeros(len(at)) if said.variance is None else said.variance
-    power = said.mean[:, 0].double().numpy() * site.target_scale
+    prediction = method.predict(query)
+    variance = torch.zeros(len(at)) if prediction.variance is None else prediction.variance
+    power = prediction.mean[:, 0].double().numpy() * site.target_scale
     with np.errstate(divide="ignore", invalid="ignore"):  # of no power, which has no decibels
         level[:, at, station] = power_in_decibels(power, variance.double().numpy() * site.target_scale**2)
     return level
@@ -151,17 +151,17 @@ def strongest_told(method: Method, lists: StrongestLists, asked: Measurements) -
     _, first, which = np.unique(asked.place, return_index=True, return_inverse=True)
     which = which.reshape(-1)
     if method.name == "nearest":  # the nearest moment as it was, not each station's own
-        known = np.isfinite(lists.place).all(1)
-        level = lists.level[known][cKDTree(lists.place[known]).query(asked.moving[first])[1]]
+        finite = np.isfinite(lists.place).all(1)
+        level = lists.level[finite][cKDTree(lists.place[finite]).query(asked.moving[first])[1]]
         level = np.nan_to_num(level, nan=-np.inf)
     else:
         level = _levels_near(method, lists, asked.site, asked.moving[first])[0]
     measured = np.full(level.shape, -np.inf)
     heard = np.flatnonzero(asked.censored_side() <= 0)
     np.maximum.at(measured, (which[heard], asked.stations_of(heard)), levels_db(asked, heard))
-    best, told = (one == one.max(1, keepdims=True) for one in (measured, level))
-    told &= np.isfinite(level)
-    share = (best & told).sum(1) / np.maximum(told.sum(1), 1)
+    best, predicted_best = (one == one.max(1, keepdims=True) for one in (measured, level))
+    predicted_best &= np.isfinite(level)
+    share = (best & predicted_best).sum(1) / np.maximum(predicted_best.sum(1), 1)
     return np.where(np.isfinite(measured.max(1)), share, np.nan)[which]
 
 

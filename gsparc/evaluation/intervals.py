@@ -27,24 +27,24 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     """
     mean, variance = scores.samples["prediction"], scores.variance * data.site.target_scale**2
     # Decibels of a power need a mean above 0.
-    known = np.isfinite(variance) & (variance > 0) & (mean > 0)
-    if not known.any():
+    valid = np.isfinite(variance) & (variance > 0) & (mean > 0)
+    if not valid.any():
         return {}
-    mean_db, spread_db = power_in_decibels(mean[known], variance[known])
-    row = scores.row[known]
+    mean_db, spread_db = power_in_decibels(mean[valid], variance[valid])
+    row = scores.row[valid]
     power = data.powers(row)[:, 0]
     silent = data.censored_side(row) > 0
     heard = (data.censored_side(row) == 0) & (power > 0)
     figures: dict[str, float | None] = {}
     if heard.any():
-        given = [scores.samples[n][known] for n in ("heard_db", "heard_std_db") if n in scores.samples]
-        middle, spread = (part[heard] for part in given or (mean_db, spread_db))
+        moments = [scores.samples[n][valid] for n in ("heard_db", "heard_std_db") if n in scores.samples]
+        middle, spread = (part[heard] for part in moments or (mean_db, spread_db))
         error = 10 * np.log10(power[heard]) - middle
-        held, width = coverage_and_width(error, half_width(SHARE) * spread)
-        figures |= {"interval/coverage_90": held, "interval/width_db": width}
+        coverage, width = coverage_and_width(error, half_width(SHARE) * spread)
+        figures |= {"interval/coverage_90": coverage, "interval/width_db": width}
         figures |= {CALIBRATION: float(np.mean((error / spread) ** 2))}
-        figures |= {"heard_above_db": float((middle - mean_db[heard]).mean())} if given else {}
-    chance = scores.samples.get("heard_share", scores.variance * np.nan)[known]
+        figures |= {"heard_above_db": float((middle - mean_db[heard]).mean())} if moments else {}
+    chance = scores.samples.get("heard_share", scores.variance * np.nan)[valid]
     limited = np.isfinite(chance)
     if not limited.any():  # all of them are of stations that heard everything
         return figures
@@ -63,10 +63,10 @@ def reduced_chi_squared(scores: Scores, data: Measurements) -> dict[str, float |
     1 where `Predictor.std` is right on average, above where it is too small, below where it is too large.
     """
     variance = scores.variance * data.site.target_scale**2
-    known = np.isfinite(scores.samples["mse"]) & (variance > 0)
-    if not known.any():
+    valid = np.isfinite(scores.samples["mse"]) & (variance > 0)
+    if not valid.any():
         return {}
-    return {CALIBRATION: float(np.mean(scores.samples["mse"][known] / variance[known]))}
+    return {CALIBRATION: float(np.mean(scores.samples["mse"][valid] / variance[valid]))}
 
 
 def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:

@@ -74,8 +74,8 @@ class State:
     @classmethod
     def from_config(cls, config: DictConfig, data: str = "", split: str = "") -> State:
         """Return the state of a resolved configuration, of hashes of measurements and of their split."""
-        kept = OmegaConf.masked_copy(config, [str(name) for name in config if name not in WHERE])
-        whole: Any = OmegaConf.to_container(kept, resolve=True)  # what is missing is `???`
+        subset = OmegaConf.masked_copy(config, [str(name) for name in config if name not in WHERE])
+        whole: Any = OmegaConf.to_container(subset, resolve=True)  # what is missing is `???`
         named = dict(dotted_settings(whole))
         where = {name: named.pop(name) for name in OF_DATA if name in named}
         files = {name: value for name, value in named.items() if isinstance(value, str)}
@@ -147,7 +147,7 @@ def run_once(
     if facts is not None:
         log.info("%s: already done", folder)
         return facts
-    record, left = read_summary(folder / RECORD), None
+    record, resume_path = read_summary(folder / RECORD), None
     changes = [] if record is None else state.changes(record)
     if record is None or record.get("ended") or changes:
         if changes and not resumes:
@@ -155,7 +155,7 @@ def run_once(
         set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
         record = {**asdict(state), "began": time.time()}
     else:
-        left = _last_state(folder, record["began"])
+        resume_path = _last_state(folder, record["began"])
     (folder / FAILURE).unlink(missing_ok=True)  # of an earlier try
 
     def write(ended: bool) -> None:
@@ -164,7 +164,7 @@ def run_once(
 
     write(False)
     try:
-        work(left)
+        work(resume_path)
     except BaseException:
         with suppress(OSError):  # such as a full disk, which the error itself names
             write(False)  # with what was imported meanwhile
@@ -178,8 +178,8 @@ def run_once(
 
 def set_earlier_aside(run_dir: Path, *begun_from: str | None) -> None:
     """Move files of an earlier run aside, except those that a training resumes or starts from."""
-    taken = [Path(path).resolve() for path in begun_from if path]
-    goes_on = any(run_dir.resolve() in (path, *path.parents) for path in taken)
+    paths = [Path(path).resolve() for path in begun_from if path]
+    goes_on = any(run_dir.resolve() in (path, *path.parents) for path in paths)
     if set_aside(run_dir, *LEFT[: 1 if goes_on else None]):
         log.info("%s: results of an earlier run are kept as NAME.earlier", run_dir)
 

@@ -131,21 +131,21 @@ class ChannelMetrics(SampleMetric):
         m = np.ones(t.shape, bool) if mask is None else mask.flatten(1).numpy()
         p, t, count = np.where(m, p, 0), np.where(m, t, 0), _nonzero(m.sum(1))
         error, power = (np.abs(p - t) ** 2).sum(1), (np.abs(t) ** 2).sum(1)
-        own, cross = (np.abs(p) ** 2).sum(1), np.abs((p.conj() * t).sum(1)) ** 2
+        p_power, cross = (np.abs(p) ** 2).sum(1), np.abs((p.conj() * t).sum(1)) ** 2
         # The projection onto the prediction: what the best complex scalar explains of the channel.
-        explained = np.divide(cross, own, out=np.zeros_like(own), where=own > 0)
+        explained = np.divide(cross, p_power, out=np.zeros_like(p_power), where=p_power > 0)
         # One free scalar fits a single-entry channel exactly: the figure is undefined there.
-        left = np.maximum(power - explained, 0.0) if t.shape[1] > 1 else power * np.nan
+        residual = np.maximum(power - explained, 0.0) if t.shape[1] > 1 else power * np.nan
         scale = self.scale if SMALLEST_UNIT <= self.scale <= 1 / SMALLEST_UNIT else 1.0
         unit = scale**2
         return {
             "error_power": error * unit,
             "target_power": power * unit,
-            "scalar_error_power": left * unit,
+            "scalar_error_power": residual * unit,
             "snr_db": _db(power, error),
             "mse": error / count * unit,
             "mae": np.abs(p - t).sum(1) / count * scale,
-            "power_db": np.where(power > 0, _db(np.maximum(own, power * SILENCE), power), np.nan),
+            "power_db": np.where(power > 0, _db(np.maximum(p_power, power * SILENCE), power), np.nan),
         }
 
     @staticmethod
@@ -175,11 +175,11 @@ class AlignedChannelMetrics(ChannelMetrics):
 
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
         p, t = (x.abs().double().flatten(1).numpy() for x in (prediction, target))
-        known = t > 0 if mask is None else (t > 0) & mask.flatten(1).numpy()
+        valid = t > 0 if mask is None else (t > 0) & mask.flatten(1).numpy()
         # SILENCE is a share of power, levels here are amplitudes.
-        floor = SILENCE**0.5 * np.where(known, t, 1.0)
-        decibels = 20 * np.log10(np.maximum(p, floor) / np.where(known, t, 1.0))
-        squares = np.where(known, decibels**2, 0).sum(1) / _nonzero(known.sum(1))
+        floor = SILENCE**0.5 * np.where(valid, t, 1.0)
+        decibels = 20 * np.log10(np.maximum(p, floor) / np.where(valid, t, 1.0))
+        squares = np.where(valid, decibels**2, 0).sum(1) / _nonzero(valid.sum(1))
         return {**super()._score(prediction, target, mask), "tone_db2": squares}
 
     @staticmethod

@@ -72,8 +72,8 @@ class Opened:
 
     def facts(self) -> dict[str, Any]:
         """Return `dataset/*`, `split/*` and `model/name`; `split/foreign` says why rows may not be unseen."""
-        own = {"split/foreign": self.doubt, "model/name": self.methods[0].name}
-        return dataset_facts(self.data) | split_facts(self.split) | own
+        run_facts = {"split/foreign": self.doubt, "model/name": self.methods[0].name}
+        return dataset_facts(self.data) | split_facts(self.split) | run_facts
 
     @property
     def doubt(self) -> str | None:
@@ -108,10 +108,10 @@ class Opened:
     def group_places(self, places: np.ndarray, count: int, seed: int) -> np.ndarray:
         """Return which of `count` groups, cut as test rows were, trained places (n, D) [m] are of, or -1."""
         fold, split = self.split.folds[0], effort_settings(self.stored[0].configuration)["split"]
-        known, group = fold.learned(), np.full(len(self.data), -1)
+        rows, group = fold.learned(), np.full(len(self.data), -1)
         for number, inner in enumerate(cut_folds(self.data, fold, split, count, seed).folds):
             group[inner.test] = number
-        return group[known[cKDTree(self.data.moving[known]).query(places)[1]]]
+        return group[rows[cKDTree(self.data.moving[rows]).query(places)[1]]]
 
 
 def open_files(
@@ -173,9 +173,9 @@ def read_like_stored(stored: checkpoint.StoredModel, path: str | Path) -> tuple[
     from gsparc.data.tables.places import place_by_row  # here, as pandas takes half a second
 
     before = stored.configuration.get("dataset") or {}
-    apart = place_by_row(path, before.get("columns") or {}, site.moving_end)
-    settings = {"file": str(path)} | ({"columns": apart} if apart else {})
-    return align_to_site(module_of(stored, settings).measurements, site), not apart
+    row_columns = place_by_row(path, before.get("columns") or {}, site.moving_end)
+    settings = {"file": str(path)} | ({"columns": row_columns} if row_columns else {})
+    return align_to_site(module_of(stored, settings).measurements, site), not row_columns
 
 
 def module_of(stored: checkpoint.StoredModel, dataset: Mapping[str, Any] | None) -> DataModule:
@@ -255,8 +255,8 @@ def _foreign(
 ) -> tuple[str | None, int | None, tuple[Measurements, Split] | None]:
     """What was trained on instead, how many of these test rows the models learned from, and `_trained`."""
     same = data.site.sha256 == stored[0].site.sha256
-    known = were_trained_on(stored, chosen)
-    if same and known:
+    same_split = were_trained_on(stored, chosen)
+    if same and same_split:
         return None, 0, None
     what = "another split" if same else f"other data than {data.site.name} (content hashes differ)"
     unplaced = [one for one in (data.site, stored[0].site) if one.georeference is None]
@@ -265,9 +265,9 @@ def _foreign(
         return f"{what}: whether these test rows lie where it was TRAINED cannot be told", None, None
     trained = _trained(stored, data)
     if trained is None:
-        what = "rows that it does not name" if same and known is None else what
+        what = "rows that it does not name" if same and same_split is None else what
         return f"{what}; these test rows may have been TRAINED on", None, None
-    own, before = trained
+    trained_data, before = trained
     # The same rows under another name or seed of split.
     if same and hash_indices(before.folds) == hash_indices(chosen.folds):
         return None, 0, trained
@@ -281,7 +281,7 @@ def _foreign(
             learned += int(np.isin(fold.test, rows).sum())
         else:
             # Order and names may differ between two files: rows at one place are taken for the same.
-            gaps, _ = cKDTree(own.moving[rows]).query(data.moving[fold.test])
+            gaps, _ = cKDTree(trained_data.moving[rows]).query(data.moving[fold.test])
             learned += int((gaps < SAME_ROW_M).sum())
     what += f" ({before.name})" * same
     how = ("were " if same else "are at places that were ") + ("TRAINED on" if learned else "trained on")
@@ -336,8 +336,8 @@ class Unseen:
         if run.learned != 0:
             advice = "calibrate with the data and split of its training"
             raise ValueError(f"{path} was trained on {run.foreign}; {advice}")
-        own, before = run.trained or (run.data, run.split)
-        rivals = Trusted.from_fold(own, before.folds[0])
+        learned_data, before = run.trained or (run.data, run.split)
+        rivals = Trusted.from_fold(learned_data, before.folds[0])
         rows = rows_to_score(run.split.folds[0], "test")
         evidence = gather_evidence(run.methods[0], run.data, rows, rivals)
         return Unseen(path, run.facts(), read_trusted(run.stored[0].extra), rivals, evidence)

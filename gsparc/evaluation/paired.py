@@ -109,7 +109,7 @@ def gains_of_rows(one: Mapping[str, Any], other: Mapping[str, Any], figure: str)
     column = sample_column(figure)
     if column not in one or column not in other:
         return None
-    a, b = (np.asarray(own[column], float) for own in (one, other))
+    a, b = (np.asarray(samples[column], float) for samples in (one, other))
     a, b = a + 0 * b, b + 0 * a  # NaN in one is NaN in both: the means are of the same rows
     if np.isfinite(a).sum() < 2:
         return None
@@ -154,10 +154,10 @@ def lead_over_runs(own: Sequence[Row], others: Sequence[Row]) -> Lead | None:
     if len(gains) > 1:
         return Lead.from_gains(np.array([np.mean(seeds) for seeds in gains.values()]), "draws")
     rows = [gains_of_rows(_samples(a), _samples(b), a["figure"]) for a, b in pairs]
-    known = [of_rows for of_rows in rows if of_rows is not None]
-    if not known or len(known) < len(rows):
+    row_gains = [of_rows for of_rows in rows if of_rows is not None]
+    if not row_gains or len(row_gains) < len(rows):
         return None
-    mean = np.mean(known, axis=0)
+    mean = np.mean(row_gains, axis=0)
     over_rows = Lead.from_gains(mean[np.isfinite(mean)], "test rows")
     over_seeds = Lead.from_gains(np.array(next(iter(gains.values()))), "seeds")
     return over_seeds if over_seeds.reach_db > over_rows.reach_db else over_rows

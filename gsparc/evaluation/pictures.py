@@ -38,8 +38,8 @@ def draw_run(
     """Draw predictions and what was found; give loggers the pictures, figures and the table of a run."""
     # Under other names, as `time/train_s` would cut off its curve; of the baselines a table.
     numbers = {name: value for name, value in facts.items() if isinstance(value, (int, float))}
-    own = {f"final/{name}": v for name, v in numbers.items() if not name.startswith("baseline/")}
-    tracking.log_final(loggers, own)
+    finals = {f"final/{name}": v for name, v in numbers.items() if not name.startswith("baseline/")}
+    tracking.log_final(loggers, finals)
     fold = split.folds[0]
     draw_sector_levels(method, data, fold, run_dir / "sectors.png")
     if len(fold.test):
@@ -191,8 +191,8 @@ def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Pat
     azimuth, stations = trend.table[:, 0].numpy(), data.site.every_station
     # Without an azimuth there is no angle to draw over.
     count[azimuth == NO_AZIMUTH] = 0
-    given = stations.beams[:, 0] % 360
-    turned = ~np.isclose(azimuth, given)  # as levels contradict what was given
+    nominal = stations.beams[:, 0] % 360
+    turned = ~np.isclose(azimuth, nominal)  # as levels contradict what was given
     enough = count >= np.where(turned, 1, LEAST)
     chosen = [int(t) for t in np.lexsort((-count, ~turned)) if enough[t]][:MOST]
     if not chosen:
@@ -213,11 +213,11 @@ def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Pat
         # A median: rows behind buildings are far below the pattern, and would lower a mean.
         gain = float((rest + trend.pattern_loss(at)).median())
         axis.plot(turn, gain - trend.pattern_loss(torch.from_numpy(around)), color=PALETTE[1])
-        title = f"{stations.shown[t]}, {azimuth[t]:.0f} deg" + f" (given {given[t]:.0f})" * int(turned[t])
+        title = f"{stations.shown[t]}, {azimuth[t]:.0f} deg" + f" (given {nominal[t]:.0f})" * int(turned[t])
         axis.set(title=title, xlim=(-180, 180), xticks=range(-180, 181, 90))
     few = [stations.shown[t] for t in np.flatnonzero((azimuth != NO_AZIMUTH) & ~enough)]
-    left = f"; too few rows to draw: {list_first(few, 6)}" if few else ""
-    figure.suptitle(fill(f"{len(chosen)} of {len(count)} sectors, contradicted azimuths first{left}", 90))
+    note = f"; too few rows to draw: {list_first(few, 6)}" if few else ""
+    figure.suptitle(fill(f"{len(chosen)} of {len(count)} sectors, contradicted azimuths first{note}", 90))
     for axis in axes.flat[len(chosen) :]:
         axis.set_visible(False)
     figure.supxlabel("angle from the azimuth that is used [deg]")

@@ -110,8 +110,8 @@ def draw_distributions(
         if name == TIMES or is_ratio(name):
             set_log_axis(axes, np.inf if name == TIMES else 0.0)
     line[0].set_ylabel("share of samples")
-    handles, shown = line[0].get_legend_handles_labels()
-    figure.legend(handles, [shorten_setting(one, 90) for one in shown], loc="outside lower center", ncols=2)
+    handles, texts = line[0].get_legend_handles_labels()
+    figure.legend(handles, [shorten_setting(one, 90) for one in texts], loc="outside lower center", ncols=2)
     figure.set_label("How the accuracy is distributed (95 % bands, dashed: medians)")
     return figure
 
@@ -121,13 +121,13 @@ def draw_sweep(rows: pd.DataFrame, title: str, path: Path, also: Sequence[str] =
 
     The paper's ablations draw the same: SSIM, PSNR, squared error, render time.
     """
-    own = own_rows(rows)
-    names = [name for name in OF_KIND[own.kind.iloc[0]].distributions if name in own.run.iloc[0].samples]
-    names += [TIMES] if any(len(run.render_ms) for run in own.run) else []
+    fits = own_rows(rows)
+    names = [name for name in OF_KIND[fits.kind.iloc[0]].distributions if name in fits.run.iloc[0].samples]
+    names += [TIMES] if any(len(run.render_ms) for run in fits.run) else []
     if not names:  # nothing was tested
         return
     labels = {}
-    for setting, seconds, ms in average(own, ["setting"], ["train_s", "query_ms"])["mean"].itertuples():
+    for setting, seconds, ms in average(fits, ["setting"], ["train_s", "query_ms"])["mean"].itertuples():
         labels[setting] = f"{shorten_setting(setting, 40)}: training {seconds:.3g} s"
         labels[setting] += f", one query {ms:.3g} ms" * bool(np.isfinite(ms))
     figure = draw_distributions(rows, names, labels)
@@ -212,11 +212,11 @@ def draw_efforts(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] 
     size = (max(PANEL * columns, 6.0), 0.9 * PANEL * len(groups) + 0.9)
     figure, grid = panels(*size, len(groups), columns, sharey="row")
     for line, here in zip(grid, groups, strict=True):
-        splits = [(own, "train_cpu_s", split) for split, own in here.groupby("split", sort=False)]
+        splits = [(cells, "train_cpu_s", split) for split, cells in here.groupby("split", sort=False)]
         first = splits[0][0]
         wanted = [*splits, *([(first, "query_ms", "queries")] if first.query_ms.notna().any() else [])]
-        for axis, (own, horizontal, shows) in zip(line, wanted, strict=False):
-            _panel(axis, own, horizontal, ours)
+        for axis, (cells, horizontal, shows) in zip(line, wanted, strict=False):
+            _panel(axis, cells, horizontal, ours)
             label = "training, CPU [s]" if horizontal == "train_cpu_s" else "one query [ms]"
             axis.set(title=f"{here.dataset.iloc[0]}, {shows}", xlabel=label)
         line[0].set_ylabel(score_heading(first.figure.iloc[0]))
@@ -231,11 +231,11 @@ def draw_efforts(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] 
 
 
 def _panel(axis: Any, rows: pd.DataFrame, horizontal: str, ours: str) -> None:
-    for name, own in rows.dropna(subset=horizontal).groupby("method", sort=False):
-        own = own.sort_values("effort", na_position="first")
+    for name, cells in rows.dropna(subset=horizontal).groupby("method", sort=False):
+        cells = cells.sort_values("effort", na_position="first")
         style = style_of(str(name)).marked | {"markersize": 11 if name == ours else 6, "capsize": 2}
-        x, spread = own[horizontal].clip(lower=LEAST_S), own.spread_db.fillna(0.0)
-        level = [shown(*one) for one in zip(own.figure, own.score_db, strict=True)]
+        x, spread = cells[horizontal].clip(lower=LEAST_S), cells.spread_db.fillna(0.0)
+        level = [shown(*one) for one in zip(cells.figure, cells.score_db, strict=True)]
         axis.errorbar(x, level, spread, label=name, **style)
     set_log_axis(axis, 1.5)
 
@@ -303,12 +303,12 @@ def draw_study(rows: pd.DataFrame, title: str, path: Path) -> None:
     figure.suptitle(title, fontsize=11)
     name = rows.figure.iloc[0]
     for axes, (what, label, x, factor, y) in zip(grid[0], wanted, strict=True):
-        for variant, own in rows.groupby("variant", sort=False):
-            clean, own = own[own.what == "none"], own[own.what == what]
-            if own.empty:
+        for variant, part in rows.groupby("variant", sort=False):
+            clean, part = part[part.what == "none"], part[part.what == what]
+            if part.empty:
                 continue
-            spread = own.spread.fillna(0.0) if y == ACCURACY else None
-            line, *_ = axes.errorbar(factor * own[x], own[y], spread, marker="o", capsize=2, label=variant)
+            spread = part.spread.fillna(0.0) if y == ACCURACY else None
+            line, *_ = axes.errorbar(factor * part[x], part[y], spread, marker="o", capsize=2, label=variant)
             if len(clean) and what != "none" and y == ACCURACY:
                 axes.axhline(clean.value.iloc[0], color=line.get_color(), linestyle=":", linewidth=1)
         set_log_axis(axes)

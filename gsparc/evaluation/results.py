@@ -76,10 +76,10 @@ class Run:
     @property
     def resolved(self) -> dict[str, Any]:
         """Settings of the model, its training and data by name, with what was chosen for those at `auto`."""
-        own = {name: v for name, v in self.config.items() if name.startswith(RESOLVED)}
+        settings = {name: v for name, v in self.config.items() if name.startswith(RESOLVED)}
         # Choices of `auto` are words like `name=value` in one line of the summary.
         chosen = [one.partition("=") for one in str(self.facts.get("model/choices") or "").split(", ")]
-        return own | {name: value for name, _, value in chosen if value}
+        return settings | {name: value for name, _, value in chosen if value}
 
     def swept(self, name: str) -> bool:
         """Return whether the command line set it."""
@@ -92,11 +92,11 @@ class Run:
         """
         named = [o for o in self.overrides if o not in {*shared} and not o.lstrip("+~").startswith(HIDDEN)]
         named = [o for o in named if not o.startswith(("model=", "dataset=", "split="))]
-        own, *others = result_rows(self.facts)
+        run_row, *others = result_rows(self.facts)
         if len(self.render_ms):
-            own["query_ms"], own["query_p95_ms"] = p50_p95(self.render_ms)
+            run_row["query_ms"], run_row["query_p95_ms"] = p50_p95(self.render_ms)
         short = [o.removeprefix("model.").removeprefix("trainer.") for o in named]
-        rows = [own | {"setting": " ".join([str(own["method"]), *short])}]
+        rows = [run_row | {"setting": " ".join([str(run_row["method"]), *short])}]
         # A sweep may thin what baselines learn from; one that could not be fitted has no value.
         of = [o for o in named if o.lstrip("+~").startswith(("split.", "dataset."))]
         beside = {row["method"]: row for row in others if row["value"] is not None}
@@ -120,9 +120,9 @@ def frame(*folders: str | Path) -> pd.DataFrame:
     for path in map(Path, folders):
         if not path.is_dir():
             raise ValueError(f"{path}: no such directory; give run directories, or a sweep's")
-        own = path / SUMMARY
+        top = path / SUMMARY
         # A run with runs below it (folds) is one; a sweep's folder has a summary that is no run's.
-        files = [own] if own.is_file() and _is_run(_facts(own)) else sorted(path.rglob(own.name))
+        files = [top] if top.is_file() and _is_run(_facts(top)) else sorted(path.rglob(top.name))
         every = {file.parent.resolve(): _facts(file) for file in files}
         here = [folder for folder, facts in every.items() if _is_run(facts)]
         if not here and not any(path.rglob("tradeoff.csv")):
@@ -172,9 +172,9 @@ def average(rows: pd.DataFrame, by: list[str], names: list[str]) -> pd.DataFrame
     the `error` of that, the standard error, NaN of one draw; `std`, `least` and `largest` are of all values,
     what seeds change where there is one draw. NaN of figures that the frame does not have.
     """
-    known = rows.reindex(columns=[*dict.fromkeys([*rows, *names])]).astype(dict.fromkeys(names, float))
-    draws = known.groupby([*by, "draw"], dropna=False, sort=False)[names].mean().reset_index()
-    of_draws, every = (one.groupby(by, dropna=False, sort=False)[names] for one in (draws, known))
+    table = rows.reindex(columns=[*dict.fromkeys([*rows, *names])]).astype(dict.fromkeys(names, float))
+    draws = table.groupby([*by, "draw"], dropna=False, sort=False)[names].mean().reset_index()
+    of_draws, every = (one.groupby(by, dropna=False, sort=False)[names] for one in (draws, table))
     spread = {"std": every.std(), "least": every.min(), "largest": every.max()}
     return pd.concat({"mean": of_draws.mean(), "error": of_draws.sem(), **spread}, axis=1)
 
@@ -260,15 +260,15 @@ def result_rows(facts: Mapping[str, Any], prefix: str = "test") -> list[dict[str
     shared["kind"] = scored_kind(facts)
     shared |= {"fold": 0 if folds == 1 else None, "figure": main_figure(facts, prefix), "alone": None}
     shared |= {"measured": sum(counts[:2]) // folds, "effects": "none"}
-    own = {name: facts.get(key) for name, key in OF_MODEL.items()}
-    model = own | {"effects": facts.get("model/effects") or "none"}
+    model_facts = {name: facts.get(key) for name, key in OF_MODEL.items()}
+    model = model_facts | {"effects": facts.get("model/effects") or "none"}
     model["alone"] = facts.get(f"field/{shared['figure']}")
     name = str(facts.get("model/name", "?"))
     rows = [shared | model | row_of_method(name, facts_under(facts, prefix), facts_under(facts, "time"))]
     # dict.fromkeys: a set of names would forget the order that the summary has them in.
     beside = dict.fromkeys(name.split("/")[1] for name in facts if name.startswith("baseline/"))
     every = ((name, facts_under(facts, f"baseline/{name}")) for name in beside)
-    rows += [dict.fromkeys(own) | shared | row_of_method(name, its, its) for name, its in every]
+    rows += [dict.fromkeys(model_facts) | shared | row_of_method(name, its, its) for name, its in every]
     return [{**row, "baseline": row is not rows[0], "value": row.get(row["figure"])} for row in rows]
 
 

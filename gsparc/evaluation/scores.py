@@ -63,10 +63,10 @@ class Scores:
         |h|^2; empty where no row weighs so much, there are few, or errors are in decibels.
         """
         error, power = self.samples.get("error_power", self.samples["mse"]), self.samples["target_power"]
-        known = np.isfinite(error) & (power > 0)
-        if "error_db" in self.samples or known.sum() < FEW:
+        valid = np.isfinite(error) & (power > 0)
+        if "error_db" in self.samples or valid.sum() < FEW:
             return {}
-        error, power, row = error[known], power[known], self.row[known]
+        error, power, row = error[valid], power[valid], self.row[valid]
         # A row may decide by its error alone, or by its power, which NMSE divides by.
         shares = np.maximum(error / max(error.sum(), TINY), power / power.sum())
         worst = int(shares.argmax())
@@ -122,9 +122,9 @@ def best_phase_of_runs(method: Method, data: Measurements, rows: np.ndarray, run
     turn = torch.ones(len(rows), dtype=torch.complex64)
     for run in runs:
         mine, overlap = np.flatnonzero(data.run[rows] == run), 0j  # type: ignore[index]
-        for _, batch, said in predict_in_batches(method, data, rows[mine], CHUNK):
+        for _, batch, prediction in predict_in_batches(method, data, rows[mine], CHUNK):
             # complex128: a sum over many rows and entries loses digits in complex64.
-            product = (said.mean.cpu().conj() * batch.target).to(torch.complex128)
+            product = (prediction.mean.cpu().conj() * batch.target).to(torch.complex128)
             overlap += complex((product if batch.mask is None else product * batch.mask).sum())
         if overlap:
             # arg of sum conj(p) t maximises Re sum conj(p e^ja) t over a: the best phase in closed form.
@@ -156,8 +156,8 @@ def score_methods(
         raise ValueError(f"{len(methods)} methods for the {len(split.folds)} folds of split={split.name}")
     every, samples = [rows_to_score(fold, eval_on) for fold in split.folds], []
     missing: list[pd.DataFrame] = []
-    own, before = learned or (data, split)
-    limited = (own.censored_side(before.folds[0].train) > 0).any()
+    learned_data, before = learned or (data, split)
+    limited = (learned_data.censored_side(before.folds[0].train) > 0).any()
     are_lists = limited and strongest_lists(data) is not None
     for method, rows, fold, taught in zip(methods, every, split.folds, before.folds, strict=True):
         runs = unseen_runs(data, fold, eval_on)
@@ -178,21 +178,21 @@ def score_methods(
         # Metrics are in the order of updates, station by station; rows are wanted in that of the fold.
         back = np.argsort(np.concatenate(order))
         scored = {name: values[back] for name, values in metric.compute().items()} | outputs
-        known = np.sort(taught.learned(eval_on))
+        learned_rows = np.sort(taught.learned(eval_on))
         if method.name == "nearest" and data.site.target.in_decibels and data.station is not None:
-            scored["served"] = levels_of_nearest_moment(own.subset(known), data.subset(rows))
+            scored["served"] = levels_of_nearest_moment(learned_data.subset(learned_rows), data.subset(rows))
         if limited:
             variance = scored["variance"] * data.site.target_scale**2
             with np.errstate(divide="ignore", invalid="ignore"):  # of no power, which has no decibels
                 level = power_in_decibels(scored["prediction"], variance)
-            there, asked = own.subset(known), data.subset(rows)
+            there, queries = learned_data.subset(learned_rows), data.subset(rows)
             lists = strongest_lists(there)
             if lists is not None and are_lists:
-                scored["strongest_told"] = strongest_told(method, lists, asked)
-                missing.append(never_listed(method, lists, data.subset(np.concatenate(every)), asked))
-            given = levels_given_heard(method, there, asked, *level, lists)
+                scored["strongest_told"] = strongest_told(method, lists, queries)
+                missing.append(never_listed(method, lists, data.subset(np.concatenate(every)), queries))
+            heard_levels = levels_given_heard(method, there, queries, *level, lists)
             # Who learned from heard rows alone predicts such levels.
-            scored |= given if method.uses_censored else {"heard_share": given["heard_share"]}
+            scored |= heard_levels if method.uses_censored else {"heard_share": heard_levels["heard_share"]}
         samples.append(scored)
     pooled = {name: np.concatenate([s[name] for s in samples]) for name in samples[0]}
     row = np.concatenate(every)

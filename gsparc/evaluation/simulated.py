@@ -42,8 +42,8 @@ def draw_floor_plan(outcome: Outcome, path: Path) -> None:
     draw_values(axes[0], at, level, size, 0.01, label="received power [dB]", **bar)
     draw_values(axes[1], at, spread[reached] * 1e9, size, 0.01, label="delay spread [ns]", **bar)
     if changed is not None:
-        known = power[changed.rows] > 0
-        errors, rows = changed.errors[known], changed.rows[known] % len(places)
+        is_heard = power[changed.rows] > 0
+        errors, rows = changed.errors[is_heard], changed.rows[is_heard] % len(places)
         label = "error without what is not needed" if np.ptp(errors) > 0 else "all is needed"
         # Errors of spectra have no decibels.
         if decision is not None and not decision.choice.deliverable.startswith("spectrum"):

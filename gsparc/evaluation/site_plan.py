@@ -73,8 +73,8 @@ def find_spots(data: Measurements, levels: LinkLevels | None) -> Spots:
     for rows in find_outliers(data).values():
         suspicious[which[rows]] = True
     if levels is not None:
-        lost = [rows for _, rows, _ in find_outlier_rows(levels)]
-        wild = levels.position[np.concatenate([np.zeros(0, np.int64), *lost])]
+        outliers = [rows for _, rows, _ in find_outlier_rows(levels)]
+        wild = levels.position[np.concatenate([np.zeros(0, np.int64), *outliers])]
         suspicious[cKDTree(place + site.origin).query(wild)[1]] = True
     level, label = _levels(data, which, count)
     names = [data.row_names[i].partition(", station")[0] for i in first[order]]
@@ -139,8 +139,8 @@ def draw_site(
 def _title(data: Measurements, places: Spots) -> str:
     stations, called = data.site.stations, data.site.target.called
     at = "" if stations is None else f", {len(stations)} station{'s' * (len(stations) > 1)}"
-    apart = spacing_words(distinct_places(data), data.site.wavelength).partition(";")[0]
-    return f"{data.site.name}: {len(data)} {called} at {len(places.place)} places{at}\n{apart}"
+    spacing = spacing_words(distinct_places(data), data.site.wavelength).partition(";")[0]
+    return f"{data.site.name}: {len(data)} {called} at {len(places.place)} places{at}\n{spacing}"
 
 
 def static_positions(data: Measurements) -> np.ndarray:
@@ -161,12 +161,12 @@ def _draw_map(
     if places.level_db is None or not np.isfinite(places.level_db[inside]).any():
         axis.scatter(*places.place[inside].T, s=size, c=PALETTE[0], linewidths=0, label=name)
     else:
-        known = inside & np.isfinite(places.level_db)
-        if (inside & ~known).any():
-            silent = places.place[inside & ~known]
+        heard = inside & np.isfinite(places.level_db)
+        if (inside & ~heard).any():
+            silent = places.place[inside & ~heard]
             axis.scatter(*silent.T, s=size, c="0.8", linewidths=0, label=f"{name}, nothing heard")
         bar: dict[str, Any] = {"label": places.label, "extend": "both", "shrink": 0.85, "pad": 0.02}
-        draw_values(axis, places.place[known], places.level_db[known], size, 0.01, **bar)
+        draw_values(axis, places.place[heard], places.level_db[heard], size, 0.01, **bar)
         axis.scatter([], [], s=25, c="0.4", linewidths=0, label=name)  # whose colours are the bar's
     side = propose_side(data)
     test = np.zeros(0, np.int64) if side is None else held_out_block_rows(data, side)
@@ -181,9 +181,9 @@ def _draw_map(
 
 def _size(place: np.ndarray, extent: float) -> float:
     """Area [points^2] of a mark as large as the distance between neighbours."""
-    apart = float(np.median(cKDTree(place).query(place, k=2)[0][:, 1])) if len(place) > 1 else extent
+    spacing = float(np.median(cKDTree(place).query(place, k=2)[0][:, 1])) if len(place) > 1 else extent
     # 72 points are an inch; clipped to what is seen (2.5) and hides no neighbours (9).
-    return float(np.clip(72 * INCHES * apart / extent, 2.5, 9.0)) ** 2
+    return float(np.clip(72 * INCHES * spacing / extent, 2.5, 9.0)) ** 2
 
 
 def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> None:
@@ -201,10 +201,10 @@ def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> Non
     # All sectors of a mast in one text: one above the other the last alone would be read.
     masts, mast = np.unique(place.round(1), axis=0, return_inverse=True)
     for number, where in enumerate(masts):
-        own = np.flatnonzero(mast.reshape(-1) == number).tolist()
+        sectors = np.flatnonzero(mast.reshape(-1) == number).tolist()
         if np.isfinite(where).all():
-            colour = "red" if set(own) & set(jumping) else "black"
-            annotate(axis, ", ".join(names[t] for t in own), where, colour)
+            colour = "red" if set(sectors) & set(jumping) else "black"
+            annotate(axis, ", ".join(names[t] for t in sectors), where, colour)
 
 
 def _draw_suspicious(axis: Any, places: Spots, low: np.ndarray, high: np.ndarray) -> None:

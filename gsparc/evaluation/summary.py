@@ -131,18 +131,18 @@ def results_table(facts: Mapping[str, Any], method: str, title: str = "", prefix
     # Silent rows, stations and variances are not of all data and methods.
     beside = [name for name in (WITH_SILENT, BEST_SERVER, CALIBRATION) if f"{prefix}/{name}" in facts]
     wanted = [*OF_KIND[facts["dataset/kind"]].columns, "skill", *beside]
-    own, *others = result_rows(facts, prefix)
-    figures = [own.get(name) for name in wanted]
+    method_row, *others = result_rows(facts, prefix)
+    figures = [method_row.get(name) for name in wanted]
     # A baseline that the method is was fitted once: its row is the method's own.
-    kept = [o for o in others if o["method"] != method or [o.get(name) for name in wanted] != figures]
+    rivals = [o for o in others if o["method"] != method or [o.get(name) for name in wanted] != figures]
     plain = plain_methods()
-    kept.sort(key=lambda row: plain.index(row["method"]) if row["method"] in plain else len(plain))
-    named = [row | {"method": f"{method} (baseline)"} if row["method"] == method else row for row in kept]
+    rivals.sort(key=lambda row: plain.index(row["method"]) if row["method"] in plain else len(plain))
+    named = [row | {"method": f"{method} (baseline)"} if row["method"] == method else row for row in rivals]
     alone = facts_under(facts, "field")
     fields = [row_of_method(f"{method}, Gaussians alone", alone, alone)] if alone else []
-    shown = (Column(name, number_format(name), of=name) for name in wanted)
-    columns = [Column("method", "", of="method"), *shown, TRAIN, P50]
-    return Table.from_rows(title, columns, [*named, *fields, own | {"method": method}], bold=method)
+    figure_columns = (Column(name, number_format(name), of=name) for name in wanted)
+    columns = [Column("method", "", of="method"), *figure_columns, TRAIN, P50]
+    return Table.from_rows(title, columns, [*named, *fields, method_row | {"method": method}], bold=method)
 
 
 def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
@@ -176,14 +176,14 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
 
 def describe_model(facts: Mapping[str, Any]) -> list[str]:
     """Return which method was chosen and what it is made of, then what it learned, of a law or of beams."""
-    made, label = facts.get("model/made"), facts.get("model/label")
+    parts, label = facts.get("model/made"), facts.get("model/label")
     # `ImageSources` is said as image sources.
     kind = re.sub("(?<=[a-z])(?=[A-Z])", " ", str(facts.get("model/class") or "")).lower()
-    said = [] if made in (None, label) else [made if kind in made else f"{kind}, {made}"]
+    texts = [] if parts in (None, label) else [parts if kind in parts else f"{kind}, {parts}"]
     # Notes of a method begin with its name, of which one is enough.
     notes = str(facts.get("model/learned") or "").replace(f"{facts.get('model/name')}: ", "")
-    said += notes.splitlines()[:MOST_LEARNED]
-    lines = [f"  {text}" if number else f"{label}: {text}" for number, text in enumerate(said)]
+    texts += notes.splitlines()[:MOST_LEARNED]
+    lines = [f"  {text}" if number else f"{label}: {text}" for number, text in enumerate(texts)]
     folds = facts.get("split/folds") or 1
     return [f"of the first of {folds} folds:"] * (folds > 1 and bool(lines)) + lines
 
@@ -242,30 +242,30 @@ def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]
     # False for NaN: methods without a std have no such figure. 1e-12: answers may be exact.
     far = {n: max(x, 1e-12) for n, x in chi2.items() if x is not None and (x < low or x > high)}
     factors = [(n, max(x, 1 / x) ** 0.5, "large" if x < 1 else "small") for n, x in far.items()]
-    said = ", ".join(f"of {name} is {times:.2g} times too {side}" for name, times, side in factors)
+    faults = ", ".join(f"of {name} is {times:.2g} times too {side}" for name, times, side in factors)
     tested = "gsparc map ckpt=FILE has tested intervals"
     if not figure.startswith("rmse"):  # for spectra and channels there are thresholds alone
         tested = "gsparc calibrate ckpt=FILE tests which answers to accept"
-    meant = f"{CALIBRATION} is 1 where std, the stated uncertainty, is right: std {said}"
-    return [f"{meant}; it orders answers, but is no error bar here; {tested}"] if said else []
+    meaning = f"{CALIBRATION} is 1 where std, the stated uncertainty, is right: std {faults}"
+    return [f"{meaning}; it orders answers, but is no error bar here; {tested}"] if faults else []
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """Return whether the best baseline beats the method, or neither; with silent rows, and of heard ones."""
-    method, said = str(facts.get("model/label") or facts.get("model/name")), list[str]()
+    method, notes = str(facts.get("model/label") or facts.get("model/name")), list[str]()
     for ahead, figure in judged_by(facts, prefix).items():
-        own = facts.get(f"{prefix}/{figure}")
+        value = facts.get(f"{prefix}/{figure}")
         keys = [k for k in facts if k.startswith("baseline/") and k.endswith(f"/{figure}")]
-        known = {k.split("/")[1]: score_of(figure, facts[k]) for k in keys if facts[k] is not None}
-        best = max(known, key=lambda name: known[name], default=None)
-        if best is None or own is None:
+        scores = {k.split("/")[1]: score_of(figure, facts[k]) for k in keys if facts[k] is not None}
+        best = max(scores, key=lambda name: scores[name], default=None)
+        if best is None or value is None:
             continue
         lead = Lead.from_facts(facts, f"baseline/{best}/{ahead}")
         if lead is not None:
-            said += judge_baseline(best, method, figure, lead, ahead == LISTED)
-        elif known[best] > score_of(figure, own):
-            said.append(f"the baseline {best} has the better {figure} here; how surely is not known")
-    return said
+            notes += judge_baseline(best, method, figure, lead, ahead == LISTED)
+        elif scores[best] > score_of(figure, value):
+            notes.append(f"the baseline {best} has the better {figure} here; how surely is not known")
+    return notes
 
 
 def judge_baseline(baseline: str, method: str, figure: str, lead: Lead, listed: bool = False) -> list[str]:

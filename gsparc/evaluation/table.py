@@ -117,9 +117,9 @@ class Table:
 
     def without(self, *names: str) -> Table:
         """Return the same but for some columns."""
-        kept = [i for i, column in enumerate(self.columns) if column.name not in names]
-        rows = [[row[i] for i in kept] for row in self.rows]
-        return replace(self, columns=[self.columns[i] for i in kept], rows=rows)
+        indices = [i for i, column in enumerate(self.columns) if column.name not in names]
+        rows = [[row[i] for i in indices] for row in self.rows]
+        return replace(self, columns=[self.columns[i] for i in indices], rows=rows)
 
     @staticmethod
     def key(value: Any) -> str:
@@ -141,8 +141,8 @@ class Table:
             if any(isinstance(cell, Interval) for cell in cells):
                 for end in ("low", "high", "error"):
                     ends = [getattr(cell, end, None) for cell in cells]
-                    known = any(one is not None for one in ends)
-                    parts |= {f"{column.name} {self.ends.get(end, end)}": ends} if known else {}
+                    has_end = any(one is not None for one in ends)
+                    parts |= {f"{column.name} {self.ends.get(end, end)}": ends} if has_end else {}
         # object: pandas would write whole numbers beside empty cells as 3.0.
         return pd.DataFrame(parts, dtype=object).to_csv(index=False, lineterminator="\n")
 
@@ -163,13 +163,13 @@ class Table:
         Words are broken where they are wider than it, never cut.
         """
         heads, rows = self.texts()
-        shown = [i for i in range(len(heads)) if not rows or any(row[i] != "-" for row in rows)]
-        least = {i: _longest_word(heads[i], (row[i] for row in rows)) for i in shown}
-        fits = sum(least.values()) + RULE * len(shown) < options.max_width
-        natural = sum(max(map(cell_len, (heads[i], *(row[i] for row in rows)))) for i in shown)
-        narrow = fits and natural + RULE * len(shown) >= options.max_width
+        indices = [i for i in range(len(heads)) if not rows or any(row[i] != "-" for row in rows)]
+        least = {i: _longest_word(heads[i], (row[i] for row in rows)) for i in indices}
+        fits = sum(least.values()) + RULE * len(indices) < options.max_width
+        natural = sum(max(map(cell_len, (heads[i], *(row[i] for row in rows)))) for i in indices)
+        narrow = fits and natural + RULE * len(indices) >= options.max_width
         result = RichTable(title=self.title, caption=self.note or None)
-        for i in shown:
+        for i in indices:
             cells = max((cell_len(row[i]) for row in rows), default=0)
             # Words leave room to heads, numbers are as wide as they are.
             head = wrap_head(heads[i], max(least[i], cells if self.columns[i].form else 0))
@@ -178,7 +178,7 @@ class Table:
                 overflow="fold", min_width=least[i] if narrow else None,
             )  # fmt: skip
         for row in rows:
-            result.add_row(*(row[i] for i in shown), style="bold" if row[0] == self.bold else None)
+            result.add_row(*(row[i] for i in indices), style="bold" if row[0] == self.bold else None)
         yield result
 
 

@@ -78,11 +78,11 @@ class SummedGradients(DDPStrategy):
 def sum_gradients(parameters: Iterable[Tensor]) -> None:
     """Replace every gradient by its sum over processes; one that no process has stays None."""
     every = list(parameters)
-    own = [torch.zeros_like(p) if p.grad is None else p.grad for p in every]
+    gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in every]
     # Sent along: a parameter without a gradient in this process may have one in another.
-    has = own[0].new_tensor([p.grad is not None for p in every])
-    flat = process_sum(torch.cat([has, *(gradient.flatten() for gradient in own)]))
-    sums = flat[len(every) :].split([gradient.numel() for gradient in own])
+    has = gradients[0].new_tensor([p.grad is not None for p in every])
+    flat = process_sum(torch.cat([has, *(gradient.flatten() for gradient in gradients)]))
+    sums = flat[len(every) :].split([gradient.numel() for gradient in gradients])
     for parameter, somewhere, result in zip(every, flat[: len(every)].tolist(), sums, strict=True):
         parameter.grad = result.view_as(parameter).to(parameter.dtype) if somewhere else None
 

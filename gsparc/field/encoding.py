@@ -92,10 +92,10 @@ class PositionEncoding(nn.Module):
             self.length, self.noise, self.kernel = prior.length, prior.noise, prior.kernel
             self.tells_share = prior.whitening is not None
             self.register_buffer("anchors", prior.anchors.float())
-            known = prior.anchors.double(), prior.length, JITTER, prior.kernel, len(prior.anchors)
+            arguments = prior.anchors.double(), prior.length, JITTER, prior.kernel, len(prior.anchors)
             whitening = prior.whitening
             if whitening is None:
-                whitening = whitened_features(*known).whitening.float()
+                whitening = whitened_features(*arguments).whitening.float()
             # What the prior holds is stored with it.
             self.register_buffer("whitening", whitening, persistent=prior.whitening is None)
         else:

@@ -151,6 +151,6 @@ def create_field(
     directions = torch.stack([horizontal * azimuth.cos(), horizontal * azimuth.sin(), height], -1)
     distance = settings.near + (settings.far - settings.near) * torch.rand(count, 1)
     means = receiver.float() + distance * directions @ rotation.float().T
-    apart = math.sqrt(2 * math.pi / max(count, 1))  # [rad] between neighbours
-    scales = settings.scale * torch.ones(count, 3) if settings.scale else (distance * apart).expand(-1, 3)
+    angle = math.sqrt(2 * math.pi / max(count, 1))  # [rad] between neighbours
+    scales = settings.scale * torch.ones(count, 3) if settings.scale else (distance * angle).expand(-1, 3)
     return GaussianField(means, scales, settings.opacity)

@@ -213,15 +213,15 @@ def make_trainer(
     for callback in callbacks:
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)
-    given = make.keywords.get("val_check_interval")
-    every = given if type(given) is int else max(1, module.total_steps // LOOKS)
+    interval = make.keywords.get("val_check_interval")
+    every = interval if type(interval) is int else max(1, module.total_steps // LOOKS)
     # A validation sees the figures of its own step.
     module.log_every = math.gcd(LOG_EVERY, every) if len(fold.val) else max(LOG_EVERY, every // LOOKS)
     per_epoch = max(1, len(fold.train) // batches.batch_size)
     options: dict[str, Any] = {
         "log_every_n_steps": max(1, min(50, per_epoch) // module.log_every) * module.log_every,
         "check_val_every_n_epoch": None,  # validations are counted in steps
-        "val_check_interval": every if given is None else given,
+        "val_check_interval": every if interval is None else interval,
         "num_sanity_val_steps": -1,  # all validation rows, before the first step: where the curve begins
     }
     if not len(fold.val):
@@ -279,14 +279,14 @@ def read_trainer_result(trainer: L.Trainer, watch: Stopwatch) -> TrainerResult:
     metrics = trainer.callback_metrics
     more = float(metrics[SPENT]) - watch.seconds, float(metrics[SPENT_CPU]) - watch.cpu_seconds
     watch.charge(*(max(spent, 0.0) for spent in more))
-    kept = int(metrics[KEPT]) if KEPT in metrics else None
-    taken = int(metrics[TAKEN])
+    best_step = int(metrics[KEPT]) if KEPT in metrics else None
+    steps = int(metrics[TAKEN])
     timers = [c for c in trainer.callbacks if isinstance(c, L.callbacks.Timer)]  # type: ignore[attr-defined]
     if not any((timer.time_remaining() or 0) <= 0 for timer in timers):
-        return TrainerResult(kept, taken, ())
-    ended = f"trainer.max_time ended training after {taken} of {trainer.max_steps} steps"
+        return TrainerResult(best_step, steps, ())
+    ended = f"trainer.max_time ended training after {steps} of {trainer.max_steps} steps"
     log.warning("%s", ended)
-    return TrainerResult(kept, taken, (f"{ended}: another machine ends elsewhere",))
+    return TrainerResult(best_step, steps, (f"{ended}: another machine ends elsewhere",))
 
 
 def _drop_unusable(callbacks: Sequence[L.Callback], val_rows: int, gaussians: bool) -> Sequence[L.Callback]:

@@ -65,21 +65,21 @@ class KeepBest(L.Callback):
         if self._kept is None:
             return
         trainer.callback_metrics[KEPT] = torch.tensor(self.step, dtype=torch.float64)  # leaves a process
-        taken = trainer.global_step
+        steps = trainer.global_step
         if module.solved and len(self.start):
             log.info(
                 "%d gradient steps moved the squared error of %d held-out rows from %.4g to %.4g; "
                 "experiment=field starts at random: there another loss or callback makes a difference",
                 self.step, len(self.start), float(self.start.mean()), self.error,
             )  # fmt: skip
-        if self.step == taken:
+        if self.step == steps:
             return
         model = module.model
         edit.resize_gaussians(model, model.gaussians, len(self._kept["gaussians.ids"]))
         model.load_state_dict(self._kept)
         log.info(
             "gradient steps: %d taken, %s kept: later ones not significantly better on %d rows held out",
-            taken, f"the first {self.step}" if self.step else "none", len(self.start),
+            steps, f"the first {self.step}" if self.step else "none", len(self.start),
         )  # fmt: skip
 
     def state_dict(self) -> dict[str, Any]:

@@ -179,13 +179,13 @@ def channel_loss(
 
 def _error_up_to_phase(prediction: Tensor, target: Tensor, mask: Tensor | None, timing: bool) -> Tensor:
     """min |h - p exp(j (phi - 2 pi k tau))|^2 over phi (and tau): |h|^2 + |p|^2 - 2 max |<p, h>|."""
-    known = torch.ones_like(target.real) if mask is None else mask.to(target.real.dtype)
-    product = (prediction.conj() * target * known).sum(1)  # (B, K)
+    weights = torch.ones_like(target.real) if mask is None else mask.to(target.real.dtype)
+    product = (prediction.conj() * target * weights).sum(1)  # (B, K)
     if timing and product.shape[1] > 1:
         period = DELAYS_PER_TONE * product.shape[1]
         best = torch.fft.ifft(product.detach(), period).abs().argmax(1, keepdim=True)
         turn = 2 * math.pi / period * best * torch.arange(product.shape[1], device=product.device)
         product = product * torch.polar(torch.ones_like(turn), turn)
-    power = ((prediction.abs().square() + target.abs().square()) * known).flatten(1).sum(1)
+    power = ((prediction.abs().square() + target.abs().square()) * weights).flatten(1).sum(1)
     alike = torch.view_as_real(product.sum(1)).square().sum(1).clamp_min(1e-20).sqrt()
-    return (power - 2 * alike) / known.flatten(1).sum(1).clamp_min(1)
+    return (power - 2 * alike) / weights.flatten(1).sum(1).clamp_min(1)

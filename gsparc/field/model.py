@@ -146,10 +146,10 @@ class GaussianModel(nn.Module):
             of_position = PositionEncoding(settings.confidence.encoding, query_box, prior)
             self.confidence = Confidence(settings.confidence, of_position)
         static = receiver.position if receiver is not None else transmitter
-        apart = None if static is None else float((static.float() - box.mean(0)).norm())
+        distance = None if static is None else float((static.float() - box.mean(0)).norm())
         law = settings.attenuation
         # A static end within 10 cm of the box's middle is no scale of distances.
-        self.d_ref = law.d_ref or (apart if apart and apart > 0.1 else 1.0)
+        self.d_ref = law.d_ref or (distance if distance and distance > 0.1 else 1.0)
         # Without the law the gain is a parameter all the same, so that state dicts have one shape.
         law = law if law.inverse_distance else AttenuationSettings()
         self.log_gain = nn.Parameter(torch.tensor(math.log(law.gain)), requires_grad=law.learn_gain)
@@ -169,8 +169,8 @@ class GaussianModel(nn.Module):
         lengths = (means - middle).norm(dim=1)
         if transmitter is not None:
             lengths = lengths + (means - transmitter.float()).norm(dim=1)
-        known = None if site.subcarriers_hz is None else torch.as_tensor(site.subcarriers_hz)
-        return ChannelResponse(antennas, subcarriers, known, lengths)
+        tones = None if site.subcarriers_hz is None else torch.as_tensor(site.subcarriers_hz)
+        return ChannelResponse(antennas, subcarriers, tones, lengths)
 
     @property
     def channels(self) -> int:

@@ -157,10 +157,10 @@ class ArrayResponse(nn.Module):
         if unknown is not None:
             share = unknown.clamp_min(SLOPE_ENDS).sqrt()
             return self.renderer(torch.cat([vectors, share[:, None].to(vectors.dtype)], 1))
-        known = torch.cat([vectors, torch.zeros_like(vectors[:, :1])], 1)  # no incoherent background
+        inputs = torch.cat([vectors, torch.zeros_like(vectors[:, :1])], 1)  # no incoherent background
         if self.normalisation != "none":  # scaled first: the slope is cut off below a fixed amplitude
-            known = known / torch.linalg.vector_norm(vectors.detach(), dim=1, keepdim=True).clamp_min(1e-20)
-        image = self.renderer(known).flatten(1)
+            inputs = inputs / torch.linalg.vector_norm(vectors.detach(), dim=1, keepdim=True).clamp_min(1e-20)
+        image = self.renderer(inputs).flatten(1)
         return normalise_spectrum(image, self.normalisation).unflatten(1, (self.grid.height, self.grid.width))
 
     def forward(self, image: Tensor, unknown: Tensor | None = None) -> Tensor:

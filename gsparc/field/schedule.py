@@ -32,7 +32,7 @@ def acts_at_step(step: int, start: int | float, stop: int | float, interval: int
         start, stop, interval: steps, or shares.
         total: steps of the schedule.
     """
-    first, last, apart = (to_steps(value, total) for value in (start, stop, interval))
+    first, last, period = (to_steps(value, total) for value in (start, stop, interval))
     if isinstance(interval, float) and step < FIRST:
         return False
-    return first <= step <= last and step % apart == 0
+    return first <= step <= last and step % period == 0

@@ -71,14 +71,14 @@ def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
     site = data.site
     if site.freedom == "none" or site.phase_reference is not None:
         return data, fold
-    known = np.sort(fold.learned())
+    fit_rows = np.sort(fold.learned())
     key = (fold.train.tobytes(), fold.val.tobytes(), site.sha256.encode())
-    for kept, its, result in _LAST:
-        if kept() is data and its == key:
+    for data_ref, its, result in _LAST:
+        if data_ref() is data and its == key:
             return result
     target, noise, found = np.array(data.target), data.noise_variance, []
-    for rows in _group_snapshots(data, known):
-        best, own = align_rows(rows, site.freedom, site), target[rows.rows]
+    for rows in _group_snapshots(data, fit_rows):
+        best, channels = align_rows(rows, site.freedom, site), target[rows.rows]
         found.append(best)
         factors = rows.to_rows(best.factors)
         if site.freedom == "phase+delay+gain":
@@ -88,13 +88,13 @@ def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
             if noise is not None:
                 noise = np.array(noise)
                 noise[rows.rows] /= level**2
-        target[rows.rows] = (own * factors).astype(target.dtype)
+        target[rows.rows] = (channels * factors).astype(target.dtype)
     reference: Literal["carrier", "neighbours"] = (
         "carrier" if all(one.phase_reference == "carrier" for one in found) else "neighbours"
     )
     log.info(
         "aligned %d rows by %s: each told by the others to NMSE %.3g; phases over places are %s",
-        len(known), describe_freedom(site.freedom), float(np.mean([one.error for one in found])),
+        len(fit_rows), describe_freedom(site.freedom), float(np.mean([one.error for one in found])),
         "the carrier's" if reference == "carrier" else "relative to neighbours",
     )  # fmt: skip
     turned = replace(
@@ -234,14 +234,14 @@ class _Rows:
 
     def _sweep_factors(self, factors: np.ndarray, weights: csr_array, sweeps: int) -> np.ndarray:
         for _ in range(sweeps):
-            told = self._predict_left_out(factors, weights)
-            factors = align_factors(self.values, told, self.tones, self.freedom_of_phase)
+            predictions = self._predict_left_out(factors, weights)
+            factors = align_factors(self.values, predictions, self.tones, self.freedom_of_phase)
         return factors
 
     def _left_out_error(self, factors: np.ndarray, weights: csr_array) -> float:
-        told = self._predict_left_out(factors, weights)
-        told = told * align_factors(told, self.values, self.tones, self.freedom)[:, None]
-        missed = np.abs(self.values - told) ** 2 * (self.values != 0)
+        predictions = self._predict_left_out(factors, weights)
+        predictions = predictions * align_factors(predictions, self.values, self.tones, self.freedom)[:, None]
+        missed = np.abs(self.values - predictions) ** 2 * (self.values != 0)
         return float(missed.sum() / (np.abs(self.values) ** 2).sum())
 
 

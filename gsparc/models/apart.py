@@ -13,10 +13,10 @@ def keep_apart(
     >>> keep_apart([9, 8, 5, 4, 1], lambda one, other: abs(one - other) < 2)
     [9, 5, 1]
     """
-    kept: list[int] = []
+    numbers: list[int] = []
     for one in order:
-        if len(kept) == limit:
+        if len(numbers) == limit:
             break
-        if not any(alike(one, other) for other in kept):
-            kept.append(one)
-    return kept
+        if not any(alike(one, other) for other in numbers):
+            numbers.append(one)
+    return numbers

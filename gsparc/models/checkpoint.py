@@ -125,8 +125,8 @@ def _write(path: Path, content: dict[str, Any]) -> None:
             torch.save(content, file)
     except (OSError, RuntimeError) as error:  # torch's writer makes the second of the first
         # What the system said, under whatever a library wrapped around it.
-        said = next((one.strerror for one in list_causes(error) if isinstance(one, OSError)), None)
-        why = said or "is the disk full?"
+        reason = next((one.strerror for one in list_causes(error) if isinstance(one, OSError)), None)
+        why = reason or "is the disk full?"
         raise CheckpointError(f"{path}: cannot be written ({why}); what was there is kept") from error
 
 
@@ -143,19 +143,19 @@ def read(path: str | Path) -> StoredModel:
 
 def _content_digest(content: Mapping[str, Any]) -> str:
     """SHA-256 of all that a checkpoint holds, of tensors type, shape and bytes."""
-    digest, left = hashlib.sha256(), [value for name, value in sorted(content.items()) if name != "sha256"]
-    while left:
-        value = left.pop()
+    digest, stack = hashlib.sha256(), [value for name, value in sorted(content.items()) if name != "sha256"]
+    while stack:
+        value = stack.pop()
         if isinstance(value, Tensor):
             digest.update(f"{value.dtype} {tuple(value.shape)}".encode())
             packed = torch.empty(value.numel(), dtype=value.dtype).copy_(value.detach().flatten())
             digest.update(packed.view(torch.uint8).numpy().tobytes())  # one number may have strides of 0
         elif isinstance(value, Mapping):
             digest.update(f"{len(value)} {list(value)}".encode())
-            left += value.values()
+            stack += value.values()
         elif isinstance(value, (list, tuple)):
             digest.update(f"{type(value)} {len(value)}".encode())
-            left += value
+            stack += value
         else:
             digest.update(f"{value!r};".encode())
     return digest.hexdigest()
@@ -209,12 +209,12 @@ def _drop_unknown_places(part: Any) -> Any:
     if not isinstance(stations, Mapping):
         return part
     facts = {name: stations.get(name) for name in ("position", "sector")}
-    known = {
+    finite_facts = {
         name: torch.where(torch.isnan(fact), 0, fact)
         for name, fact in facts.items()
         if isinstance(fact, Tensor) and fact.is_floating_point()
     }
-    return {**part, "stations": {**stations, **known}}
+    return {**part, "stations": {**stations, **finite_facts}}
 
 
 def _stored_from_content(content: Mapping[str, Any], path: Path) -> StoredModel:
@@ -229,8 +229,8 @@ def _stored_from_content(content: Mapping[str, Any], path: Path) -> StoredModel:
 
 
 def _site_from(facts: Mapping[str, Any]) -> Site:
-    known = {f.name for f in fields(Site)}
-    values = {k: v for k, v in _tensors_to_numpy(facts).items() if k in known}
+    names = {f.name for f in fields(Site)}
+    values = {k: v for k, v in _tensors_to_numpy(facts).items() if k in names}
     if values.get("grid") is not None:
         values["grid"] = SphereGrid(**values["grid"])
     if values.get("stations") is not None:
@@ -252,9 +252,9 @@ def _tensors_to_numpy(facts: Mapping[str, Any]) -> dict[str, Any]:
 
 def _exceeds_limits(content: Any) -> bool:
     """Whether a container is in it twice or too deep, or a tensor has not as many numbers as are stored."""
-    left, seen = [(content, 0)], set[int]()
-    while left:
-        value, depth = left.pop()
+    stack, seen = [(content, 0)], set[int]()
+    while stack:
+        value, depth = stack.pop()
         if isinstance(value, Tensor):
             other = value.is_meta or value.is_quantized or value.is_nested
             if other or value.layout != torch.strided or value.nbytes > value.untyped_storage().nbytes():
@@ -264,7 +264,7 @@ def _exceeds_limits(content: Any) -> bool:
                 return True
             seen.add(id(value))
             parts = value.values() if isinstance(value, Mapping) else value
-            left += [(part, depth + 1) for part in parts]
+            stack += [(part, depth + 1) for part in parts]
     return False
 
 

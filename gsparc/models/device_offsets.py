@@ -46,8 +46,8 @@ def take_off_devices(data: Measurements, fold: Fold) -> Measurements:
     spread = float(offset.var(ddof=1)) if len(offset) > 1 else 0.0
     levels = np.tile([0.0, spread], (len(names) + 1, 1))
     levels[heard] = np.c_[offset, np.zeros(len(heard))]
-    said = [f"{names[one]} {value:+.1f} dB" for one, value in zip(heard, offset, strict=True)]
-    log.info("devices: %s, beside their mean", list_first(said, 6))
+    notes = [f"{names[one]} {value:+.1f} dB" for one, value in zip(heard, offset, strict=True)]
+    log.info("devices: %s, beside their mean", list_first(notes, 6))
     return without_devices(data, replace(data.site, device_levels=levels))
 
 
@@ -66,6 +66,6 @@ def find_device(name: str, site: Site) -> int:
     """Return the number of a device by its name; `ValueError` where there is none."""
     names = site.device_names or ()
     if name not in names:
-        known = f"there are {list_first(names)}" if names else f"{site.name} tells no devices apart"
-        raise ValueError(f"no device {name!r}; {known}")
+        hint = f"there are {list_first(names)}" if names else f"{site.name} tells no devices apart"
+        raise ValueError(f"no device {name!r}; {hint}")
     return names.index(name)

@@ -77,19 +77,19 @@ def fit_or_resume(
         module = copy.copy(context.datamodule)
         module.measurements = ordered
         context = replace(context, datamodule=module)
-    (ordered, rows), left = align_phases(ordered, rows), context.resume
+    (ordered, rows), resume_path = align_phases(ordered, rows), context.resume
     aligning = watch.seconds if ordered.site.freedom != "none" else 0.0
-    if left is not None:  # what was read then is not known
+    if resume_path is not None:  # what was read then is not known
         heeded.count_reads("*")
-    if left is not None and not left.exists():  # the interrupted run had not begun this part
+    if resume_path is not None and not resume_path.exists():  # the interrupted run had not begun this part
         context = replace(context, resume=None)
-    elif left is not None and left.is_dir():
-        if (left / checkpoint.MODEL).exists():
+    elif resume_path is not None and resume_path.is_dir():
+        if (resume_path / checkpoint.MODEL).exists():
             whole = replace(data, site=ordered.site)
-            return _restore_fit(factory, whole, fold, context, left / checkpoint.MODEL)
+            return _restore_fit(factory, whole, fold, context, resume_path / checkpoint.MODEL)
         # What has parts looks for each of them in the folder itself.
         if not factory.has_parts:
-            resume = next((left / name for name in LAST if (left / name).exists()), None)
+            resume = next((resume_path / name for name in LAST if (resume_path / name).exists()), None)
             context = replace(context, resume=resume)
     method = factory.create_for(ordered)
     if context.init_from is not None and not (method.has_parts or method.takes_weights):
@@ -180,12 +180,12 @@ class Origin:
             ValueError: it is of other data, rows, seed or settings, which are named.
         """
         before, now = stored.configuration, yaml.safe_load(self.config) or {}
-        own, differing = self._hashes(), []
+        hashes, differing = self._hashes(), []
         origin = stored.extra.get("origin")
         if origin is None:
             raise ValueError(f"ckpt_path={stored.path}: does not say what it learned from; start without it")
         for name, group, what in _HASHED:
-            if origin[name] != own[name]:
+            if origin[name] != hashes[name]:
                 differing += _list_differences(before, now, (group,)) or [f"other {what}"]
         if stored.site.sha256 == self.site.sha256:  # of other data, all of it may differ
             facts = {name: (getattr(stored.site, name), getattr(self.site, name)) for name in UNHASHED}

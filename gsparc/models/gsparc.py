@@ -65,8 +65,8 @@ def choose(data: Measurements, settings: Gsparc, quiet: bool = False) -> Method:
             (True, ImageProcess),
         )
         kind = next(kind for called, kind in table if called)
-        for said in settings.own_terms.said if kind is not Powers else ():
-            raise ValueError(f"{said} of received powers; the target is {site.kind} here")
+        for remark in settings.own_terms.said if kind is not Powers else ():
+            raise ValueError(f"{remark} of received powers; the target is {site.kind} here")
         rendered = issubclass(kind, ImageProcess)
         if (rendered and hides is False) or (kind is Bearings and hides is True):
             why = "rasterized Gaussians always occlude each other"
@@ -148,8 +148,8 @@ class Gsparc(LearnsTogether):
         solved = {import_path(kind): kind for kind in (ImageSources, Channels, Powers, Bearings)}
         if target in solved:
             alone = not self.rendered.settings.field.count
-            own: dict[str, Any] = vars(self.own_terms) if solved[target] is Powers else {}
-            return solved[target](self.switches, self.position_std, self.init, residual_alone=alone, **own)
+            terms: dict[str, Any] = vars(self.own_terms) if solved[target] is Powers else {}
+            return solved[target](self.switches, self.position_std, self.init, residual_alone=alone, **terms)
         rendered = {import_path(kind): kind for kind in (ArrayProcess, ImageProcess)}
         if target not in rendered:
             raise ValueError(f"model=gsparc makes no {target}: train again")

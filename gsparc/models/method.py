@@ -67,9 +67,9 @@ class Prediction:
         many = factor.reshape(-1, *shape[: self.mean.ndim - 1])
         mean, variance, explained = self.mean * many, self.variance, self.explained
         if variance is not None:
-            own = (mean / RELATIVE_DB).square() * spread.reshape(many.shape)
+            device_variance = (mean / RELATIVE_DB).square() * spread.reshape(many.shape)
             scale = factor.square().reshape(-1, *shape[: variance.ndim - 1])
-            variance = variance * scale + own.reshape(variance.shape)
+            variance = variance * scale + device_variance.reshape(variance.shape)
         return Prediction(mean, variance, self.unknown, None if explained is None else explained * many)
 
     @staticmethod
@@ -304,29 +304,29 @@ def predict_in_batches(
         for start in range(0, len(rows), size):
             chosen = order[start : start + size]
             batch = data.batch(rows[chosen])
-            said = method.predict(batch)
+            answer = method.predict(batch)
             if data.device is not None:
-                said = said.of_devices(method.fitted_site, torch.from_numpy(data.device[rows[chosen]]))
-            yield chosen, batch, said
+                answer = answer.of_devices(method.fitted_site, torch.from_numpy(data.device[rows[chosen]]))
+            yield chosen, batch, answer
 
     if data.site.freedom == "none":
         yield from predict_batches()
         return
-    told, back = list(predict_batches()), np.argsort(order)
+    answers, back = list(predict_batches()), np.argsort(order)
     factors = factors_to_measured(
-        torch.cat([said.mean.detach().cpu() for _, _, said in told])[back], data, rows
+        torch.cat([answer.mean.detach().cpu() for _, _, answer in answers])[back], data, rows
     )
-    for chosen, batch, said in told:
+    for chosen, batch, answer in answers:
         factor = factors[chosen]
-        variance = None if said.variance is None else said.variance * factor[:, 0].abs().square().mean(1)
-        yield chosen, batch, replace(said, mean=said.mean * factor, variance=variance)
+        variance = None if answer.variance is None else answer.variance * factor[:, 0].abs().square().mean(1)
+        yield chosen, batch, replace(answer, mean=answer.mean * factor, variance=variance)
 
 
 def factors_to_measured(means: Tensor, data: Measurements, rows: np.ndarray) -> Tensor:
     """Return factors (n, 1, K) complex64 that turn means (n, A, K) to rows (n,) by what is free of these."""
     moments = Snapshots.from_rows(data, rows)
-    told = moments.arrange(means.numpy())
-    turns = align_factors(told * (moments.values != 0), moments.values, moments.tones, data.site.freedom)
+    answers = moments.arrange(means.numpy())
+    turns = align_factors(answers * (moments.values != 0), moments.values, moments.tones, data.site.freedom)
     return torch.from_numpy(moments.to_rows(turns).astype(np.complex64))
 
 

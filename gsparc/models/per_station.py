@@ -68,8 +68,8 @@ def stations_of_fold(method: MethodFactory, data: Measurements, fold: Fold) -> S
     count = len(data.site.every_station)
     # Rows where nothing was heard count for a method that learns from their level.
     rows = fold.train if method.uses_censored else heard_rows(data, fold.train)
-    known, asked = (np.bincount(data.stations_of(some), minlength=count) for some in (rows, fold.test))
-    return StationsOfFold(known >= LEAST_ROWS, (asked > 0) & (known < LEAST_ROWS))
+    n_train, n_test = (np.bincount(data.stations_of(some), minlength=count) for some in (rows, fold.test))
+    return StationsOfFold(n_train >= LEAST_ROWS, (n_test > 0) & (n_train < LEAST_ROWS))
 
 
 def station_site(site: Site, number: int) -> Site:
@@ -131,18 +131,18 @@ class PerStation(Method):
         watch = Stopwatch()
         numbers = self._station_numbers(data, fold, context)
         self.site, notes = data.site, list[str]()
-        left = None if context.resume is None else fitting.run_folder(context.resume, fitting.STATIONS)
+        resume_dir = None if context.resume is None else fitting.run_folder(context.resume, fitting.STATIONS)
         resumable = self.factory.resumable and context.run_dir != Path()
-        if resumable and left is None:  # of an earlier run in this folder
+        if resumable and resume_dir is None:  # of an earlier run in this folder
             for file in context.run_dir.glob("station*/**/*.ckpt"):
                 file.unlink()
 
         def fit_station(turn: int) -> tuple[Method, FitReport, float, float]:
             number = numbers[turn]
             folder = "unheard" if number == UNHEARD else f"station{number}"
-            resume = None if left is None else left / folder
+            resume = None if resume_dir is None else resume_dir / folder
             # The run's `datamodule` loads rows of all stations: a station's fit makes loaders of its own.
-            own = context.for_part(folder, datamodule=None, resume=resume)
+            part_context = context.for_part(folder, datamodule=None, resume=resume)
             if len(numbers) > 1:
                 # Others take a second each: `run_all` says how far they are.
                 level = logging.INFO if self.factory.resumable else logging.DEBUG
@@ -153,7 +153,7 @@ class PerStation(Method):
             inner = Fold(*(np.flatnonzero(np.isin(rows, chosen)) for chosen in vars(fold).values()))
             before, cpu_before = watch.seconds, watch.cpu_seconds
             try:
-                copy, report = fitting.fit_or_resume(self.factory, part, inner, own)
+                copy, report = fitting.fit_or_resume(self.factory, part, inner, part_context)
             except KeyboardInterrupt:
                 # A single station's own message already names the file to go on from.
                 if not resumable or len(numbers) == 1:
@@ -161,8 +161,8 @@ class PerStation(Method):
                 progress = f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
                 raise KeyboardInterrupt(f"{progress}; go on with ckpt_path={context.run_dir}") from None
             if resumable and len(numbers) > 1:
-                extra = fitting.run_extra(report, part, inner, own)
-                checkpoint.save(own.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
+                extra = fitting.run_extra(report, part, inner, part_context)
+                checkpoint.save(part_context.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
             return copy, report, watch.seconds - before, watch.cpu_seconds - cpu_before
 
         fits = run_all(fit_station, range(len(numbers)), f"stations of {self.name}")
@@ -173,8 +173,8 @@ class PerStation(Method):
         heard = [one for one, number in zip(reports, numbers, strict=True) if number != UNHEARD]
         learned = pool_station_weights([note for one in heard for note in one.notes])
         notes += dict.fromkeys(learned.values())
-        lost = [t for t in range(len(data.site.every_station)) if not {t, UNHEARD} & {*numbers}]
-        if who := list_first([self._station_name(number) for number in lost]):
+        nan_stations = [t for t in range(len(data.site.every_station)) if not {t, UNHEARD} & {*numbers}]
+        if who := list_first([self._station_name(number) for number in nan_stations]):
             notes.append(Caution(f"answers are NaN, of fewer than {LEAST_ROWS} rows: station {who}"))
         for turn, number in enumerate(numbers):
             self._copies[number] = fits[turn][0]
@@ -207,10 +207,10 @@ class PerStation(Method):
             if not self.factory.both_ends and not joint:
                 raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
             numbers.append(UNHEARD)
-        lost = np.isnan(stations.position).any(1)
+        no_position = np.isnan(stations.position).any(1)
         if joint:  # it seeks those that have rows
-            lost &= only_tested & ~np.isin(np.arange(len(stations)), data.stations_of(fold.train))
-        if UNHEARD in numbers and lost.any():
+            no_position &= only_tested & ~np.isin(np.arange(len(stations)), data.stations_of(fold.train))
+        if UNHEARD in numbers and no_position.any():
             needs = f"{self.name}: places of stations are unknown, it needs them"
             others = f" for those without training rows ({names}); give them, or split otherwise"
             raise ValueError(needs + ("; say stations=each" if together and not joint else others))
@@ -229,8 +229,8 @@ class PerStation(Method):
         result = PerStation(self.factory)
         result.site, result._shared = data.site, self._shared
         for number, copy in self._copies.items():
-            own, part = self._rows_and_measurements(data, number)
-            chosen = np.flatnonzero(np.isin(own, rows))
+            station_rows, part = self._rows_and_measurements(data, number)
+            chosen = np.flatnonzero(np.isin(station_rows, rows))
             if len(chosen) < LEAST_ROWS:
                 continue
             learned = copy.copy_conditioned(part, chosen) if isinstance(copy, Reconditions) else None
@@ -283,8 +283,8 @@ class PerStation(Method):
         """See `AddsCarriers`."""
         copy, site = self._copies.get(UNHEARD), self.fitted_site
         if not self._shared or not isinstance(copy, AddsCarriers):
-            known = "knows its own carriers alone" if self._shared else "learned each carrier alone"
-            raise ValueError(f"{self.name} {known}; model=carriers answers at others")
+            reason = "knows its own carriers alone" if self._shared else "learned each carrier alone"
+            raise ValueError(f"{self.name} {reason}; model=carriers answers at others")
         result = PerStation(self.factory)
         result._copies, result._shared = {UNHEARD: copy.add_carrier(frequency_hz)}, True
         result.site = replace(site, stations=site.every_station.add_carrier(frequency_hz))
@@ -342,13 +342,13 @@ class PerStation(Method):
 
 def _combine_facts(facts: list[Any], name: str) -> float | int | str | None:
     """A fact of all copies."""
-    known = [value for value in facts if value is not None]
-    if not known:
+    values = [value for value in facts if value is not None]
+    if not values:
         return None
-    if isinstance(known[0], str):
-        return ", ".join(dict.fromkeys(known))
+    if isinstance(values[0], str):
+        return ", ".join(dict.fromkeys(values))
     # Shares are averaged; counts and seconds of the copies add up.
-    return float(np.mean(known)) if name == "model/variance_explained" else sum(known)
+    return float(np.mean(values)) if name == "model/variance_explained" else sum(values)
 
 
 def _to_station_query(site: Site, query: Query) -> Query:

@@ -33,8 +33,8 @@ def list_settings(method: Method, grid: Mapping[str, Sequence[Any] | None]) -> I
 
     Strides must divide the columns, others are left out with a warning.
     """
-    known = method.reduction_settings()
-    axes = {knob: values for knob, values in grid.items() if knob in known and values is not None}
+    knobs = method.reduction_settings()
+    axes = {knob: values for knob, values in grid.items() if knob in knobs and values is not None}
     if "stride" in axes:
         axes["stride"] = _dividing_strides(axes["stride"], method)
     together = [

@@ -76,12 +76,12 @@ def estimate_place_errors(seen: Linearised, place: Tensor, std: Tensor) -> tuple
     weight, count = 1 / seen.variance, len(std)
     # Errors in units of their own deviation: d / s ~ N(0, 1).
     slope = seen.slope * std[place][:, None, None]
-    own = torch.einsum("ndk,ndl,nd->nkl", slope, slope, weight)
-    size = own.new_zeros(count, *own.shape[1:]).index_add(0, place, own)
+    information = torch.einsum("ndk,ndl,nd->nkl", slope, slope, weight)
+    size = information.new_zeros(count, *information.shape[1:]).index_add(0, place, information)
     towards = torch.einsum("ndk,nd,nd->nk", slope, seen.residual, weight)
     pull = towards.new_zeros(count, *towards.shape[1:]).index_add(0, place, towards)
     whole, entries = float((seen.residual.square() * weight).sum()), int((weight > 0).sum())
-    tried = []
+    trials = []
     for share in SHARES:
         precision = torch.eye(slope.shape[-1], dtype=slope.dtype) + size / share
         unit = torch.linalg.solve(precision, pull[..., None])[..., 0] / share
@@ -89,10 +89,10 @@ def estimate_place_errors(seen: Linearised, place: Tensor, std: Tensor) -> tuple
         exact = (whole / share + entries * math.log(share)) / 2
         # What integrating over d adds, by the matrix inversion and determinant lemmas.
         fit = float((pull * unit).sum()) / share - float(precision.logdet().sum())
-        tried.append((exact - fit / 2, exact, unit))
-    least, _, unit = min(tried, key=lambda each: each[0])
+        trials.append((exact - fit / 2, exact, unit))
+    least, _, unit = min(trials, key=lambda each: each[0])
     # Without errors c is chosen too: a better scale of variances is no gain of theirs.
-    return unit * std[:, None], min(exact for _, exact, _ in tried) - least
+    return unit * std[:, None], min(exact for _, exact, _ in trials) - least
 
 
 def refine_places(
@@ -124,9 +124,9 @@ def _linearise(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Linea
     Raises:
         ValueError: the field does not predict its rows from all others.
     """
-    left, site = field.left_out(), data.site
-    batch, moving = data.batch(left.rows), torch.from_numpy(data.moving[left.rows])
-    if left.mean.numel() != batch.target.numel():
+    left_out, site = field.left_out(), data.site
+    batch, moving = data.batch(left_out.rows), torch.from_numpy(data.moving[left_out.rows])
+    if left_out.mean.numel() != batch.target.numel():
         raise ValueError(f"{field.name}: of several tones or antennas one is kept of rows left out")
 
     def batch_at(places: Tensor) -> Batch:
@@ -138,9 +138,9 @@ def _linearise(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Linea
     with torch.no_grad():
         result = field.predict(batch_at(moving))  # what is computed once and kept must not be so inside `jvp`
     assert result.variance is not None
-    variance = torch.where(left.variance.isnan(), result.variance, left.variance).double()
+    variance = torch.where(left_out.variance.isnan(), result.variance, left_out.variance).double()
     target = site.target
-    answers, variance = target.moments_in_error_unit(left.mean, variance)
+    answers, variance = target.moments_in_error_unit(left_out.mean, variance)
     true, mean = (to_real_entries(values) for values in (target.in_error_unit(batch.target), answers))
     residual = true - mean
     parts = 2 if batch.target.is_complex() else 1
@@ -150,7 +150,7 @@ def _linearise(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Linea
         spread = torch.where(batch.mask.flatten(1).repeat_interleave(parts, 1), spread, math.inf)
     axes = torch.eye(moving.shape[1]).to(moving)[:, None].expand(-1, *moving.shape).contiguous()
     slope = [torch.func.jvp(predict_entries, (moving,), (axis,))[1].detach() for axis in axes]
-    return left.rows, Linearised(residual, torch.stack(slope, -1), spread)
+    return left_out.rows, Linearised(residual, torch.stack(slope, -1), spread)
 
 
 def move_rows(data: Measurements, rows: np.ndarray, offsets: np.ndarray) -> Measurements:

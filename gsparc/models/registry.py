@@ -121,15 +121,15 @@ def fill_defaults(node: DictConfig, own: Mapping[str, Any] | None = None, group:
     if not isinstance(kind, type):  # refused where it is built
         return node
     own = config_node(kind) if own is None else own
-    given, taken = set(node), {*own, *accepted_arguments(kind)} - {"_target_"}
-    for name in (name for name in given - taken if not name.startswith("_")):
+    keys, names = set(node), {*own, *accepted_arguments(kind)} - {"_target_"}
+    for name in (name for name in keys - names if not name.startswith("_")):
         hint = (
-            suggest_or_list(name, taken).replace("mean '", f"mean '{group}.") if taken else ", which has none"
+            suggest_or_list(name, names).replace("mean '", f"mean '{group}.") if names else ", which has none"
         )
         raise SettingError(f"{group}.{name}: no such setting of {kind.__name__}{hint}")
     with open_dict(node):
-        node.update({name: default for name, default in own.items() if name not in given})
-    for name in given & own.keys():
+        node.update({name: default for name, default in own.items() if name not in keys})
+    for name in keys & own.keys():
         if OmegaConf.is_interpolation(node, name):
             continue
         value, default = node.get(name), own[name]
@@ -137,8 +137,8 @@ def fill_defaults(node: DictConfig, own: Mapping[str, Any] | None = None, group:
             raise SettingError(f"{group}.{name}={value}: say {name}={value}")
         if isinstance(default, Mapping) and not isinstance(value, DictConfig):
             some = "=..., ".join(f"{group}.{name}.{key}" for key in list(default)[1:3])  # after `_target_`
-            said = f"{group}.{name}={value}: is a group of settings"
-            raise SettingError(f"{said}, given one by one: {some}=...")
+            fault = f"{group}.{name}={value}: is a group of settings"
+            raise SettingError(f"{fault}, given one by one: {some}=...")
         if isinstance(default, Mapping):
             fill_defaults(value, default, f"{group}.{name}")
     return node

@@ -95,15 +95,15 @@ def best_run_factors(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
     # The eigenvector of least residual power is right but for the logarithm, and near enough to start from.
     factors = np.linalg.eigh(quadratic / np.outer(scale, scale))[1][:, 0] / scale
     factors = np.where(np.abs(factors) > 1e-6 * np.abs(factors).max(), factors, np.abs(factors).max())
-    own = quadratic.diagonal().real
+    diagonal = quadratic.diagonal().real
     for _ in range(SWEEPS):
         before = factors.copy()
         power = float((factors.conj() @ quadratic @ factors).real) / size.sum()
         for r in range(len(size)):
-            others = own[r] * factors[r] - quadratic[r] @ factors
+            others = diagonal[r] * factors[r] - quadratic[r] @ factors
             pull = abs(others)
-            # Positive root of own x^2 - pull x - power size = 0, the likelihood's slope by a factor's size.
-            twice = max(2 * own[r], np.finfo(float).tiny)
+            # Positive root of diagonal x^2 - pull x - power size = 0, the likelihood's slope by its size.
+            twice = max(2 * diagonal[r], np.finfo(float).tiny)
             length = (pull + np.sqrt(pull**2 + 2 * twice * power * size[r])) / twice
             factors[r] = length * (others / pull if pull > 0 else 1.0)
         if np.abs(factors - before).max() <= SETTLED * np.abs(factors).max():

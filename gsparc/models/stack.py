@@ -59,8 +59,8 @@ def choose_weights(
     single, part = np.eye(count)[winner], np.unique(unit, return_inverse=True)[1].reshape(-1)
     if count < 2 or part.max() == 0:
         return single
-    apart = (mean_and_error(errors[:, k] - errors[:, winner], unit) for k in range(count) if k != winner)
-    if part.max() + 1 < few and all(gain < 2 * error for gain, error in apart):
+    gains = (mean_and_error(errors[:, k] - errors[:, winner], unit) for k in range(count) if k != winner)
+    if part.max() + 1 < few and all(gain < 2 * error for gain, error in gains):
         return np.full(count, 1 / count)
     part, mixed = part % PARTS, np.empty(len(gram))
     for here in (part == number for number in range(int(part.max()) + 1)):
@@ -130,10 +130,10 @@ def leave_out_groups(
     """
     if not groups:
         return None
-    answers, apart = [], copy.copy(member)
+    answers, clone = [], copy.copy(member)
     for group in groups:
-        apart.condition(data, np.setdiff1d(rows, group))
-        answers.append(apart.predict(data.batch(group)))
+        clone.condition(data, np.setdiff1d(rows, group))
+        answers.append(clone.predict(data.batch(group)))
     mean, variance = (torch.cat([getattr(one, name) for one in answers]) for name in ("mean", "variance"))
     return LeftOutRows(np.concatenate(groups), mean, variance)
 

@@ -48,6 +48,6 @@ class AllStationsView(OneStationView):
         """Return the mean and variance (B, T); the ends that stand are not read."""
         rows = torch.arange(len(query)).repeat_interleave(self.count)
         station = torch.arange(self.count).repeat(len(query))
-        said = self.inner.predict(replace(query.rows(rows), station=station))
-        variance = None if said.variance is None else said.variance.view(-1, self.count)
-        return Prediction(said.mean.view(-1, self.count), variance)
+        prediction = self.inner.predict(replace(query.rows(rows), station=station))
+        variance = None if prediction.variance is None else prediction.variance.view(-1, self.count)
+        return Prediction(prediction.mean.view(-1, self.count), variance)

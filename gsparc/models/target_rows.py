@@ -44,7 +44,7 @@ def unheard_note(data: Measurements, rows: np.ndarray, method: str) -> tuple[str
     """Say what a fit of `method` to `heard_rows(data, rows)`, rows (n,), left out, if anything."""
     side, notes = data.censored_side(rows), {1: "where nothing was heard are not learned from"}
     notes[-1] = "in saturation are learned from as if measured at that level"
-    return tuple(f"{method}: {n} rows {said}" for s, said in notes.items() if (n := int((side == s).sum())))
+    return tuple(f"{method}: {n} rows {text}" for s, text in notes.items() if (n := int((side == s).sum())))
 
 
 def power_rows(data: Measurements, rows: np.ndarray) -> PowerRows:

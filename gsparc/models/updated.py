@@ -101,15 +101,15 @@ class Updated(View):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        said = self.inner.predict(query)
-        before = map_level(self.inner, said, self.fitted_site)
+        prediction = self.inner.predict(query)
+        before = map_level(self.inner, prediction, self.fitted_site)
         now = self._level_now(query, before)
         unknown = None
-        if said.unknown is not None:
+        if prediction.unknown is not None:
             share = (now.doubt + before.noise) / (before.doubt + before.noise + TINY)
-            unknown = (said.unknown * share).clamp(0, 1).to(said.unknown.dtype)
+            unknown = (prediction.unknown * share).clamp(0, 1).to(prediction.unknown.dtype)
         power, variance = linear_moments(now.mean, now.doubt + before.noise)
-        kind = said.mean.dtype
+        kind = prediction.mean.dtype
         return Prediction(power.to(kind), variance.to(kind), unknown)
 
     def change(self, query: Query) -> MeanVariance:

@@ -34,15 +34,15 @@ class SpectrumRenderer(nn.Module):
 
     def __init__(self, array: np.ndarray, grid: SphereGrid, wavelength: float, background: Tensor) -> None:
         super().__init__()
-        known = make_co_array(array, wavelength)
+        co_array = make_co_array(array, wavelength)
         # Half a turn of azimuth takes d.u to -d.u for elements in a plane: cosines stay, sines change sign.
         planar = float(np.ptp(array[:, 2])) < 1e-6 * wavelength
         self.half_turn = planar and grid.periodic and grid.width % 2 == 0
-        pairs = torch.stack([known.real_pairs, known.imag_pairs], 1).flatten(0, 1)
+        pairs = torch.stack([co_array.real_pairs, co_array.imag_pairs], 1).flatten(0, 1)
         self.register_buffer("pairs", pairs.float())
         self.register_buffer("square", background.float().square())
-        basis = known.spectrum_basis(grid, wavelength).view(grid.height, grid.width, -1)
-        count = len(known.difference)
+        basis = co_array.spectrum_basis(grid, wavelength).view(grid.height, grid.width, -1)
+        count = len(co_array.difference)
         self.spans = [slice(0, count), slice(count, None)] if self.half_turn else [slice(None)]
         columns = grid.width // 2 if self.half_turn else grid.width
         for number, span in enumerate(self.spans):

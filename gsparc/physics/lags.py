@@ -34,13 +34,13 @@ class SpectrumLags:
     """
 
     def __init__(self, array: np.ndarray, grid: SphereGrid, wavelength: float) -> None:
-        known = make_co_array(array, wavelength)
-        differences = 2 * np.pi * np.round(known.difference / wavelength, 6)  # radians per unit of direction
+        lags = make_co_array(array, wavelength)
+        differences = 2 * np.pi * np.round(lags.difference / wavelength, 6)  # radians per unit of direction
         self._differences = torch.from_numpy(differences.T).float()
         # Of the pairs that are d apart, half are so the other way round.
-        pairs = known.real_pairs.sum(0)[: len(differences)]
+        pairs = lags.real_pairs.sum(0)[: len(differences)]
         pairs[1:] /= 2
-        self._share, self.count = (pairs / known.elements**2).float(), known.real_pairs.shape[1]
+        self._share, self.count = (pairs / lags.elements**2).float(), lags.real_pairs.shape[1]
         angle = differences @ grid.directions().numpy().reshape(-1, 3).T
         waves = torch.from_numpy(np.concatenate([np.cos(angle), np.sin(angle[1:])]))
         # Of d and -d together: r e^(-j a) + conj(r) e^(j a) = 2 (Re r cos a + Im r sin a).

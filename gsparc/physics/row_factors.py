@@ -72,20 +72,20 @@ def align_factors(
         )
     product = (values * reference.conj()).sum(1)
     slope = np.zeros(len(values))
-    tried = resolvable_delays(tones) if freedom != "phase" else np.zeros(1)
-    if len(tried) > 2:
-        steering = np.exp(2j * np.pi * tried[:, None] * (tones - tones.mean()))
+    delays = resolvable_delays(tones) if freedom != "phase" else np.zeros(1)
+    if len(delays) > 2:
+        steering = np.exp(2j * np.pi * delays[:, None] * (tones - tones.mean()))
         size = np.abs(product @ steering.T)
-        rows, best = np.arange(len(size)), size.argmax(1).clip(1, len(tried) - 2)
+        rows, best = np.arange(len(size)), size.argmax(1).clip(1, len(delays) - 2)
         before, peak, after = (size[rows, best + by] for by in (-1, 0, 1))
         # The vertex of a parabola through the largest and both neighbours; never flat, so that it exists.
         curvature = np.minimum(before - 2 * peak + after, -np.finfo(float).tiny)
-        slope = tried[best] + (0.5 * (before - after) / curvature).clip(-1, 1) * (tried[1] - tried[0])
+        slope = delays[best] + (0.5 * (before - after) / curvature).clip(-1, 1) * (delays[1] - delays[0])
     turned = np.exp(2j * np.pi * slope[:, None] * (tones - tones.mean()))
     overlap = (product * turned).sum(1)
     factor = turned * np.exp(-1j * np.angle(overlap))[:, None]
     if freedom == "phase+delay+gain":
-        own = (np.abs(values) ** 2).sum((1, 2))
+        power = (np.abs(values) ** 2).sum((1, 2))
         # The gain of least squares; a row of zeros keeps 1.
-        factor *= np.divide(np.abs(overlap), own, out=np.ones_like(own), where=own > 0)[:, None]
+        factor *= np.divide(np.abs(overlap), power, out=np.ones_like(power), where=power > 0)[:, None]
     return factor

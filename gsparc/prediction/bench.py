@@ -116,20 +116,20 @@ def kernel_cases(count: int, projection: Projection, device: str = "cpu") -> Ite
 def loss_case(device: str = "cpu") -> Case:
     """Return L1 and SSIM of a batch of spectra with their gradient."""
     draw = torch.Generator().manual_seed(0)
-    target, shown = (
+    target, image = (
         torch.rand((BATCH, GRID.height, GRID.width), generator=draw).to(device) for _ in range(2)
     )
-    shown.requires_grad_()
+    image.requires_grad_()
 
     def convolved() -> Tensor:
-        ssim = structural_similarity_index_measure(shown[:, None], target[:, None], data_range=1.0)
+        ssim = structural_similarity_index_measure(image[:, None], target[:, None], data_range=1.0)
         assert isinstance(ssim, Tensor)
-        return ssim + (shown - target).abs().mean()
+        return ssim + (image - target).abs().mean()
 
     def gradient(of: Callable[[], Tensor]) -> Call:
-        return lambda: torch.autograd.grad(of(), shown)
+        return lambda: torch.autograd.grad(of(), image)
 
-    return Case("loss of spectra", str(BATCH), gradient(lambda: spectrum_loss(shown, target).sum()),
+    return Case("loss of spectra", str(BATCH), gradient(lambda: spectrum_loss(image, target).sum()),
                 gradient(convolved))  # fmt: skip
 
 

@@ -61,9 +61,9 @@ def interpolate_tones(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarr
         torch.ones(()), -turn[..., None] * torch.from_numpy((tones_hz - middle) / step).float()
     )
     # Delays spread evenly over a window correlate over frequency as a sinc: this is the Wiener filter.
-    known = np.sinc(window * (tones_hz[:, None] - tones_hz)) + REGULARISED * np.eye(len(tones_hz))
+    gram = np.sinc(window * (tones_hz[:, None] - tones_hz)) + REGULARISED * np.eye(len(tones_hz))
     cross = np.sinc(window * (wanted_hz[:, None] - tones_hz))
-    matrix = torch.from_numpy(np.linalg.solve(known, cross.T)).to(channel.dtype)
+    matrix = torch.from_numpy(np.linalg.solve(gram, cross.T)).to(channel.dtype)
     back = torch.polar(
         torch.ones(()), turn[..., None] * torch.from_numpy((wanted_hz - middle) / step).float()
     )

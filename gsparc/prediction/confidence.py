@@ -103,10 +103,10 @@ class Trusted(Stored):
 
         Length and noise of the kernel are chosen by likelihood on a few known rows.
         """
-        known = fold.learned()
+        rows = fold.learned()
         # A fixed seed: a checkpoint has the same rival whenever it is calibrated.
-        kernel = kernel_of_targets(data, known[draw_rows(len(known), KERNEL_ROWS, 0)], COMPONENTS)
-        return Trusted(known=data.moving[known], kernel=kernel)
+        kernel = kernel_of_targets(data, rows[draw_rows(len(rows), KERNEL_ROWS, 0)], COMPONENTS)
+        return Trusted(known=data.moving[rows], kernel=kernel)
 
     def covers(self, places: np.ndarray) -> np.ndarray:
         """Tell whether local places (B, 3) [m] lie in the box, (B,) bool; all where none is known."""
@@ -143,11 +143,11 @@ class Trusted(Stored):
             return -cKDTree(self.known).query(places)[0]
         if kind == "gp_variance" and self.kernel is not None and places is not None:
             return -process_variance(self.kernel, self.known, places)
-        own = said.confidence
-        if kind == "expected" and (own := said.variance) is not None:
+        scores = said.confidence
+        if kind == "expected" and (scores := said.variance) is not None:
             # A predicted silence counts as -300 dB, as a power of 0 would make every score of it infinite.
-            own = -own / said.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
-        return None if own is None else own.double().numpy()
+            scores = -scores / said.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
+        return None if scores is None else scores.double().numpy()
 
     def check_kind(self, kind: str) -> None:
         """Refuse a kind that there is not, or that needs what was never stored: `ValueError`."""

@@ -114,8 +114,8 @@ class Watch(Stored):
             table, alarmed = result._surprises(stations, first, extent), False
             last, begin = np.diff(table["place"], append=np.inf) != 0, 0
             for turn, row in enumerate(table):
-                name, own = int(row["station"]), len(result.begun) + int(row["station"]) * SIDES**2
-                streams = [name, own + int(row["cell"])]
+                name, base = int(row["station"]), len(result.begun) + int(row["station"]) * SIDES**2
+                streams = [name, base + int(row["cell"])]
                 means = [row["surprise"]] * 2
                 if last[turn] and len(result.begun) >= COMMON:  # mean over stations heard at one place
                     streams.append(-1)
@@ -151,11 +151,11 @@ class Watch(Stored):
 
     def _advance(self, stream: int, number: int, surprise: float, rows: float) -> bool:
         """Whether a stream's detector, in place one row further, raises an alarm."""
-        own, total, count = self.detector[stream], self.total[stream], len(self.begun)
+        detector, total, count = self.detector[stream], self.total[stream], len(self.begun)
         ratio = np.log(1 - MIXED + MIXED * np.exp(SIZES * np.clip(surprise, -CLIP, CLIP) - SIZES**2 / 2))
         self.since[stream, total <= 0] = number
         total[:] = np.maximum(total, 0) + ratio
-        own[:] = np.logaddexp(own, 0) + ratio
+        detector[:] = np.logaddexp(detector, 0) + ratio
         # A third of all alarms for each family of streams, in equal shares.
         family = 1 if stream == -1 else count if stream < count else count * SIDES**2
         return self._evidence(stream) >= math.log(3 * family * rows)
@@ -183,18 +183,18 @@ class Watch(Stored):
         for who, turn in last.items():
             alarm, names = alarms[turn], [*stations] if who < 0 else [who]
             since = [stations[n][stations[n].number >= alarm.since] for n in names if n in stations]
-            told = reduce(LaterRows.join, [rows[:NAMED] for rows in since], LaterRows.empty())
-            if not len(told):  # these rows were forgotten
+            group = reduce(LaterRows.join, [rows[:NAMED] for rows in since], LaterRows.empty())
+            if not len(group):  # these rows were forgotten
                 continue
-            kind = DEVICE if who < 0 else _find_kind(told, extent, len(np.unique(self.cells(told.places))))
-            silent = told.silent.double().mean() > SILENT
-            off = told.missed.abs() > LOUD * (told.doubt + told.noise).sqrt()
+            kind = DEVICE if who < 0 else _find_kind(group, extent, len(np.unique(self.cells(group.places))))
+            silent = group.silent.double().mean() > SILENT
+            off = group.missed.abs() > LOUD * (group.doubt + group.noise).sqrt()
             # Of a part of the place only the rows that lie in it tell how much.
-            told = told[off] if KINDS[kind].name == "local" and off.any() else told
-            where = tuple(horizontal(moving_end(told.places.numpy())).mean(0).tolist())
+            group = group[off] if KINDS[kind].name == "local" and off.any() else group
+            where = tuple(horizontal(moving_end(group.places.numpy())).mean(0).tolist())
             called = "device" if who < 0 else "gone" if silent else KINDS[kind].name
             self.kind[names] = kind
-            alarms[turn] = replace(alarm, kind=called, change_db=float(told.missed.mean()), place=where)
+            alarms[turn] = replace(alarm, kind=called, change_db=float(group.missed.mean()), place=where)
         return replace(self, alarms=tuple(alarms))
 
 

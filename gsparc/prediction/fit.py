@@ -69,24 +69,24 @@ def fit(
     """
     refuse_seconds(arrays)
     inputs = {"rx_position": rx, "tx_position": tx, "csi": csi, "spectrum": spectrum, **arrays}
-    given = {name: _array_of(value) for name, value in inputs.items() if value is not None}
-    raw = Raw(given, {}) if rssi is None else _raw_powers(given, _array_of(rssi), unit)
+    columns = {name: _array_of(value) for name, value in inputs.items() if value is not None}
+    raw = Raw(columns, {}) if rssi is None else _raw_powers(columns, _array_of(rssi), unit)
     raw.attributes["name"] = "arrays"  # the source is of messages
     try:
         reading = interpret(raw, "gsparc.fit")
     except DataError as refused:
-        said = "; ".join(refused.problems).replace("dataset.frequency_hz", "frequency_hz")  # an array here
-        raise DataError(said) from None
+        text = "; ".join(refused.problems).replace("dataset.frequency_hz", "frequency_hz")  # an array here
+        raise DataError(text) from None
     none = np.zeros(0, np.int64)
     data, _ = order_rows(set_freedom(reading.data, align), Fold(none, none, none))
     for note in [*reading.notes, *find_implausible(reading.data, reading.file_row)[0]]:
         log.warning("%s", note)
-    kind, own = method_class(model), {**(settings or {}), **({} if terms == () else {"terms": terms})}
-    for name in own.keys() - accepted_arguments(kind):
+    kind, options = method_class(model), {**(settings or {}), **({} if terms == () else {"terms": terms})}
+    for name in options.keys() - accepted_arguments(kind):
         raise ValueError(
             f"settings: model={model!r} has no {name!r}{suggest_or_list(name, accepted_arguments(kind))}"
         )
-    factory = wrap_per_station(kind(**own), data)
+    factory = wrap_per_station(kind(**options), data)
     fold = _split_validation(data, VALIDATED if factory.takes_effort else 0.0, seed)
     context = FitContext(seed=seed, effort=effort)
     method, report = fitting.fit_or_resume(factory, data, fold, context)
@@ -110,18 +110,18 @@ def _raw_powers(arrays: dict[str, np.ndarray], powers: np.ndarray, unit: str) ->
     for end in ("rx", "tx"):
         shape = arrays.get(f"{end}_position", np.zeros(0)).shape
         if 1 < stations != len(powers) and shape[:1] == (stations,) and len(shape) == 2:
-            said = f"{end} and rssi are of {stations} stations: say station_position= in place of {end}="
-            raise DataError(f"gsparc.fit: {said}")
+            text = f"{end} and rssi are of {stations} stations: say station_position= in place of {end}="
+            raise DataError(f"gsparc.fit: {text}")
     unknown = unit in ("dB", LINEAR)  # what they refer to
-    given = PowerUnit.from_name(str(unit), "dB" if unknown else "dBW")
-    if given.decibels:
-        return Raw({**arrays, "rssi_db": powers}, {"level_unit": given.name})
+    power_unit = PowerUnit.from_name(str(unit), "dB" if unknown else "dBW")
+    if power_unit.decibels:
+        return Raw({**arrays, "rssi_db": powers}, {"level_unit": power_unit.name})
     if "noise_variance" in arrays:
         # A variance scales with the square of the unit.
-        arrays = {**arrays, "noise_variance": arrays["noise_variance"] / given.scale**2}
+        arrays = {**arrays, "noise_variance": arrays["noise_variance"] / power_unit.scale**2}
     if powers.dtype.kind in "iuf":  # others are refused by name
-        powers = powers / given.scale
-    about = {"unit": given.name, "level_unit": "dB" if unknown else "dBW"}
+        powers = powers / power_unit.scale
+    about = {"unit": power_unit.name, "level_unit": "dB" if unknown else "dBW"}
     return Raw({**arrays, "rssi": powers}, about)
 
 

@@ -32,8 +32,8 @@ class JointMixin:
             places: (G, 3) of the moving end, world [m]; (G, k, 3): one for each of `stations`.
             stations: (k,) numbers.
         """
-        known = self.method.joint_method()
-        return None if known is None else self._predict_levels(known, places, torch.as_tensor(stations))
+        method = self.method.joint_method()
+        return None if method is None else self._predict_levels(method, places, torch.as_tensor(stations))
 
     def predict_new(
         self, places: Any, station: Any, sectors: Any, like: int | None = None
@@ -47,10 +47,10 @@ class JointMixin:
                 [deg], and power over the mean of those that stand [dB].
             like: number of a station of their band; None: of the first.
         """
-        if (known := self.method.joint_method()) is None:
+        if (joint_method := self.method.joint_method()) is None:
             return None
         still = np.asarray(station, np.float64) - self.site.origin
-        more = known.add_station(still, torch.as_tensor(sectors, dtype=torch.float64), like)
+        more = joint_method.add_station(still, torch.as_tensor(sectors, dtype=torch.float64), like)
         new = len(self.site.every_station) + torch.arange(len(sectors))
         level, covariance, _ = self._predict_levels(more, places, new)
         return level, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
@@ -69,9 +69,9 @@ class JointMixin:
             if (joint := self.predict_joint(places[part], stations)) is not None:
                 field = joint.covariance - np.diag(joint.noise)
                 read = field + np.eye(len(stations)) * np.where(listed[part], joint.noise, UNREAD)[:, None]
-                told = field @ np.linalg.solve(read, field)
-                own, told = (one.diagonal(axis1=1, axis2=2) for one in (field, told))
-                noise = own * (own - told) / np.maximum(told, 1 / UNREAD)
+                reduction = field @ np.linalg.solve(read, field)
+                variance, reduction = (one.diagonal(axis1=1, axis2=2) for one in (field, reduction))
+                noise = variance * (variance - reduction) / np.maximum(reduction, 1 / UNREAD)
                 # k stations tell as much as k measurements of one at best.
                 more[part] = np.maximum(noise, joint.noise / len(stations)) - joint.noise
         return more
@@ -103,10 +103,10 @@ class JointMixin:
         """
         query = self.queries.query(tx, rx, torch.float64).query
         places = query.places(self.site)
-        known = self.method.joint_method()
-        if isinstance(self.method, OneStationView) and known is not None:
+        joint_method = self.method.joint_method()
+        if isinstance(self.method, OneStationView) and joint_method is not None:
             station = torch.full((len(places),), self.method.number)
-            _, covariance, noise = known.predict_joint(places[None], station)
+            _, covariance, noise = joint_method.predict_joint(places[None], station)
             return (covariance[0] - noise.diag()).numpy(), float(noise[0])
         process = self.method.process() if isinstance(self.method, HasProcess) else None
         if process is None:

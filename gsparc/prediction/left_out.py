@@ -53,8 +53,8 @@ class Evidence:
 
 def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> Prediction:
     """Return what a method says of rows (n,), in their order; see `predict_in_batches`."""
-    order, _, said = zip(*predict_in_batches(method, data, rows), strict=True)
-    return Prediction.joined(said, torch.from_numpy(np.argsort(np.concatenate(order))))
+    order, _, answers = zip(*predict_in_batches(method, data, rows), strict=True)
+    return Prediction.joined(answers, torch.from_numpy(np.argsort(np.concatenate(order))))
 
 
 def gather_evidence(method: Method, data: Measurements, rows: np.ndarray, rivals: Trusted) -> Evidence:
@@ -76,7 +76,7 @@ def score_answers(
     error = (miss / power.clamp_min(1e-30)).double().numpy()
     every = {kind: rivals.score(kind, said, places) for kind in KINDS}
     # Scores with a NaN rank nothing.
-    scores = {kind: own for kind, own in every.items() if own is not None and not np.isnan(own).any()}
+    scores = {kind: score for kind, score in every.items() if score is not None and not np.isnan(score).any()}
     return Evidence(rows, places, error, scores)
 
 
@@ -141,13 +141,13 @@ def held_out_levels(method: Method, data: Measurements, fold: Fold, block: np.nd
 
     Without rows that have no level, or of which the method predicts none.
     """
-    rows, known = fold.test, fold.learned()
+    rows, train_rows = fold.test, fold.learned()
     mean, spread = np.full((2, len(rows)), np.nan)
-    for chosen, _, said in predict_in_batches(method, data, rows, CHUNK):
-        mean[chosen], spread[chosen] = predicted_levels(said, data.site.kind, data.site.target_scale)
+    for chosen, _, prediction in predict_in_batches(method, data, rows, CHUNK):
+        mean[chosen], spread[chosen] = predicted_levels(prediction, data.site.kind, data.site.target_scale)
     level, side = measured_levels(data, rows)
     station = data.stations_of(rows)
-    far = nearest_distances(data.moving[known], data.stations_of(known), data.moving[rows], station)
+    far = nearest_distances(data.moving[train_rows], data.stations_of(train_rows), data.moving[rows], station)
     every = HeldOutLevels(level, mean, spread, far, block, station, side)
     return every.subset(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread))
 
@@ -158,7 +158,7 @@ def nearest_distances(
     """Return how far places (n, D) are from the nearest `known` one (m, D) of their station, else any [m]."""
     distance = np.full(len(places), np.inf)
     for number in np.unique(station):
-        own = known[known_station == number]
+        candidates = known[known_station == number]
         chosen = station == number
-        distance[chosen] = cKDTree(own if len(own) else known).query(places[chosen])[0]
+        distance[chosen] = cKDTree(candidates if len(candidates) else known).query(places[chosen])[0]
     return distance

@@ -34,9 +34,9 @@ def predicted_levels(prediction: Prediction, kind: Kind, scale: float = 1.0) -> 
     if kind == "rssi":
         power = mean[:, 0].astype(np.float64) * scale
     else:
-        own = (np.abs(mean.astype(np.complex128)) ** 2).mean(axis=1) * scale**2
+        mean_power = (np.abs(mean.astype(np.complex128)) ** 2).mean(axis=1) * scale**2
         # Var |m + e|^2 for complex normal e is 2 |m|^2 v + v^2.
-        power, error = own + error, 2 * own * error + error**2
+        power, error = mean_power + error, 2 * mean_power * error + error**2
     level, spread = np.full(len(mean), np.nan), np.full(len(mean), np.nan)
     good = np.isfinite(power) & (power > 0)
     level[good], spread[good] = power_in_decibels(power[good], error[good])
@@ -54,8 +54,8 @@ def measured_levels(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, n
         # Censored rows are masked out as targets, but their levels are known.
         seen = data.mask[rows].reshape(power.shape) | (side != 0)[:, None]
         power = np.where(seen, power, np.nan)
-    known = np.isfinite(power)
-    mean = np.where(known, power, 0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+    finite = np.isfinite(power)
+    mean = np.where(finite, power, 0).sum(axis=1) / np.maximum(finite.sum(axis=1), 1)
     with np.errstate(divide="ignore", invalid="ignore"):
         level = np.where(mean > 0, 10 * np.log10(mean), np.nan)
     return level, side
@@ -73,10 +73,10 @@ def joint_levels(predictor: Predictor, places: np.ndarray, stations: np.ndarray)
     Returns:
         None where each station is by itself.
     """
-    known = predictor.predict_joint(places, stations)
-    if known is None:
+    prediction = predictor.predict_joint(places, stations)
+    if prediction is None:
         return None
-    level, covariance, _ = known
+    level, covariance, _ = prediction
     spread = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     # Of the correlations only those with the strongest decide which station serves.
     row, first = np.arange(len(level)), level.argmax(1)

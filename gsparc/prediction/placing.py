@@ -25,18 +25,18 @@ def fill_heights(queries: QueryPlaces, site: Site) -> QueryPlaces:
         DataError: it was measured at several heights, or the model does not say at which.
     """
     ends, notes = dict(queries.ends), list(queries.notes)
-    known = usual_heights(site)
+    heights = usual_heights(site)
     for end, where in queries.ends.items():
         if where.height is not None:
             continue
-        if end not in known:
+        if end not in heights:
             low, high = site.moving_box[:, 2::3][:, -1 if end == "rx" else 0] + site.origin[2]
             several = f"the {ENDS[end]} was measured at heights from {low:g} to {high:g} m"
             say = f"say columns.{'' if len(ends) == 1 else end + '_'}height=NUMBER, or give it in the file"
             raise DataError(f"{queries.source}: no height, and {several}; {say}")
-        height = np.full(len(queries), known[end])
+        height = np.full(len(queries), heights[end])
         ends[end] = replace(where, height=height)
-        notes.append(f"no height of the {ENDS[end]}: taken as {known[end]:g} m, as when it was measured")
+        notes.append(f"no height of the {ENDS[end]}: taken as {heights[end]:g} m, as when it was measured")
     return replace(queries, ends=ends, notes=tuple(notes))
 
 

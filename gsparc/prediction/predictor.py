@@ -159,18 +159,18 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         Raises:
             ValueError: the model knows one carrier, or its own carriers alone.
         """
-        known = self.site.every_station.carrier_hz
-        if known is None:
+        carriers = self.site.every_station.carrier_hz
+        if carriers is None:
             raise ValueError(f"frequency_hz={frequency_hz:g}: {self.site.name} has one carrier alone")
         if not (np.isfinite(frequency_hz) and frequency_hz > 0):
             raise ValueError(f"frequency_hz={frequency_hz}: expected a frequency above 0 [Hz]")
-        if len(here := np.flatnonzero(np.isclose(known, frequency_hz, rtol=1e-6))) == 1:
+        if len(here := np.flatnonzero(np.isclose(carriers, frequency_hz, rtol=1e-6))) == 1:
             return self.ask_station(int(here[0]))
         both = self.method, self._whole
         if not all(isinstance(one, AddsCarriers) for one in both):
             raise ValueError(f"frequency_hz={frequency_hz:g}: {self.method.name} has no other carriers")
         method, whole = (cast(AddsCarriers, one).add_carrier(frequency_hz) for one in both)
-        return self._copy_with(method, whole, method.fitted_site, self._unit).ask_station(len(known))
+        return self._copy_with(method, whole, method.fitted_site, self._unit).ask_station(len(carriers))
 
     def _copy_with(self, method: Method, whole: Method | None, site: Site, unit: str | None) -> Predictor:
         copy = Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, unit)
@@ -226,9 +226,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         if grad:
             return self._predict_grad(self._whole, tx, rx, wanted)[0]
         query = self.queries.query(tx, rx).query
-        own = predict_with_threads(self._whole, query)
-        sure = self._method_confidence(own, query)
-        return replace(self._in_unit(own, wanted), unknown=None if sure is None else 1 - sure)
+        prediction = predict_with_threads(self._whole, query)
+        sure = self._method_confidence(prediction, query)
+        return replace(self._in_unit(prediction, wanted), unknown=None if sure is None else 1 - sure)
 
     def predict_query(self, query: Query) -> Prediction:
         """Return what the model says of a query, whose places are local (less `site.origin`) [m].
@@ -260,12 +260,12 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
 
         def ask(asked: Predictor) -> Any:
             query, single, as_torch = asked.queries.query(tx, rx)
-            said = asked._in_unit(predict_with_threads(asked._whole, query), asked._answer_unit(unit))
-            if said.variance is None:
+            prediction = asked._in_unit(predict_with_threads(asked._whole, query), asked._answer_unit(unit))
+            if prediction.variance is None:
                 raise ValueError(f"{self.method.name} states no deviations")
-            spread = said.variance.sqrt().float()
+            spread = prediction.variance.sqrt().float()
             # As many axes as the answers have, so that both broadcast.
-            spread = spread.reshape(len(spread), -1, *[1] * (said.mean.ndim - 2))
+            spread = spread.reshape(len(spread), -1, *[1] * (prediction.mean.ndim - 2))
             return match_input(spread, single, as_torch)
 
         return self._ask_stations(ask, tx, rx)
@@ -276,19 +276,19 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         Stations that the model has no answer for, as they had too few training rows, are NaN.
         """
         # 0 where both ends move: then there is no station that a query could leave out.
-        said = {"tx": tx, "rx": rx}.get(self.site.static_end or "", 0) is not None
-        if said or self.site.kind != "rssi" or self.site.stations is None:
+        has_station = {"tx": tx, "rx": rx}.get(self.site.static_end or "", 0) is not None
+        if has_station or self.site.kind != "rssi" or self.site.stations is None:
             return ask(self)
         # One call for all stations where the method has one, else a call for each.
         every = self.method.all_stations() if isinstance(self.method, PerStation) else None
         if every is not None:
             return ask(self._copy_with(every, None, station_site(self.site, 0), self._unit))
         stations = self._each_station()
-        answers = [None if asked is None else ask(asked) for asked in stations]
-        known = next(one for one in answers if one is not None)
+        answers = [None if predictor is None else ask(predictor) for predictor in stations]
+        answer = next(one for one in answers if one is not None)
         # A station without an answer: NaN in the shape of the others', NumPy or torch alike.
-        columns = [known * np.nan if one is None else one for one in answers]
-        return torch.cat(columns, dim=-1) if isinstance(known, Tensor) else np.concatenate(columns, axis=-1)
+        columns = [answer * np.nan if one is None else one for one in answers]
+        return torch.cat(columns, dim=-1) if isinstance(answer, Tensor) else np.concatenate(columns, axis=-1)
 
     def _each_station(self) -> list[Predictor | None]:
         """The same model asked about each station; None where that had too few training rows."""
@@ -332,8 +332,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
             ValueError: the model predicts something else, a position is missing or not finite, or `grad` as
                 in `predict`.
         """
-        asked = self if frequency_hz is None else self.select_carrier(frequency_hz)
-        return asked._predict_mean("spectrum", tx, rx, grad)
+        predictor = self if frequency_hz is None else self.select_carrier(frequency_hz)
+        return predictor._predict_mean("spectrum", tx, rx, grad)
 
     def csi(
         self, tx: Any = None, rx: Any = None, *, uplink: Any = None, frequency_hz: Any = None,
@@ -438,10 +438,10 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
     def _predict_grad(self, method: Method, tx: Any, rx: Any, wanted: PowerUnit) -> tuple[Prediction, bool]:
         """Moments in a unit that autograd follows, and whether one position was given; see the class."""
         moments, dtype, single = predict_with_gradients(method, self.queries, tx, rx, self._prepared)
-        said, own = self._in_unit(moments, wanted), (self.kind or self.trusted.kind) in (None, "learned")
-        mean = said.mean.to(dtype.to_complex() if said.mean.is_complex() else dtype)
-        unknown = None if said.unknown is None or not own else said.unknown.to(dtype)
-        return Prediction(mean, said.variance, unknown), single
+        result, is_own = self._in_unit(moments, wanted), (self.kind or self.trusted.kind) in (None, "learned")
+        mean = result.mean.to(dtype.to_complex() if result.mean.is_complex() else dtype)
+        unknown = None if result.unknown is None or not is_own else result.unknown.to(dtype)
+        return Prediction(mean, result.variance, unknown), single
 
     def _in_unit(self, stored: Prediction, unit: PowerUnit) -> Prediction:
         """Of stored targets, as the chosen device reads them, in a unit."""

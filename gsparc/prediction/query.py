@@ -85,8 +85,8 @@ class Queries:
 
     def _static_place(self, place: np.ndarray | None) -> np.ndarray:
         """Local position (3,) or (B, 3) of the static end; a known one must be where it was measured."""
-        known, end = self.site.static_position, self.site.static_end
-        if known is None:
+        position, end = self.site.static_position, self.site.static_end
+        if position is None:
             if place is not None:
                 return place[0] if len(place) == 1 else place
             if self.site.stations is not None:
@@ -94,10 +94,10 @@ class Queries:
             if self.site.kind in ("rssi", "csi"):  # learned without its transmitter's place
                 return np.full(3, np.nan)
             raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
-        if place is not None and (np.linalg.norm(place - known, axis=-1) > SAME_PLACE_M).any():
-            stood = np.array2string(known + self.site.origin, precision=3, separator=", ")
+        if place is not None and (np.linalg.norm(place - position, axis=-1) > SAME_PLACE_M).any():
+            stood = np.array2string(position + self.site.origin, precision=3, separator=", ")
             raise ValueError(f"{end}= differs from where it stood when measured, {stood} m: leave it out")
-        return known
+        return position
 
     def _rx_rotation(self, rx: Any, count: int) -> np.ndarray:
         if isinstance(rx, Pose):

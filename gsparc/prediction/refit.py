@@ -54,8 +54,8 @@ class Learned:
         One that can forget rows does so, with its settings as they are; another one is fitted anew.
         """
         if isinstance(self.method, Reconditions):
-            known = np.sort(fold.learned())
-            less = self.method.copy_conditioned(without_devices(self.data, self.method.fitted_site), known)
+            rows = np.sort(fold.learned())
+            less = self.method.copy_conditioned(without_devices(self.data, self.method.fitted_site), rows)
             if less is not None:
                 return less
         # Nobody goes on from this fit: its checkpoints and curves go with the folder.

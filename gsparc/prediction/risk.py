@@ -182,9 +182,9 @@ def best_kind(areas: dict[str, np.ndarray]) -> str:
     The first, mostly the model's own, stays where another gains no more than the paired standard error (the
     one-standard-error rule of Breiman, Friedman, Olshen and Stone 1984).
     """
-    own, best = next(iter(areas)), min(areas, key=lambda kind: areas[kind].mean())
+    default, best = next(iter(areas)), min(areas, key=lambda kind: areas[kind].mean())
     # Both are of the same rows: their difference scatters less than either.
-    return best if is_surely_above(areas[own] - areas[best], 1.0) else own
+    return best if is_surely_above(areas[default] - areas[best], 1.0) else default
 
 
 def explain_kind(evidence: Evidence, rows: np.ndarray) -> str:
@@ -256,12 +256,12 @@ def calibration_facts(evidence: Evidence, trials: Sequence[Trial], guarantee: Gu
     bar = float(risks["distance"].mean())
     for kind, risk in risks.items():
         area = float(risk.mean())
-        own = {
+        figures = {
             "area": area, "risk_at_70": float(risk[max(round(0.7 * len(risk)), 1) - 1]),
             "rank_correlation": rank_correlation(evidence.scores[kind], -loss),
             "area_below_distance": 1 - area / bar if bar > 0 else None,  # nothing to save
         }  # fmt: skip
-        facts |= {f"confidence/{kind}/{name}": value for name, value in own.items()}
+        facts |= {f"confidence/{kind}/{name}": value for name, value in figures.items()}
     facts |= {f"promise/{name}": value for name, value in vars(guarantee).items()}
     for trial in trials:
         facts |= {f"trial/{trial.how}/{name}": value for name, value in trial.summarise().items()}

@@ -145,14 +145,14 @@ class UpdateMixin:
         watch, deviations = version.watch.look(noisy, first, extent, false_alarm)
         numbers = np.arange(first, first + sum(map(len, new.values())))
         alarms, skipped = watch.alarms[len(version.watch.alarms) :], len(rows) - len(numbers)
-        said = f"update: {len(numbers)} rows, {skipped} skipped, {len(alarms)} alarms"
+        entry = f"update: {len(numbers)} rows, {skipped} skipped, {len(alarms)} alarms"
         if refit:
             belief = replace(belief, scale=refit_scale(stations, belief))
-            said += f", lengths of changes at {belief.scale:.2g} of the usual"
+            entry += f", lengths of changes at {belief.scale:.2g} of the usual"
         changes = replace(
             changes, belief=belief, next_number=first + len(numbers), next_batch=changes.next_batch + 1
         )
-        self._add_version(stations, said, changes, watch)
+        self._add_version(stations, entry, changes, watch)
         return Found(numbers, deviations, self._in_world(alarms), skipped)
 
     def forget(self, rows: Any) -> None:
@@ -164,8 +164,8 @@ class UpdateMixin:
         gone, stations = np.atleast_1d(np.asarray(rows, np.int64)), self._current.changes.stations
         if len(unknown := np.setdiff1d(gone, self.rows)):
             raise ValueError(f"forget: no later row that is kept has number {unknown[0]}; see `measured`")
-        left = {n: one[~torch.isin(one.number, torch.from_numpy(gone))] for n, one in stations.items()}
-        self._add_version(left, f"forget: {len(gone)} rows")
+        remainder = {n: one[~torch.isin(one.number, torch.from_numpy(gone))] for n, one in stations.items()}
+        self._add_version(remainder, f"forget: {len(gone)} rows")
 
     def shift(self, change_db: float, station: str | int | None = None) -> None:
         """Say that the level of a station, or of all, is so many decibels higher from now on.
@@ -182,8 +182,8 @@ class UpdateMixin:
         changes = self._current.changes
         shifts = {n: dict(changes.shifts).get(n, 0.0) + float(change_db) for n in names}
         shifts = dict(changes.shifts) | shifts
-        said = f"shift: {change_db:+g} dB of {'all stations' if station is None else station}"
-        self._add_version(changes.stations, said, replace(changes, shifts=tuple(sorted(shifts.items()))))
+        entry = f"shift: {change_db:+g} dB of {'all stations' if station is None else station}"
+        self._add_version(changes.stations, entry, replace(changes, shifts=tuple(sorted(shifts.items()))))
 
     def undo(self, count: int = 1) -> None:
         """Go back so many versions, bit for bit; `ValueError` where so many are not kept."""
@@ -269,10 +269,10 @@ class UpdateMixin:
         self._become((*(self.versions or (now,)), version)[-VERSIONS:])
 
     def _become(self, versions: tuple[Version, ...]) -> None:
-        told = stored_changes(versions_extra(versions[-1:]))
+        changes = stored_changes(versions_extra(versions[-1:]))
         whole_is_same = self._whole is self.method
-        self.versions, self.method = versions, with_changes(self.method, told)
-        self._whole = self.method if whole_is_same else with_changes(self._whole, told)
+        self.versions, self.method = versions, with_changes(self.method, changes)
+        self._whole = self.method if whole_is_same else with_changes(self._whole, changes)
         self._prepared.clear()
 
     # -- rows ------------------------------------------------------------------------------------------
@@ -298,29 +298,29 @@ class UpdateMixin:
         """New rows of each station that has a map, as they miss it."""
         method, site = with_changes(self.method, None), self.site
         number, result, shifts = np.full(len(rows), -1), {}, dict(changes.shifts)
-        said: dict[int, tuple[np.ndarray, Level]] = {}
+        levels: dict[int, tuple[np.ndarray, Level]] = {}
         for name in np.unique(rows.station).tolist():
-            own = np.flatnonzero(rows.station == name)
+            index = np.flatnonzero(rows.station == name)
             try:
                 answers = method.station_method(name) if isinstance(method, PerStation) else method
             except ValueError:  # it had too few rows to be learned
                 continue
             there = station_site(site, name) if isinstance(method, PerStation) else site
-            query = Query.from_places(there, torch.from_numpy(rows.places[own]).float())
+            query = Query.from_places(there, torch.from_numpy(rows.places[index]).float())
             level = map_level(answers, predict_with_threads(answers, query), site)
-            missed = rows.decibels[own] - level.mean.numpy() - shifts.get(name, 0.0)
+            missed = rows.decibels[index] - level.mean.numpy() - shifts.get(name, 0.0)
             # Of silence only a level is known that the power is below.
-            tells = missed * -rows.side[own] > LOUD * np.sqrt((level.doubt + level.noise).numpy())
-            used = np.flatnonzero((rows.side[own] == 0) | tells)
-            said[name] = own[used], level[torch.from_numpy(used)]
-            number[own[used]] = 0
+            tells = missed * -rows.side[index] > LOUD * np.sqrt((level.doubt + level.noise).numpy())
+            used = np.flatnonzero((rows.side[index] == 0) | tells)
+            levels[name] = index[used], level[torch.from_numpy(used)]
+            number[index[used]] = 0
         number[number == 0] = changes.next_number + np.arange((number == 0).sum())
-        for name, (own, level) in said.items():
-            missed = torch.from_numpy(rows.decibels[own]) - level.mean - shifts.get(name, 0.0)
+        for name, (index, level) in levels.items():
+            missed = torch.from_numpy(rows.decibels[index]) - level.mean - shifts.get(name, 0.0)
             result[name] = LaterRows(
-                torch.from_numpy(number[own]), torch.full((len(own),), changes.next_batch),
-                torch.from_numpy(rows.places[own]), level.mean, missed, level.doubt, level.noise,
-                torch.zeros_like(missed), torch.from_numpy(rows.side[own] != 0),
+                torch.from_numpy(number[index]), torch.full((len(index),), changes.next_batch),
+                torch.from_numpy(rows.places[index]), level.mean, missed, level.doubt, level.noise,
+                torch.zeros_like(missed), torch.from_numpy(rows.side[index] != 0),
             )  # fmt: skip
         return {name: one for name, one in result.items() if len(one)}
 

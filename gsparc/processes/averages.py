@@ -64,6 +64,6 @@ def mixture_moments(parts: Sequence[tuple[float, Tensor, Tensor]]) -> MeanVarian
     if len(parts) == 1:
         return MeanVariance(*parts[0][1:])
     mean = torch.stack([share * one for share, one, _ in parts]).sum(0)
-    apart = ((one - mean).abs().square().reshape(len(mean), -1).mean(1) for _, one, _ in parts)
-    spread = [share * (own + off) for (share, _, own), off in zip(parts, apart, strict=True)]
+    deviations = ((one - mean).abs().square().reshape(len(mean), -1).mean(1) for _, one, _ in parts)
+    spread = [share * (variance + off) for (share, _, variance), off in zip(parts, deviations, strict=True)]
     return MeanVariance(mean, torch.stack(spread).sum(0))

@@ -62,8 +62,8 @@ def truncated_moments(z: Tensor) -> TruncatedMoments:
     ratio = (-inside.square() / 2 - 0.5 * math.log(2 * math.pi) - torch.special.log_ndtr(inside)).exp()
     series = -1 / t - t + 2 * t**3  # Abramowitz and Stegun 26.2.12
     remaining = t**2 * (1 - 6 * t**2 + 50 * t**4)
-    lost = torch.where(z < FAR, 1 - remaining, ratio * (inside + ratio))
-    return TruncatedMoments(torch.where(z < FAR, series, ratio), lost.clamp(LEAST, 1 - 1e-12))
+    reduction = torch.where(z < FAR, 1 - remaining, ratio * (inside + ratio))
+    return TruncatedMoments(torch.where(z < FAR, series, ratio), reduction.clamp(LEAST, 1 - 1e-12))
 
 
 def fit_by_ep(
@@ -99,18 +99,18 @@ def fit_by_ep(
         value = ((1 - DAMPING) * value / variance + DAMPING * result / wide) / both
         variance = 1 / both
     # The evidence of expectation propagation: Rasmussen and Williams 2006, eq. 3.65.
-    apart = cavity_variance + variance
+    variance_sum = cavity_variance + variance
     evidence = -0.5 * (((value - mean) @ weights) + factor.log_determinant)
     evidence += torch.special.log_ndtr(side * (level - cavity) / cavity_variance.sqrt()).sum()
-    evidence += 0.5 * (apart.log() + (cavity - value).square() / apart).sum()
+    evidence += 0.5 * (variance_sum.log() + (cavity - value).square() / variance_sum).sum()
     return PseudoValues(value, variance, float(evidence), settled)
 
 
 def _match_sites(mean: Tensor, variance: Tensor, level: Tensor, side: Tensor | float) -> MeanVariance:
     """Values and variances (m,) that turn Gaussians (m,) into ones with the moments of the parts allowed."""
     deviation = variance.sqrt()
-    ratio, lost = truncated_moments(side * (level - mean) / deviation)
-    return MeanVariance(mean - side * deviation * ratio / lost, variance * (1 - lost) / lost)
+    ratio, reduction = truncated_moments(side * (level - mean) / deviation)
+    return MeanVariance(mean - side * deviation * ratio / reduction, variance * (1 - reduction) / reduction)
 
 
 @dataclass(frozen=True)
@@ -135,10 +135,10 @@ class ConditionalGaussian:
             values: (n,), read where known.
             unknown: (n,) bool.
         """
-        known = ~unknown
-        factor = Factor.from_gram(gram[known][:, known], "raise")
+        is_known = ~unknown
+        factor = Factor.from_gram(gram[is_known][:, is_known], "raise")
         # Cross covariances and values in one solve.
-        white = factor.whiten(torch.cat([gram[known][:, unknown], values[known][:, None]], 1))
+        white = factor.whiten(torch.cat([gram[is_known][:, unknown], values[is_known][:, None]], 1))
         cross, white = white[:, :-1], white[:, -1]
         evidence = -0.5 * (white @ white + factor.log_determinant + len(white) * math.log(2 * math.pi))
         return cls(cross.T @ white, gram[unknown][:, unknown] - cross.T @ cross, float(evidence))
@@ -179,13 +179,13 @@ def log_evidence(
         weights = factor.solve(values[:, None])[:, 0]
         value = -0.5 * (values @ weights + factor.log_determinant + len(values) * math.log(2 * math.pi))
         return float(value), 0.5 * (torch.outer(weights, weights) - factor.inverse), weights
-    known = ConditionalGaussian.from_gram(gram, values, unknown)
+    prior = ConditionalGaussian.from_gram(gram, values, unknown)
     begin, within = (last[0] if last else None), SETTLED if last is None else NEARLY
-    sites = fit_by_ep(known, values[unknown], side[unknown], begin, within)
+    sites = fit_by_ep(prior, values[unknown], side[unknown], begin, within)
     if last is not None:
         last[:] = [sites]
     # A stand-in is a measurement whose noise is its own variance.
     extra = torch.zeros_like(values).masked_scatter(unknown, sites.variance)
     inverse = Factor.from_gram(gram + torch.diag(extra), "raise").inverse
     weights = inverse @ values.masked_scatter(unknown, sites.value)
-    return known.log_evidence + sites.log_evidence, 0.5 * (torch.outer(weights, weights) - inverse), weights
+    return prior.log_evidence + sites.log_evidence, 0.5 * (torch.outer(weights, weights) - inverse), weights

@@ -172,8 +172,8 @@ class LaterRows(Stored):
         error = later.doubt + later.noise + near.square() @ spread / total.square()
         offset, unsure = off.mean(), SURE**2 * error.mean() / len(off)
         added = (offset.square() - unsure).clamp_min(0.0)
-        left, total = off - offset * (added > 0), near.sum(0)
-        local = (left @ near / total).square() - SURE**2 * (error @ near.square()) / total.square()
+        residual, total = off - offset * (added > 0), near.sum(0)
+        local = (residual @ near / total).square() - SURE**2 * (error @ near.square()) / total.square()
         aged = fade_db**2 * len(later) / HUNDRED
         return replace(self, faded=self.faded + aged + added + near.amax(0) * local.clamp_min(0.0))
 
@@ -183,13 +183,13 @@ def _covariance(
     kinds: Tensor | slice = slice(None),
 ) -> Tensor:  # fmt: skip
     """Covariances (..., K, n, m) of what is missed at places (..., n, D) and (..., m, D), by kind."""
-    apart = distances(a, b)[..., None, :, :]
+    distance = distances(a, b)[..., None, :, :]
     doubt = (doubt_a[..., :, None] * doubt_b[..., None, :]).sqrt()[..., None, :, :]
-    own = doubt * matern32(apart, extent * ERRORS)
+    map_errors = doubt * matern32(distance, extent * ERRORS)
     sizes = SIZE * extent * torch.where(KEEPS > 0, scale, 1.0)
     each = (part[kinds, None, None] for part in (OFFSET.square(), LOCAL.square(), sizes, KEEPS))
     offset, local, length, keeps = each
-    return keeps * own + offset + local * matern32(apart, length)
+    return keeps * map_errors + offset + local * matern32(distance, length)
 
 
 def _values(rows: LaterRows, common: float) -> Tensor:
@@ -255,13 +255,13 @@ def refit_scale(stations: Mapping[int, LaterRows], belief: Belief) -> float:
 
     1 is likeliest before any row, and one an octave off `OCTAVES` deviations away.
     """
-    told, tried = [rows for rows in stations.values() if len(rows)], [belief.scale * step for step in STEPS]
-    if not told:
+    parts, scales = [rows for rows in stations.values() if len(rows)], [belief.scale * step for step in STEPS]
+    if not parts:
         return belief.scale
-    common, before = _common_offset(told), NOISY.log()[:, None] + SHARE.log()
-    density = [evidence(told, belief.extent, common, scale, REFITTED) + before for scale in tried]
+    common, before = _common_offset(parts), NOISY.log()[:, None] + SHARE.log()
+    density = [evidence(parts, belief.extent, common, scale, REFITTED) + before for scale in scales]
     likely = torch.stack(density).flatten(2).logsumexp(2).sum(1)
-    return tried[int((likely - (OCTAVES * torch.tensor(tried).log2()).square() / 2).argmax())]
+    return scales[int((likely - (OCTAVES * torch.tensor(scales).log2()).square() / 2).argmax())]
 
 
 def _common_offset(stations: Sequence[LaterRows]) -> float:
@@ -302,30 +302,30 @@ def correct(
     if not len(rows):
         return MeanVariance(level + belief.common, doubt)
     weight, added = belief.of(station)
-    kept = (weight >= LEAST).nonzero()[:, 0]
-    weight = weight[kept] / weight[kept].sum()
-    noise, values = added + rows.noise + rows.faded + TINY, _values(rows, belief.common)[kept]
+    kinds = (weight >= LEAST).nonzero()[:, 0]
+    weight = weight[kinds] / weight[kinds].sum()
+    noise, values = added + rows.noise + rows.faded + TINY, _values(rows, belief.common)[kinds]
     if len(rows) <= NEAR:
-        mean, left, near = _solve(belief, rows, noise, values, kept, places[None], doubt[None])
-        mean, left, near = mean[0], left[0], near[0]
+        mean, variance, near = _solve(belief, rows, noise, values, kinds, places[None], doubt[None])
+        mean, variance, near = mean[0], variance[0], near[0]
     else:
         nearest = torch.from_numpy(cKDTree(rows.places.numpy()).query(places.numpy(), NEAR)[1])
         blocks = zip(nearest.split(BLOCK), places.split(BLOCK), doubt.split(BLOCK), strict=True)
         parts = [
             _solve(
-                belief, rows[index], noise[index], values[:, index].movedim(0, 1), kept,
-                place[:, None], own[:, None],
+                belief, rows[index], noise[index], values[:, index].movedim(0, 1), kinds,
+                place[:, None], map_doubt[:, None],
             )
-            for index, place, own in blocks
+            for index, place, map_doubt in blocks
         ]  # fmt: skip
-        mean, left, near = (torch.cat(part)[..., 0].T for part in zip(*parts, strict=True))
+        mean, variance, near = (torch.cat(part)[..., 0].T for part in zip(*parts, strict=True))
     # Rows in a part of the place cannot tell what was moved elsewhere; of many stations their share does.
     seen = float(torch.linalg.vector_norm(rows.places.amax(0) - rows.places.amin(0))) / belief.extent
     seen = 1.0 if len(belief.names) > 1 else min(seen, 1.0) ** WHOLE
-    away = (1 - KEEPS[kept, None]) * (near + (1 - near) * seen)
-    mean = belief.common + level + (KEEPS[kept, None] + away) * mean + away * (rows.middle - level)
+    away = (1 - KEEPS[kinds, None]) * (near + (1 - near) * seen)
+    mean = belief.common + level + (KEEPS[kinds, None] + away) * mean + away * (rows.middle - level)
     middle = weight @ mean
-    return MeanVariance(middle, weight @ (left + (mean - middle).square()))
+    return MeanVariance(middle, weight @ (variance + (mean - middle).square()))
 
 
 def _solve(
@@ -343,9 +343,9 @@ def _solve(
     factor = Factor.from_gram(gram, "raise")
     mean = (cross @ factor.solve(values[..., None]))[..., 0]
     prior = KEEPS[kept, None] * doubt[:, None] + (OFFSET.square() + LOCAL.square())[kept, None]
-    told = factor.whiten(cross.mT.contiguous()).square().sum(-2)
+    reduction = factor.whiten(cross.mT.contiguous()).square().sum(-2)
     near = matern32(distances(places, rows.places), belief.extent * AWAY).amax(-1)
-    return mean, (prior - told).clamp_min(0.0), near[:, None].expand_as(mean)
+    return mean, (prior - reduction).clamp_min(0.0), near[:, None].expand_as(mean)
 
 
 @torch.no_grad()
@@ -356,19 +356,19 @@ def innovations(rows: LaterRows, first: int, extent: float, kind: int = 0) -> Me
     """
     count = len(rows)
     new, order = torch.arange(first, count), torch.arange(count)
-    apart = distances(rows.places[first:], rows.places)
-    apart[order >= new[:, None]] = math.inf
-    near = apart.topk(min(TOLD, count), largest=False)
+    distance = distances(rows.places[first:], rows.places)
+    distance[order >= new[:, None]] = math.inf
+    near = distance.topk(min(TOLD, count), largest=False)
     unknown = near.values.isinf()  # of the first rows there are fewer
     at, index = rows[new], near.indices
-    known = rows[index]
+    past = rows[index]
     one = slice(kind, kind + 1)
-    own = _covariance(known.places, known.places, known.doubt, known.doubt, extent, kinds=one)[:, 0]
-    own.diagonal(dim1=-2, dim2=-1).add_(known.noise + known.faded + torch.where(unknown, UNTOLD, TINY))
-    cross = _covariance(at.places[:, None], known.places, at.doubt[:, None], known.doubt, extent, kinds=one)[
+    gram = _covariance(past.places, past.places, past.doubt, past.doubt, extent, kinds=one)[:, 0]
+    gram.diagonal(dim1=-2, dim2=-1).add_(past.noise + past.faded + torch.where(unknown, UNTOLD, TINY))
+    cross = _covariance(at.places[:, None], past.places, at.doubt[:, None], past.doubt, extent, kinds=one)[
         :, 0
     ]
-    weights = Factor.from_gram(own, "raise").solve(cross.mT)[..., 0]
+    weights = Factor.from_gram(gram, "raise").solve(cross.mT)[..., 0]
     prior = KEEPS[kind] * at.doubt + OFFSET[kind].square() + LOCAL[kind].square()
     variance = prior + at.noise - (weights * cross[:, 0]).sum(1)
-    return MeanVariance(at.missed - (weights * known.missed).sum(1), variance.clamp_min(TINY))
+    return MeanVariance(at.missed - (weights * past.missed).sum(1), variance.clamp_min(TINY))

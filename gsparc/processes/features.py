@@ -89,9 +89,9 @@ def whitened_features(rows: Tensor, length: float, noise: float, name: Correlati
 
 def place_features(places: Tensor, rows: Tensor, length: float, noise: float, name: Correlation) -> Features:
     """Return features at given places (E, 3) that stand for all rows (n, 3); see `whitened_features`."""
-    own = correlation(places, places, length, name)
-    own.diagonal().add_(JITTER)
-    factor = Factor.from_gram(own)
+    gram = correlation(places, places, length, name)
+    gram.diagonal().add_(JITTER)
+    factor = Factor.from_gram(gram)
     seen = factor.whiten(correlation(places, rows, length, name))
     size, turn = torch.linalg.eigh(seen @ seen.T)
     size = size.clamp_min(LEAST)
@@ -113,16 +113,16 @@ def pivoted_rows(rows: Tensor, length: float, enough: float, name: Correlation, 
     tensor([0, 2])
     """
     most = min(most, len(rows))
-    left, factor = torch.ones(len(rows), dtype=rows.dtype), rows.new_zeros(most, len(rows))
+    variance, factor = torch.ones(len(rows), dtype=rows.dtype), rows.new_zeros(most, len(rows))
     chosen: list[int] = []
     while len(chosen) < most:
-        row, number = int(left.argmax()), len(chosen)
-        if chosen and float(left[row]) <= max(enough, JITTER):
+        row, number = int(variance.argmax()), len(chosen)
+        if chosen and float(variance[row]) <= max(enough, JITTER):
             break
         column = correlation(rows[row : row + 1], rows, length, name)[0]
         column -= factor[:number, row] @ factor[:number]
-        factor[number] = column / left[row].sqrt()
-        left -= factor[number].square()
-        left[row] = -1.0  # never again, whatever rounding says
+        factor[number] = column / variance[row].sqrt()
+        variance -= factor[number].square()
+        variance[row] = -1.0  # never again, whatever rounding says
         chosen.append(row)
     return torch.tensor(chosen)

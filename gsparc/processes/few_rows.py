@@ -44,10 +44,10 @@ def first_rows(order: np.ndarray, most: int, group: np.ndarray, silent: np.ndarr
     """
     chosen = [order[:0]]
     for one in np.unique(group):
-        own = order[group[order] == one]
-        loud, quiet = own[~silent[own]], own[silent[own]]
-        if len(own) > most:
-            share = max(round(most * len(loud) / len(own)), min(len(loud), most // 2))
+        rows = order[group[order] == one]
+        loud, quiet = rows[~silent[rows]], rows[silent[rows]]
+        if len(rows) > most:
+            share = max(round(most * len(loud) / len(rows)), min(len(loud), most // 2))
             loud, quiet = loud[:share], quiet[: most - share]
         chosen += [loud, quiet]
     return np.sort(np.concatenate(chosen))

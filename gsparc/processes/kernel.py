@@ -299,8 +299,8 @@ class Kernel(Stored):
         ends = [" of each end" * isinstance(term, EndShadowing) for term in self.signals]
         kind = "exponential " * isinstance(self.terms[0], ExponentialShadowing)
         word = "lengths" if len(parts) > 1 else "length"
-        said = " and ".join(part + end for part, end in zip(parts, ends, strict=True))
-        return f"{kind}{word} {said}, noise {self.noise:.3g} of the signal's variance"
+        text = " and ".join(part + end for part, end in zip(parts, ends, strict=True))
+        return f"{kind}{word} {text}, noise {self.noise:.3g} of the signal's variance"
 
     @property
     def compiled_lengths(self) -> list[float] | None:
@@ -360,7 +360,7 @@ class Kernel(Stored):
         """Return the kernel of other parameters; numbers are tensors where gradients flow."""
         sizes, count = [len(term.parameters()) for term in self.terms], len(self.terms) - 1
         *numbers, logits, noise = parameters.split([*sizes[:-1], count - 1, sizes[-1]])
-        signals = tuple(term.with_values(own) for term, own in zip(self.signals, numbers, strict=True))
+        signals = tuple(term.with_values(values) for term, values in zip(self.signals, numbers, strict=True))
         if count > 1:
             # Of logits all shares lie between 0 and 1, whatever a step does.
             shares = torch.cat([logits, logits.new_zeros(1)]).softmax(0)

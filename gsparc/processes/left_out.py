@@ -93,13 +93,13 @@ def left_out_signal(
         disturbance: N (n, n), covariance of what is no signal.
     """
     if groups is None:
-        own = (1 - (disturbance * inverse.mT).sum(1)) / inverse.diagonal()
-        rest = disturbance + torch.diag(own)
+        correction = (1 - (disturbance * inverse.mT).sum(1)) / inverse.diagonal()
+        rest = disturbance + torch.diag(correction)
         return rest @ weights, (rest * (rest @ inverse).conj()).sum(1).real
     residual, mixed = disturbance @ weights, disturbance @ inverse
     for rows in groups:
-        own, _ = left_out_group(inverse, weights, rows)
-        residual[rows] += own - mixed[rows[:, None], rows] @ own
+        correction, _ = left_out_group(inverse, weights, rows)
+        residual[rows] += correction - mixed[rows[:, None], rows] @ correction
     return residual, None
 
 

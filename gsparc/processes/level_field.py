@@ -81,20 +81,20 @@ def fit_level_field(
                 factor = Factor.from_gram(kernel.gram(torch.from_numpy(place[part])))
                 both = np.column_stack([np.ones(len(part)), table[part]])
                 white = factor.whiten(torch.from_numpy(both)).numpy()
-                known = float(white[:, 0] @ white[:, 0])
-                mean = white[:, 0] @ white[:, 1:] / known
-                own = white[:, 1:] - np.outer(white[:, 0], mean)
-                gram += own.T @ own
+                precision = float(white[:, 0] @ white[:, 0])
+                mean = white[:, 0] @ white[:, 1:] / precision
+                values = white[:, 1:] - np.outer(white[:, 0], mean)
+                gram += values.T @ values
                 logarithms += 2 * float(factor.lower.diagonal().log().sum())
-                means.append((known, *mean))
+                means.append((precision, *mean))
             slope = np.linalg.pinv(gram[1:, 1:]) @ gram[1:, 0]
             rest = float(gram[0, 0] - slope @ gram[1:, 0])
             weight, constant = np.array(means)[:, 0], np.array(means)[:, 1:] @ np.r_[1.0, -slope]
             for spread in SPREADS:
-                own = 1 / (spread + 1 / weight)
-                between = float(own @ (constant - own @ constant / own.sum()) ** 2)
+                values = 1 / (spread + 1 / weight)
+                between = float(values @ (constant - values @ constant / values.sum()) ** 2)
                 variance = max((rest + between) / count, 1e-6)
-                more = float(np.log1p(spread * weight).sum()) + math.log(own.sum())
+                more = float(np.log1p(spread * weight).sum()) + math.log(values.sum())
                 more += len(slope) * math.log(count)
                 score = -0.5 * (count * math.log(variance) + logarithms + more)
                 found.append(LevelField(score, replace(kernel, amplitude=variance), table[:, 1:], slope))

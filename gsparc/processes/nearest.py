@@ -156,19 +156,19 @@ class Nearest(Posterior):
 
     def _answer(self, queries: Tensor, excluded: np.ndarray | None, float64: bool) -> MeanVariance:
         index = torch.from_numpy(self.near.nearest_rows(to_numpy(queries), excluded, self.most))
-        weights, known = self._weigh_neighbours(queries, index)
+        weights, reduction = self._weigh_neighbours(queries, index)
         rest = self.rest[index]
         if float64:
             rest = rest.to(torch.complex128 if rest.is_complex() else torch.float64)
         mean = torch.bmm(weights[:, None].to(rest.dtype), rest)[:, 0]
-        left = 1 + self.prior.kernel.noise - known
+        variance = 1 + self.prior.kernel.noise - reduction
         if self.prior.trend is not None:
             # What the near rows leave open of the mean law's terms.
             explained = torch.bmm(weights[:, None], self._trend_columns[index])[:, 0]
             unsure = self.prior.columns(queries) - explained
             mean = self.prior.mean(queries) + mean + unsure @ self.terms
-            left = left + ((unsure @ self.spread) * unsure).sum(1)
-        return MeanVariance(mean, left.clamp_min(0.0))
+            variance = variance + ((unsure @ self.spread) * unsure).sum(1)
+        return MeanVariance(mean, variance.clamp_min(0.0))
 
     def _weigh_neighbours(self, queries: Tensor, index: Tensor) -> KrigingWeights:
         """Of rows (B, k), see `neighbour_weights`."""
@@ -286,8 +286,8 @@ def nearest_density(
     covariance, noise = kernel.correlations_of(sample.apart), kernel.noise / sample.counts
     value, near = sample.values[:, 0], sample.values[:, 1:]
     gram = covariance[:, 1:, 1:] + torch.diag_embed(noise[:, 1:] + JITTER)
-    weights, known = kriging_weights(gram, covariance[:, 0, 1:])
-    variance = 1 + noise[:, 0] - known
+    weights, reduction = kriging_weights(gram, covariance[:, 0, 1:])
+    variance = 1 + noise[:, 0] - reduction
     missed = value - torch.einsum("tk,tkp->tp", weights.to(near.dtype), near)
     squared, spread = missed.abs().square().mean(1) / variance, variance.log().sum()
     count = variance.new_tensor(len(variance))
@@ -323,9 +323,9 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
     level = Neighbourhood.from_places(values.places, seed).level
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]
     parts = []
-    for own in sets:
-        row = covering_rows(values.places[own], LOOKED_AT // len(sets), seed)
-        parts.append(own[rows_with_nearest(values.places[own], row, LOOKED_BY)])
+    for members in sets:
+        row = covering_rows(values.places[members], LOOKED_AT // len(sets), seed)
+        parts.append(members[rows_with_nearest(values.places[members], row, LOOKED_BY)])
     rows = np.concatenate(parts)
     near = distances(every[rows], every[rows])
     sample = NeighbourSample(near, rest[rows], values.count[rows])
@@ -335,7 +335,7 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
     if len(start.lengths) == 2:
         starts.append(start)
     note = f"settings chosen on {len(rows)} of {count} places, each given its nearest {LOOKED_BY}"
-    among = f"among {' and '.join(str(len(own)) for own in sets)}"
+    among = f"among {' and '.join(str(len(members)) for members in sets)}"
     bounds = starts[0].bounds(torch.from_numpy(scale))
     search = starts, bounds, LOOKS, SETTLED / len(rows)
     return fit_kernel(lambda one: nearest_density(one, sample), *search)[1], f"{note} {among}"

@@ -47,15 +47,15 @@ class Neighbourhood(Stored):
             rows = rows[covering_rows(places[rows], int(len(rows) / SPARSER), seed)]
             sets.append(rows)
         level = np.full(len(places), len(sets), np.int8)
-        for number, own in enumerate(sets):
+        for number, members in enumerate(sets):
             # Sets were drawn from dense to sparse, and 0 is the sparsest.
-            level[own] = len(sets) - 1 - number
+            level[members] = len(sets) - 1 - number
         return cls(places, level)
 
     @cached_property
     def _trees(self) -> list[tuple[np.ndarray, cKDTree]]:
         sets = [np.flatnonzero(self.level == number) for number in range(int(self.level.max()) + 1)]
-        return [(own, cKDTree(self.places[own])) for own in sets]
+        return [(members, cKDTree(self.places[members])) for members in sets]
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -68,7 +68,7 @@ class Neighbourhood(Stored):
         share = int(most * WIDER) // max(sparser, 1)
         # The densest set has what the sparser ones leave, rounding included.
         counts = [most - share * sparser, *[share] * sparser]
-        return [(own, count) for (own, _), count in zip(self._trees[::-1], counts, strict=True)]
+        return [(members, count) for (members, _), count in zip(self._trees[::-1], counts, strict=True)]
 
     def nearest_rows(
         self, queries: np.ndarray, excluded: np.ndarray | None = None, most: int = NEIGHBOURS
@@ -84,8 +84,8 @@ class Neighbourhood(Stored):
         result: list[np.ndarray] = []
         # One more is looked for, as the place itself is among the nearest.
         more = 0 if excluded is None else 1
-        for (own, count), (_, tree) in zip(self.split_by_density(most), self._trees[::-1], strict=True):
-            row = own[tree.query(queries, k=np.arange(1, min(count + more, tree.n) + 1))[1]]
+        for (members, count), (_, tree) in zip(self.split_by_density(most), self._trees[::-1], strict=True):
+            row = members[tree.query(queries, k=np.arange(1, min(count + more, tree.n) + 1))[1]]
             if excluded is not None:
                 # A stable sort puts the place itself last and keeps the others from near to far.
                 later = np.argsort(row == excluded[:, None], axis=1, kind="stable")[:, : row.shape[1] - 1]

@@ -73,13 +73,13 @@ class Exact(Posterior):
 
     def answer(self, queries: Tensor, float64: bool = False) -> MeanVariance:
         """See `Posterior`."""
-        own = self.prior.columns(queries)
-        cross, prior = self.cross_covariance(queries, own), self.prior.variance(own)
+        columns = self.prior.columns(queries)
+        cross, prior = self.cross_covariance(queries, columns), self.prior.variance(columns)
         if self._vecchia is not None:
-            left = self._vecchia.answer(queries).variance
+            variance = self._vecchia.answer(queries).variance
         else:  # rounding may leave a variance below 0 at a row's place
-            left = (prior - self.factor.whiten(cross.T).square().sum(0)).clamp_min(0.0)
-        return MeanVariance(self._mean(queries, cross), left.minimum(prior))
+            variance = (prior - self.factor.whiten(cross.T).square().sum(0)).clamp_min(0.0)
+        return MeanVariance(self._mean(queries, cross), variance.minimum(prior))
 
     @cached_property
     def _vecchia(self) -> Nearest | None:

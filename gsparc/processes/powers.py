@@ -78,8 +78,8 @@ class PowerRows:
         """
         places = torch.from_numpy(self.places)
         rest = torch.from_numpy(self.decibels) - trend.mean(places)
-        apart = distances(places, places) if kernel is None or kernel.is_isotropic else places
-        return KernelRows(apart, trend.columns(places), rest[:, None], torch.from_numpy(self.side))
+        geometry = distances(places, places) if kernel is None or kernel.is_isotropic else places
+        return KernelRows(geometry, trend.columns(places), rest[:, None], torch.from_numpy(self.side))
 
     def draw_subset(self, count: int, seed: int) -> Self:
         """Draw at most so many, in their order; at least half of them were heard where as many were."""
@@ -126,8 +126,8 @@ class PowerProcess(Stored):
     @property
     def members(self) -> tuple[tuple[float, PowerProcess], ...]:
         """Every process alone, with its share, this one first."""
-        own = 1 - sum(share for share, _ in self.others)
-        return (own, replace(self, others=()) if self.others else self), *self.others
+        first_share = 1 - sum(share for share, _ in self.others)
+        return (first_share, replace(self, others=()) if self.others else self), *self.others
 
     @property
     def kernel(self) -> Kernel:
@@ -155,9 +155,9 @@ class PowerProcess(Stored):
             mean, variance = mixture_moments([part[:3] for part in parts])
             return PowerAnswer(mean, variance, sum((p[0] * p[3] for p in parts), torch.zeros_like(mean)))
         result = self.posterior.answer(queries)
-        own = 1 + self.kernel.noise
-        whole = max(self.heard, own)
-        by_law = 1 - own / whole  # share of that variance
+        prior_variance = 1 + self.kernel.noise
+        whole = max(self.heard, prior_variance)
+        by_law = 1 - prior_variance / whole  # share of that variance
         far = self.posterior.nearest_distance(queries) / self._trend_reach
         # What the law explains counts as unknown where no row is near.
         unknown = result.variance / whole + by_law * (1 - (-far.square()).exp())
@@ -215,8 +215,8 @@ def condition_on_powers(
     if len(rows.places) <= MOST_ROWS or rows.silent.all() or not prior.kernel.is_isotropic:
         process, notes = _condition_exactly(rows.draw_subset(MOST_ROWS, seed), prior, least)
         drawn = len(rows.places) > MOST_ROWS and not rows.silent.all()
-        said = f"{MOST_ROWS} of {len(rows.places)} rows, drawn evenly, are learned from"
-        return process, (said,) * drawn + notes
+        remark = f"{MOST_ROWS} of {len(rows.places)} rows, drawn evenly, are learned from"
+        return process, (remark,) * drawn + notes
     loud = rows.measured_rows
     values = loud.means_at_places()
     share = values.count / values.count.sum()
@@ -241,8 +241,8 @@ def condition_on_powers(
 
 
 def _condition_exactly(rows: PowerRows, prior: Prior, least: int) -> tuple[PowerProcess, tuple[str, ...]]:
-    counts = {said: int((rows.side == side).sum()) for side, said in BOUNDS.items()}
-    notes = [f"{count} rows {said} their level" for said, count in counts.items() if count]
+    counts = {phrase: int((rows.side == side).sum()) for side, phrase in BOUNDS.items()}
+    notes = [f"{count} rows {phrase} their level" for phrase, count in counts.items() if count]
     places, decibels, extra, factor = _add_pseudo_values(rows, prior, least, notes)
     posterior = Exact.from_values(prior, places, decibels[:, None], extra, factor)
     loud = decibels[extra <= 0]  # below: the mean of several at one place
@@ -263,9 +263,9 @@ def _add_pseudo_values(
     gram.diagonal().add_(prior.kernel.noise)
     # In deviations of the process, as its covariance has amplitude 1.
     unit = (decibels - mean) / deviation
-    known, level = ConditionalGaussian.from_gram(gram, unit, silent), unit[silent]
+    conditional, level = ConditionalGaussian.from_gram(gram, unit, silent), unit[silent]
     side = torch.from_numpy(rows.side)[silent]
-    doubt = side * known.z_score(level)
+    doubt = side * conditional.z_score(level)
     near = (doubt < CERTAIN).nonzero()[:, 0]
     most = min(max(int((~silent).sum()), least), MOST_SILENT)
     if len(near) > most:
@@ -274,7 +274,7 @@ def _add_pseudo_values(
         near = near[doubt[near].argsort()[:most].sort().values]
     at = silent.nonzero()[near, 0]
     if len(near):
-        sites = fit_by_ep(known.marginal(near), level[near], side[near])
+        sites = fit_by_ep(conditional.marginal(near), level[near], side[near])
         decibels = decibels.index_put((at,), deviation * sites.value + mean[at])
         extra = extra.index_put((at,), sites.variance)
         if not sites.settled:

@@ -133,8 +133,8 @@ class Sectors(Trend):
 
         The latter (n, 10) [dB] are central differences, half a spread to either side.
         """
-        shared, own = STEPS.split((len(SHARED), len(OWN_SPREAD) - 1), 1)
-        ends = self.powers_at(places, self.shared + shared, self.levels, own)
+        shared, sector_steps = STEPS.split((len(SHARED), len(OWN_SPREAD) - 1), 1)
+        ends = self.powers_at(places, self.shared + shared, self.levels, sector_steps)
         return ends[-1], ((ends[: len(STEPS) // 2] - ends[len(STEPS) // 2 : -1]) / (2 * STEP)).T
 
     def shared_columns(self, places: Tensor, slopes: Tensor | None = None) -> Tensor:
@@ -153,9 +153,9 @@ class Sectors(Trend):
         (mean, slopes), decades = self.linearise(places), (self.law.decades(places) - self.middle)[:, None]
         parts = torch.cat([slopes[:, len(SHARED) :], OWN_SPREAD[-1] * decades], 1)
         # Each sector of a site has columns of its own, which are 0 in the rows of the others.
-        own = (self.indicators[0][sector_of(places).long(), :, None] * parts[:, None]).flatten(1)
+        blocks = (self.indicators[0][sector_of(places).long(), :, None] * parts[:, None]).flatten(1)
         return mean + self.known_mean(places), torch.cat(
-            [own, self.shared_columns(places, slopes) @ self.doubt], 1
+            [blocks, self.shared_columns(places, slopes) @ self.doubt], 1
         ) / self.unit
 
 
@@ -182,9 +182,9 @@ class SectorShadowing(Term[Tensor]):
         # exp((cos angle - 1) / b^2): a Gaussian of small angles that closes around the circle.
         alike = (towards[0] / BEARING**2 @ towards[1].mT - 1 / BEARING**2).exp()
         (site, sector, bearing, level), (wide, near) = self.shares, self.lengths
-        own = sector * (distance * (-1 / near)).exp() + bearing * alike + level
+        sector_part = sector * (distance * (-1 / near)).exp() + bearing * alike + level
         same = sector_of(a)[..., :, None] == sector_of(b)[..., None, :]
-        return site * (distance * (-1 / wide)).exp() + same * own
+        return site * (distance * (-1 / wide)).exp() + same * sector_part
 
     def parameters(self) -> Tensor:
         """Return logarithms of lengths and shares (6,)."""

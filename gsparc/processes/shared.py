@@ -102,36 +102,36 @@ class SharedTermsPosterior:
             number: (B,) int64, of the process; one that is not there has no rows.
             float64: whether few queries are answered in double precision too, as slopes need it.
         """
-        (mean, own), columns = self.never.mean_and_columns(queries), self.columns(queries)
-        mean, left = mean[:, 0], torch.zeros(len(queries), dtype=torch.float64)
+        (mean, term), columns = self.never.mean_and_columns(queries), self.columns(queries)
+        mean, variance = mean[:, 0], torch.zeros(len(queries), dtype=torch.float64)
         for who, at in self._group_queries(number):
-            prior, more, white, shared = self._condition(queries[at], who, own[at], columns[at], not float64)
+            prior, more, white, shared = self._condition(queries[at], who, term[at], columns[at], not float64)
             # -1 stands where a process is asked less often than another of the batch.
             there = at >= 0
             at = at[there]
-            spread = prior.kernel.amplitude * prior.variance(own[at])
+            spread = prior.kernel.amplitude * prior.variance(term[at])
             if white:
-                known = torch.stack([one.square().sum(1) for one in white])
-                spread = (spread - known[there]).clamp_min(0.0)
+                reduction = torch.stack([one.square().sum(1) for one in white])
+                spread = (spread - reduction[there]).clamp_min(0.0)
             mean = mean.index_add(0, at, more[there])
-            left = left.index_add(0, at, spread + shared.square().sum(2)[there])
-        return MeanVariance(mean, left)
+            variance = variance.index_add(0, at, spread + shared.square().sum(2)[there])
+        return MeanVariance(mean, variance)
 
     def predict_joint(self, queries: Tensor, number: int) -> tuple[Tensor, Tensor]:
         """Return means (B, k) and covariances (B, k, k) of one process's measurements at (B, k, D)."""
         flat, groups = queries.flatten(0, 1), queries.shape[:2]
-        own = self.never.columns(flat)
-        asked = flat[None], (number,), own[None], self.columns(flat)[None]
-        prior, more, white, shared = self._condition(*asked, may_round=False)
-        terms, kernel = own.unflatten(0, groups), prior.kernel
-        left = kernel.correlations(queries, queries) + terms @ terms.mT
-        left = kernel.amplitude * (left + kernel.noise * torch.eye(groups[1], dtype=left.dtype))
+        flat_terms = self.never.columns(flat)
+        inputs = flat[None], (number,), flat_terms[None], self.columns(flat)[None]
+        prior, more, white, shared = self._condition(*inputs, may_round=False)
+        terms, kernel = flat_terms.unflatten(0, groups), prior.kernel
+        matrix = kernel.correlations(queries, queries) + terms @ terms.mT
+        matrix = kernel.amplitude * (matrix + kernel.noise * torch.eye(groups[1], dtype=matrix.dtype))
         # Rows take variance away; weights that are not fully known give some back.
         for root, sign in (*((one, -1) for one in white), (shared[0], 1)):
             each = root.unflatten(0, groups)
-            left = left + sign * each @ each.mT
+            matrix = matrix + sign * each @ each.mT
         mean = self.never.mean(flat)[:, 0] + more[0]
-        return mean.unflatten(0, groups), left
+        return mean.unflatten(0, groups), matrix
 
     def _group_queries(self, number: Tensor) -> Iterator[tuple[tuple[int, ...], Tensor]]:
         """Processes and their queries (S, k), -1 in place of none: all at once where each is asked little."""
@@ -141,8 +141,8 @@ class SharedTermsPosterior:
         if self._alike and numbers == sorted(self.processes) and max(map(len, at)) <= ROUNDED:
             yield tuple(numbers), pad_sequence(at, batch_first=True, padding_value=-1)
             return
-        for one, own in zip(numbers, at, strict=True):
-            yield from (((one,), part[None]) for part in own.split(QUERIES))
+        for one, queries in zip(numbers, at, strict=True):
+            yield from (((one,), part[None]) for part in queries.split(QUERIES))
 
     def _condition(
         self, queries: Tensor, numbers: tuple[int, ...], own_terms: Tensor, columns: Tensor, may_round: bool
@@ -166,8 +166,8 @@ class SharedTermsPosterior:
             else:
                 white = [one.whiten(part).T for one, part in zip(factors, parts, strict=True)]
             if len(self.mean):
-                told = [one.double() @ block.columns for one, block in zip(white, blocks, strict=True)]
-                shared = shared - torch.cat(told)
+                projections = [one.double() @ block.columns for one, block in zip(white, blocks, strict=True)]
+                shared = shared - torch.cat(projections)
         if len(self.mean):
             shared = self.factor.whiten(shared.T).T
         return Conditioning(prior, more, white, shared.unflatten(0, queries.shape[:2]))
@@ -192,9 +192,9 @@ class SharedTermsPosterior:
         block = self.block(number)
         root = block.process.factor.root / process_deviation(block.process.prior)
         # Diagonal of `L^-T (1 - V C V^T) L^-1`, C the covariance of the weights (Woodbury).
-        known = self.factor.whiten((root.T @ block.columns).T).square().sum(0)
+        reduction = self.factor.whiten((root.T @ block.columns).T).square().sum(0)
         rest = block.values - block.columns @ self.mean
-        return left_out_residuals(root.square().sum(0) - known, root.T @ rest)
+        return left_out_residuals(root.square().sum(0) - reduction, root.T @ rest)
 
 
 def process_deviation(prior: Prior) -> float:
@@ -221,9 +221,9 @@ def left_out_processes(blocks: list[Block]) -> list[LeftOutErrors]:
     factor, mean = shared_weights(blocks)
     result = []
     for block in blocks:
-        known = factor.whiten(block.columns.T)
+        white = factor.whiten(block.columns.T)
         lower = block.process.factor.lower * process_deviation(block.process.prior)
-        inner = Factor.from_gram(torch.eye(len(lower), dtype=torch.float64) - known.T @ known)
+        inner = Factor.from_gram(torch.eye(len(lower), dtype=torch.float64) - white.T @ white)
         error = inner.solve((block.values - block.columns @ mean)[:, None])[:, 0]
         result.append(LeftOutErrors(lower @ error, inner.whiten(lower.T).square().sum(0)))
     return result

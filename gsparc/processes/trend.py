@@ -90,9 +90,9 @@ class Walls(Columns):
             (at @ self.axes.flatten(0, 1).T).view(len(places), -1, 3) - self.corners
             for at in (moving_end(places), other)
         )
-        apart = (start - end)[..., :1]
+        difference = (start - end)[..., :1]
         # Where a path meets the wall's plane; a path along the plane is divided by 1, and never counts.
-        met = start + start[..., :1] / torch.where(apart == 0, 1.0, apart) * (end - start)
+        met = start + start[..., :1] / torch.where(difference == 0, 1.0, difference) * (end - start)
         inside = ((met[..., 1:] >= 0) & (met[..., 1:] <= self.sizes)).all(-1)
         hit = (inside & (start[..., 0] * end[..., 0] < 0)).to(places)
         level = self.axes[:, 0, 2].abs() > LEVEL

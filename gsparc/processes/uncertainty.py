@@ -138,8 +138,8 @@ def coverage_and_width(error: np.ndarray, half: np.ndarray) -> tuple[float, floa
 
     Where nothing is promised `half` is NaN; these rows are left out.
     """
-    known = np.isfinite(half)
-    return float((np.abs(error) <= half)[known].mean()), float(2 * half[known].mean())
+    finite = np.isfinite(half)
+    return float((np.abs(error) <= half)[finite].mean()), float(2 * half[finite].mean())
 
 
 def binomial_interval(errors: int, count: int, level: float = 0.95) -> tuple[float, float]:

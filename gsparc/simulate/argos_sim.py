@@ -190,6 +190,6 @@ class ArgosStandIn(Checked):
         """See `StandIn.folder`."""
         name = f"{STAND_IN}-{self.count}-{self.seed}{'' if self.offsets else '-aligned'}"
         name += "" if self.scatterers == SCATTERERS else f"-{self.scatterers}"
-        own = Offsets() if self.offsets else Offsets(0.0, 0.0, 0.0)
-        how = self.count, self.seed, own, self.scatterers
+        offsets = Offsets() if self.offsets else Offsets(0.0, 0.0, 0.0)
+        how = self.count, self.seed, offsets, self.scatterers
         return make_once(Path(self.root) / name, lambda folder: write_argos_sim(folder, *how))

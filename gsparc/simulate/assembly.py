@@ -112,10 +112,10 @@ def join_shards(shards: Shards, rows: int) -> ShardRows:
     whole: dict[str, np.ndarray] = {}
     for number in shards.list_shards():
         part = shards.read(number)
-        own, mine, _ = part.pop(ROWS), part.pop("offsets"), part.pop(SECONDS)
-        place = np.repeat(offsets[own] - mine[:-1], np.diff(mine)) + np.arange(mine[-1])  # of its paths
+        index, mine, _ = part.pop(ROWS), part.pop("offsets"), part.pop(SECONDS)
+        place = np.repeat(offsets[index] - mine[:-1], np.diff(mine)) + np.arange(mine[-1])  # of its paths
         for name, values in part.items():
-            at, length = (place, offsets[-1]) if name in ARRAYS else (own, rows)
+            at, length = (place, offsets[-1]) if name in ARRAYS else (index, rows)
             if name not in whole:
                 whole[name] = allocate((int(length), *values.shape[1:]), values.dtype)
             whole[name][at] = values

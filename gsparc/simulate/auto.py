@@ -169,8 +169,8 @@ def choose_effects(probe: SurveyProbe, settings: AutoSettings) -> Choice:
     for row in rows:
         effect, _, depth = row.effect.partition(" > ")
         # Rows are named after an effect, or `depth > N`.
-        kept = chosen.depth > int(depth) if depth else bool(getattr(chosen, effect))
-        table.append(replace(row, kept=kept))
+        in_use = chosen.depth > int(depth) if depth else bool(getattr(chosen, effect))
+        table.append(replace(row, kept=in_use))
     return Choice(chosen, str(required), tuple(table), len(probe.reached))
 
 

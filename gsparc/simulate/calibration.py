@@ -147,13 +147,13 @@ class Replay:
         apply_materials(
             self.tracer, {name: Material.from_logarithms(pair) for name, pair in materials.items()}
         )  # without gradients
-        lost = ~np.isfinite(gradient)
-        if lost.any():
+        invalid = ~np.isfinite(gradient)
+        if invalid.any():
             log.warning(
                 "%d of %d slopes by materials are not finite: these do not move in this step",
-                int(lost.sum()), len(gradient),
+                int(invalid.sum()), len(gradient),
             )  # fmt: skip
-        return value, np.where(lost, 0.0, gradient)
+        return value, np.where(invalid, 0.0, gradient)
 
     def _powers(self) -> Any:
         """(R,) as the solver's array, with gradients: evaluated loops have them, and cost the same here."""

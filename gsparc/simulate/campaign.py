@@ -130,8 +130,8 @@ class _Tracing:
 
 def _trace_all(campaign: CampaignSettings, survey: Survey, shards: Shards) -> None:
     """Trace what is missing."""
-    left = np.setdiff1d(np.arange(len(survey)), _decided_on(shards))
-    parts = [(n, left[i : i + campaign.shard]) for n, i in enumerate(range(0, len(left), campaign.shard), 1)]
+    rest = np.setdiff1d(np.arange(len(survey)), _decided_on(shards))
+    parts = [(n, rest[i : i + campaign.shard]) for n, i in enumerate(range(0, len(rest), campaign.shard), 1)]
     missing = [(n, rows) for n, rows in parts if not shards.path(n).exists()]
     if len(missing) < len(parts):
         log.info("%d of %d shards already done", len(parts) - len(missing), len(parts))

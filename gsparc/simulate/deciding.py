@@ -128,9 +128,9 @@ class Decider:
         )
 
     def _verified(self, choice: Choice, less: Effects | TracedPaths) -> tuple[Choice, Changed]:
-        held = self._probe(self.held_back)
-        errors = held.errors(less, self.settings.required)
-        verified = auto.verify_choice(choice, self.settings, errors[held.reached])
+        probe = self._probe(self.held_back)
+        errors = probe.errors(less, self.settings.required)
+        verified = auto.verify_choice(choice, self.settings, errors[probe.reached])
         return verified, Changed(self.held_back, errors)
 
     def _with_fewer_rays(self, choice: Choice, changed: Changed | None) -> tuple[Choice, Changed | None]:
@@ -142,12 +142,12 @@ class Decider:
         samples = max(round(self.settings.rays * self.campaign.sampling.samples), 1)
         log.info("auto: the same receivers with %d rays", samples)
         fewer = self.survey.with_samples(samples).trace(self.both, choice.effects)
-        tried, held = np.split(np.arange(len(self.both)), [len(self.probes)])
+        probe_index, check_index = np.split(np.arange(len(self.both)), [len(self.probes)])
         probe = self._probe(self.probes)
-        thinned = auto.choose_rays(choice, self.settings, probe, fewer.select_receivers(tried), samples)
+        thinned = auto.choose_rays(choice, self.settings, probe, fewer.select_receivers(probe_index), samples)
         if thinned.samples is None:
             return thinned, changed
-        verified, errors = self._verified(thinned, fewer.select_receivers(held))
+        verified, errors = self._verified(thinned, fewer.select_receivers(check_index))
         if verified.refused:
             return replace(auto.keep_all_rays(thinned), verdict=choice.verdict), changed
         return verified, errors

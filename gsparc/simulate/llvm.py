@@ -71,15 +71,15 @@ def library_fault(library: Path) -> str | None:
     environment = {**os.environ, VARIABLE: str(library)}
     solve = [sys.executable, "-c", TINY_SOLVE]
     # The first solve compiles, which takes minutes where the machine is busy.
-    tried = subprocess.run(solve, env=environment, capture_output=True, text=True, timeout=300)
-    lines = tried.stderr.strip().splitlines() or ["no message"]
+    result = subprocess.run(solve, env=environment, capture_output=True, text=True, timeout=300)
+    lines = result.stderr.strip().splitlines() or ["no message"]
     # The line that names LLVM says most; else the last one.
     words = next((line for line in lines if "LLVM" in line), lines[-1]).strip()
-    if tried.returncode == 0:
+    if result.returncode == 0:
         with whole_file(seal) as partial:
             partial.touch()
         return None
-    died = f"killed by signal {-tried.returncode}" if tried.returncode < 0 else f"exit {tried.returncode}"
+    died = f"killed by signal {-result.returncode}" if result.returncode < 0 else f"exit {result.returncode}"
     return f"a tiny solve failed ({died}: {words[:160]})"
 
 

@@ -331,10 +331,10 @@ class RayTracer(TracingEngine):
         """
         low, top = self.bounding_box()[:, 2]
         height = self.surface_height(np.random.default_rng(0).uniform(area[0], area[1], size=(500, 2)))
-        known = height[np.isfinite(height)]
-        if not len(known):
+        heights = height[np.isfinite(height)]
+        if not len(heights):
             raise ValueError(f"scene.area_m={area.tolist()}: nothing of the scene is there; say another")
-        return bool((known < (low + top) / 2).mean() > 0.05)
+        return bool((heights < (low + top) / 2).mean() > 0.05)
 
     def _hit(self, points: np.ndarray, direction: np.ndarray) -> Any:
         import mitsuba as mi

@@ -62,8 +62,8 @@ class SpectrumSettings(ArraySettings):
 
     def attributes(self) -> dict[str, str | float | int]:
         """Return the definition as attributes of a file."""
-        own = {f"spectrum_{key}": value for key, value in asdict(self).items()}
-        return {"normalisation": "max", "spectrum_scale": "amplitude", **own}
+        settings = {f"spectrum_{key}": value for key, value in asdict(self).items()}
+        return {"normalisation": "max", "spectrum_scale": "amplitude", **settings}
 
 
 def render_spectra(

@@ -28,8 +28,8 @@ def curve_row(
         **figures: of `FIGURES`.
     """
     # What is not finite is not known.
-    known = error is not None and math.isfinite(error)
-    row = {"seconds": round(seconds, 3), "what": what, "error": error if known else "", "step": step}
+    has_error = error is not None and math.isfinite(error)
+    row = {"seconds": round(seconds, 3), "what": what, "error": error if has_error else "", "step": step}
     return {name: "" if (row | figures).get(name) is None else (row | figures)[name] for name in COLUMNS}
 
 

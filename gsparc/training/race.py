@@ -68,21 +68,21 @@ class Race:
         now = mean_square(missed)
         self.note(name, now)
         _, here, there = np.intersect1d(self.rows, rows, return_indices=True)
-        best, own = (each.detach().flatten(1) for each in (self.missed[here], missed[there]))
+        best, candidate = (each.detach().flatten(1) for each in (self.missed[here], missed[there]))
         if now <= STALLED * (before[-1] if before else math.inf):
             return now
-        apart, whole = best - own, max(float(best.abs().square().sum()), 1e-30)
-        gains = (best * apart.conj()).real.double().sum(1) / whole
-        if has_settled([*before, now], own):
-            squares = apart.abs().double().square().sum(1) / whole
+        difference, whole = best - candidate, max(float(best.abs().square().sum()), 1e-30)
+        gains = (best * difference.conj()).real.double().sum(1) / whole
+        if has_settled([*before, now], candidate):
+            squares = difference.abs().double().square().sum(1) / whole
             weight = min(max(float(gains.sum() / squares.sum().clamp_min(1e-30)), 0.0), 1.0)
             gains = weight * (2 * gains - weight * squares)
         gain, error = float(gains.sum()), standard_error(gains.numpy()) * len(gains)
-        known = f"the best so far (error {self.error:.3f} of the energy of rows held out)"
+        reference = f"the best so far (error {self.error:.3f} of the energy of rows held out)"
         if now > FAR * mean_square(best):
-            raise FellBehind(f"{name}: {now / mean_square(best):.0f} times the error of {known}")
+            raise FellBehind(f"{name}: {now / mean_square(best):.0f} times the error of {reference}")
         if gain + SURE * error < LEAST_GAIN:
-            raise FellBehind(f"{name}: averaging it with {known} gains {gain:.0%} ± {error:.0%}")
+            raise FellBehind(f"{name}: averaging it with {reference} gains {gain:.0%} ± {error:.0%}")
         return now
 
 

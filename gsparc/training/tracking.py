@@ -67,18 +67,18 @@ def refuse_missing_loggers(config: DictConfig) -> None:
 @contextmanager
 def open_loggers(config: DictConfig) -> Iterator[list[Logger]]:
     """Yield loggers of `config.logger`, told the whole resolved `config`, closed whatever happens."""
-    made: list[Logger] = []
+    loggers: list[Logger] = []
     settings: Any = OmegaConf.to_container(config, resolve=True)
     status = "failed"
     try:
-        made.extend(instantiate(node) for node in (config.logger or {}).values())
-        for logger in made:
+        loggers.extend(instantiate(node) for node in (config.logger or {}).values())
+        for logger in loggers:
             if not isinstance(logger, CSVLogger):
                 logger.log_hyperparams(settings)
-        yield made
+        yield loggers
         status = "success"
     finally:
-        for logger in made:
+        for logger in loggers:
             if isinstance(logger, CSVLogger):  # now: its folder is opened by the process that trains
                 logger.log_hyperparams(settings)
             logger.finalize(status)
@@ -101,10 +101,10 @@ def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
     if mode is None:
         stays = not wandb.login(prompt=False) if offline is None else offline
         mode = "offline" if stays else None
-    given = {name: value for name, value in settings.items() if value}
+    arguments = {name: value for name, value in settings.items() if value}
     # `mode` as an argument: Lightning's `offline` sets a variable that wandb, asked for a login, warns of
     # and does not read; of `anonymous` it warns whatever the value.
-    logger = WandbLogger(offline=mode == "offline", **{**_job_tags(), **given, "mode": mode})
+    logger = WandbLogger(offline=mode == "offline", **{**_job_tags(), **arguments, "mode": mode})
     logger._offline = False
     logger._wandb_init.pop("anonymous", None)
     return logger
@@ -118,13 +118,13 @@ def _job_tags() -> dict[str, Any]:
     tags = [str(one) for group in TAGS if (one := hydra.runtime.choices.get(group))]
     if hydra.mode != RunMode.MULTIRUN:
         return {"name": "-".join(tags), "tags": tags}
-    given, file = [], Path(hydra.sweep.dir) / "multirun.yaml"
+    overrides, file = [], Path(hydra.sweep.dir) / "multirun.yaml"
     if file.exists():  # of Hydra's own sweeper
-        given = yaml.safe_load(file.read_text(encoding="utf-8"))["hydra"]["overrides"]["task"]
-    every = OverridesParser.create().parse_overrides(given)
+        overrides = yaml.safe_load(file.read_text(encoding="utf-8"))["hydra"]["overrides"]["task"]
+    every = OverridesParser.create().parse_overrides(overrides)
     varies = {one.key_or_group: one.is_sweep_override() for one in every}
-    own = " ".join(o for o in hydra.overrides.task if varies.get(o.lstrip("+~").partition("=")[0], True))
-    return {"name": f"{hydra.job.num} {own}"[:NAME], "group": Path(hydra.sweep.dir).name, "tags": tags}
+    changes = " ".join(o for o in hydra.overrides.task if varies.get(o.lstrip("+~").partition("=")[0], True))
+    return {"name": f"{hydra.job.num} {changes}"[:NAME], "group": Path(hydra.sweep.dir).name, "tags": tags}
 
 
 def tensorboard_logger(save_dir: str, name: str = "tensorboard") -> TensorBoardLogger:

@@ -172,11 +172,11 @@ class Batcher:
     def _next(self) -> list[WaitingRequest]:
         """The request that waits longest, and the smallest others: few places do not wait for many."""
         waiting = [one for one in self.waiting if not one.answer.done()]
-        batch, left = waiting[:1], self.most
+        batch, capacity = waiting[:1], self.most
         # By size: a request for a thousand places would otherwise delay many for one.
         for one in sorted(waiting[1:], key=lambda one: one.size):
-            left -= one.size
-            batch += [one] if left >= 0 else []
+            capacity -= one.size
+            batch += [one] if capacity >= 0 else []
         self.waiting = [one for one in waiting if one not in batch]
         if not self.waiting:
             self.some.clear()
@@ -257,8 +257,8 @@ def build_application(
                 # A bracket opens each place and one all of them: enough to refuse a body before it is parsed.
                 count = len(body) // PLACE if raw else (body.count(b"[") - lists) // lists
                 if count > most or len(body) > most * BYTES * (1 if lists == 1 else 1 + each) + MORE:
-                    said = f"at most {most} places, {each} numbers each"
-                    raise HTTPException(413, said, {"connection": "close"})
+                    message = f"at most {most} places, {each} numbers each"
+                    raise HTTPException(413, message, {"connection": "close"})
         except ClientDisconnect:
             raise HTTPException(400, "the client left") from None
         return bytes(body), count
@@ -283,8 +283,8 @@ def build_application(
             return await asyncio.to_thread(add_rows, body)
         except ValueError as error:  # of a body, too
             wanted = '{"places": [[x, y, z], ...], "levels": [[level or null of each station], ...]}'
-            said = f"expected {wanted}" if isinstance(error, ValidationError) else str(error)
-            raise HTTPException(422, said) from error
+            message = f"expected {wanted}" if isinstance(error, ValidationError) else str(error)
+            raise HTTPException(422, message) from error
 
     if keep is not None:
         app.post("/update")(update)

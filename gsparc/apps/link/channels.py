@@ -99,8 +99,8 @@ def true_channels(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray
 
 def band_evidence(band: BandChannels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
     """Return evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
-    said = Prediction(band.predicted, band.variance, 1 - band.confidence)
-    return score_answers(said, band.true, rows, data.moving[rows], Trusted.from_fold(data, fold))
+    prediction = Prediction(band.predicted, band.variance, 1 - band.confidence)
+    return score_answers(prediction, band.true, rows, data.moving[rows], Trusted.from_fold(data, fold))
 
 
 @lru_cache(maxsize=1)

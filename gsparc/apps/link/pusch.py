@@ -62,8 +62,8 @@ class Pusch:
         }  # fmt: skip
         decoder = nr.TBDecoder(self.transmitter._tb_encoder, num_bp_iter=iterations)
         how = {"tb_decoder": decoder, "return_tb_crc_status": True}
-        made = partial(nr.PUSCHReceiver, self.transmitter, **how)
-        self.receivers = {name: made(channel_estimator=estimators[name]) for name in names}
+        factory = partial(nr.PUSCHReceiver, self.transmitter, **how)
+        self.receivers = {name: factory(channel_estimator=estimators[name]) for name in names}
 
     @property
     def pilot_share(self) -> float:
@@ -97,8 +97,8 @@ class Pusch:
                 decoded, fine = receiver(received, no)
                 failed = ~fine.bool().flatten().cpu().numpy()
                 wrong = (decoded != bits).double().mean(-1).flatten().cpu().numpy()
-                own = {"position": rows, "receiver": name, "failed": failed, "wrong": wrong}
-                parts.append(pd.DataFrame({"ebno_db": ebno_db, **own}))
+                columns = {"position": rows, "receiver": name, "failed": failed, "wrong": wrong}
+                parts.append(pd.DataFrame({"ebno_db": ebno_db, **columns}))
         return pd.concat(parts, ignore_index=True)
 
     def _slots(self, channel: Tensor) -> Tensor:
@@ -138,15 +138,15 @@ class _Wiener:
         variance = variance.double().clamp_min(LEAST_VARIANCE)[:, None]
         # In units of the prior variance: R_c (R_cc + N / v)^-1, a matrix for each position with its own.
         doubt = torch.diag_embed((noise / variance).to(self.whole.dtype))
-        known = self.whole[self.comb][:, self.comb] + doubt
+        gram = self.whole[self.comb][:, self.comb] + doubt
         cross = self.whole[:, self.comb]
-        filtering = torch.linalg.solve(known.mT, cross.T.expand(len(known), -1, -1)).mT
+        filtering = torch.linalg.solve(gram.mT, cross.T.expand(len(gram), -1, -1)).mT
         news = (matched - mean[:, self.comb]).to(filtering.dtype)
         smooth = mean + (filtering @ news[..., None])[..., 0].to(torch.complex64)
         # The error's variance, v (R - F C^H), which rounding may take below 0.
-        left = (torch.diagonal(self.whole).real - (filtering * cross.conj()).sum(-1).real).clamp_min(0)
+        residual = (torch.diagonal(self.whole).real - (filtering * cross.conj()).sum(-1).real).clamp_min(0)
         shape = (len(y), 1, 1, 1, 1, y.shape[3], y.shape[4])
-        spread = (variance * left).float().view(-1, 1, 1, 1, 1, 1, self.whole.shape[0])
+        spread = (variance * residual).float().view(-1, 1, 1, 1, 1, 1, self.whole.shape[0])
         estimate = smooth.view(len(y), 1, 1, 1, 1, 1, -1).expand(shape).contiguous()
         return estimate, spread.expand(shape).contiguous()
 

@@ -63,8 +63,8 @@ class LinkStudy:
         promise = Guarantee(**settings["promise"])
         how = settings["confidence"], settings["spatial"], int(settings["seed"])
         kind, threshold, self.test, aside = calibrate_threshold(evidence, promise, *how)
-        every, given = as_confidence(kind, evidence.scores[kind]), settings["threshold"]
-        self.least = confidence_threshold(kind, threshold) if given is None else float(given)
+        every, setting = as_confidence(kind, evidence.scores[kind]), settings["threshold"]
+        self.least = confidence_threshold(kind, threshold) if setting is None else float(setting)
         self.confidence = every[self.test]
         self.accepted = self.confidence >= self.least
         # Rates are tuned on rows set aside from the test, and on those that would be accepted.
@@ -83,7 +83,7 @@ class LinkStudy:
             "threshold": self.least if np.isfinite(self.least) else None,
             "model/states_variance": states_variance,
         }  # fmt: skip
-        if given is None:  # a threshold by hand promises nothing
+        if setting is None:  # a threshold by hand promises nothing
             self.facts |= {
                 "promise/alpha": promise.alpha, "promise/delta": promise.delta,
                 "promise/calibrated_on": threshold.accepted, "promise/bound": threshold.bound(promise.delta),
@@ -103,11 +103,11 @@ class LinkStudy:
 
     def rates(self) -> tuple[list[Rates], dict[str, Any]]:
         """Return rate adaptation at every noise level and its facts."""
-        own, other = (
+        test_band, other = (
             predict_channels(self.method, self.data, self.fold.test[rows], self.tones, self.one).band()
             for rows in (self.test, self.aside)
         )
-        rates = study.adapt_rates(own, other, self.mcs, self.rule)
+        rates = study.adapt_rates(test_band, other, self.mcs, self.rule)
         return rates, study.rate_facts(rates, self.accepted)
 
     def send(
@@ -117,9 +117,9 @@ class LinkStudy:
         begun = time.perf_counter()
         # Only training rows: the estimator's correlation must not know test channels.
         heard = self.data.targets(self.fold.train)[:, self.antenna]
-        known = frequency_correlation(heard, self.tones, self.spacing_hz, self.count)
+        correlation = frequency_correlation(heard, self.tones, self.spacing_hz, self.count)
         shape = self.shape
-        how = shape["blocks"], shape["spacing_khz"], known, shape["iterations"], self.receivers
+        how = shape["blocks"], shape["spacing_khz"], correlation, shape["iterations"], self.receivers
         pusch = Pusch(modulation, *how)
         sizes = shape["coarse"], shape["fine"], shape["batch"]
         blocks = study.send_blocks(pusch, self.grid.band(), levels, sizes)

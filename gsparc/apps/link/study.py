@@ -71,10 +71,10 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
         there, guess = true[:, :count], predicted[:, :count]
         loss = beam_loss_db(there, guess).numpy()
         best = beam_gain(there, there).mean()
-        own = torch.maximum(beam_gain(there, guess).mean(), LEAST * best)
+        gain = torch.maximum(beam_gain(there, guess).mean(), LEAST * best)
         here = {
-            "gain_db": float(10 * best.log10()), "predicted_gain_db": float(10 * own.log10()),
-            "loss_db": float(10 * (best / own).log10()),
+            "gain_db": float(10 * best.log10()), "predicted_gain_db": float(10 * gain.log10()),
+            "loss_db": float(10 * (best / gain).log10()),
             "loss_db_mean": float(loss.mean()), "loss_db_max": float(loss.max()),
             "share_losing_more_than_1_db": float((loss > 1).mean()),
             "loss_db_accepted": float(loss[accepted].mean()) if accepted.any() else None,
@@ -116,7 +116,7 @@ def rate_facts(rates: Sequence[Rates], accepted: np.ndarray) -> dict[str, Any]:
     most; of all positions, of accepted ones, and of all where the others send pilots.
     """
     parts = ((one.snr_db, _rates_of(one, accepted)) for one in rates)
-    return {f"mcs/{snr:g}dB/{name}": value for snr, own in parts for name, value in own.items()}
+    return {f"mcs/{snr:g}dB/{name}": value for snr, figures in parts for name, value in figures.items()}
 
 
 def _rates_of(one: Rates, accepted: np.ndarray) -> dict[str, Any]:
@@ -129,12 +129,12 @@ def _rates_of(one: Rates, accepted: np.ndarray) -> dict[str, Any]:
     }  # fmt: skip
     for name, some in (("", np.ones(len(accepted), bool)), ("_accepted", accepted)):
         miss = np.abs(one.chosen - one.oracle)[some]
-        own = {
+        figures = {
             "shortfall": _shortfall(chosen[some], oracle[some]),
             "shortfall_best": _shortfall(chosen[some], one.best_bps[some]),
             "tbler": float(one.fails[some].mean()), "off_by_more_than_2": float((miss > 2).mean()),
         } if some.any() else {}  # fmt: skip
-        facts |= {key + name: value for key, value in own.items()}
+        facts |= {key + name: value for key, value in figures.items()}
     return facts
 
 
@@ -170,8 +170,8 @@ def error_curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.Dat
     A curve's index is the Eb/N0 [dB], its columns `bler`, `ber` (NaN without a block), `errors`, `blocks`.
     """
     parts: dict[str, pd.DataFrame] = {}
-    for name, own in blocks.groupby("receiver", sort=False):
-        parts[str(name)], parts[f"{name}@accepted"] = own, own[accepted[own.position]]
+    for name, rows in blocks.groupby("receiver", sort=False):
+        parts[str(name)], parts[f"{name}@accepted"] = rows, rows[accepted[rows.position]]
     if pilot := next((name for name in FALLBACK if name in parts), None):
         others = parts[pilot][~accepted[parts[pilot].position]]
         parts["fallback"] = pd.concat([parts["predicted@accepted"], others])

@@ -93,8 +93,8 @@ def cover_box(
     centre = np.stack(np.meshgrid(*laid, indexing="ij"), -1).reshape(-1, 3)
     if around:
         tree = cKDTree(np.unique(trained, axis=0))
-        apart = np.median(tree.query(tree.data, k=min(2, tree.n))[0][:, -1])
-        centre = centre[tree.query(centre)[0] <= max(REACH * apart, np.linalg.norm(edge))]
+        spacing = np.median(tree.query(tree.data, k=min(2, tree.n))[0][:, -1])
+        centre = centre[tree.query(centre)[0] <= max(REACH * spacing, np.linalg.norm(edge))]
     if open_at is not None:
         centre = centre[open_at(centre)]
         if not len(centre):

@@ -39,15 +39,15 @@ def locate_fingerprints(config: DictConfig, run_dir: Path) -> Report:
     how: Any = "file" if config.data else chosen.split
     cut = float(chosen.side_m), float(chosen.held_out)
     if config.data:
-        known, heard = rows, read_fingerprints(config.data, False).select_access_points(rows.access_point)
+        reference, heard = rows, read_fingerprints(config.data, False).select_access_points(rows.access_point)
     else:
-        known, heard = map(rows.subset, split_fingerprints(rows, how, *cut, int(config.seed)))
+        reference, heard = map(rows.subset, split_fingerprints(rows, how, *cut, int(config.seed)))
     heard = heard.subset(sample_rows(config, len(heard.level)))
-    both = fingerprint_snapshots(heard), fingerprint_snapshots(known)
+    both = fingerprint_snapshots(heard), fingerprint_snapshots(reference)
     place, each_ms, fit_s = locate_by_neighbours(METHOD, *both[::-1])
     facts = {
         "dataset/name": Path(chosen.file).stem, "dataset/sha256": sha256(rows.level.tobytes()).hexdigest(),
-        "split/name": how, "split/train": len(known.level), "time/fit_s": fit_s,
+        "split/name": how, "split/train": len(reference.level), "time/fit_s": fit_s,
         "time/locate_ms": each_ms,
     }  # fmt: skip
     return report(run_dir, config, METHOD, *both, columns_of_places(place, heard.position), facts)

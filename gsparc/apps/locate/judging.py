@@ -90,13 +90,13 @@ def report(
         rows.append([name, median, p90])
     title = f"{Path(config.data).stem if config.data else facts['dataset/name']}, {len(heard)} snapshots"
     heads = Column("method", ""), Column("median [m]", ".3g"), Column("p90 [m]", ".3g")
-    shown = [Table(title, heads, rows)]
+    tables = [Table(title, heads, rows)]
     facts["locate/coverage"] = None if inside is None else float(np.mean(inside))
     if inside is not None:
         median = f"{facts[f'locate/{size}']:.3g} {SIZES[size]} (median)"
         areas = f"areas of {median} hold {np.mean(inside):.0%} of places"
         doubts.insert(0, f"{areas}, {promise}; {facts['time/locate_ms_p50']:.3g} ms a snapshot")
-    return facts, shown, doubts
+    return facts, tables, doubts
 
 
 def _doubts(columns: dict[str, Any], facts: dict[str, Any]) -> list[str]:
@@ -105,11 +105,11 @@ def _doubts(columns: dict[str, Any], facts: dict[str, Any]) -> list[str]:
     for key, why in locating.DOUBTS.items():
         facts[f"locate/{key}"] = count = int((doubt == why).sum())
         if count:
-            said = f"{why}, where areas promise nothing (locate.csv, doubt)"
-            lines.append(f"{count} of {len(doubt)} snapshots: {said}")
+            reason = f"{why}, where areas promise nothing (locate.csv, doubt)"
+            lines.append(f"{count} of {len(doubt)} snapshots: {reason}")
     if lines and "inside" in columns and (sure := doubt == "").any():
-        held = np.mean(np.array(columns["inside"])[sure])
-        lines.append(f"areas of the other {sure.sum()} hold {held:.0%} of places")
+        share = np.mean(np.array(columns["inside"])[sure])
+        lines.append(f"areas of the other {sure.sum()} hold {share:.0%} of places")
     return lines
 
 
@@ -168,17 +168,17 @@ def locate_by_model(
 
     located = write_as_found(locator.locate(heard), run_dir / "locate.csv", columns)
     trained = group_snapshots(data, learned)
-    own = "are promised" if config.calibrate or stored else "are not calibrated"  # of which was warned
-    said = f"{share:.0%} {own}; {float(box.volume.sum()):.3g} {SIZES[size]} were searched"
+    status = "are promised" if config.calibrate or stored else "are not calibrated"  # of which was warned
+    claim = f"{share:.0%} {status}; {float(box.volume.sum()):.3g} {SIZES[size]} were searched"
     beyond = int(beyond_box(heard.place, box.box()).sum()) if placed else 0
-    said += f", {beyond} true places lie beyond these" * bool(beyond)
+    claim += f", {beyond} true places lie beyond these" * bool(beyond)
     true = heard.place + origin if placed else None
     shown_at = [locating.to_world(one, origin) for one in located]
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")
     each_ms = float(np.median([one.seconds for one in located]) * 1e3)
     facts = {**run.facts(), "locate/calibrated_on": count, "time/locate_ms_p50": each_ms}
     group = run.group_places(trained.place, int(config.calibrate) or 3, int(config.seed))
-    return report(run_dir, config, run.methods[0].name, heard, trained, columns(located), facts, said, group)
+    return report(run_dir, config, run.methods[0].name, heard, trained, columns(located), facts, claim, group)
 
 
 def _snapshots(config: DictConfig, run: Opened) -> tuple[Scans, bool]:

@@ -118,9 +118,9 @@ def level_misfit(
         floor: (n, P) levels [dB] below which a silent power lies, NaN of those that were heard.
     """
     heard, seen = _where(values)
-    known, precision, log_variance = _moments(mean, variance)
-    weighed = known * precision
-    square = heard.square() @ precision.T - 2 * heard @ weighed.T + seen @ (known * weighed).T
+    means, precision, log_variance = _moments(mean, variance)
+    weighed = means * precision
+    square = heard.square() @ precision.T - 2 * heard @ weighed.T + seen @ (means * weighed).T
     slope = heard @ precision.T - seen @ weighed.T
     # Sherman and Morrison: (D + o^2 1 1^T)^-1 takes one rank out; its determinant is |D| times this.
     shared = 1 + offset_db**2 * (seen @ precision.T)
@@ -143,7 +143,7 @@ def _where(values: Tensor) -> tuple[Tensor, Tensor]:
 
 def _moments(mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Means, inverse variances and logarithms of variances (G, P), all 0 where nothing is predicted."""
-    known = ~torch.isnan(mean.real)
-    safe = torch.where(known, variance.clamp_min(TINY), torch.ones_like(variance))
-    precision = torch.where(known, 1 / safe, torch.zeros_like(safe))
-    return torch.where(known, mean, torch.zeros_like(mean)), precision, safe.log()
+    is_predicted = ~torch.isnan(mean.real)
+    safe = torch.where(is_predicted, variance.clamp_min(TINY), torch.ones_like(variance))
+    precision = torch.where(is_predicted, 1 / safe, torch.zeros_like(safe))
+    return torch.where(is_predicted, mean, torch.zeros_like(mean)), precision, safe.log()

@@ -130,10 +130,10 @@ class Locator:
                     search, doubt = wide, DOUBTS["beyond"]
             posterior, mass, volume = search.posterior(self.trust), self.trust.level, search.cells.volume
             area = float(volume[densest_cells(posterior.log_density, volume, mass)].sum())
-            known = posterior.peak(), area, posterior.count_modes(mass), posterior
+            estimate = posterior.peak(), area, posterior.count_modes(mass), posterior
             seconds, true = time.perf_counter() - started, heard.place[number]
             inside = int(posterior.mass_above(true) <= mass) if np.isfinite(true).all() else None
-            return Located(*known, seconds, doubt, inside)
+            return Located(*estimate, seconds, doubt, inside)
 
         yield from (found for _, found in run_each(one, range(len(heard)), "snapshots"))
 

@@ -38,15 +38,15 @@ def locate_by_neighbours(
         ValueError: nothing was heard in any of those that are learned from.
     """
     started = time.perf_counter()
-    known, asked, places = feature_vectors(trained), feature_vectors(heard), trained.place
-    if not np.isfinite(known).any():
+    features, queries, places = feature_vectors(trained), feature_vectors(heard), trained.place
+    if not np.isfinite(features).any():
         raise ValueError(f"{name}: no row that could be learned from holds a value")
-    floor = np.nanmin(known) - BELOW * (np.nanmax(known) - np.nanmin(known))
-    known, asked = (np.where(np.isfinite(one), one, floor) for one in (known, asked))
-    count = _count(PLAIN[name], known, places, group)
-    nearest = KNeighborsRegressor(count, weights="distance", algorithm="brute").fit(known, places)
+    floor = np.nanmin(features) - BELOW * (np.nanmax(features) - np.nanmin(features))
+    features, queries = (np.where(np.isfinite(one), one, floor) for one in (features, queries))
+    count = _count(PLAIN[name], features, places, group)
+    nearest = KNeighborsRegressor(count, weights="distance", algorithm="brute").fit(features, places)
     fitted = time.perf_counter()
-    place = nearest.predict(asked)
+    place = nearest.predict(queries)
     return place, (time.perf_counter() - fitted) / max(len(heard), 1) * 1e3, fitted - started
 
 

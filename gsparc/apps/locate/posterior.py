@@ -86,8 +86,8 @@ class PlacePosterior:
         precision = 1 / (self.spread**2 + edge**2 / 12)
         # About the middle: squares of large coordinates cancel in the product below.
         middle = centre.mean(0)
-        near, apart = centre - middle, places[:, live] - middle
-        squared = apart**2 @ precision.T + (near**2 * precision).sum(1) - 2 * apart @ (near * precision).T
+        near, offset = centre - middle, places[:, live] - middle
+        squared = offset**2 @ precision.T + (near**2 * precision).sum(1) - 2 * offset @ (near * precision).T
         mass = np.exp(self.sharp[self._blurred]) * self.cells.volume[self._blurred]
         weight = mass * np.sqrt(precision / (2 * np.pi)).prod(1)
         return np.exp(-0.5 * squared.clip(0)) * weight, centre, precision

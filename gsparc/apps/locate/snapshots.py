@@ -66,9 +66,9 @@ def group_snapshots(data: Measurements, rows: np.ndarray) -> Scans:
     values[which, station] = measured
     quiet = torch.zeros(values.shape, dtype=torch.bool)
     quiet[which, station] = (side > 0)[:, None]
-    own = _without_silence(values.flatten(1), quiet.flatten(1) if quiet.any() else None)
+    parts = _without_silence(values.flatten(1), quiet.flatten(1) if quiet.any() else None)
     names = np.array([name.partition(", station")[0] for name in data.row_names])
-    return Scans(site.kind, *own, data.moving[rows][first], names[rows][first] if len(names) else None)
+    return Scans(site.kind, *parts, data.moving[rows][first], names[rows][first] if len(names) else None)
 
 
 def snapshots_of_values(
@@ -99,8 +99,8 @@ def snapshots_of_values(
         raise ValueError("locate: there is a snapshot in which nothing was heard")
     scaled = heard.to(torch.complex128 if heard.is_complex() else torch.float64) / site.target_scale
     flat = scaled if scaled.ndim == site.target.axes else scaled.flatten(0, 1)
-    own = flatten_targets(site.target.in_error_unit(flat)).reshape(len(heard), -1)
-    parts = _without_silence(own, None if silent is None else torch.as_tensor(silent))
+    rows = flatten_targets(site.target.in_error_unit(flat)).reshape(len(heard), -1)
+    parts = _without_silence(rows, None if silent is None else torch.as_tensor(silent))
     return Scans(site.kind, *parts, np.full((len(heard), 3), np.nan))
 
 

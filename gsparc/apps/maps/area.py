@@ -160,7 +160,7 @@ def _height(site: Site | None, height_m: float | None) -> float:
         return float(height_m)
     if site is None:
         return HEIGHT
-    known = usual_heights(site).get(site.moving_end)
-    if known is not None:
-        return known
+    height = usual_heights(site).get(site.moving_end)
+    if height is not None:
+        return height
     return float(site.moving_box[:, -1].mean() + site.origin[2])

@@ -26,8 +26,8 @@ def add_changes(field: FieldMap, predictor: Predictor, dry: bool = False) -> Fie
     for row, number in enumerate([] if dry else field.number):
         cells = np.flatnonzero(field.best_server.reshape(-1) == row)
         if len(cells):
-            own = predictor.ask_station(int(number))
-            layers[:, cells] = own.change(**{own.site.moving_end: field.grid.places(cells)})
+            model = predictor.ask_station(int(number))
+            layers[:, cells] = model.change(**{model.site.moving_end: field.grid.places(cells)})
     change, deviation = layers.reshape(2, *field.best_server.shape)
     return replace(field, extra={**field.extra, CHANGE: change, DEVIATION: deviation})
 

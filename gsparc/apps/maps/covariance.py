@@ -66,12 +66,12 @@ def error_covariances(
     covariances, every = [], choose_stations(predictor, None)[0]
     names = predictor.site.every_station.name
     ask = {name: predictor.ask_station(names.index(name)) for name in every}
-    told = {name: predict_levels(ask[name], places, other_end) for name in every}
+    answers = {name: predict_levels(ask[name], places, other_end) for name in every}
     each = len(every) if promise is None else min(promise.stations_of_place(), len(every))
-    level = np.nan_to_num([told[name][0] for name in every], nan=-np.inf)
+    level = np.nan_to_num([answers[name][0] for name in every], nan=-np.inf)
     listed = (level >= np.sort(level, 0)[-each]).T
     more = predictor.noise_by_others(places, [names.index(name) for name in every], listed).T
-    levels, spreads = np.array([told[name] for name in stations]).swapaxes(0, 1)
+    levels, spreads = np.array([answers[name] for name in stations]).swapaxes(0, 1)
     for name, worth in zip(stations, weigh_goal(levels, spreads, goal, threshold_db), strict=True):
         number, asking = names.index(name), ask[name]
         covariance, noise = asking.covariance(**query_ends(asking.site, places, other_end))
@@ -80,7 +80,7 @@ def error_covariances(
             calibration = promise.calibration()
             far = promise.distance(to_local(asking.site, places, other_end), number)
             inside = np.minimum(far, calibration.reach)  # beyond it, as at its edge
-            _, error = calibration.half_and_error(told[name][1], inside, np.full(len(far), number))
+            _, error = calibration.half_and_error(answers[name][1], inside, np.full(len(far), number))
             ratio = error**2 / (np.maximum(covariance.diagonal(), 0) + noise)
             weight = np.clip(np.nan_to_num(ratio, nan=1.0), *BETWEEN)
         measured = noise + more[every.index(name)]

@@ -37,8 +37,8 @@ def draw_strongest(
     held-out blocks say. See `covered_between`; without a promise only each square's own spread is right.
     """
     level, error = (one.reshape(len(one), -1) for one in (field.power_db, field.expected_error_db))
-    known = np.flatnonzero(np.isfinite(level).any(0))
-    square = known[evenly_spaced(len(known), SQUARES)]
+    cells = np.flatnonzero(np.isfinite(level).any(0))
+    square = cells[evenly_spaced(len(cells), SQUARES)]
     few = np.nan_to_num(level[:, square].astype(np.float64), nan=-np.inf)
     station = np.argsort(-few, axis=0)[:STRONGEST]
     rank, at = np.nonzero(np.isfinite(np.take_along_axis(few, station, axis=0)))

@@ -118,10 +118,10 @@ class FieldMap:
 
     def summarise(self) -> dict[str, float | int | str | None]:
         """Return `map/*` for `summary.json`; shares are of the cells that something is said of."""
-        known = self.grid.inside & ~self.refused
+        mask = self.grid.inside & ~self.refused
 
         def reduce(layer: np.ndarray, reduced: Callable[[np.ndarray], Any] = np.mean) -> float | None:
-            values = layer[known & np.isfinite(layer)]
+            values = layer[mask & np.isfinite(layer)]
             return float(reduced(values)) if len(values) else None
 
         power = self.layer("power_db")
@@ -146,10 +146,10 @@ def empty_layers(stations: int, shape: tuple[int, int]) -> dict[str, np.ndarray]
 
 def best_server(power_db: np.ndarray) -> np.ndarray:
     """Number of the strongest of (T, n) powers [dB], (n,) int16; `REFUSED` where none is known."""
-    known = np.isfinite(power_db)
+    finite = np.isfinite(power_db)
     # -inf, since argmax takes the first NaN for the largest.
-    number = np.where(known, power_db, -np.inf).argmax(axis=0)
-    return np.where(known.any(axis=0), number, REFUSED).astype(np.int16)
+    number = np.where(finite, power_db, -np.inf).argmax(axis=0)
+    return np.where(finite.any(axis=0), number, REFUSED).astype(np.int16)
 
 
 def server_chance(
@@ -211,9 +211,9 @@ def _chance_all_below(
     Unknown ones do.
     """
     # Of a rival given the strongest: never 0, which would divide.
-    left, total, cell = wrong * np.sqrt(np.maximum(1 - np.square(alike), 1e-6)), 0.0, np.arange(len(first))
+    spread, total, cell = wrong * np.sqrt(np.maximum(1 - np.square(alike), 1e-6)), 0.0, np.arange(len(first))
     for level, error in zip(limit, z, strict=True):
-        below = ndtr((level - rival - alike * wrong * error) / left)
+        below = ndtr((level - rival - alike * wrong * error) / spread)
         below[first, cell] = 1.0
         total = total + np.nan_to_num(below, nan=1.0).prod(axis=0)
     return np.asarray(total / len(z))

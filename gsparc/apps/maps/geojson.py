@@ -44,8 +44,8 @@ def draws_shapes(path: str | Path) -> bool:
 
 def is_drawn(area: Any) -> bool:
     """Tell whether an area is a file of shapes, or a polygon in well-known text."""
-    held = isinstance(area, str | Path)
-    return held and (Path(area).suffix.lower() in SUFFIXES or TEXT.match(str(area)) is not None)
+    is_text = isinstance(area, str | Path)
+    return is_text and (Path(area).suffix.lower() in SUFFIXES or TEXT.match(str(area)) is not None)
 
 
 def _geometries(path: str | Path) -> list[Any]:

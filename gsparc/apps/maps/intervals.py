@@ -58,8 +58,8 @@ class IntervalScales:
 
         NaN out of reach.
         """
-        own = np.append(self.station, 1.0)[np.minimum(station, len(self.station))]
-        scaled = np.where(distance <= self.reach, own * np.maximum(spread_db, self.least), np.nan)
+        scale = np.append(self.station, 1.0)[np.minimum(station, len(self.station))]
+        scaled = np.where(distance <= self.reach, scale * np.maximum(spread_db, self.least), np.nan)
         half, rms = (scaled * np.interp(distance, self.distance, factor) for factor in (self.half, self.rms))
         return half, rms
 
@@ -75,9 +75,9 @@ class IntervalScales:
         if self.tail is None:
             return ndtr(standard)
         # Beyond the rarest error that was seen it is rarer still, as of a normal one.
-        known, normal = np.interp(standard, self.tail, TAIL), ndtr(standard)
-        chance = np.where(standard > self.tail[-1], np.maximum(known, normal), known)
-        chance = np.where(standard < self.tail[0], np.minimum(known, normal), chance)
+        tail_chance, normal = np.interp(standard, self.tail, TAIL), ndtr(standard)
+        chance = np.where(standard > self.tail[-1], np.maximum(tail_chance, normal), tail_chance)
+        chance = np.where(standard < self.tail[0], np.minimum(tail_chance, normal), chance)
         return np.where(np.isfinite(standard), chance, np.nan)
 
 
@@ -128,10 +128,10 @@ def _of_stations(used: HeldOutLevels, level: float) -> np.ndarray:
     """How much larger each station's errors are than all (T,); drawn towards 1 where blocks are few."""
     whole, factors = _half_and_rms(used, level)[0], np.ones(int(used.station.max()) + 1)
     for number in np.unique(used.station) if len(factors) > 1 and whole > 0 else ():
-        own = used.subset(used.station == number)
-        if own.heard.sum() >= LEAST_ROWS:
-            blocks = len(np.unique(own.block))
-            ratio = max(_half_and_rms(own, level)[0] / whole, 1e-3)
+        rows = used.subset(used.station == number)
+        if rows.heard.sum() >= LEAST_ROWS:
+            blocks = len(np.unique(rows.block))
+            ratio = max(_half_and_rms(rows, level)[0] / whole, 1e-3)
             factors[number] = ratio ** (blocks / (blocks + ENOUGH_BLOCKS))
     return factors
 
@@ -160,7 +160,7 @@ def cross_validate(evidence: HeldOutLevels, share: float) -> Coverage:
     part = np.random.default_rng(0).permutation(len(blocks))[number.reshape(-1)] % PARTS
     half = np.full(len(evidence), np.nan)
     for turn in range(min(PARTS, len(blocks))):
-        tried = (part == turn) & evidence.heard
-        half[tried] = calibrate(evidence.subset(part != turn), share).half_of(evidence.subset(tried))
-    held, width = coverage_and_width(evidence.level_db - evidence.mean_db, half)
-    return Coverage(held, width, int(np.isfinite(half).sum()), len(blocks))
+        in_test = (part == turn) & evidence.heard
+        half[in_test] = calibrate(evidence.subset(part != turn), share).half_of(evidence.subset(in_test))
+    coverage, width = coverage_and_width(evidence.level_db - evidence.mean_db, half)
+    return Coverage(coverage, width, int(np.isfinite(half).sum()), len(blocks))

@@ -59,12 +59,12 @@ def write_kmz(path: str | Path, field: FieldMap, layers: Sequence[Layer]) -> Non
 
 def _colours(layer: Layer) -> np.ndarray:
     """Colours and opacity (ny, nx, 4) uint8; nothing where nothing is said."""
-    known = np.isfinite(layer.values)
-    shown = layer.legend.to_colours(layer.values)
+    finite = np.isfinite(layer.values)
+    colours = layer.legend.to_colours(layer.values)
     if layer.words:
         table = (255 * layer.table()[:, :3]).astype(np.uint8)
-        shown = table[np.where(known, layer.values, 0).astype(int)]
-    return np.dstack([shown, np.where(known, round(255 * OPACITY), 0)]).astype(np.uint8)
+        colours = table[np.where(finite, layer.values, 0).astype(int)]
+    return np.dstack([colours, np.where(finite, round(255 * OPACITY), 0)]).astype(np.uint8)
 
 
 def _explain(layer: Layer) -> str:

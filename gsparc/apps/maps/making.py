@@ -130,10 +130,10 @@ def predict_map(
         raise DataError(f"area: {fault}, where no error was tested; map nearer, or a larger promise.block_m")
     overlap = values.pop("overlap")
     extra = {} if len(names) == 1 else {"overlap": overlap}
-    known = np.zeros((0, 2)) if promise is None else promise.known[:, -3:-1] + site.origin[:2]
+    places = np.zeros((0, 2)) if promise is None else promise.known[:, -3:-1] + site.origin[:2]
     return FieldMap(
         grid, **values, share=share, calibrated=promise is not None,
-        threshold_db=threshold_db, extra=extra, places=np.unique(known, axis=0), notes=tuple(notes),
+        threshold_db=threshold_db, extra=extra, places=np.unique(places, axis=0), notes=tuple(notes),
         unit=site.level_unit, **about,
     ).to_unit(level.raised_db, level.name)  # fmt: skip
 
@@ -238,12 +238,12 @@ def _asker(
     Of one station (n, 2), or of those that are known together (n, 3 T), with the correlation of their
     errors with the strongest's.
     """
-    own = predictor if joint else predictor.ask_station(int(numbers[0]))
+    model = predictor if joint else predictor.ask_station(int(numbers[0]))
 
     def one(cells: np.ndarray) -> np.ndarray:
-        if (every := joint_levels(own, grid.places(cells), numbers) if joint else None) is not None:
+        if (every := joint_levels(model, grid.places(cells), numbers) if joint else None) is not None:
             return every.reshape(len(cells), -1)
-        return np.column_stack(predict_levels(own, grid.places(cells), other_end))
+        return np.column_stack(predict_levels(model, grid.places(cells), other_end))
 
     name = f" of {names[0]}" if len(names) == 1 and names[0] else ""
 
@@ -278,12 +278,12 @@ def _hearing_floors(promise: Promise | None, numbers: np.ndarray, noise_db: floa
     if promise is None:
         return floor
     for row, number in enumerate(numbers):
-        own = promise.evidence.subset(promise.evidence.station == number)
-        if len(own):
-            quiet = own.level_db[own.side > 0]
+        levels = promise.evidence.subset(promise.evidence.station == number)
+        if len(levels):
+            quiet = levels.level_db[levels.side > 0]
             # The least level: those of lists are of their weakest cells, far above what is heard.
             # 1 %, not the least: one faulty row would place the floor anywhere.
-            floor[row] = max(floor[row], quiet.min() if len(quiet) else np.quantile(own.level_db, 0.01))
+            floor[row] = max(floor[row], quiet.min() if len(quiet) else np.quantile(levels.level_db, 0.01))
     return floor
 
 

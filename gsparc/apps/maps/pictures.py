@@ -53,9 +53,9 @@ class Legend:
     @classmethod
     def over(cls, label: str, values: np.ndarray, colours: str = "viridis") -> Legend:
         """Return colours from the 1 to the 99 % quantile of those values that are finite."""
-        known = values[np.isfinite(values)]
+        finite_values = values[np.isfinite(values)]
         # One and 99 %: a cell at a mast would leave one colour for the rest.
-        low, high = np.percentile(known, [1, 99]) if len(known) else (0.0, 1.0)
+        low, high = np.percentile(finite_values, [1, 99]) if len(finite_values) else (0.0, 1.0)
         return cls(label, float(low), float(high if high > low else low + 1.0), colours)
 
 
@@ -151,11 +151,11 @@ def list_layers(field: FieldMap) -> Iterator[Layer]:
         yield _servers("best_server", field.layer("best_server"), field.stations, field.site, doubt)
     for band in dict.fromkeys(field.bands):
         its = np.array(field.bands) == band
-        own, names = field.power_db[its], tuple(np.array(field.stations)[its].tolist())
-        if not np.isfinite(own).any():
+        powers, names = field.power_db[its], tuple(np.array(field.stations)[its].tolist())
+        if not np.isfinite(powers).any():
             continue
-        strongest = best_server(own.reshape(len(own), -1)).reshape(field.grid.inside.shape)
-        level = np.take_along_axis(own, np.maximum(strongest, 0).astype(np.int64)[None], 0)[0]
+        strongest = best_server(powers.reshape(len(powers), -1)).reshape(field.grid.inside.shape)
+        level = np.take_along_axis(powers, np.maximum(strongest, 0).astype(np.int64)[None], 0)[0]
         yield Layer(f"power {band}", level, Legend.over(f"received power at {band} [{unit}]", level))
         where = np.where(strongest == REFUSED, np.nan, strongest)
         yield _servers(f"best_server {band}", where, names, field.site[its], None)
@@ -195,13 +195,13 @@ def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: Floo
     nothing = np.where(field.refused, 1.0, np.nan)
     grey = ListedColormap(["0.82"])
     axis.imshow(nothing, origin="lower", extent=field.grid.extent, cmap=grey, zorder=1, alpha=0.6)
-    legend, known = layer.legend, layer.values[np.isfinite(layer.values)]
+    legend, values = layer.legend, layer.values[np.isfinite(layer.values)]
     limits = {"vmin": legend.low, "vmax": legend.high}
     image = _cells(axis, field.grid, layer.values, plan, cmap=ListedColormap(layer.table()), **limits)
     if layer.words:
         _name_areas(axis, field.grid, layer)
     else:
-        beyond = bool((known < legend.low).any()), bool((known > legend.high).any())
+        beyond = bool((values < legend.low).any()), bool((values > legend.high).any())
         ends = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
         figure.colorbar(image, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
     if layer.unsure is not None:
@@ -223,8 +223,8 @@ def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
         axis.text(grid.x[column], grid.y[row], word, ha="center", va="center", fontsize="small", zorder=5,
                   path_effects=from_above.OUTLINE)  # fmt: skip
     listed = layer.class_table()
-    shown = [row for row in zip(listed["colour"], listed["station"], listed["share"], strict=True) if row[2]]
-    for colour, word, _ in shown[:MOST_COLOURS]:
+    areas = [row for row in zip(listed["colour"], listed["station"], listed["share"], strict=True) if row[2]]
+    for colour, word, _ in areas[:MOST_COLOURS]:
         axis.plot([], [], "s", color=colour, label=word)
     if len(listed["number"]) > MOST_COLOURS:
         fewer = f"{len(listed['number']) - MOST_COLOURS} more, that serve less: {file_name(layer, '.csv')}"
@@ -262,15 +262,15 @@ def draw_measured_places(axis: Any, field: FieldMap) -> None:
     """Mark measured points and stations; those outside the map are left out."""
     left, right, low, high = field.grid.extent
     from_above.draw_measured(axis, field.places)
-    known = field.station_place
-    inside = (known >= [left, low]).all(1) & (known <= [right, high]).all(1)
-    faces = np.isfinite(field.azimuth) if len(field.azimuth) else np.zeros(len(known), bool)
+    positions = field.station_place
+    inside = (positions >= [left, low]).all(1) & (positions <= [right, high]).all(1)
+    faces = np.isfinite(field.azimuth) if len(field.azimuth) else np.zeros(len(positions), bool)
     if (inside & ~faces).any():
-        from_above.draw_stations(axis, known[inside & ~faces])
+        from_above.draw_stations(axis, positions[inside & ~faces])
     if (inside & faces).any():
-        from_above.draw_sectors(axis, known[inside & faces], field.azimuth[inside & faces])
-    if 1 < len(known) <= NAMED and not faces.any():
-        for where, name in zip(known[inside], np.array(field.stations)[inside], strict=True):
+        from_above.draw_sectors(axis, positions[inside & faces], field.azimuth[inside & faces])
+    if 1 < len(positions) <= NAMED and not faces.any():
+        for where, name in zip(positions[inside], np.array(field.stations)[inside], strict=True):
             from_above.annotate(axis, name, where)
 
 

@@ -72,14 +72,14 @@ class NewAntenna(Checked):
         """
         if self.carrier_hz is None:
             return None
-        known = np.zeros(0) if stations.carrier_hz is None else stations.carrier_hz
-        away = np.abs(np.log(known / self.carrier_hz))
-        if not len(known) or away.min() > np.log(ONE_BAND):
-            bands = ", ".join(f"{one / 1e6:g}" for one in np.unique(known)) or "unknown ones"
+        carriers = np.zeros(0) if stations.carrier_hz is None else stations.carrier_hz
+        away = np.abs(np.log(carriers / self.carrier_hz))
+        if not len(carriers) or away.min() > np.log(ONE_BAND):
+            bands = ", ".join(f"{one / 1e6:g}" for one in np.unique(carriers)) or "unknown ones"
             raise DataError(
                 f"antenna.carrier_hz={self.carrier_hz:g}: no station's band; there are {bands} MHz"
             )
-        return int(away.argmin()) if np.ptp(known) else None
+        return int(away.argmin()) if np.ptp(carriers) else None
 
     def sectors(self) -> np.ndarray:
         """Return (k, 5), see `gsparc.prediction.predictor.Predictor.elsewhere`.
@@ -176,7 +176,7 @@ def place_station(
     Raises:
         DataError: as there; or all of the area is too far from what was measured.
     """
-    grid, candidates, given = lay_candidates(predictor, area, antenna=antenna, **where)
+    grid, candidates, columns = lay_candidates(predictor, area, antenna=antenna, **where)
     left, right, south, north = grid.extent
     now = predict_map(
         predictor, [left, south, right, north], height_m=grid.height, step_m=grid.step,
@@ -184,20 +184,20 @@ def place_station(
     )  # fmt: skip
     # Refused squares are left out: as unserved they would count against the stations that stand,
     # and draw a new one to where nothing was tested.
-    known = grid.inside & ~now.refused
-    if not known.any():
+    mask = grid.inside & ~now.refused
+    if not mask.any():
         raise DataError("area: all of it is too far from what was measured; map nearer, or promised=false")
-    now = replace(now, power_db=np.where(known, now.power_db, np.nan))
+    now = replace(now, power_db=np.where(mask, now.power_db, np.nan))
     square, best = draw_strongest(now, predictor, promise)
-    old, cells, before = best >= threshold_db, grid.places(square), 1 - float(now.outage[known].mean())
+    old, cells, before = best >= threshold_db, grid.places(square), 1 - float(now.outage[mask].mean())
     alike = shadowing(cells, 1.0 if promise is None else promise.block_m)
-    own = error.within * draw_errors(alike, seed=1)  # errors of a new station are its own
+    errors = error.within * draw_errors(alike, seed=1)  # errors of a new station are its own
     # Student's t, as few stations tell the deviation: the normal's ends held too little.
     offset = error.offset_db * t.rvs(max(error.stations, 1), size=DRAWS, random_state=2)
 
     def tried(place: np.ndarray) -> np.ndarray:
         level, spread = _new(predictor, place, cells, antenna)
-        new = ~old & (level[:, None] + spread[:, None] * own + offset >= threshold_db)
+        new = ~old & (level[:, None] + spread[:, None] * errors + offset >= threshold_db)
         share = share_between((old | new).mean(0), before + new.mean())
         return np.array([new.mean(), *share, *central_interval(new.mean(0), SHARE)])
 
@@ -205,12 +205,12 @@ def place_station(
     if promise is None or not error.stations:
         scores[:, 1:] = np.nan
     order = np.argsort(-scores[:, 0], kind="stable")
-    given, places = {head: words[order] for head, words in given.items()}, candidates[order]
+    columns, places = {head: words[order] for head, words in columns.items()}, candidates[order]
     gain, still = scores[order, 0], now.station_place
     nearest = np.fmin.reduce(cdist(places[:, :2], still), axis=1)
     return Placement(
         places, before + gain, gain, scores[order, 1:], nearest, before,
-        1 - float(known.sum() / grid.inside.sum()), grid, still, given,
+        1 - float(mask.sum() / grid.inside.sum()), grid, still, columns,
     )  # fmt: skip
 
 
@@ -236,18 +236,18 @@ def lay_candidates(
     if site.stations is None or site.static_end is None:
         raise DataError(f"place: {site.name} has no stations; several that were trained together are needed")
     grid = coarse_grid(predictor, area, height_m)
-    known = site.stations.position[:, 2] + site.origin[2]
-    if station_height_m is None and np.isnan(known).all():
+    heights = site.stations.position[:, 2] + site.origin[2]
+    if station_height_m is None and np.isnan(heights).all():
         raise DataError("station_height_m: no station's height is known; say station_height_m=METRES")
-    height = float(np.nanmedian(known) if station_height_m is None else station_height_m)
+    height = float(np.nanmedian(heights) if station_height_m is None else station_height_m)
     lattice = grid if sites is not None else coarse_grid(predictor, area, height_m, count=count)
-    candidates, given = _candidates(lattice, sites, predictor, height, count)
+    candidates, columns = _candidates(lattice, sites, predictor, height, count)
     try:
         _new(predictor, candidates[0], grid.places()[:1], antenna)
     except ValueError as refused:
-        told = unheard_stations_error(f"{predictor.method.name} ({refused})")
-        raise refused if isinstance(refused, DataError) else told from None
-    return grid, candidates, given
+        error = unheard_stations_error(f"{predictor.method.name} ({refused})")
+        raise refused if isinstance(refused, DataError) else error from None
+    return grid, candidates, columns
 
 
 def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
@@ -255,8 +255,8 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
 
     A sector alone would be left to its site's others, which share its shadowing.
     """
-    data, known, stations = learned.data, learned.rows, learned.data.site.every_station
-    site = number_sites(stations, stations.position)[data.stations_of(known)]
+    data, rows, stations = learned.data, learned.rows, learned.data.site.every_station
+    site = number_sites(stations, stations.position)[data.stations_of(rows)]
     heard = np.unique(site)
     if len(heard) < LEAST_STATIONS:
         return NewStationError()
@@ -265,9 +265,9 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
     parts: list[HeldOutLevels] = []
     # Without validation rows: the site left out is the test, all else is learned from.
     for one in chosen:
-        own = site == one
-        inner = Fold(known[~own], known[:0], known[own])
-        parts.append(leave_out(learned, inner, np.full(int(own.sum()), one)))
+        at_site = site == one
+        inner = Fold(rows[~at_site], rows[:0], rows[at_site])
+        parts.append(leave_out(learned, inner, np.full(int(at_site.sum()), one)))
     parts = [one for one in parts if one.heard.any()]  # of silent rows alone no error is known
     return NewStationError.from_evidence(parts) if parts else NewStationError()
 
@@ -276,11 +276,11 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
     """Places (n, 3) and, of a table of them, its other columns (n,)."""
     if sites is not None and not draws_shapes(sites):
         site, end = predictor.site, predictor.site.still_end
-        asked = read_query_places(sites, (end,))
-        where = asked.ends[end]
-        above = np.full(len(asked), height) if where.height is None else where.height
-        given = {head: words for head, role, words in asked.table if role in (None, "row_name")}
-        return to_world(replace(asked, ends={end: replace(where, height=above)}), site)[end], given
+        queries = read_query_places(sites, (end,))
+        where = queries.ends[end]
+        above = np.full(len(queries), height) if where.height is None else where.height
+        columns = {head: words for head, role, words in queries.table if role in (None, "row_name")}
+        return to_world(replace(queries, ends={end: replace(where, height=above)}), site)[end], columns
     if sites is not None:
         every, _ = walkable_places(sites, grid, "sites")
     else:
@@ -292,17 +292,17 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
 def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: NewAntenna) -> Any:
     """Level and deviation (n,) [dB] of the strongest sector at `place` (3,), in cells (n, 3)."""
     like = antenna.find_alike(predictor.site.every_station)
-    known = predictor.predict_new(cells, place, antenna.sectors(), like)
-    if known is None and (antenna.azimuth is not None or like is not None):
+    prediction = predictor.predict_new(cells, place, antenna.sectors(), like)
+    if prediction is None and (antenna.azimuth is not None or like is not None):
         lacks = (
             "carrier_hz: {} knows no bands" if antenna.azimuth is None else "azimuth: {} knows no patterns"
         )
         raise DataError(f"antenna.{lacks.format(predictor.method.name)}; model=gsparc does")
-    if known is None:
+    if prediction is None:
         level, spread = predict_levels(predictor, cells, station=place)
     else:
-        strongest = known[0].argmax(1)[:, None]
-        level, spread = (np.take_along_axis(part, strongest, 1)[:, 0] for part in known)
+        strongest = prediction[0].argmax(1)[:, None]
+        level, spread = (np.take_along_axis(part, strongest, 1)[:, 0] for part in prediction)
     return np.nan_to_num(level + antenna.power_db, nan=-np.inf), np.nan_to_num(spread, nan=1.0)
 
 

@@ -218,12 +218,12 @@ def choose_greedily(
             return chosen, expected, f"{why} after {len(chosen)} places"
         best = int(np.where(possible, gains, -np.inf).argmax())
         # Mean square errors subtract, roots do not.
-        left = float(np.sqrt(max(error**2 - gains[best] / (len(unknown) * wanted.sum()), 0)))
-        if (gain := error - left) < least_gain_db:
+        error_after = float(np.sqrt(max(error**2 - gains[best] / (len(unknown) * wanted.sum()), 0)))
+        if (gain := error - error_after) < least_gain_db:
             return chosen, expected, f"the next place gains {gain:.2g} dB, less than {least_gain_db:g} dB"
         for one in unknown:
             one.condition_on(first + best)
-        error = left
+        error = error_after
         chosen.append(best)
         expected.append(error)
         tour.add(best)

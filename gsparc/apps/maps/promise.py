@@ -129,10 +129,10 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
         cut = learned.cut_folds(1, settings.seed + number // len(SIDES), split)
         inner = learned.drop_unlearned(cut.folds[0])
         rng = np.random.default_rng([settings.seed, number])
-        tried = np.sort(rng.permutation(inner.test)[: settings.rows])
+        rows = np.sort(rng.permutation(inner.test)[: settings.rows])
         # Blocks of two folds are never one, though they may hold the same rows.
-        unit = cut.unit[tried] + number * (len(data) + 1)
-        return leave_out(learned, replace(inner, test=tried), unit, split)
+        unit = cut.unit[rows] + number * (len(data) + 1)
+        return leave_out(learned, replace(inner, test=rows), unit, split)
 
     folds = range(max(settings.folds, int(np.ceil(ROWS_OUT / SHARE_OUT / len(learned.rows)))))
     parts = run_all(evidence_without, folds, "fits without blocks of places")
@@ -195,18 +195,18 @@ def map_notes(
     if (outage := figures["map/outage"]) is not None:
         level = f"{field.threshold_db:g} {field.unit} or more of some station (the mean of 1 - outage)"
         ends = "" if covered is None else " (90 % interval {:.1%} to {:.1%})".format(*covered)
-        left = (field.grid.inside & field.refused).sum() / max(field.grid.inside.sum(), 1)
-        only = f" ({left:.0%} of the area is refused, and not among them)" * bool(left)
+        refused_share = (field.grid.inside & field.refused).sum() / max(field.grid.inside.sum(), 1)
+        only = f" ({refused_share:.0%} of the area is refused, and not among them)" * bool(refused_share)
         notes.append(f"{1 - float(outage):.1%}{ends} of the predicted squares{only} with {level}")
     if field.unit == "dB":
         notes.append("levels are in dB, as the data name no unit: if they are dBm, say unit=dBm")
     if coverage is None:
-        own = "they are the model's own deviations, and no place is refused as too far from data"
-        return [*notes, f"intervals are not tested: {own}"]
+        caveat = "they are the model's own deviations, and no place is refused as too far from data"
+        return [*notes, f"intervals are not tested: {caveat}"]
     tested = f"tested on {coverage.rows} heard rows of {coverage.blocks} held-out blocks"
-    held = f"{coverage.share:.1%} of these rows held, {coverage.width_db:.1f} dB wide in their mean"
+    outcome = f"{coverage.share:.1%} of these rows held, {coverage.width_db:.1f} dB wide in their mean"
     of_map = f"in the map {figures['map/width_db']:.1f} dB, the strongest's over predicted squares"
-    notes.append(f"{field.share:.0%} intervals, {tested}: {held}; {of_map}")
+    notes.append(f"{field.share:.0%} intervals, {tested}: {outcome}; {of_map}")
     if figures["map/refused"]:
         squares = f"{figures['map/refused']} of {int(field.grid.inside.sum())} squares"
         notes.append(f"{squares} are refused: too far from what was measured")

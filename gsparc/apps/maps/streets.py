@@ -40,8 +40,8 @@ class StreetGraph:
         # To the micrometre: ends that are computed from two lines are one node.
         node, number = np.unique(corner.round(6), axis=0, return_inverse=True)
         pairs = np.stack([number.reshape(-1)[:-1], number.reshape(-1)[1:]])[:, piece[1:] == piece[:-1]]
-        apart = np.linalg.norm(node[pairs[0]] - node[pairs[1]], axis=1)
-        return cls(node, csr_matrix((apart, pairs), shape=(len(node), len(node))))
+        lengths = np.linalg.norm(node[pairs[0]] - node[pairs[1]], axis=1)
+        return cls(node, csr_matrix((lengths, pairs), shape=(len(node), len(node))))
 
 
 @dataclass(frozen=True)

@@ -100,17 +100,17 @@ def merge_paths(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | No
         towards: (N, 3); None where not known.
     """
     gain = gain.astype(np.complex128)
-    left = np.argsort(-(np.abs(gain) ** 2).mean(axis=0))
+    queue = np.argsort(-(np.abs(gain) ** 2).mean(axis=0))
     firsts, power = [], []
-    while len(left):
-        first = left[0]
-        alike = left == first
+    while len(queue):
+        first = queue[0]
+        alike = queue == first
         if towards is not None:
-            near = np.abs(delay_ns[left] - delay_ns[first]) < SAME_NS
-            alike |= near & (towards[left] @ towards[first] > SAME_COSINE)
+            near = np.abs(delay_ns[queue] - delay_ns[first]) < SAME_NS
+            alike |= near & (towards[queue] @ towards[first] > SAME_COSINE)
         firsts.append(first)
-        power.append(float((np.abs(gain[:, left[alike]].sum(axis=1)) ** 2).mean()))
-        left = left[~alike]
+        power.append(float((np.abs(gain[:, queue[alike]].sum(axis=1)) ** 2).mean()))
+        queue = queue[~alike]
     level = np.array(power)
     order = np.argsort(-level)
     order = order[level[order] > level.max(initial=0.0) * 10 ** (-SILENT_DB / 10)]

@@ -30,8 +30,8 @@ def explain_level(answer: Answer, moving: str, tree: cKDTree | None) -> list[str
     if there is not None:
         lines.append(f"{float(np.linalg.norm(here - there)):.3g} m from the other end")
     if tree is not None:
-        apart = float(tree.query(here)[0])
-        lines.append("measured here" if apart < 1e-3 else f"nearest measurement: {apart:.3g} m away")
+        distance = float(tree.query(here)[0])
+        lines.append("measured here" if distance < 1e-3 else f"nearest measurement: {distance:.3g} m away")
     return lines + _paths(answer)
 
 

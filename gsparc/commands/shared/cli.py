@@ -67,7 +67,7 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
         sys.argv[1:] = add_settings_of_run(sys.argv[1:])
     before = os.environ.get(FULL_ERROR)
     os.environ[FULL_ERROR] = "1"  # Hydra then raises instead of printing and exiting by itself
-    given, words = _read_options(sys.argv[1:])
+    options, words = _read_options(sys.argv[1:])
     # Hydra takes overrides in one piece alone, which options would cut.
     sys.argv[1:] = words + [word for word in sys.argv[1:] if word not in words]
     main = hydra.main(version_base="1.3", config_path=CONFIGS, config_name=config)(_bypass(task))
@@ -77,11 +77,11 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     try:
         with _noting(interrupts):
             refuse_seconds(dict(word.lstrip("+").split("=", 1) for word in words if "=" in word))
-            for folder in (given.config_dir, given.config_path):
+            for folder in (options.config_dir, options.config_path):
                 check_yaml(folder)
-            if given.cfg and given.multirun:
+            if options.cfg and options.multirun:
                 raise ValueError("--cfg shows one job: leave out -m, and give one value of each setting")
-            if given.cfg in ("job", "all"):
+            if options.cfg in ("job", "all"):
                 _show_whole(main)
             else:
                 main()
@@ -114,15 +114,15 @@ def _read_options(words: list[str]) -> tuple[argparse.Namespace, list[str]]:
         parser.add_argument(*name.split())
     parser.add_argument("--info", "-i", nargs="?")
     parser.add_argument("--multirun", "-m", action="store_true")
-    given, rest = parser.parse_known_args(words)
-    return given, [word for word in rest if not word.startswith("-")]
+    options, rest = parser.parse_known_args(words)
+    return options, [word for word in rest if not word.startswith("-")]
 
 
 def _show_whole(main: Callable[[], object]) -> None:
     """What `--cfg` prints, with those settings of the model that its file leaves to its class."""
-    with redirect_stdout(StringIO()) as said:
+    with redirect_stdout(StringIO()) as output:
         main()
-    config = DictConfig(OmegaConf.create(said.getvalue()))
+    config = DictConfig(OmegaConf.create(output.getvalue()))
     node = config if "_target_" in config else config.get("model")  # the former with `--package model`
     if isinstance(node, DictConfig):
         registry.fill_defaults(node)

@@ -21,26 +21,26 @@ def add_settings_of_run(words: Sequence[str]) -> list[str]:
         words: overrides and options. A group chosen among them, as `model=gp`, leaves out what the run was
             told of that group. A run that was interrupted finishes in its folder, unless another is given.
     """
-    said = {_key(word): word.partition("=")[2].strip("'\"") for word in words if not word.startswith("-")}
-    if said.get("ckpt_path", "") in ("", "null"):
+    values = {_key(word): word.partition("=")[2].strip("'\"") for word in words if not word.startswith("-")}
+    if values.get("ckpt_path", "") in ("", "null"):
         return [*words]
-    left = Path(said["ckpt_path"]).resolve()
-    notes = [folder / ".hydra" for folder in (left, *left.parents)[:DEEP]]
-    told = next((folder for folder in notes if (folder / "overrides.yaml").exists()), None)
-    if told is None:
+    ckpt = Path(values["ckpt_path"]).resolve()
+    notes = [folder / ".hydra" for folder in (ckpt, *ckpt.parents)[:DEEP]]
+    hydra_dir = next((folder for folder in notes if (folder / "overrides.yaml").exists()), None)
+    if hydra_dir is None:
         return [*words]
-    files = (told / "overrides.yaml", told / "hydra.yaml")
+    files = (hydra_dir / "overrides.yaml", hydra_dir / "hydra.yaml")
     its, hydra = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in files)
-    own = [one for one in its if not {_key(one), _key(one).partition(".")[0]} & said.keys()]
-    own = [one for one in own if _key(one).rpartition(".")[2] not in GONE]  # of runs that seconds ended
-    own = [_found_from(Path(hydra["hydra"]["runtime"]["cwd"]), one) for one in own]
+    lines = [one for one in its if not {_key(one), _key(one).partition(".")[0]} & values.keys()]
+    lines = [one for one in lines if _key(one).rpartition(".")[2] not in GONE]  # of runs that seconds ended
+    lines = [_found_from(Path(hydra["hydra"]["runtime"]["cwd"]), one) for one in lines]
     if {"-m", "--multirun"} & {*words}:
-        return [*own, *words]
-    own.append("hydra.mode=RUN")  # it may be a job of a multirun
+        return [*lines, *words]
+    lines.append("hydra.mode=RUN")  # it may be a job of a multirun
     # What a finished run has left stays as it is, and so do the settings that an interrupted one began with.
-    if "hydra.run.dir" not in said and not (told.parent / SUMMARY).exists():
-        own += [f"hydra.run.dir='{told.parent}'", "hydra.output_subdir=null"]
-    return [*own, *words]
+    if "hydra.run.dir" not in values and not (hydra_dir.parent / SUMMARY).exists():
+        lines += [f"hydra.run.dir='{hydra_dir.parent}'", "hydra.output_subdir=null"]
+    return [*lines, *words]
 
 
 def _key(override: str) -> str:

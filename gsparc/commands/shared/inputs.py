@@ -89,9 +89,9 @@ def _data(config: DictConfig, known: Measurements | None) -> DataModule:
         module.measurements = known
     module.measurements  # noqa: B018 (read now, so that errors show the path that was typed)
     for key in ("root", "file"):  # absolute, so that a checkpoint finds its data from any folder
-        given = None if OmegaConf.is_missing(config.dataset, key) else config.dataset.get(key)
-        if given:
-            config.dataset[key] = str(Path(given).resolve())
+        location = None if OmegaConf.is_missing(config.dataset, key) else config.dataset.get(key)
+        if location:
+            config.dataset[key] = str(Path(location).resolve())
     if start is not None:
         try:
             module.measurements = align_to_site(module.measurements, checkpoint.read(start).site, whole=True)

@@ -21,15 +21,15 @@ def offer_plugins() -> None:
     for group in GROUPS:
         for name, path in plugins(group).items():
             try:
-                own = config_node(get_class(path))
+                defaults = config_node(get_class(path))
             except Exception as error:  # whatever another package does when it is imported
                 warnings.warn(f"plugin {name} ({path}) is left out: {error}", stacklevel=1)
                 continue
             shared: dict[str, Any] = {"name": name, "batch_size": 16} if group == "dataset" else {}
-            if group == "model" and "seed" in own:
+            if group == "model" and "seed" in defaults:
                 # What a plugin draws follows the seed of the run.
                 shared["seed"] = "${seed}"
-            node = {**own, **shared}
+            node = {**defaults, **shared}
             ConfigStore.instance().store(name=name, group=group, node=node, provider="plugin")
 
 

@@ -57,16 +57,16 @@ class RunSettings(Checked):
         values = OmegaConf.to_container(config, resolve=True)
         assert isinstance(values, dict)
         refuse_seconds(dict(_leaves(values)))
-        known: dict[str, Any] = {f.name: values[f.name] for f in fields(cls) if f.name in values}
+        arguments: dict[str, Any] = {f.name: values[f.name] for f in fields(cls) if f.name in values}
         if "model" not in values:  # names of stations to ask, not how they are learned
-            known.pop("stations", None)
-        settings = cls(**{**known, "baselines": _methods(known.get("baselines", []))})
+            arguments.pop("stations", None)
+        settings = cls(**{**arguments, "baselines": _methods(arguments.get("baselines", []))})
         trainer = values.get("trainer") or {}
         clip = trainer.get("gradient_clip_val")
         or_null(POSITIVE).check("trainer.gradient_clip_val", clip)  # Lightning takes any number
         if few := trainer.get("overfit_batches"):  # starts in closed form and refits learn from all rows
-            said = f"trainer.overfit_batches={few}: not supported; split.train_count=32 learns from few rows"
-            raise SettingError(f"{said}, which eval_on=train then scores")
+            fault = f"trainer.overfit_batches={few}: not supported; split.train_count=32 learns from few rows"
+            raise SettingError(f"{fault}, which eval_on=train then scores")
         accelerator = trainer.get("accelerator", "auto")
         kinds = ["auto", "gpu", *_accelerators()] if trainer else [accelerator]
         if accelerator not in kinds:  # Lightning says so, but not where a model takes no steps

@@ -40,12 +40,12 @@ def layout_warnings(data: Measurements) -> list[str]:
     declared = _unexplained(few, site.array)
     if declared < UNEXPLAINED:
         return []
-    found = {words: left for words, left in _rivals(few) if left < RIVAL * declared}
+    found = {words: residual for words, residual in _rivals(few) if residual < RIVAL * declared}
     best = min(found, key=lambda words: found[words], default=None)
     if best is None:
         return []
-    left = f"{declared:.1%} of these spectra cannot be of the declared array, {found[best]:.2%}"
-    return [f"{left} with {best}: is it that?"]
+    residual = f"{declared:.1%} of these spectra cannot be of the declared array, {found[best]:.2%}"
+    return [f"{residual} with {best}: is it that?"]
 
 
 def _rivals(data: Measurements) -> Iterator[tuple[str, float]]:
@@ -90,13 +90,13 @@ def carrier_warnings(data: Measurements) -> list[str]:
         shifted += [f"{name} ({where})" for where in ways]
     found = []
     if shifted:
-        said = "spectra are more like those of other carriers at the place before or after theirs"
-        found.append(f"{said} at {', '.join(shifted)}: are their rows shifted by one?")
+        symptom = "spectra are more like those of other carriers at the place before or after theirs"
+        found.append(f"{symptom} at {', '.join(shifted)}: are their rows shifted by one?")
     mirrored = convert_conventions(data, ["clockwise"])
     gain = _along_direct_path(mirrored) - _along_direct_path(data)
     if _clear(np.bincount(data.place, gain) / np.bincount(data.place)):
-        said = "direct paths are where azimuths that run the other way would have them"
-        found.append(f"{said}: is an axis mirrored? dataset.clockwise=true mends azimuths")
+        symptom = "direct paths are where azimuths that run the other way would have them"
+        found.append(f"{symptom}: is an axis mirrored? dataset.clockwise=true mends azimuths")
     return found
 
 

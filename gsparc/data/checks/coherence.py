@@ -55,9 +55,9 @@ class Coherence:
     freedom: Freedom
 
     def __str__(self) -> str:
-        own = "" if self.freedom == "none" else f"every row has {describe_freedom(self.freedom)} of its own: "
+        tag = "" if self.freedom == "none" else f"every row has {describe_freedom(self.freedom)} of its own: "
         return (
-            f"{own}rows {self.distance * 1e3:.3g} mm apart correlate by {self.as_measured:.2f} as measured, "
+            f"{tag}rows {self.distance * 1e3:.3g} mm apart correlate by {self.as_measured:.2f} as measured, "
             f"by {self.phase:.2f} after a free phase, {self.delay:.2f} after a free delay too; their levels "
             f"scatter by {self.level_db:.1f} dB ({self.pairs} pairs)"
         )
@@ -98,8 +98,8 @@ def estimate_coherence(data: Measurements) -> Coherence | None:
         freedom = "phase+delay" if delay > phase + MORE else "phase"
         least = scatter * (1 - 2 * SPREAD / np.sqrt(len(near)))  # few pairs that fade scatter by chance
         freedom = "phase+delay+gain" if least > SCATTER_DB[reach] else freedom
-    apart = np.linalg.norm(rows.places[near[:, 0]] - rows.places[near[:, 1]], axis=1)
-    return Coherence(len(near), float(np.median(apart)), float(measured), phase, delay, scatter, freedom)
+    distances = np.linalg.norm(rows.places[near[:, 0]] - rows.places[near[:, 1]], axis=1)
+    return Coherence(len(near), float(np.median(distances)), float(measured), phase, delay, scatter, freedom)
 
 
 def set_freedom(data: Measurements, align: str) -> Measurements:
@@ -120,9 +120,9 @@ def set_freedom(data: Measurements, align: str) -> Measurements:
             return data
         freedom = found.freedom
         log.warning("%s; they are aligned (dataset.align=none keeps them as they are)", found)
-        if (apart := neighbour_distance(data.moving) / (data.site.wavelength or np.inf)) > IN_LINE:
+        if (spacing := neighbour_distance(data.moving) / (data.site.wavelength or np.inf)) > IN_LINE:
             what = "neighbours tell levels, not the shape over subcarriers"
-            log.warning("places are %.3g wavelengths apart: %s", apart, what)
+            log.warning("places are %.3g wavelengths apart: %s", spacing, what)
     return replace(data, site=replace(data.site, freedom=freedom))
 
 
@@ -137,13 +137,13 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _neighbours(rows: Snapshots, reach: float, pairs: bool) -> np.ndarray:
     """Rows of one run within `reach` [m]: pairs (P, 2), or triples (P, 3) in line, the middle one first."""
     found = [np.zeros((0, 2 if pairs else 3), np.int64)]
-    for _, own in rows_by(rows.run):
-        at = rows.places[own]
-        near, index = (part.reshape(len(own), -1) for part in cKDTree(at).query(at, k=min(AROUND, len(own))))
-        good = (near <= reach) & (index != np.arange(len(own))[:, None])
+    for _, run in rows_by(rows.run):
+        at = rows.places[run]
+        near, index = (part.reshape(len(run), -1) for part in cKDTree(at).query(at, k=min(AROUND, len(run))))
+        good = (near <= reach) & (index != np.arange(len(run))[:, None])
         if pairs:
-            one, column = np.nonzero(good & (index > np.arange(len(own))[:, None]))
-            found.append(own[np.c_[one, index[one, column]]])
+            one, column = np.nonzero(good & (index > np.arange(len(run))[:, None]))
+            found.append(run[np.c_[one, index[one, column]]])
             continue
         good &= near > 0
         step = (at[index] - at[:, None]) / np.maximum(near, 1e-12)[..., None]
@@ -153,6 +153,6 @@ def _neighbours(rows: Snapshots, reach: float, pairs: bool) -> np.ndarray:
         opposite = good & ((step * towards).sum(-1) < STRAIGHT) & (length > EVEN * near)
         middle = np.flatnonzero(good.any(1) & opposite.any(1))
         third = opposite.argmax(1)
-        found.append(own[np.c_[middle, index[middle, first[middle]], index[middle, third[middle]]]])
+        found.append(run[np.c_[middle, index[middle, first[middle]], index[middle, third[middle]]]])
     every = np.concatenate(found)
     return every[evenly_spaced(len(every), MOST)]

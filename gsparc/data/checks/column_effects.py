@@ -102,12 +102,12 @@ def find_effects(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, n
     while len(links) >= LEAST_ROWS and len(found) < MOST_EFFECTS:
         plain, pairs = _fit(links, links.station), (_near_pairs(links), _far_pairs(links, rng))
         rest = [head for head in columns if head not in {one.head for one in found}]
-        tried = [_effect(links, plain, pairs, head, texts[head], values[head]) for head in rest]
-        known = sorted((one for one in tried if one is not None), key=lambda one: one.contrast)
-        if not known:
+        candidates = [_effect(links, plain, pairs, head, texts[head], values[head]) for head in rest]
+        effects = sorted((one for one in candidates if one is not None), key=lambda one: one.contrast)
+        if not effects:
             break
         # Of columns that tell the same apart the first of the fewest values.
-        alike = (one for one in known if one.contrast <= ALIKE * known[0].contrast)
+        alike = (one for one in effects if one.contrast <= ALIKE * effects[0].contrast)
         best = min(alike, key=lambda one: texts[one.head].max())
         found.append(best)
         value = values[best.head]
@@ -125,14 +125,14 @@ def run_warnings(data: Measurements) -> list[str]:
     if not data.site.maps_levels or data.run is None:
         return []
     links, rows = LevelsAtPlaces.of(data)
-    said = {
+    hints = {
         "transmitter": "did what stands still move between them? dataset.runs=[NAME] takes one",
         "device": "another gain or device in each? dataset.columns.device=HEAD takes offsets off a table's",
     }
     return [
-        f"runs explain {one.share:.0%} of what places and stations leave: {said[one.kind]}"
+        f"runs explain {one.share:.0%} of what places and stations leave: {hints[one.kind]}"
         for one in find_effects(links, rows, {"run": data.run.astype(str)})
-        if one.kind in said
+        if one.kind in hints
     ]
 
 
@@ -141,22 +141,22 @@ def find_filled(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, np
 
     What is interpolated has no noise of its own: it differs far less from its neighbours than a measurement.
     """
-    filled, apart = {}, np.full(len(links), np.nan)
-    for _, own in rows_by(links.station):
-        if len(own) > NEAR:
-            near = cKDTree(links.place[own]).query(links.place[own], k=NEAR // 2 + 1)[1][:, 1:]
-            apart[own] = links.level[own] - links.level[own][near].mean(1)
+    filled, delta = {}, np.full(len(links), np.nan)
+    for _, rows in rows_by(links.station):
+        if len(rows) > NEAR:
+            near = cKDTree(links.place[rows]).query(links.place[rows], k=NEAR // 2 + 1)[1][:, 1:]
+            delta[rows] = links.level[rows] - links.level[rows][near].mean(1)
     for head, words in columns.items():
-        said = np.char.lower(words[row])
-        if {*np.unique(said).tolist()} not in TRUTHS:
+        cells = np.char.lower(words[row])
+        if {*np.unique(cells).tolist()} not in TRUTHS:
             continue
-        spread = {value: apart[(said == value) & np.isfinite(apart)] for value in np.unique(said).tolist()}
+        spread = {value: delta[(cells == value) & np.isfinite(delta)] for value in np.unique(cells).tolist()}
         (smooth, less), (_, more) = sorted(spread.items(), key=lambda item: np.median(np.abs(item[1])))
         if min(len(less), len(more)) < LEAST_ROWS / 3:
             continue
         ratio = math.log(max(float(np.var(less)), 1e-12) / float(np.var(more)))
         if ratio < math.log(SMOOTH) and ratio < -SURE * math.sqrt(2 / len(less) + 2 / len(more)):
-            filled[head] = str(words[row][said == smooth][0])
+            filled[head] = str(words[row][cells == smooth][0])
     return filled
 
 
@@ -214,22 +214,22 @@ def _contrast(
         slope: that multiplies numbers; 0: none.
     """
     level, which = links.level, np.unique(links.station, return_inverse=True)[1].reshape(-1)
-    left = level - slope * code if slope else level
+    residual = level - slope * code if slope else level
     # Stations of few rows are looked at together, about their own means.
     few = np.bincount(which)[which] < LEAST_ROWS / 3
     for one in np.unique(part := np.where(few, -1, which)):
-        own = part == one
-        whole, within = (_centred(value[own], which[own]) for value in (level, left))
-        within = within if slope else _centred(within, code[own])
-        if np.var(within) < (1 - COPY[int(which.max() > 0)]) * np.var(whole) and own.sum() >= LEAST_ROWS / 3:
+        mask = part == one
+        whole, within = (_centred(value[mask], which[mask]) for value in (level, residual))
+        within = within if slope else _centred(within, code[mask])
+        if np.var(within) < (1 - COPY[int(which.max() > 0)]) * np.var(whole) and mask.sum() >= LEAST_ROWS / 3:
             return 1.0
     rest = []
     for first, second in (pair.T for pair in pairs):
         change, step = level[first] - level[second], code[first] - code[second]
-        left = change - slope * step if slope else change[step == 0]
-        if min(len(left), (step != 0).sum()) < NEAR:
+        residual = change - slope * step if slope else change[step == 0]
+        if min(len(residual), (step != 0).sum()) < NEAR:
             return 1.0
-        rest.append(float((left**2).mean() / max((change**2).mean(), 1e-12)))
+        rest.append(float((residual**2).mean() / max((change**2).mean(), 1e-12)))
     contrast = rest[0] / max(rest[1], 1e-12)
     if rest[1] > WEAK and contrast < 1 / LESS:  # it tells nothing of far rows
         return min(contrast, LESS)
@@ -245,17 +245,17 @@ def _centred(value: np.ndarray, group: np.ndarray) -> np.ndarray:
 def _near_pairs(links: LevelsAtPlaces) -> np.ndarray:
     """Pairs (P, 2) of near rows of a station."""
     pairs = [np.zeros((0, 2), np.int64)]
-    for _, own in rows_by(links.station):
-        count = min(NEAR + 1, len(own))
-        index = own[cKDTree(links.place[own]).query(links.place[own], k=count)[1].reshape(-1, count)]
-        both = np.sort(np.c_[np.repeat(own, count), index.ravel()], axis=1)
+    for _, rows in rows_by(links.station):
+        count = min(NEAR + 1, len(rows))
+        index = rows[cKDTree(links.place[rows]).query(links.place[rows], k=count)[1].reshape(-1, count)]
+        both = np.sort(np.c_[np.repeat(rows, count), index.ravel()], axis=1)
         pairs.append(np.unique(both[both[:, 0] != both[:, 1]], axis=0))
     return np.concatenate(pairs)
 
 
 def _far_pairs(links: LevelsAtPlaces, rng: np.random.Generator) -> np.ndarray:
     """Pairs (P, 2) of any rows of a station."""
-    pairs = np.concatenate([rng.choice(own, (4 * NEAR * len(own), 2)) for _, own in rows_by(links.station)])
+    pairs = np.concatenate([rng.choice(ids, (4 * NEAR * len(ids), 2)) for _, ids in rows_by(links.station)])
     return pairs[pairs[:, 0] != pairs[:, 1]]
 
 

@@ -101,8 +101,8 @@ def _arrayed(data: Measurements) -> tuple[Measurements, np.ndarray]:
 def _drawn(data: Measurements) -> np.ndarray:
     """Rows (n,) at places of their own, drawn at random; channels half a wavelength apart."""
     place, kind = np.hstack([data.tx, data.rx_position]), data.site.kind
-    known = np.flatnonzero(np.isfinite(place).all(axis=1))
-    order = np.random.default_rng(0).permutation(known)[: 20 * ROWS]
+    rows = np.flatnonzero(np.isfinite(place).all(axis=1))
+    order = np.random.default_rng(0).permutation(rows)[: 20 * ROWS]
     if not len(order):
         return order
     side = float(np.ptp(place[order], axis=0).max()) / ROWS + 1e-9
@@ -159,10 +159,10 @@ def _rivals_of_places(data: Measurements) -> list[str]:
     Beside a field of levels for each station: what is alike about near rows says nothing of distances.
     """
     links, rows = LevelsAtPlaces.of(data)
-    known = np.flatnonzero(np.isfinite(np.hstack([data.tx, data.rx_position])[rows]).all(axis=1))
-    if data.site.static_end is None or len(known) < FEWEST["spectrum"]:
+    candidates = np.flatnonzero(np.isfinite(np.hstack([data.tx, data.rx_position])[rows]).all(axis=1))
+    if data.site.static_end is None or len(candidates) < FEWEST["spectrum"]:
         return []
-    drawn = known[draw_rows(len(known), ROWS, 0)]
+    drawn = candidates[draw_rows(len(candidates), ROWS, 0)]
     data, links = data.subset(rows[drawn]), links.take(drawn)
 
     def score(placed: Measurements, least: float = 10 * EXPONENTS[0]) -> float:

@@ -15,7 +15,7 @@ from gsparc.ops import SphereGrid
 
 def describe(data: Measurements) -> list[tuple[str, str]]:
     """Return (topic, sentence) pairs about a dataset; topics of what it has none of are left out."""
-    site, own, error = data.site, data.release_split, data.site.convergence_error
+    site, pair, error = data.site, data.release_split, data.site.convergence_error
     phases = estimate_coherence(data)
     tones = np.zeros(1) if site.subcarriers_hz is None else site.subcarriers_hz
     weak, strong = (int((data.censored_side() == side).sum()) for side in (1, -1))
@@ -39,7 +39,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("mask", f"{data.mask.mean():.1%} of the entries were measured"
          if data.mask is not None and data.censored is None else ""),
         ("directions", "" if paths is None else f"{sum(map(len, paths))} directions of arrival"),
-        ("split", "" if own is None else f"its own: {len(own[0])} rows to train, {len(own[1])} to test"),
+        ("split", "" if pair is None else f"its own: {len(pair[0])} rows to train, {len(pair[1])} to test"),
         ("split?", propose_split(data)),
         ("convergence", "" if error is None else f"solver error (NMSE between two seeds) {error:.3g}"),
         ("sha256", site.sha256),
@@ -102,10 +102,10 @@ def _static(site: Site) -> str:
         return "neither end"
     end, stations = ENDS[site.static_end], site.every_station
     if site.stations is not None and (site.several or site.static_position is None):
-        known = stations.position[np.isfinite(stations.position).all(axis=1)]
-        lost = len(stations) - len(known)
-        where = _box(known) if len(known) else ""
-        where += f", {lost} of them at unknown places" if lost else ""
+        places = stations.position[np.isfinite(stations.position).all(axis=1)]
+        unknown_count = len(stations) - len(places)
+        where = _box(places) if len(places) else ""
+        where += f", {unknown_count} of them at unknown places" if unknown_count else ""
         count = f"{len(stations)} station{'s' * (len(stations) > 1)}"
         return f"the {end}, {count}{where}: {list_first(stations.shown, 4)}"
     if site.static_position is None:

@@ -42,7 +42,7 @@ class LinkLevels:
 
     def heard(self) -> Iterator[tuple[int, np.ndarray]]:
         """Yield each station, and its rows (k,) with a value."""
-        yield from ((t, own[np.isfinite(self.level_db[own])]) for t, own in rows_by(self.station))
+        yield from ((t, rows[np.isfinite(self.level_db[rows])]) for t, rows in rows_by(self.station))
 
 
 def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkLevels | None:
@@ -71,14 +71,14 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     absent = np.zeros(0, np.int64)
     # What was not heard is known to be weak, or was said to be unknown, which `links.absent` judges; a file
     # with a station for each place, as of serving cells, has no empty cells.
-    told = data.censored is not None or data.provenance.get("absent") == "unknown"
-    if not told and len(first) < len(np.unique(link)):
+    absence_stated = data.censored is not None or data.provenance.get("absent") == "unknown"
+    if not absence_stated and len(first) < len(np.unique(link)):
         absent = np.setdiff1d(np.arange(len(first) * count), link)
     parts = [name.split(FROM_ROW) for name in stations.name]
     for t in [t for t, (name, *_) in enumerate(parts) if sum(name == other for other, *_ in parts) > 1]:
         # A part of a station is not absent before its first row or after its last.
-        at, own = absent // count, which[station == t]
-        within = (at > own.min(initial=len(first))) & (at < own.max(initial=0))
+        at, visits = absent // count, which[station == t]
+        within = (at > visits.min(initial=len(first))) & (at < visits.max(initial=0))
         absent = absent[(absent % count != t) | within]
     order = np.argsort(np.concatenate([rows, first[absent // count]]), kind="stable")
     of_row = np.concatenate([rows, first[absent // count]])[order]
@@ -88,5 +88,5 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     names, keys = ([name or UNNAMED for name in names] for names in (stations.shown, stations.name))
     number = of_row if file_row is None else file_row[of_row]
     place = data.moving[of_row] + site.origin
-    known = stations.position + site.origin
-    return LinkLevels(place, of_link, levels, of_file, number, names, keys, known, limited)
+    positions = stations.position + site.origin
+    return LinkLevels(place, of_link, levels, of_file, number, names, keys, positions, limited)

@@ -26,9 +26,9 @@ def misplaced_warnings(levels: LinkLevels) -> list[str]:
     Of the sectors of a site the strongest counts, so that no beam makes up for a distance.
     """
     where, first, site = np.unique(levels.station_position, axis=0, return_index=True, return_inverse=True)
-    site, known = site.reshape(-1)[levels.station], np.isfinite(where).all(axis=1)
+    site, finite = site.reshape(-1)[levels.station], np.isfinite(where).all(axis=1)
     heard = dict[int, np.ndarray]()
-    for one in np.flatnonzero(known)[:SITES].tolist():
+    for one in np.flatnonzero(finite)[:SITES].tolist():
         rows = np.flatnonzero((site == one) & np.isfinite(levels.level_db))
         rows = rows[np.argsort(-levels.level_db[rows], kind="stable")]
         rows = rows[np.sort(np.unique(levels.position[rows], axis=0, return_index=True)[1])]
@@ -40,26 +40,26 @@ def misplaced_warnings(levels: LinkLevels) -> list[str]:
     names, kilometres = [levels.names[t] for t in first], list[str]()
     for one, rows in heard.items():
         some = np.random.default_rng(0).permutation(rows)[:MOST]
-        places = np.vstack([where[one], where[one] * [1e3, 1e3, 1], where[one] + shifts, where[known]])
+        places = np.vstack([where[one], where[one] * [1e3, 1e3, 1], where[one] + shifts, where[finite]])
         gain = _gains(levels.position[some], levels.level_db[some], places)
         kilometres += [names[one]] * bool(gain[0] > LIKELY)
         shifted += np.maximum(gain[1 : 1 + len(SHARES)], -LIKELY)
         # Each that is tried may fit by chance.
-        gains[one, known] = gain[1 + len(SHARES) :] - math.log(len(where))
+        gains[one, finite] = gain[1 + len(SHARES) :] - math.log(len(where))
     gains[np.diag_indices(len(where))] = 0
     who = list_first(kilometres)
-    said = f"levels of {who} fall with distance from a place a thousand times as far: is it in kilometres?"
+    finding = f"levels of {who} fall with distance from a place a thousand times as far: is it in kilometres?"
     stated, likely = linear_sum_assignment(gains, maximize=True)
-    warnings, moved = [said] * bool(kilometres), np.flatnonzero(stated != likely)
+    warnings, moved = [finding] * bool(kilometres), np.flatnonzero(stated != likely)
     exchanged = gains[stated, likely].sum()
     if shifted.max() > max(CLEAR, exchanged) and len(heard) >= FEW:
         x, y, _ = shifts[shifted.argmax()]
-        said = f"fall with distance from places ({x:+.0f}, {y:+.0f}) m beside the stated ones"
-        warnings.append(f"levels of all {len(heard)} sites {said}: is their list about another origin?")
+        finding = f"fall with distance from places ({x:+.0f}, {y:+.0f}) m beside the stated ones"
+        warnings.append(f"levels of all {len(heard)} sites {finding}: is their list about another origin?")
     elif len(moved) >= FEW and exchanged > CLEAR:
         pairs = list_first([f"{names[i]} from that of {names[likely[i]]}" for i in moved])
-        said = f"levels fall with distance from places of other stations, {pairs}"
-        warnings.append(f"{said}: are names or places exchanged?")
+        finding = f"levels fall with distance from places of other stations, {pairs}"
+        warnings.append(f"{finding}: are names or places exchanged?")
     return warnings
 
 

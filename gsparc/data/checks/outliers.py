@@ -25,9 +25,9 @@ def find_strong_outliers(peaks: np.ndarray) -> np.ndarray:
     """Tell which rows (S,) have a largest magnitude, `peaks` (S,), far above all others'; no silent ones."""
     with np.errstate(divide="ignore"):
         level = 20 * np.log10(np.asarray(peaks, dtype=np.float64))
-    known = np.isfinite(level)
+    finite = np.isfinite(level)
     strong = np.zeros(len(level), bool)
-    strong[known] = _few_beyond(level[known], lambda inner, outer: outer - inner > GAP_DB)
+    strong[finite] = _few_beyond(level[finite], lambda inner, outer: outer - inner > GAP_DB)
     return strong
 
 

@@ -45,8 +45,8 @@ def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) 
         levels: of powers.
         steps: `find_level_steps` them.
     """
-    told = [*level_warnings(levels.level_db), *two_unit_warnings(levels), *floor_warnings(levels)]
-    severe = map(Severe, [*told, *misplaced_warnings(levels)])
+    texts = [*level_warnings(levels.level_db), *two_unit_warnings(levels), *floor_warnings(levels)]
+    severe = map(Severe, [*texts, *misplaced_warnings(levels)])
     warnings = [*severe, *twin_warnings(levels), *still_warnings(levels), *outlier_row_warnings(levels)]
     return [*warnings, *step_warnings(levels, steps), *gap_warnings(levels)]
 
@@ -82,40 +82,40 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         return [f"levels of {low:.4g} to {high:.4g}, most below thermal noise of a hertz: in decibels?"]
     whole = (np.abs(values - values.round()) < 1e-3).all()  # powers in single precision
     if low >= 0 and (high <= 1 or high > HIGHEST_DBM or whole):
-        said = f"no level of {low:g} to {high:g} is below 0: losses (store minus them; dataset.columns."
-        return [f"{said}rssi_db=HEAD*-1), per cent, an index, or linear (give it as rssi, in W)?"]
+        finding = f"no level of {low:g} to {high:g} is below 0: losses (store minus them; dataset.columns."
+        return [f"{finding}rssi_db=HEAD*-1), per cent, an index, or linear (give it as rssi, in W)?"]
     return []
 
 
 def two_unit_warnings(levels: LinkLevels) -> list[str]:
     """Warn of some levels in another unit, as dBW beside dBm: near rows agree, or are far apart."""
-    apart = [np.zeros(0)]
+    differences = [np.zeros(0)]
     for _, used in levels.heard():
         place, level = levels.position[used], levels.level_db[used]
         if len(used) > NEIGHBOURS:
-            apart.append(np.abs(level - level[cKDTree(place).query(place, 2)[1][:, 1]]))
-    rows = np.concatenate(apart)
+            differences.append(np.abs(level - level[cKDTree(place).query(place, 2)[1][:, 1]]))
+    rows = np.concatenate(differences)
     far, between = int((rows > APART_DB).sum()), int(((rows > APART_DB / 2) & (rows <= APART_DB)).sum())
     if far <= max(REPEATS, FEW_APART * len(rows), between):
         return []
-    said = f"{far} of {len(rows)} levels are over {APART_DB:g} dB from that of the nearest row"
-    return [f"{said}, {between} over {APART_DB / 2:g}: in two units?"]
+    finding = f"{far} of {len(rows)} levels are over {APART_DB:g} dB from that of the nearest row"
+    return [f"{finding}, {between} over {APART_DB / 2:g}: in two units?"]
 
 
 def floor_warnings(levels: LinkLevels) -> list[str]:
     """Warn of stations whose levels pile up at a receiver's own noise, or lowest reading."""
     piles, names = find_noise(levels.station, levels.level_db, levels.limited), levels.names
     # Upwards, so that levels below what is said are those of the pile; single precision has errors of 1e-6.
-    said = [
+    floors = [
         ("" if t < 0 else _of([names[t]], len(names)), float(np.ceil(round(100 * top, 3)) / 100), share)
         for t, (top, share) in piles.items()
     ]
-    shares = list_first([f"{share:.0%} of the levels{who} below {top:g} dB" for who, top, share in said])
+    shares = list_first([f"{share:.0%} of the levels{who} below {top:g} dB" for who, top, share in floors])
     return [
         f"not heard? {shares}, a receiver's noise or lowest reading, are learned as signals; sensitivity_db="
         f"{top:g} in the file (of a table dataset.columns.sensitivity_db={top:g}, or a column of stations, "
         "of each its own) takes levels below as not heard"
-        for top in sorted(top for _, top, _ in said)[-1:]
+        for top in sorted(top for _, top, _ in floors)[-1:]
     ]
 
 
@@ -126,7 +126,7 @@ def find_noise(
 
     NaN are no levels; stations `limited` have a level of hearing that is known.
     """
-    station, level_db = station[known := np.isfinite(level_db)], level_db[known]
+    station, level_db = station[finite := np.isfinite(level_db)], level_db[finite]
     heard = {int(t): level_db[station == t] for t in np.unique(station) if t not in limited}
     # Of a station that is seldom heard weak levels are missing, not piled up.
     often = max(map(len, heard.values()), default=0) / 2
@@ -147,8 +147,8 @@ def find_floor_pile(levels: np.ndarray) -> tuple[float, float] | None:
         return None
     if counts[0] > max(PILE * len(levels), 10, 5 * float(np.median(counts)), 3 * counts[1]):
         return float(different[1]), counts[0] / len(levels)
-    held = np.searchsorted(levels, levels + NOISE_DB, "right") - np.arange(len(levels))
-    first, count = int(held.argmax()), int(held.max())
+    window_counts = np.searchsorted(levels, levels + NOISE_DB, "right") - np.arange(len(levels))
+    first, count = int(window_counts.argmax()), int(window_counts.max())
     top = levels[first] + NOISE_DB
     after, end = np.searchsorted(levels, top + np.array([1, 1 + NOISE_DB]))  # a decibel above the pile
     low = first <= 0.1 * count + 2 and count >= max(PILED * len(levels), 15)
@@ -211,8 +211,8 @@ def still_warnings(levels: LinkLevels) -> list[str]:
             if len(piece) >= LONG_GAP and np.ptp(level) > STILL_DB and np.diff(level).var() < level.var() / 2:
                 where = levels.rows[piece[0]], levels.rows[piece[-1]], len(piece)
                 still[where][levels.names[t]] = float(np.ptp(level))
-    said = f"all rows{_of([*alone], len(levels.names))} are at one place, while levels change by up to "
-    return [f"{said}{max([0.0, *alone.values()]):.0f} dB: elsewhere nothing is learned of it"] * bool(
+    finding = f"all rows{_of([*alone], len(levels.names))} are at one place, while levels change by up to "
+    return [f"{finding}{max([0.0, *alone.values()]):.0f} dB: elsewhere nothing is learned of it"] * bool(
         alone
     ) + [
         f"{first} to {last}: one place for {count} rows, while levels change by {max(who.values()):.0f} dB"
@@ -265,16 +265,16 @@ def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) ->
     names, rows, warnings = levels.names, levels.rows, []
     for t in dict.fromkeys(t for t, _ in steps):
         who = f"station {names[t]}" if len(names) > 1 else "the level"
-        own = [step for one, step in steps if one == t]
-        said = " and ".join(
+        station_steps = [step for one, step in steps if one == t]
+        change = " and ".join(
             f"{'rises' if step.change_db > 0 else 'falls'} by {abs(step.change_db):.0f} dB between "
             f"{rows[step.last]} and {rows[step.first]}"
-            for step in own
+            for step in station_steps
         )
-        first = ",".join(str(levels.file_row[step.first]) for step in own)
+        first = ",".join(str(levels.file_row[step.first]) for step in station_steps)
         setting = f"'dataset.level_steps={{{levels.keys[t]}:[{first}]}}' (rows from 0) makes it another"
         setting = "" if names[t] == UNNAMED else f" {setting} station from there on"
-        warnings.append(f"{who} {said}, which the places do not explain: another gain or antenna?{setting}")
+        warnings.append(f"{who} {change}, which the places do not explain: another gain or antenna?{setting}")
     return warnings
 
 
@@ -320,17 +320,17 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
             (faint if unheard else plain)[name] = count
     if faint:
         # First of all: what is not heard and not said so leaves weak stations far too strong.
-        lost = f"{sum(faint.values())} levels are missing{_of([*faint], len(names))}, beside the weakest ones"
+        text = f"{sum(faint.values())} levels are missing{_of([*faint], len(names))}, beside the weakest ones"
         advice = "not heard? then say dataset.absent=silent"
-        warnings.append(f"{advice}: {lost}; left out, weak levels are predicted too high")
+        warnings.append(f"{advice}: {text}; left out, weak levels are predicted too high")
     for (first, last, length), who in sorted(outages.items(), key=lambda item: -item[0][2]):
         where = f"no level in the {length} rows from {first} to {last}{_of(who, len(names))}"
         warnings.append(f"{where}: off, or not listed; these rows are not used")
     if silent:
         warnings.append(f"no level in any row{_of(silent, len(names))}")
     if plain:
-        lost = f"{sum(plain.values())} single levels missing{_of([*plain], len(names))}"
-        warnings.append(f"{lost}, few or beside strong ones: lost or not listed; they are not used")
+        text = f"{sum(plain.values())} single levels missing{_of([*plain], len(names))}"
+        warnings.append(f"{text}, few or beside strong ones: lost or not listed; they are not used")
     return warnings
 
 

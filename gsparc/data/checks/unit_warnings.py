@@ -30,7 +30,7 @@ def unit_warnings(data: Measurements) -> list[str]:
         hints = next(filter(None, map(_position_hints, places)), [])
         still = np.zeros((0, 2)) if site.stations is None else site.stations.position[:, :2] + site.origin[:2]
         mixed = {"rows": _find_other_unit(places[1][:, :2]), "stations": _find_other_unit(still)}
-        hints = [f"of {who} {said}" for who, said in mixed.items() if said] or hints
+        hints = [f"of {who} {hint}" for who, hint in mixed.items() if hint] or hints
         if site.kind != "csi":  # an array's antennas stand close together
             hints += _compare_reaches(still, places[1][:, :2])
     if site.array is not None and site.wavelength is not None:
@@ -77,8 +77,8 @@ def _position_hints(positions: np.ndarray) -> list[str]:
     # Survey tools print millimetres as whole numbers; metres come with decimals.
     if across > 1000 and (positions % 1 == 0).all():
         size = " x ".join(f"{e / 1000:.4g}" for e in extent)
-        said = f"positions are whole numbers up to {across:.0f} apart"
-        return [f"{said}: millimetres? the box is {size} m then"]
+        finding = f"positions are whole numbers up to {across:.0f} apart"
+        return [f"{finding}: millimetres? the box is {size} m then"]
     if 0 < width < 0.01:
         return [f"everything lies within {width * 1e3:.2g} mm; if these are kilometres, convert to metres"]
     return []
@@ -86,10 +86,10 @@ def _position_hints(positions: np.ndarray) -> list[str]:
 
 def _group_hints(positions: np.ndarray) -> list[str]:
     """A warning of two groups of positions (n, 3) far apart."""
-    said = "lost digits, latitude and longitude exchanged in some rows, zones of a projection (give "
-    said += "degrees), or two sites (a file for each)?"
+    causes = "lost digits, latitude and longitude exchanged in some rows, zones of a projection (give "
+    causes += "degrees), or two sites (a file for each)?"
     groups = find_gap(positions[:, :2])
-    return [] if groups is None else [f"two groups of places {groups[1] / 1e3:.4g} km apart: {said}"]
+    return [] if groups is None else [f"two groups of places {groups[1] / 1e3:.4g} km apart: {causes}"]
 
 
 def _find_other_unit(places: np.ndarray) -> str:
@@ -107,8 +107,8 @@ def _find_other_unit(places: np.ndarray) -> str:
     small, wide = (float(np.ptp(some, axis=0).max()) for some in (spot, rest))
     kilometres = wide < 3e3 * small < 9 * wide and _are_thousandths(spot, rest, 0.5).all()
     if kilometres or (wide < 3 * DEGREE_M * small < 9 * wide and np.abs(spot).max() <= 180):
-        said = f"{len(spot)} of {len(places)} places lie within {small:.2g} m, the others over {wide:.4g} m: "
-        return f"{said}in {'kilometres' if kilometres else 'degrees'}? give all of them in one unit"
+        text = f"{len(spot)} of {len(places)} places lie within {small:.2g} m, the others over {wide:.4g} m: "
+        return f"{text}in {'kilometres' if kilometres else 'degrees'}? give all of them in one unit"
     return ""
 
 

@@ -90,8 +90,8 @@ def find_implausible(
     hints: list[str] = [Severe(f"units? {hint}") for hint in unit_warnings(data)]
     places = len(data) if data.place is None else len(np.unique(data.place))
     if places * len(data.site.every_station) > most:
-        said = "too many links to be looked at for implausible levels here; gsparc check does"
-        return [*hints, said], None, []
+        note = "too many links to be looked at for implausible levels here; gsparc check does"
+        return [*hints, note], None, []
     hints += map(Severe, convention_warnings(data))
     if (levels := link_levels(data, file_row)) is None:
         return hints, None, []

@@ -82,15 +82,15 @@ def apply_settings(
         SettingError: another word for a convention.
     """
     settings = {"not_heard": not_heard, "absent": absent, "saturation_db": saturation_db}
-    said: dict[str, Any] = {name: value for name, value in settings.items() if value not in (None, "auto")}
+    facts: dict[str, Any] = {name: value for name, value in settings.items() if value not in (None, "auto")}
     for name, follows in conventions.items():
         or_null(switch()).check(f"dataset.{name}", follows)
     followed = [name for name, follows in conventions.items() if follows]
-    said |= {"conventions": " ".join(followed)} if followed else {}
-    given = {"tx_position": tx_position, "frequency_hz": frequency_hz}
-    given |= {"carrier_hz": carrier_hz, "spacing_hz": spacing_hz}
-    arrays = {name: finite_array(value) for name, value in given.items() if value is not None}
-    return replace(raw, arrays={**raw.arrays, **arrays}, attributes={**raw.attributes, **said})
+    facts |= {"conventions": " ".join(followed)} if followed else {}
+    values = {"tx_position": tx_position, "frequency_hz": frequency_hz}
+    values |= {"carrier_hz": carrier_hz, "spacing_hz": spacing_hz}
+    arrays = {name: finite_array(value) for name, value in values.items() if value is not None}
+    return replace(raw, arrays={**raw.arrays, **arrays}, attributes={**raw.attributes, **facts})
 
 
 class Own(Campaign):
@@ -135,7 +135,7 @@ def read_any(path: str | Path, **settings: Any) -> Reading:
     # Releases before anything else: their folders may hold tables that look like one's own.
     release = dataset_by_path(path)
     if release is not None:
-        raw, said = release.reader(path), f"this is the release of dataset={release.choice}"
+        raw, note = release.reader(path), f"this is the release of dataset={release.choice}"
     elif path.is_dir():
         if not any((path / name).exists() for name in ("gateway_info.yml", "tx_pos.csv", "spectrum")):
             raise DataError(
@@ -144,10 +144,10 @@ def read_any(path: str | Path, **settings: Any) -> Reading:
             )
         return Reading(load_rfid(path), ())
     else:
-        raw, said = read_file_or_table(path, **table), ""
+        raw, note = read_file_or_table(path, **table), ""
         if (campaign := dataset_by_arrays(raw)) is not None:
-            raw, said = campaign.reader(path), f"this is a file of dataset={campaign.choice}"
-    raw = replace(raw, notes=(*filter(None, [said]), *raw.notes))
+            raw, note = campaign.reader(path), f"this is a file of dataset={campaign.choice}"
+    raw = replace(raw, notes=(*filter(None, [note]), *raw.notes))
     return interpret(apply_settings(raw, **settings), path, part)
 
 
@@ -163,7 +163,7 @@ def read_file_or_table(
     """
     if not is_table(path):
         named = any(value is not None for value in (columns or {}).values())
-        for name in [name for name, given in (("columns", named), ("stations_file", stations_file)) if given]:
+        for name in [name for name, entry in (("columns", named), ("stations_file", stations_file)) if entry]:
             raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
         return read_raw(path)
     from gsparc.data.tables.read import parse_table  # here, as pandas takes half a second to import

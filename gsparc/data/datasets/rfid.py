@@ -90,8 +90,8 @@ def load_rfid(
     count = None if positions is None else len(positions)
     spectra = _read_spectra(root / "spectrum", f"{moving}_pos.csv", count, problems)
     if moving == "rx" and (root / "freq.txt").exists():
-        said = "carriers of rows are read beside tx_pos.csv; with rx_pos.csv leave it out"
-        problems.add(root / "freq.txt", said)
+        fault = "carriers of rows are read beside tx_pos.csv; with rx_pos.csv leave it out"
+        problems.add(root / "freq.txt", fault)
     carriers = _read_carriers(root / "freq.txt", f"{moving}_pos.csv", count, problems)
     release_split = read_split(root, count, problems, first=1)
     rows = np.arange(count or 0)
@@ -202,10 +202,10 @@ def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
     """Positions (S, 3) float64 [m] of the end that moves."""
     sheet = problems.attempt(lambda: _sheet(path, ["x", "y", "z"], problems))
     axes = [] if sheet is None else [sheet.numbers(axis) for axis in "xyz"]
-    known = [values for values in axes if values is not None]
-    if sheet is None or len(known) < len(axes):
+    columns = [values for values in axes if values is not None]
+    if sheet is None or len(columns) < len(axes):
         return None
-    positions = np.stack(known, axis=1)
+    positions = np.stack(columns, axis=1)
     check_positions(problems, str(path), positions, [*sheet.rows])
     return positions
 

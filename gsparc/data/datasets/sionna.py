@@ -64,10 +64,10 @@ def _tested(
     train: np.ndarray | None, truth: np.ndarray | None, test: np.ndarray, plain: bool
 ) -> np.ndarray | None:
     """Flags (S, ...) of `train` with those of `truth` in test rows; None is `plain` everywhere."""
-    known = truth if train is None else train
-    if known is None:
+    template = truth if train is None else train
+    if template is None:
         return None
-    flags = np.full(known.shape, plain) if train is None else train.copy()
+    flags = np.full(template.shape, plain) if train is None else train.copy()
     flags[test] = plain if truth is None else truth[test]
     return flags
 

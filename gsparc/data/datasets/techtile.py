@@ -79,8 +79,8 @@ def _of_release(raw: Raw, path: Path, antennas: str | Path | None) -> Raw:
         raise DataError(f"{path}: no cycle has both a position and a channel; is it another file?")
     run = variables["experiment_id"].astype(str)[experiment]
     number = variables["cycle_id"].astype(str)[cycle]
-    lost = int((measured & ~placed).sum())
-    notes = (f"{lost} of {int(measured.sum())} cycles left out: no position",) if lost else ()
+    drop_count = int((measured & ~placed).sum())
+    notes = (f"{drop_count} of {int(measured.sum())} cycles left out: no position",) if drop_count else ()
     arrays = {
         "tx_position": where[experiment, cycle],
         "station_position": np.asarray(places, dtype=np.float64),

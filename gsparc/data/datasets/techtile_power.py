@@ -54,16 +54,16 @@ def _of_release(folder: Path) -> Raw:
         "rssi_db": level[heard].astype(np.float32),
         "frequency_hz": np.array(CARRIER_HZ),
     }
-    lost = f"{(~heard).sum()} of {len(heard)} rows left out: no position, or no power"
-    return Raw(arrays, notes=() if heard.all() else (lost,))
+    note = f"{(~heard).sum()} of {len(heard)} rows left out: no position, or no power"
+    return Raw(arrays, notes=() if heard.all() else (note,))
 
 
 def _attributes(path: Path, classes: set[str], names: tuple[str, ...]) -> np.ndarray:
     """Attributes (rows, names) of the objects in an array; DataError where one has none of them."""
-    held: Any = read_pickle(path, classes, npy=True)
+    objects: Any = read_pickle(path, classes, npy=True)
     errors = (AttributeError, KeyError, TypeError, ValueError)
     with readable(path, f"expected an array of objects with {', '.join(names)}", errors):
-        return np.array([[float(one.state[name]) for name in names] for one in held])
+        return np.array([[float(one.state[name]) for name in names] for one in objects])
 
 
 class TechtilePower(Campaign):

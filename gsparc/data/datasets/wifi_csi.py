@@ -71,8 +71,8 @@ def read_wifi_csi(
         raise DataError(f"{path}: no packet has a place in the table of places; see the warnings above")
     kinds = sorted({(str(one.csi.shape[1:]), one.carrier_hz) for one in logs}, key=str)
     if len(kinds) > 1:
-        said = f"antennas, subcarriers and carriers {list_first(kinds)}"
-        raise DataError(f"{path}: {said}; give each a folder of its own")
+        variants = f"antennas, subcarriers and carriers {list_first(kinds)}"
+        raise DataError(f"{path}: {variants}; give each a folder of its own")
     carrier = carrier_hz or logs[0].carrier_hz
     if carrier is None:
         raise DataError(f"{path}: neither it nor the places name the channel; say dataset.carrier_hz")
@@ -85,12 +85,12 @@ def read_wifi_csi(
     tone, csi = _filled(logs[0].tone, csi, path)
     csi, unit = _levelled(csi, rssi, path)
     names, station = np.unique(sender, return_inverse=True)
-    known = dict(transmitters or {})
-    for name in set(known) - set(names):
+    sender_places = dict(transmitters or {})
+    for name in set(sender_places) - set(names):
         raise DataError(f"dataset.transmitters: no packet is from {name!r}; there are {', '.join(names)}")
     arrays = {
         "rx_position": position,
-        "station_position": np.array([known.get(name, [np.nan] * 3) for name in names], np.float64),
+        "station_position": np.array([sender_places.get(name, [np.nan] * 3) for name in names], np.float64),
         "station_name": np.array([name or "transmitter" for name in names]),
         "station": station.reshape(-1),
         "time_s": time,
@@ -156,19 +156,19 @@ def _filled(tone: np.ndarray, csi: np.ndarray, path: Path) -> tuple[np.ndarray, 
     order = np.argsort(tone)
     tone, csi = tone[order], csi[..., order]
     low, high = FILLED.get(int(-tone.min()), (0, int(tone.max())))
-    kept = (np.abs(tone) >= low) & (np.abs(tone) <= high)
+    in_band = (np.abs(tone) >= low) & (np.abs(tone) <= high)
     with np.errstate(divide="ignore", invalid="ignore"):
         power = 10 * np.log10(np.mean(np.abs(csi) ** 2, axis=1))
-        beside = np.median(power - np.median(power[:, kept], axis=1, keepdims=True), axis=0)
+        beside = np.median(power - np.median(power[:, in_band], axis=1, keepdims=True), axis=0)
     right = (beside > WEAK_DB) & (beside < STRONG_DB)
-    if not (kept & right).any():
+    if not (in_band & right).any():
         raise DataError(f"{path}: no subcarrier has a level; is it a log of another card or chip?")
-    if not (kept & right).all():
-        wrong = list(tone[kept & ~right])
+    if not (in_band & right).all():
+        wrong = list(tone[in_band & ~right])
         odd = f", and {list_first(wrong)}: their level is none" if wrong else ""
-        what = f"{(kept & right).sum()} of {len(tone)} subcarriers; guard and unused ones left out"
+        what = f"{(in_band & right).sum()} of {len(tone)} subcarriers; guard and unused ones left out"
         log.info("%s: %s%s", path, what, odd)
-    return tone[kept & right], csi[..., kept & right]
+    return tone[in_band & right], csi[..., in_band & right]
 
 
 def _levelled(csi: np.ndarray, rssi_dbm: np.ndarray, path: Path) -> tuple[np.ndarray, str]:
@@ -180,13 +180,13 @@ def _levelled(csi: np.ndarray, rssi_dbm: np.ndarray, path: Path) -> tuple[np.nda
         count = np.isnan(rssi_dbm).sum()
         raise DataError(f"{path}: {count} packets without RSSI; give all places an rssi_dbm")
     power_db = 10 * np.log10(np.sum(np.abs(csi) ** 2, axis=1).mean(axis=1))
-    apart = rssi_dbm - power_db
-    if np.std(apart) <= KEPT_DB:
-        return csi * 10 ** (np.median(apart) / 20), "dBm"
+    offset_db = rssi_dbm - power_db
+    if np.std(offset_db) <= KEPT_DB:
+        return csi * 10 ** (np.median(offset_db) / 20), "dBm"
     alike = np.corrcoef(power_db, rssi_dbm)[0, 1] if np.ptp(rssi_dbm) and np.ptp(power_db) else 0.0
     why = f"the channel's own power, after the gain control, correlates with it by {alike:.2f}"
     log.warning("%s: the level of each row is its RSSI; %s", path, why)
-    return csi * (10 ** (apart / 20))[:, None, None], "dBm"
+    return csi * (10 ** (offset_db / 20))[:, None, None], "dBm"
 
 
 class WifiCsi(Campaign):

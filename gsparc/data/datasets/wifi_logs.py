@@ -129,10 +129,10 @@ def _intel(path: Path, csiread: Any, _: str) -> Packets:
     content = path.read_bytes()
     size = int.from_bytes(content[:2], "big")
     if size + 2 == RECORD.itemsize:  # with time and sender, which `csiread` would take for the channel
-        own = read_log(path)
-        power = np.sum(np.abs(own.csi) ** 2, axis=2).mean(axis=1).clip(1e-300)  # of zeros: no level in dB
-        sender = format_address(np.frombuffer(own.sender.tobytes(), np.uint8).reshape(-1, 6))
-        return Packets(own.time, sender, own.csi.swapaxes(1, 2), TONES, 10 * np.log10(power))
+        records = read_log(path)
+        power = np.sum(np.abs(records.csi) ** 2, axis=2).mean(axis=1).clip(1e-300)  # of zeros: no level in dB
+        sender = format_address(np.frombuffer(records.sender.tobytes(), np.uint8).reshape(-1, 6))
+        return Packets(records.time, sender, records.csi.swapaxes(1, 2), TONES, 10 * np.log10(power))
     at, count = 0, 0
     while at + 2 < len(content):
         size = int.from_bytes(content[at : at + 2], "big")
@@ -142,15 +142,15 @@ def _intel(path: Path, csiread: Any, _: str) -> Packets:
     log = csiread.Intel(str(path), STREAMS, STREAMS, if_report=False, bufsize=count)
     log.read()
     wide = (log.rate & HT40) > 0
-    kept = (log.Nrx == log.Nrx.max(initial=0)) & (wide == wide[:1])
-    tick = log.timestamp_low[kept].astype(np.float64)
+    valid = (log.Nrx == log.Nrx.max(initial=0)) & (wide == wide[:1])
+    tick = log.timestamp_low[valid].astype(np.float64)
     tick += TICKS * np.cumsum(np.diff(tick, prepend=tick[:1]) < 0)
     return Packets(
         1e-6 * tick,
         np.full(len(tick), ""),
-        log.csi[kept, :, : int(log.Nrx.max(initial=0)), 0].swapaxes(1, 2),  # the first transmit antenna
+        log.csi[valid, :, : int(log.Nrx.max(initial=0)), 0].swapaxes(1, 2),  # the first transmit antenna
         TONES_40 if wide[:1].any() else TONES,
-        log.get_total_rss()[kept],
+        log.get_total_rss()[valid],
     )
 
 

@@ -75,8 +75,8 @@ def read_wsr(
     arrays = read_converted(path, "wsr npz").arrays
     arrays["csi"] = np.sqrt(arrays["csi"]) * arrays.pop("sign")
     good = arrays.pop("good")
-    kept = {name: arrays[name][good] for name in ("rx_position", "station", "run", "csi")}
-    return Raw({**arrays, **kept}, {"name": "wsr"})
+    row_arrays = {name: arrays[name][good] for name in ("rx_position", "station", "run", "csi")}
+    return Raw({**arrays, **row_arrays}, {"name": "wsr"})
 
 
 def _of_release(root: Path, transmitters: Mapping[str, Sequence[float]], spacing_m: float) -> Raw:
@@ -151,8 +151,8 @@ def _way(path: Path) -> np.ndarray:
 def _link(robot: Log, other_robot: Log, way: np.ndarray, spacing_m: float) -> Iterator[Pair]:
     """Places (n, 3) and channels (n, 30) of each part of a run in which the root can be followed."""
     # A log does not name its own card: it is the sender with whose packets the oscillators cancel.
-    tried = [_square(robot, other_robot, sender) for sender in np.unique(robot.sender)]
-    agree, mine, square = max(tried, key=lambda one: one[0])
+    trials = [_square(robot, other_robot, sender) for sender in np.unique(robot.sender)]
+    agree, mine, square = max(trials, key=lambda one: one[0])
     if agree < LEAST_AGREEMENT:
         return
     place = np.stack([np.interp(robot.time[mine], way[:, 0], axis) for axis in way[:, 1:].T], axis=1)
@@ -160,11 +160,11 @@ def _link(robot: Log, other_robot: Log, way: np.ndarray, spacing_m: float) -> It
     for part in np.split(np.arange(len(path)), np.flatnonzero(np.diff(path) > GAP_M) + 1):
         root = follow_root(square[part])
         step = np.floor(path[part] / spacing_m)
-        kept = np.flatnonzero(np.diff(step, prepend=step[:1]) > 0)
-        kept = kept[(kept >= AVERAGED // 2) & (kept < len(part) - AVERAGED // 2)]
-        if len(kept):
-            around = kept[:, None] + np.arange(AVERAGED) - AVERAGED // 2
-            yield place[part][kept], root[around].mean(axis=1)
+        centres = np.flatnonzero(np.diff(step, prepend=step[:1]) > 0)
+        centres = centres[(centres >= AVERAGED // 2) & (centres < len(part) - AVERAGED // 2)]
+        if len(centres):
+            around = centres[:, None] + np.arange(AVERAGED) - AVERAGED // 2
+            yield place[part][centres], root[around].mean(axis=1)
 
 
 def _square(robot: Log, other_robot: Log, sender: np.void) -> tuple[float, np.ndarray, np.ndarray]:

@@ -27,19 +27,19 @@ def add_absent(check: Checker, measured: str, count: int) -> None:
         return None  # refused where values are read
     _, first, of_place = np.unique(arrays["place"], return_index=True, return_inverse=True)
     of_place = of_place.reshape(-1)
-    known = ~np.isnan(arrays["rssi_db"])
-    some = np.bincount(of_place, known) > 0
+    has_level = ~np.isnan(arrays["rssi_db"])
+    some = np.bincount(of_place, has_level) > 0
     # Links are numbered place by station, so that those without a row are a set difference.
-    lost = np.setdiff1d(np.arange(len(first) * count), of_place * count + arrays["station"])
-    lost = lost[some[lost // count]]
+    gaps = np.setdiff1d(np.arange(len(first) * count), of_place * count + arrays["station"])
+    gaps = gaps[some[gaps // count]]
     floor = _floors(arrays, count)
     # Minus infinity lies below whatever turns out to be the limit of hearing.
-    _repeat(check, np.r_[: len(of_place), first[lost // count]], lost % count)
+    _repeat(check, np.r_[: len(of_place), first[gaps // count]], gaps % count)
     if floor is not None and floor.ndim:
-        check.raw.arrays["sensitivity_db"][len(of_place) :] = floor[lost % count]
-    empty = np.flatnonzero(~known & some[of_place])  # cells of a wide table
+        check.raw.arrays["sensitivity_db"][len(of_place) :] = floor[gaps % count]
+    empty = np.flatnonzero(~has_level & some[of_place])  # cells of a wide table
     check.raw.arrays["rssi_db"][empty] = -np.inf
-    silent = len(lost) + len(empty)
+    silent = len(gaps) + len(empty)
     check.notes.append(f"{silent} links without a level were not heard, as dataset.absent=silent says")
 
 
@@ -61,8 +61,8 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
     lists = StrongestLists.from_rows(arrays["place"][heard], of[heard], levels[heard], moving, count)
     strongest = lists.are_strongest()
     # What is known not to be heard, of marks or a stated sensitivity, needs no guess.
-    said = floor is not None or np.isneginf(levels).any() or find_marks(levels[heard])
-    found = None if strongest or said or absent == "silent" else lists.below_floor()
+    limit_known = floor is not None or np.isneginf(levels).any() or find_marks(levels[heard])
+    found = None if strongest or limit_known or absent == "silent" else lists.below_floor()
     if not strongest and found is None:
         return 0
     missing = f"lists of the {lists.length} strongest of {count} stations"
@@ -77,11 +77,11 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
         # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
         stated = np.full(count, np.nan if floor is None else floor)
         floor = np.nan_to_num(stated, nan=levels[heard].min())
-        lost = lists.short_are_lost(floor)
-        may = np.isnan(lists.level) & (lists.full[:, None] | (not lost))
+        is_lossy = lists.short_are_lost(floor)
+        may = np.isnan(lists.level) & (lists.full[:, None] | (not is_lossy))
         how = "one that a full list leaves out is below its weakest"
         how += f", in lists shorter than {lists.length}: "
-        how += "unknown, strong ones are lost there" if lost else f"below {floor.min():.4g} dB"
+        how += "unknown, strong ones are lost there" if is_lossy else f"below {floor.min():.4g} dB"
     if absent != "auto":
         does = "unlisted ones are predicted too high, and figures of listed rows do not show it"
         if absent == "silent":

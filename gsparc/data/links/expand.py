@@ -50,12 +50,12 @@ def expand_links(check: Checker, measured: str, part: Selection) -> Links | None
     links = read(check, measured, part)
     if links is None:
         return None
-    held = check.raw.arrays
+    arrays = check.raw.arrays
     if links.stations is not None:
         # From here on rows have positions of their own, as in a file of one static end.
-        held[f"{links.static_end}_position"] = links.stations.position[held["station"]]
+        arrays[f"{links.static_end}_position"] = links.stations.position[arrays["station"]]
         if links.stations.rotation is not None:
-            held["rx_rotation"] = links.stations.rotation[held["station"]]
+            arrays["rx_rotation"] = links.stations.rotation[arrays["station"]]
     return replace(links, georeference=origin)
 
 
@@ -141,8 +141,8 @@ def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
             by_row = len(value) == rows and (rows != count or name == "carrier_hz")
             check.raw.arrays[name] = value[row if by_row else station]
             if by_row and rows == count and len(np.unique(value)) > 1:
-                said = "as many values as rows and as stations; taken as one for each row"
-                check.notes.append(f"{name}: {said}")
+                remark = "as many values as rows and as stations; taken as one for each row"
+                check.notes.append(f"{name}: {remark}")
     for name in STATION_FIELDS[1:]:
         check.raw.arrays.pop(name, None)
     stations = _selected(check, measured, stations, part) or stations

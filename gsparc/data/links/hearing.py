@@ -88,10 +88,10 @@ def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) 
         floor, censored = np.full(len(values), values[values > 0].min()), (values == 0) & marked
     if floor is not None:
         arrays[measured] = np.where(censored, floor, arrays[measured])
-    lost = (unknown if mask is None else unknown & mask.astype(bool)).any(axis=axes) & ~censored
-    if mask is not None and lost.any():
+    is_missing = (unknown if mask is None else unknown & mask.astype(bool)).any(axis=axes) & ~censored
+    if mask is not None and is_missing.any():
         return links  # marked as measured, and is not: refused where values are read
-    keep = marked & ~lost
+    keep = marked & ~is_missing
     if silent and values.any():
         keep &= values.any(axis=axes)
     # As `Measurements.censored`: 1 too weak, -1 too strong, 0 measured.
@@ -121,8 +121,8 @@ def _stated_floor(check: Checker, measured: str, values: np.ndarray) -> np.ndarr
     """The level (S,) [dB] below which the file says that nothing is heard; None without, or of no use."""
     level = check.read_real("sensitivity_db", (), (1,), values.shape[:1])
     saturates = not isinstance(check.raw.attributes.get("saturation_db", "auto"), str)
-    for name, said in (("sensitivity_db", level is not None), ("dataset.saturation_db", saturates)):
-        if said and measured != "rssi_db":
+    for name, is_set in (("sensitivity_db", level is not None), ("dataset.saturation_db", saturates)):
+        if is_set and measured != "rssi_db":
             return check.refuse(name, f"goes with rssi_db, not with {measured}")
     if level is None or values.ndim != 1:
         return None
@@ -174,11 +174,11 @@ def forget_unknown(check: Checker, moving: str) -> None:
         beside: list[bool] = []
         marked = (values == mark) & np.isfinite(place).all(1)
         for one in np.unique(station[marked]):
-            own, asked = (np.flatnonzero(rows & (station == one)) for rows in (heard, marked))
-            if len(own) < BESIDE:
+            heard_rows, marked_rows = (np.flatnonzero(rows & (station == one)) for rows in (heard, marked))
+            if len(heard_rows) < BESIDE:
                 continue
-            near = cKDTree(place[own]).query(place[asked], k=BESIDE)[1]
-            level = values[own].astype(float)
+            near = cKDTree(place[heard_rows]).query(place[marked_rows], k=BESIDE)[1]
+            level = values[heard_rows].astype(float)
             beside += (level[near].mean(1) < np.median(level)).tolist()
         # A coin that falls on either side: of few marks nothing is told.
         if not (mark == 0 and alone) and (len(beside) < LEAST_MARKS or np.mean(beside) > WEAK_SHARE):
@@ -186,42 +186,42 @@ def forget_unknown(check: Checker, moving: str) -> None:
         check.raw.arrays["rssi_db"] = np.where(values == mark, np.nan, check.raw.arrays["rssi_db"])
         share = f"{int((values == mark).sum())} of {len(values)} levels"
         where = "" if mark == 0 and alone else ", beside strong levels as well as weak ones"
-        said = f"{share} are exactly {round(mark, 6) + 0:g}, apart from all others{where}: no value, left out"
-        check.notes.append(Caution(f"{said}; dataset.not_heard=[{mark:.12g}] takes them as not heard"))
+        note = f"{share} are exactly {round(mark, 6) + 0:g}, apart from all others{where}: no value, left out"
+        check.notes.append(Caution(f"{note}; dataset.not_heard=[{mark:.12g}] takes them as not heard"))
 
 
 def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None) -> np.ndarray:
     """Which of levels (S,) are marks for "not heard", (S,) bool: those that the file names, else found."""
-    given = check.raw.attributes.get("not_heard")
-    marks = find_marks(values) if given is None else np.atleast_1d(np.asarray(given, np.float64)).tolist()
+    setting = check.raw.attributes.get("not_heard")
+    marks = find_marks(values) if setting is None else np.atleast_1d(np.asarray(setting, np.float64)).tolist()
     # `not_heard=[]` keeps minus infinity as a level, too.
-    silent = np.isin(values, marks) | ((values == -np.inf) & (given is None or len(marks) > 0))
+    silent = np.isin(values, marks) | ((values == -np.inf) & (setting is None or len(marks) > 0))
     floor = "sensitivity_db"
     if level is None and silent.any() and np.isfinite(values[~silent]).any():
         floor = f"{values[~silent & np.isfinite(values)].min():.4g} dB, the weakest"
-    for mark in marks if given is None else ():
+    for mark in marks if setting is None else ():
         share = f"{int((values == mark).sum())} of {len(values)} levels are exactly {round(mark, 6) + 0:g}"
-        said = f"{share}, apart from all others: taken as not heard, below {floor}"
+        note = f"{share}, apart from all others: taken as not heard, below {floor}"
         does = "refuses" if abs(mark) > MOST_DB else "keeps"
         say = f"dataset.not_heard=[] {does} them, sensitivity_db (dataset.columns.sensitivity_db) sets that"
-        check.notes.append(Caution(f"{said}; {say}"))
+        check.notes.append(Caution(f"{note}; {say}"))
     return silent
 
 
 def _saturated(check: Checker, values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Which of levels (S,) are at least the file's, or the found, level of saturation, (S,) bool."""
-    given = check.raw.attributes.get("saturation_db", "auto")
-    level = find_saturation(values[known]) if given == "auto" else None if given == "none" else float(given)
+    limit = check.raw.attributes.get("saturation_db", "auto")
+    level = find_saturation(values[known]) if limit == "auto" else None if limit == "none" else float(limit)
     if level is None:
         return np.zeros(len(values), bool)
     # Both in float32: a file's level may differ from the decimal setting by its rounding.
     above = known & (values.astype(np.float32) >= np.float32(level))
-    said = f"{int(above.sum())} of {int(known.sum())} levels are"
-    if given == "auto":
-        said += f" exactly {level:.6g}, the most: a receiver in saturation? taken as at least that"
-        check.notes.append(Caution(f"{said}; dataset.saturation_db=none takes them as measured"))
+    note = f"{int(above.sum())} of {int(known.sum())} levels are"
+    if limit == "auto":
+        note += f" exactly {level:.6g}, the most: a receiver in saturation? taken as at least that"
+        check.notes.append(Caution(f"{note}; dataset.saturation_db=none takes them as measured"))
     else:
-        check.notes.append(f"{said} {level:g} dB or more: saturated, taken as at least that")
+        check.notes.append(f"{note} {level:g} dB or more: saturated, taken as at least that")
     # Saturated rows hold the level itself: that bound is all that is known of them.
     check.raw.arrays["rssi_db"] = np.where(above, level, values)
     return above

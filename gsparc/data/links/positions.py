@@ -46,23 +46,23 @@ def _without_fix(check: Checker, measured: str) -> None:
         place = np.column_stack(pair)[:, :2].astype(np.float64)
         null, earth = (place == 0).all(axis=1), np.array(ON_EARTH if degrees else [(-FARTHEST, FARTHEST)] * 2)
         off = np.asarray(~((place >= earth[:, 0]) & (place <= earth[:, 1])).all(axis=1))
-        known = place[~(null | off)]
-        if not len(known):
+        fixes = place[~(null | off)]
+        if not len(fixes):
             continue
-        lost = dict[str, np.ndarray]()
-        least = NO_FIX_DEG if degrees else max(NO_FIX_M, 3 * np.ptp(known, axis=0).max())
-        if np.abs(np.median(known, axis=0)).max() > least:  # else 0, 0 is a place like any other
+        faults = dict[str, np.ndarray]()
+        least = NO_FIX_DEG if degrees else max(NO_FIX_M, 3 * np.ptp(fixes, axis=0).max())
+        if np.abs(np.median(fixes, axis=0)).max() > least:  # else 0, 0 is a place like any other
             _unknown_at_zero(check, degrees)
-            lost[f"{'latitude and longitude' if degrees else 'x and y'} are 0: no fix"] = null
+            faults[f"{'latitude and longitude' if degrees else 'x and y'} are 0: no fix"] = null
         # One value that repeats is a mark of a logger; several are faults only where they are few.
         if off.sum() <= max(1, FEW * rows) or (2 * off.sum() < rows and not np.ptp(place[off], axis=0).any()):
             x, y = place[off.argmax()]
-            lost[f"no such place on Earth, ({x:g}, {y:g}) {'degrees' if degrees else 'm'}"] = off
-        for what, out in [(what, out) for what, out in lost.items() if out.any()]:
+            faults[f"no such place on Earth, ({x:g}, {y:g}) {'degrees' if degrees else 'm'}"] = off
+        for what, out in [(what, out) for what, out in faults.items() if out.any()]:
             which = name_row_ranges([str(name) for name in arrays["row_name"][out]])
             check.notes.append(Caution(f"{which}: {what}; these {out.sum()} of {rows} rows are left out"))
-        keep = ~np.any([*lost.values()], axis=0)
-        if lost and not keep.all():
+        keep = ~np.any([*faults.values()], axis=0)
+        if faults and not keep.all():
             check.raw = replace(check.raw, arrays=take_rows(arrays, np.flatnonzero(keep), rows))
             arrays = check.raw.arrays
 
@@ -123,9 +123,9 @@ def _in_metres(check: Checker) -> Georeference | None:
     end = "tx" if check.present("tx_height", "rx_position") else "rx"
     for prefix, name in (("", end), ("station_", "station")):
         if prefix in places:
-            known = np.isfinite(places[prefix][0])
-            arrays[f"{name}_position"] = np.full((known.size, 2), np.nan)
-            arrays[f"{name}_position"][known] = origin.from_degrees(*(part[known] for part in places[prefix]))
+            valid = np.isfinite(places[prefix][0])
+            arrays[f"{name}_position"] = np.full((valid.size, 2), np.nan)
+            arrays[f"{name}_position"][valid] = origin.from_degrees(*(part[valid] for part in places[prefix]))
             if f"{name}_height" not in arrays:
                 arrays[f"{name}_height"] = np.array(0.0)
                 check.notes.append(f"no {name}_height: taken as 0 m")

@@ -29,8 +29,8 @@ def find_station(wanted: str | int, stations: Stations) -> int | None:
     """
     counted = not any(name.isdigit() for name in stations.name)
     numbers = [str(number) for number in range(len(stations) if counted else 0)]
-    known = stations.name, stations.label or (), stations.shown, numbers
-    named = (list(names).index(str(wanted)) for names in known if list(names).count(str(wanted)) == 1)
+    name_lists = stations.name, stations.label or (), stations.shown, numbers
+    named = (list(names).index(str(wanted)) for names in name_lists if list(names).count(str(wanted)) == 1)
     return next(named, None)
 
 
@@ -79,13 +79,13 @@ def read_station_table(check: Checker, may_miss: bool = False) -> Stations | Non
     """
     arrays = check.raw.arrays
     positions = arrays["station_position"]
-    lost = np.isnan(positions[:, :2]).all(axis=1) & may_miss
-    arrays["station_position"] = np.where(lost[:, None], 0, positions)
+    no_place = np.isnan(positions[:, :2]).all(axis=1) & may_miss
+    arrays["station_position"] = np.where(no_place[:, None], 0, positions)
     places = check.read_positions("station_position", None)
     if places is None:
         return None
     count = len(places)
-    places[lost] = np.nan
+    places[no_place] = np.nan
     names, label = (check.raw.arrays.get(f"station_{what}") for what in ("name", "label"))
     for what, texts in (("station_name", names), ("station_label", label)):
         if texts is not None and not check.has_shape(what, texts, (count,)):
@@ -104,8 +104,8 @@ def read_station_table(check: Checker, may_miss: bool = False) -> Stations | Non
         wrong = np.abs(sector[:, :4]).max(initial=0, where=np.isfinite(sector[:, :4]))
         if wrong > FULL_TURN:
             return check.refuse("station_azimuth", f"{wrong:g}; expected degrees, none beyond {FULL_TURN:g}")
-    shown = None if label is None else tuple(map(str, label))
-    return Stations(places, called, rotation, sector=sector, label=shown)
+    labels = None if label is None else tuple(map(str, label))
+    return Stations(places, called, rotation, sector=sector, label=labels)
 
 
 def read_station_of_row(check: Checker, rows: int, count: int) -> np.ndarray | None:
@@ -136,8 +136,8 @@ def _of_one(check: Checker, station: np.ndarray, carrier: np.ndarray, names: Seq
     if count.max() == 1:
         return carrier
     most = names[one[count.argmax(), 0]]
-    said = f"station {most} at {count.max()} carriers within {100 * (ONE_CARRIER - 1):.0f} % is one"
-    check.notes.append(f"{said}, and the like; dataset.columns.station=STATION+CARRIER tells them apart")
+    note = f"station {most} at {count.max()} carriers within {100 * (ONE_CARRIER - 1):.0f} % is one"
+    check.notes.append(f"{note}, and the like; dataset.columns.station=STATION+CARRIER tells them apart")
     ends = [different[np.array(bands) == number] for number in range(bands[-1] + 1)]
     return np.array([(end[0] + end[-1]) / 2 for end in ends])[band]
 

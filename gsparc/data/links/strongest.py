@@ -115,18 +115,18 @@ class StrongestLists:
     @cached_property
     def beside(self) -> np.ndarray:
         """(M, T) levels at the nearest other place, NaN where there are none."""
-        known = np.flatnonzero(np.isfinite(self.place).all(1))
-        places, first, which = np.unique(self.place[known], axis=0, return_index=True, return_inverse=True)
+        moments = np.flatnonzero(np.isfinite(self.place).all(1))
+        places, first, which = np.unique(self.place[moments], axis=0, return_index=True, return_inverse=True)
         result = np.full(self.level.shape, np.nan)
         if len(places) > 1:
             near = cKDTree(places).query(places, k=2)[1][:, 1]
-            result[known] = self.level[known[first[near[which.reshape(-1)]]]]
+            result[moments] = self.level[moments[first[near[which.reshape(-1)]]]]
         return result
 
     def strong_beside(self, floor: np.ndarray) -> np.ndarray:
         """Return which of `beside`, (M, T), are well above floors (T,) [dB]."""
-        apart = np.abs(self.level - self.beside)
-        spread = 1.4826 * float(np.nanmedian(apart if np.isfinite(apart).any() else 0))
+        differences = np.abs(self.level - self.beside)
+        spread = 1.4826 * float(np.nanmedian(differences if np.isfinite(differences).any() else 0))
         return self.beside > floor + max(STRONG_DB, SPREADS * spread)
 
     def short_are_lost(self, floor: np.ndarray) -> bool:
@@ -143,19 +143,19 @@ class StrongestLists:
         heard = ~missing.all(0)
         floor[heard] = np.nanpercentile(self.level[:, heard], FLOOR, axis=0)
         strong = self.strong_beside(floor)
-        edges, lost = missing & np.isfinite(self.beside), missing & strong
+        edges, strong_gaps = missing & np.isfinite(self.beside), missing & strong
         if min(edges.sum(), strong.sum()) < LEAST_LINKS:
             return None
-        if lost.sum() > min(LOST * strong.sum(), BESIDE_STRONG * edges.sum()):
+        if strong_gaps.sum() > min(LOST * strong.sum(), BESIDE_STRONG * edges.sum()):
             return None
-        several = (lost.sum(0) > 1) & (lost.sum(0) > BESIDE_STRONG / 2 * edges.sum(0))
+        several = (strong_gaps.sum(0) > 1) & (strong_gaps.sum(0) > BESIDE_STRONG / 2 * edges.sum(0))
         return floor, missing & ~strong & heard & ~several
 
     def listed_near(self, places: np.ndarray) -> np.ndarray:
         """Return which stations (n, T) any of the lists nearest to places (n, 3) [m] holds."""
-        known = np.isfinite(self.place).all(1)
-        listed, result = np.isfinite(self.level[known]), np.zeros((len(places), self.level.shape[1]), bool)
-        near = cKDTree(self.place[known]).query(places, range(1, min(NEAREST, len(listed)) + 1))[1]
+        has_fix = np.isfinite(self.place).all(1)
+        listed, result = np.isfinite(self.level[has_fix]), np.zeros((len(places), self.level.shape[1]), bool)
+        near = cKDTree(self.place[has_fix]).query(places, range(1, min(NEAREST, len(listed)) + 1))[1]
         for one in near.T:  # together they would take much memory
             result |= listed[one]
         return result
@@ -172,13 +172,13 @@ class StrongestLists:
             may: (M, T) which links, none with a level.
         """
         below = np.where(self.full[:, None], np.nanmin(self.level, 1)[:, None], floor)
-        known = np.isfinite(self.place).all(1)
+        has_fix = np.isfinite(self.place).all(1)
         whole = max(round(WHOLE * most / (self.level.shape[1] - self.length)), 1)
         start = np.linspace(0, len(self.level) - RUN, max(whole // RUN, 1)).astype(np.int64)
         turn = np.random.default_rng(0).random(may.shape)
-        turn[known] += self.listed_near(self.place[known])
+        turn[has_fix] += self.listed_near(self.place[has_fix])
         turn[start[:, None] + np.arange(RUN)] = np.inf
-        links = np.flatnonzero(may & known[:, None])
+        links = np.flatnonzero(may & has_fix[:, None])
         links = np.sort(links[np.argsort(-turn.flat[links], kind="stable")[:most]])
         moment, station = np.unravel_index(links, may.shape)
         return moment, station, below[moment, station]

@@ -159,11 +159,11 @@ def fetch(name: str, accept: bool = False, timeout_s: float = STALLED_S, retries
         wanted.folder.mkdir(parents=True, exist_ok=True)
         lock = FileLock(wanted.folder / ".lock")
         try:
-            held = lock.acquire(timeout=0)
+            guard = lock.acquire(timeout=0)
         except Timeout:
             log.warning("%s: another process fetches it; waiting for it to end", wanted.name)
-            held = lock.acquire()
-        with held:
+            guard = lock.acquire()
+        with guard:
             if wanted.hub is not None:
                 return fetch_from_hub(wanted.hub, wanted.strip, wanted.folder)
             # Of a fetch that was killed: nobody else holds the lock.
@@ -232,8 +232,8 @@ def _download(url: str, output_file: Any, _: Any, source: Source, timeout_s: flo
 
     end, size = time.monotonic() + PATIENCE * timeout_s + source.bytes / SLOWEST, 0
     plain = {"Accept-Encoding": "identity"}
-    asked = requests.get(url, headers=plain, timeout=timeout_s, stream=True)
-    with asked as answer, Path(output_file).open("wb") as file:
+    response = requests.get(url, headers=plain, timeout=timeout_s, stream=True)
+    with response as answer, Path(output_file).open("wb") as file:
         answer.raise_for_status()
         try:
             while part := answer.raw.read1(CHUNK, decode_content=False):

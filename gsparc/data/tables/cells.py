@@ -32,9 +32,9 @@ def unfold_cells(sheet: Sheet) -> Sheet:
     parts: list[pd.DataFrame] = []
     unfolded: list[str] = []
     for head in sheet.heads:
-        if (held := _records(sheet, head)) is not None:
-            parts.append(held)
-            unfolded.append(f"{head} ({', '.join(held)})")
+        if (table := _records(sheet, head)) is not None:
+            parts.append(table)
+            unfolded.append(f"{head} ({', '.join(table)})")
             continue
         rows = [_numbers(cell) for cell in sheet.frame[head].iloc[:1]]
         rows += [_numbers(cell) for cell in sheet.frame[head].iloc[1:]] if rows[0] is not None else []

@@ -54,11 +54,11 @@ class Column(Head):
     @property
     def schema_unit(self) -> str:
         """Unit of its values once they are read."""
-        unit, own = SCHEMA.get(KINDS[self.role], "deg"), self.unit
-        if (own is None or not own.name) and "rsrp" in words_of(self.head or ""):
+        unit, raw_unit = SCHEMA.get(KINDS[self.role], "deg"), self.unit
+        if (raw_unit is None or not raw_unit.name) and "rsrp" in words_of(self.head or ""):
             return unit  # dBm by definition (3GPP TS 36.214)
         # Other levels of which nobody said more are in dB; calling them dBm would invent a reference.
-        relative = own is None or (own.name != "dBm" and (own.times or not own.changes))
+        relative = raw_unit is None or (raw_unit.name != "dBm" and (raw_unit.times or not raw_unit.changes))
         return "dB" if unit == "dBm" and relative else unit
 
     def numbers(self, sheet: Sheet) -> np.ndarray | None:
@@ -111,11 +111,11 @@ def choose_columns(
             chosen[columns[0].role] = columns
     if sheet.problems:
         return chosen
-    said = used_heads(chosen)
+    chosen_heads = used_heads(chosen)
     guesses: dict[str, list[Column]] = {}
     for head in sheet.heads:
-        meaning = heads.parse_head(head) if head not in said else Head()
-        if head not in said and head in labelled:
+        meaning = heads.parse_head(head) if head not in chosen_heads else Head()
+        if head not in chosen_heads and head in labelled:
             power = "rssi" if meaning.role == "rssi" else "rssi_db"
             meaning = Head(power, labelled[head], meaning.unit, "station", meaning.strange)
         role = meaning.role
@@ -245,8 +245,8 @@ def _warn_of_levels(sheet: Sheet, columns: tuple[Column, ...], used: Container[s
     low, high = levels.min(), min(levels.max(), 0)
     alike = [Column(head=h) for h in rest if (numbers[h].between(low, high) & (numbers[h] < 0)).mean() > 0.5]
     if alike:
-        said = f"{_names(alike)} hold{'s' * (len(alike) == 1)} values like these levels and are not used: "
-        sheet.notes.append(Caution(f"{said}of stations, too? call them as {columns[0].head!r} is called"))
+        finding = f"{_names(alike)} hold{'s' * (len(alike) == 1)} values like these levels and are not used: "
+        sheet.notes.append(Caution(f"{finding}of stations, too? call them as {columns[0].head!r} is called"))
 
 
 def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
@@ -309,8 +309,8 @@ def _sum_of_columns(sheet: Sheet, role: str, text: str) -> Column | None:
 def _times(column: Column, factor: str) -> Column:
     """The same times a number, or, where it already is, times -1."""
     unit = column.unit or Unit("", KINDS[column.role])
-    said = f"-{unit.times}" if unit.times else factor
-    return replace(column, unit=replace(unit, times=said, factor=unit.factor * float(factor)))
+    multiplier = f"-{unit.times}" if unit.times else factor
+    return replace(column, unit=replace(unit, times=multiplier, factor=unit.factor * float(factor)))
 
 
 def _head(sheet: Sheet, text: str) -> str | None:
@@ -343,7 +343,7 @@ def _one_way(sheet: Sheet, guesses: dict[str, list[Column]]) -> None:
         by_way = [columns for columns in by_way if columns]
         if len(by_way) < 2:
             continue
-        first = [replace(own[0], head=_pattern(own)) if ways is MEASURED else own[0] for own in by_way]
+        first = [replace(cols[0], head=_pattern(cols)) if ways is MEASURED else cols[0] for cols in by_way]
         fault = f"{' and '.join(map(_names, by_way))} both say where"
         if ways is MEASURED:
             fault = f"{_names(first)} are different measurements"
@@ -433,10 +433,10 @@ def _turned(column: Column, unit: Unit) -> str:
         return f"column {column.head!r}: {bare} turned into {wanted}"
     then = f", then {bare} (by its head) into {wanted}" if bare not in ("", wanted) else ""
     value = float(unit.convert(np.array(100.0)))
-    said = f"column {column.head!r} times {factor}{then}: 100 in the file is {value:g} {wanted}"
+    note = f"column {column.head!r} times {factor}{then}: 100 in the file is {value:g} {wanted}"
     if then and math.isclose(abs(float(factor)), UNITS[bare.lower()].factor):
-        return Caution(f"{said}; twice? {_choice(column)} turns {bare} alone")
-    return said
+        return Caution(f"{note}; twice? {_choice(column)} turns {bare} alone")
+    return note
 
 
 def rename_for_stations(column: Column) -> Column:

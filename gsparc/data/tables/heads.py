@@ -114,9 +114,9 @@ def words_of(text: str) -> list[str]:
     text = "".join(letter for letter in normalize("NFD", text) if not combining(letter))
     text = re.sub(r"(?i)(?<![a-z])([eg])node[ _-]?b", r"\1nb", text)  # eNodeB is one word
     text = re.sub(r"(?i)physical[ _]*(?:layer[ _]*)?cell[ _]*id(?:entity)?", "pci", text)
-    apart = re.sub(r"(?<=[a-z0-9])(?=[A-Z])(?!Bm?\b|BW\b|Hz|W\b)", " ", text)
-    apart = re.sub(r"(rssi|rsrp|rss|power)(?=\d)", r"\1 ", apart, flags=re.IGNORECASE)
-    return [word for word in re.split(r"[^0-9a-zµμ°]+", apart.lower()) if word]
+    phrase = re.sub(r"(?<=[a-z0-9])(?=[A-Z])(?!Bm?\b|BW\b|Hz|W\b)", " ", text)
+    phrase = re.sub(r"(rssi|rsrp|rss|power)(?=\d)", r"\1 ", phrase, flags=re.IGNORECASE)
+    return [word for word in re.split(r"[^0-9a-zµμ°]+", phrase.lower()) if word]
 
 
 def _role(words: list[str], unit: Unit | None, plain: str) -> Head:

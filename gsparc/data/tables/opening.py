@@ -187,7 +187,7 @@ def _without_banner(lines: Lines, notes: list[str]) -> Lines:
         usual = Counter(map(len, cells)).most_common(1)[0][0]
         named = {cell: bool(parse_head(cell).role) for row in cells[:MOST_ABOVE] for cell in set(row)}
         roles = [sum(named[cell] for cell in row) for row in cells[:MOST_ABOVE]]
-        first = next((i for i, known in enumerate(roles) if known > 1 and len(cells[i]) == usual), 0)
+        first = next((i for i, count in enumerate(roles) if count > 1 and len(cells[i]) == usual), 0)
         above = [len(row) != usual or 2 * sum(c.strip() != "" for c in row) <= usual for row in cells[:first]]
         if usual > 1 and first and all(above) and 2 * max(roles[:first]) < roles[first]:
             above_them = f"left out above: {lines[numbers[0]][:40]!r}"
@@ -206,8 +206,8 @@ def _heads_once(lines: Lines, delimiter: str, notes: list[str]) -> Lines:
         above = [*above, n] if titled else []
     if again:
         where = name_row_ranges([f"line {n}" for n in sorted(again)])
-        asked = "the heads again; left out: are these files joined that belong together?"
-        notes.append(Caution(f"{where}: {asked}"))
+        question = "the heads again; left out: are these files joined that belong together?"
+        notes.append(Caution(f"{where}: {question}"))
     return {n: text for n, text in lines.items() if n not in again}
 
 

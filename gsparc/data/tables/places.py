@@ -98,8 +98,8 @@ def drop_rows_without_place(sheet: Sheet, chosen: Chosen) -> Sheet:
     if not lost.any() or lost.all():
         return sheet
     named = np.array(sheet.rows)
-    said = f"{name_row_ranges(named[lost].tolist())}: no place; these {lost.sum()} of {len(sheet)} rows are"
-    sheet.notes.append(Caution(f"{said} left out"))
+    remark = f"{name_row_ranges(named[lost].tolist())}: no place; these {lost.sum()} of {len(sheet)} rows are"
+    sheet.notes.append(Caution(f"{remark} left out"))
     frame = sheet.frame[~lost].reset_index(drop=True)
     return replace(sheet, frame=frame, rows=tuple(named[~lost].tolist()))
 
@@ -117,31 +117,31 @@ def place_by_row(path: str | Path, columns: Mapping[str, object], end: str) -> d
     """
     sheet = read_sheet(path)
     roles = [f"{before}{axis}" for before in ENDS[:-1] for axis in AXES]
-    said = {key: value for key, value in columns.items() if OTHER_NAMES.get(key, key) in roles}
-    here = {key: head for key, head in said.items() if head in sheet.heads}
+    settings = {key: value for key, value in columns.items() if OTHER_NAMES.get(key, key) in roles}
+    here = {key: head for key, head in settings.items() if head in sheet.heads}
     chosen = choose_columns(sheet, here, {}, [*roles, "station"])
     if any(role in chosen for role in roles):
         return {}
-    apart = BY_ROW
+    row_key = BY_ROW
     if "station" in chosen:
-        apart += BY_ROW.join(_times(sheet, sheet.joined(column.head for column in chosen["station"])))
-    return {**dict.fromkeys(said), f"{end}_x": apart, f"{end}_y": apart, f"{end}_z": 0}
+        row_key += BY_ROW.join(_times(sheet, sheet.joined(column.head for column in chosen["station"])))
+    return {**dict.fromkeys(settings), f"{end}_x": row_key, f"{end}_y": row_key, f"{end}_z": 0}
 
 
 def _times(sheet: Sheet, station: np.ndarray) -> list[str]:
     """Heads of the columns that tell which rows, of a station (S,) each, are of one moment, or DataError."""
     heads = [head for head in sheet.heads if LISTS["time"] & set(words_of(head))]
-    asked = f"{sheet.source}: no coordinates, and rows of one station each: which are of one moment?"
+    fault = f"{sheet.source}: no coordinates, and rows of one station each: which are of one moment?"
     wanted = "expected a column of times, or one row a moment with a column of levels per station"
     if not heads:
-        raise DataError(f"{asked} {wanted}")
+        raise DataError(f"{fault} {wanted}")
     moment, named = sheet.joined(heads), list_first([*map(repr, heads)])
     links, moments = len({*zip(moment.tolist(), station.tolist(), strict=True)}), len(set(moment))
     alone, empty = moments == len(moment) and len(set(station)) > 1, int((moment == "").sum())
     # Clocks of whole seconds repeat now and then; those of days, or of each row, tell nothing.
     if empty or alone or 2 * links < len(moment):
         found = f"{named} has {moments} values in {len(moment)} rows, {empty} empty"
-        raise DataError(f"{asked} {found}; {wanted}")
+        raise DataError(f"{fault} {found}; {wanted}")
     return heads
 
 
@@ -234,20 +234,20 @@ class StationList:
 
     def shared_name_problem(self, words: np.ndarray) -> str | None:
         """Return what is wrong where words (S,) are of a column whose names several stations share."""
-        known = set(words.tolist())
+        column = set(words.tolist())
         for head, names in self.repeated.items():
-            twice = [name for name in dict.fromkeys(names) if names.count(name) > 1 and name in known]
-            if twice and len(known & set(names)) > len(known & set(self.names)):
-                which = [own for own, name in zip(self.names, names, strict=True) if name == twice[0]]
+            twice = [name for name in dict.fromkeys(names) if names.count(name) > 1 and name in column]
+            if twice and len(column & set(names)) > len(column & set(self.names)):
+                which = [station for station, name in zip(self.names, names, strict=True) if name == twice[0]]
                 advice = "leave only those of the area in the list, or say dataset.columns.station=HEAD+HEAD"
                 return f"{head} {twice[0]} names {list_first(which)} of the list of stations; {advice}"
         return None
 
     def use_names_of(self, words: np.ndarray) -> StationList:
         """Return the same under the names that most of words (S,) are of, its own first."""
-        known = set(words.tolist())
+        column = set(words.tolist())
         # Of names that fit alike the list's own are taken, as `max` keeps the first.
-        names = max((self.names, *self.aliases), key=lambda names: len(known & set(names)))
+        names = max((self.names, *self.aliases), key=lambda names: len(column & set(names)))
         return replace(self, names=names, label=None if names == self.names else self.names)
 
     def part_by(self, words: np.ndarray, longer: np.ndarray) -> StationList:
@@ -267,13 +267,13 @@ class StationList:
     def add_missing(self, words: np.ndarray, notes: list[str]) -> StationList:
         """Add those of words (S,) that it lacks, if few, at unknown places, with a note; return it."""
         names = [word for word in dict.fromkeys(words.tolist()) if word]
-        lost = [word for word in names if word not in self.names]
+        missing_names = [word for word in names if word not in self.names]
         # Of few stations, or with a third of them missing, it is the wrong list rather than an old one.
-        if not lost or len(names) < LEAST_LISTED or len(names) < 3 * len(lost):
+        if not missing_names or len(names) < LEAST_LISTED or len(names) < 3 * len(missing_names):
             return self
-        rows, more = int(np.isin(words, lost).sum()), len(lost)
-        said = f"{more} of {len(names)} stations are not in the list, with {rows} of {len(words)} rows"
-        notes.append(Caution(f"{said}: {list_first(lost)}; their places are unknown"))
+        rows, more = int(np.isin(words, missing_names).sum()), len(missing_names)
+        finding = f"{more} of {len(names)} stations are not in the list, with {rows} of {len(words)} rows"
+        notes.append(Caution(f"{finding}: {list_first(missing_names)}; their places are unknown"))
         height = None if self.places.height is None else np.r_[self.places.height, np.full(more, np.nan)]
         across = np.concatenate([self.places.across, np.full((more, 2), np.nan)])
         extra = {
@@ -282,8 +282,8 @@ class StationList:
             for name, array in self.extra.items()
         }
         where = Places(across, height, self.places.degrees)
-        label = None if self.label is None else (*self.label, *lost)
-        return replace(self, names=(*self.names, *lost), places=where, extra=extra, label=label)
+        label = None if self.label is None else (*self.label, *missing_names)
+        return replace(self, names=(*self.names, *missing_names), places=where, extra=extra, label=label)
 
 
 def read_stations(sheet: Sheet) -> StationList | None:
@@ -293,13 +293,13 @@ def read_stations(sheet: Sheet) -> StationList | None:
     if not called and len(naming) > 1:  # a list names a station in each row, and may name its site, too
         called = [head for head in naming if len(set(sheet.words(head).tolist())) == len(sheet)][:1]
     # What is of a beam, or a carrier, is no measurement, whatever its head says besides.
-    own = {*SECTOR, *TILTS, "carrier_hz"}
-    others = sheet.frame[[head for head in sheet.heads if sector_quantity(head) not in own]]
+    group = {*SECTOR, *TILTS, "carrier_hz"}
+    others = sheet.frame[[head for head in sheet.heads if sector_quantity(head) not in group]]
     plain = replace(sheet, frame=others, notes=[])
     columns = choose_columns(plain, {"station": called[0]} if len(called) == 1 else {}).values()
-    chosen = {rename_for_stations(own[0]).role: tuple(map(rename_for_stations, own)) for own in columns}
-    told = (note for note in plain.notes if not note.startswith("not used"))
-    sheet.notes.extend(type(note)(f"{sheet.source}: {note}") for note in told)
+    chosen = {rename_for_stations(group[0]).role: tuple(map(rename_for_stations, group)) for group in columns}
+    notes = (note for note in plain.notes if not note.startswith("not used"))
+    sheet.notes.extend(type(note)(f"{sheet.source}: {note}") for note in notes)
     if "station" not in chosen:
         return sheet.refuse("no column of names; expected one called name or station")
     coordinates = read_places(sheet, chosen, "station_", unknown=True)

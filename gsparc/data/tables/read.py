@@ -148,8 +148,8 @@ class Builder:
         if np.isnan(values).all():
             self.refuse("no value in any row", columns[0].head or "")
         for text, count in self.sheet.marks.items():
-            said = f"{count} of {values.size} levels are {text!r}: taken as not heard"
-            self.notes.append(Caution(f"{said}, below the weakest; dataset.not_heard=[] refuses them"))
+            note = f"{count} of {values.size} levels are {text!r}: taken as not heard"
+            self.notes.append(Caution(f"{note}, below the weakest; dataset.not_heard=[] refuses them"))
         first = columns[0]
         guessed = role == "rssi_db" and first.unit is None and first.word not in ("", role)
         # Received levels in dBm are below 0: a column without one is a power, a share, or lost its sign.
@@ -170,8 +170,8 @@ class Builder:
         # A tone may lack one of its two columns: both sets are joined, so that the lacking one is named.
         amplitudes = names == heads.POLAR and not pairs[1]
         self.tones = np.array(sorted(set(pairs[0]) | set(pairs[1])))
-        for name, own, other in zip(names, pairs, pairs[::-1], strict=True):
-            for tone in [] if amplitudes else sorted(set(other) - set(own)):
+        for name, tones, other in zip(names, pairs, pairs[::-1], strict=True):
+            for tone in [] if amplitudes else sorted(set(other) - set(tones)):
                 fault = f"{other[tone].head!r} has no {name} beside it"
                 self.refuse(f"{fault}; say dataset.columns.{name}=COLUMN")
         parts = [[part[tone].numbers(self.sheet) for tone in sorted(part)] for part in pairs if part]
@@ -186,8 +186,8 @@ class Builder:
         first, second = (np.stack([v for v in part if v is not None], axis=1) for part in parts)
         csi = first + 1j * second
         if names == heads.POLAR:
-            csi, said = join_polar(first, second, [pair[self.tones[0]].unit for pair in pairs])
-            self.notes += said
+            csi, notes = join_polar(first, second, [pair[self.tones[0]].unit for pair in pairs])
+            self.notes += notes
         csi = csi[:, 0] if csi.shape[1] == 1 else csi
         self.arrays["csi"] = csi
         if np.isnan(csi).any():
@@ -236,8 +236,8 @@ class Builder:
             self.arrays |= {} if stations.label is None else {"station_label": np.array(stations.label)}
             self.arrays |= {} if stations.index is None else {"station": stations.index.astype(np.int64)}
             # A list in degrees does not go with rows that are apart in metres, of which nobody knows where.
-            apart = any(column.by_row for column in self.chosen.get(f"{moving}_x", ()))
-            others["station"] = Places.unknown(len(stations.names)) if apart else stations.places
+            by_row = any(column.by_row for column in self.chosen.get(f"{moving}_x", ()))
+            others["station"] = Places.unknown(len(stations.names)) if by_row else stations.places
         self._add_places(moving, where)
         for name, other in others.items():
             if other.degrees != where.degrees:
@@ -295,11 +295,11 @@ class Builder:
             listed, joined = self.listed.use_names_of(plain), self.listed.use_names_of(words)
             exact = columns[0].label == JOINED and bool(columns[0].word)
             # Where the list knows the names without what other columns add to them, these are taken.
-            known = set(plain) <= set(listed.names)
-            words = plain if exact and known else words
+            is_listed = set(plain) <= set(listed.names)
+            words = plain if exact and is_listed else words
             # What other columns add to a listed name stands where that does: antennas, carriers, devices.
-            apart = known and not set(words) <= set(joined.names)
-            self.listed = listed.part_by(plain, words) if apart else listed if words is plain else joined
+            is_finer = is_listed and not set(words) <= set(joined.names)
+            self.listed = listed.part_by(plain, words) if is_finer else listed if words is plain else joined
         nameless = f"no station; expected its name{self._complete_names()}"
         self.sheet.refuse_rows(head, np.flatnonzero(words == ""), nameless)
         if self.listed is not None:
@@ -352,7 +352,7 @@ class Builder:
             return self._nowhere(labels, degrees)
         self._all_listed(np.array(labels), None)
         names = self.listed.label or self.listed.names
-        silent = [own for own, name in zip(names, self.listed.names, strict=True) if name not in labels]
+        silent = [title for title, name in zip(names, self.listed.names, strict=True) if name not in labels]
         used = used_heads(self.chosen)
         for name in silent:
             # Heads that are used belong to other stations; 0.6 is difflib's own cutoff.
@@ -376,8 +376,8 @@ class Builder:
             return self.refuse(wrong)
         if head is not None:
             self.listed = self.listed.add_missing(words, self.notes)
-        known = {"", *self.listed.names}
-        unlisted = [word for word in dict.fromkeys(words.tolist()) if word not in known]
+        names = {"", *self.listed.names}
+        unlisted = [word for word in dict.fromkeys(words.tolist()) if word not in names]
         place = f"{self.sheet.source}, " + ("the heads" if head is None else f"column {head!r}")
         if len(unlisted) > MOST_NAMED:
             fault = f"{list_first([*map(repr, unlisted)])} are no listed stations; the list has "
@@ -413,8 +413,8 @@ class Builder:
         """Add positions [m], or degrees and heights."""
         height = places.UNKNOWN_HEIGHT if where.height is None else where.height
         if where.height is None:
-            said = f"no height of the {ENDS.get(name, 'stations')}: taken as {places.UNKNOWN_HEIGHT:g} m"
-            self.notes.append(said if name in ENDS else Caution(said))
+            note = f"no height of the {ENDS.get(name, 'stations')}: taken as {places.UNKNOWN_HEIGHT:g} m"
+            self.notes.append(note if name in ENDS else Caution(note))
         # Equal heights are kept as one: schema arrays of shape () hold for all rows.
         elif len(np.unique(where.height)) == 1:
             height = where.height[0]

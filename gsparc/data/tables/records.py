@@ -72,8 +72,8 @@ def _of_json(text: str) -> list[dict[str, Any]]:
         if len(content) < 2 or not all(isinstance(one, dict) for one in content):
             raise whole from None
     if isinstance(content, dict):
-        held = [value for value in content.values() if _holds_records(value)]
-        content = held[0] if len(held) == 1 else _of_columns(content) or [content]
+        lists = [value for value in content.values() if _holds_records(value)]
+        content = lists[0] if len(lists) == 1 else _of_columns(content) or [content]
     if not _holds_records(content):
         raise ValueError("no records: expected [{...}, ...], or one {...} a line")
     return [one if isinstance(one, dict) else {} for one in content]  # rows keep their numbers
@@ -101,10 +101,10 @@ def _of_columns(content: dict[str, Any]) -> list[dict[str, Any]]:
     """
     if isinstance(rows := content.get("data"), list) and isinstance(heads := content.get("columns"), list):
         return [dict(zip(heads, row, strict=True)) for row in rows]
-    held = [*content.values()]
-    if all(isinstance(one, dict) for one in held) and all(map(str.isdigit, content)):
-        return held if len(held) > 1 else []
-    columns = [list(c.values()) if isinstance(c, dict) else c for c in held]
+    values = [*content.values()]
+    if all(isinstance(one, dict) for one in values) and all(map(str.isdigit, content)):
+        return values if len(values) > 1 else []
+    columns = [list(c.values()) if isinstance(c, dict) else c for c in values]
     if len(columns) < 2 or not all(isinstance(c, list) and len(c) == len(columns[0]) > 1 for c in columns):
         return []
     return [dict(zip(content, row, strict=True)) for row in zip(*columns, strict=True)]
@@ -118,12 +118,12 @@ def _of_xml(text: str) -> list[dict[str, Any]]:
     for point in points:
         record: dict[str, Any] = dict(point.attrib)
         for one in point.iter():
-            held = next((child.text for child in one if _tag(child) == "value"), one.text)
+            value = next((child.text for child in one if _tag(child) == "value"), one.text)
             name = one.get("name", _tag(one))
             if name == "coordinates" and one.text:
                 record[name] = np.fromstring(one.text, sep=",").tolist()
-            elif held and held.strip() and name != "value":
-                record[name] = held.strip()
+            elif value and value.strip() and name != "value":
+                record[name] = value.strip()
         records.append(record)
     return records
 

@@ -52,21 +52,21 @@ def earfcn_hz(channel: np.ndarray) -> np.ndarray:
     """Return downlink frequencies [Hz] of LTE or NR channel numbers (n,), NaN of none (TS 36.101, 5.7.3)."""
     lowest, first = BANDS.sort_values("first_earfcn").to_numpy().T
     at = np.searchsorted(first, np.nan_to_num(channel, nan=-1), side="right") - 1
-    own = channel - first[at]
-    lte = np.where((at >= 0) & (own < WIDEST), lowest[at] + 0.1 * own, np.nan)
+    offset = channel - first[at]
+    lte = np.where((at >= 0) & (offset < WIDEST), lowest[at] + 0.1 * offset, np.nan)
     nr = np.where(channel < 600_000, 0.005 * channel, 3000 + 0.015 * (channel - 600_000))
     nr = np.where(channel < 2_016_667, nr, 24250.08 + 0.06 * (channel - 2_016_667))
-    held = np.abs(nr[:, None] - NR_MHZ.mean(axis=1)) <= np.ptp(NR_MHZ, axis=1) / 2
-    named = np.where(channel < FIRST_NR, lte, np.where(held.any(axis=1), nr, np.nan))
+    in_band = np.abs(nr[:, None] - NR_MHZ.mean(axis=1)) <= np.ptp(NR_MHZ, axis=1) / 2
+    named = np.where(channel < FIRST_NR, lte, np.where(in_band.any(axis=1), nr, np.nan))
     return np.where(channel % 1 == 0, named, np.nan) * MHZ
 
 
 def band_hz(band: np.ndarray) -> np.ndarray:
     """Return lowest downlink frequencies [Hz] of LTE bands (n,), or of [MHz] that name one; NaN of none."""
-    known = BANDS["lowest_mhz"].reindex(np.nan_to_num(band).astype(int)).to_numpy()
+    band_mhz = BANDS["lowest_mhz"].reindex(np.nan_to_num(band).astype(int)).to_numpy()
     lowest = BANDS["lowest_mhz"].to_numpy()
     names = (abs(np.nan_to_num(band)[:, None] / lowest - 1) < NEAR_BAND).any(axis=1)
-    return np.where(band > MOST_BAND, np.where(names, band, np.nan), known) * MHZ
+    return np.where(band > MOST_BAND, np.where(names, band, np.nan), band_mhz) * MHZ
 
 
 def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndarray]:
@@ -84,23 +84,23 @@ def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndar
         if name is None or name in found or not np.isfinite(values).any():
             unread.append(repr(head))
             continue
-        said = name if unit is None or name != "carrier_hz" else f"{name} in {unit.name}"
-        lost = np.flatnonzero(np.isnan(values) & (sheet.words(head) != "") & np.isnan(written))
-        if len(lost):
-            cells = list_first([f"'{sheet.words(head)[i]}' in {sheet.rows[i]}" for i in lost])
+        meaning = name if unit is None or name != "carrier_hz" else f"{name} in {unit.name}"
+        bad_rows = np.flatnonzero(np.isnan(values) & (sheet.words(head) != "") & np.isnan(written))
+        if len(bad_rows):
+            cells = list_first([f"'{sheet.words(head)[i]}' in {sheet.rows[i]}" for i in bad_rows])
             notes.append(Caution(f"{sheet.source}: column {head!r}: {cells}: no {name}; unknown"))
         if name == "station_azimuth" and (values < 0).any() and (values[values < 0] == -1).all():
-            values, said = np.where(values < 0, np.nan, values), f"{name}, -1 unknown"
+            values, meaning = np.where(values < 0, np.nan, values), f"{name}, -1 unknown"
         high = np.nanmedian(values) > UNSAID_DBM or not np.nan_to_num(values).any()
         empty = "station_width", "station_thickness", *["station_power_db"] * bool(high)
         if name in empty and (values == 0).any():
-            values, said = np.where(values == 0, np.nan, values), f"{name}, 0 unknown"
+            values, meaning = np.where(values == 0, np.nan, values), f"{name}, 0 unknown"
         if name in TILTS and (values < 0).any() and not (values > 0).any():
             notes.append(Caution(f"{sheet.source}: {head!r} are all below 0: read as below the horizon"))
             values = -values
         _doubt(sheet, head, name, values, written, unit is None)
         found[name] = values
-        heads.append(f"{head!r} as {said}")
+        heads.append(f"{head!r} as {meaning}")
     parts = [found.pop(name) for name in TILTS if name in found]
     if parts:
         total = np.nansum(parts[-2:] if len(parts) < 3 else parts[:1], axis=0)
@@ -125,46 +125,46 @@ def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndar
 def _read_cells(sheet: Sheet, head: str, name: str | None) -> tuple[np.ndarray, np.ndarray, Unit | None]:
     """Read values (T,) in the schema's unit, by each cell's or the head's; those without; the head's unit."""
     cells = pd.Series(sheet.words(head) if name else np.zeros(0, str)).str.replace(",", ".").str.extract(CELL)
-    numbers, own = pd.to_numeric(cells[0]).to_numpy(float), cells[1].fillna("").str.lower().to_numpy()
+    numbers, units = pd.to_numeric(cells[0]).to_numpy(float), cells[1].fillna("").str.lower().to_numpy()
     unit = unit_of(head)[1] or UNITS.get(words_of(head)[-1])
-    written, values = np.where(own == "", numbers, np.nan), np.full(len(own), np.nan)
+    written, values = np.where(units == "", numbers, np.nan), np.full(len(units), np.nan)
     if name == "carrier_hz" and unit is None:  # their range is narrower than the steps of units
         hertz = [UNITS[one] for one in ("hz", "khz", "mhz", "ghz")]
         unit = next((one for one in hertz if _fits(one, written, name)), hertz[0])
-    for text in np.unique(own):
+    for text in np.unique(units):
         one = UNITS.get(text) if text else unit or UNITS["m"]
         kinds = (RANGES[name][3], *["level"] * (name == "station_power_db")) if name in RANGES else ()
         if one is not None and (one.kind in kinds or not (text or unit)):
-            values[own == text] = _convert(one, numbers[own == text])
+            values[units == text] = _convert(one, numbers[units == text])
     return values, written, unit
 
 
 def _convert(unit: Unit, values: np.ndarray) -> np.ndarray:
     """Values (n,) in a unit, in the schema's; powers in dBm."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        own = unit.convert(values)
-        return 10 * np.log10(own) + 30 if unit.kind == "power" else own
+        result = unit.convert(values)
+        return 10 * np.log10(result) + 30 if unit.kind == "power" else result
 
 
 def _fits(unit: Unit, values: np.ndarray, name: str) -> bool:
     """Whether values (n,) that are in a unit can be those of a quantity of `RANGES`."""
     low, high, least, _ = RANGES[name]
-    own = _convert(unit, values[np.isfinite(values)])
-    return not own.any() or bool(((own >= low) & (own <= high)).all() and np.abs(own).max() >= least)
+    trial = _convert(unit, values[np.isfinite(values)])
+    return not trial.any() or bool(((trial >= low) & (trial <= high)).all() and np.abs(trial).max() >= least)
 
 
 def _doubt(sheet: Sheet, head: str, name: str, values: np.ndarray, written: np.ndarray, unsaid: bool) -> None:
     """Refuse values (T,) that cannot be (DataError), doubt rare ones, and name the unit that fits."""
     if name not in RANGES or np.isnan(values).all():
         return
-    (least, most, _, kind), (low, high, apart) = RANGES[name], USUAL.get(name, (*RANGES[name][:2], np.inf))
+    (least, most, _, kind), (low, high, spread) = RANGES[name], USUAL.get(name, (*RANGES[name][:2], np.inf))
     low, middle = UNSAID_DBM if unsaid and kind == "power" else low, np.nanmedian(values)
     refused, off = not _fits(UNITS["m"], values, name), (values < least) | (values > most)
     if not off.any():
         off = refused & np.isfinite(values) | (values < low) | (values > high)
         turned = (values % 1 != 0) & (np.abs(values) < 2 * np.pi)  # degrees of azimuths are seldom as small
         off |= turned & (name == "station_azimuth") & (turned.sum() >= max(LEAST, FEW * len(values)))
-        single = np.abs(values - middle) > apart
+        single = np.abs(values - middle) > spread
         off |= single & (single.sum() <= FEW * len(values))
     if not off.any():
         return
@@ -172,21 +172,21 @@ def _doubt(sheet: Sheet, head: str, name: str, values: np.ndarray, written: np.n
     middle = float(np.median(rest)) if off.sum() <= FEW * len(values) and len(rest) else np.nan
     others = [one for one in UNITS.values() if one.kind == kind and (one.changes or kind == "power")]
     least_usual, written = USUAL.get(name, (least,))[0], written[off]
-    own = {one.name: _convert(one, written) for one in others}
-    usual = {one: (v >= least_usual) & (v <= high) & ~(abs(v - middle) > apart) for one, v in own.items()}
+    trials = {one.name: _convert(one, written) for one in others}
+    usual = {one: (v >= least_usual) & (v <= high) & ~(abs(v - middle) > spread) for one, v in trials.items()}
     fitting = [one for one, holds in usual.items() if holds.all()]
-    shown = [f"{values[i]:g} in {sheet.rows[i]}" for i in np.flatnonzero(off)]
-    said = f"{sheet.source}: column {head!r} holds {list_first(shown, 3)}; expected {name} of "
-    said += f"{low:g} to {high:g}" + ("" if np.isnan(middle) else f", {middle:g} of most")
+    cells = [f"{values[i]:g} in {sheet.rows[i]}" for i in np.flatnonzero(off)]
+    fault = f"{sheet.source}: column {head!r} holds {list_first(cells, 3)}; expected {name} of "
+    fault += f"{low:g} to {high:g}" + ("" if np.isnan(middle) else f", {middle:g} of most")
     if fitting and np.isfinite(middle):
-        said += f"; in {fitting[0]}? then write so, as '{written[0]:g} {fitting[0]}'"
+        fault += f"; in {fitting[0]}? then write so, as '{written[0]:g} {fitting[0]}'"
     elif fitting:
         fitting[2:] = ["dBm"] if kind == "power" and not refused else fitting[2:3]
-        said += f"; name its unit, as in '{unit_of(head)[0]} [{fitting[0]}]'"
-        said += f", where {' or '.join(fitting)} would fit" * (len(fitting) > 1)
+        fault += f"; name its unit, as in '{unit_of(head)[0]} [{fitting[0]}]'"
+        fault += f", where {' or '.join(fitting)} would fit" * (len(fitting) > 1)
     if refused:
-        raise DataError(said)
-    sheet.notes.append(Caution(said))
+        raise DataError(fault)
+    sheet.notes.append(Caution(fault))
 
 
 def number_sites(sheet: Sheet) -> tuple[str, np.ndarray] | None:

@@ -20,10 +20,10 @@ def find_slots(heads: tuple[str, ...]) -> dict[str, dict[str, str]]:
     found: dict[str, dict[str, str]] = {}
     for head in heads:
         words = words_of(unit_of(head)[0])
-        held = [HOLDS[word] for word in words if word in HOLDS]
+        kinds = [HOLDS[word] for word in words if word in HOLDS]
         name = " ".join(word for word in words if word not in {*HOLDS, "cell", "dbm"})
-        if len(held) == 1 and held[0] not in found.setdefault(name, {}):
-            found[name][held[0]] = head
+        if len(kinds) == 1 and kinds[0] not in found.setdefault(name, {}):
+            found[name][kinds[0]] = head
     slots = {name: parts for name, parts in found.items() if set(parts) >= NEEDED}
     return slots if len(slots) >= LEAST else {}
 
@@ -44,14 +44,14 @@ def unfold_slots(sheet: Sheet, said: Container[str]) -> Sheet:
     level = next(iter(slots.values()))["RSRP"]
     names = {"PCI": "PCI", "RSRP": f"RSRP{level[len(unit_of(level)[0]) :]}", "EARFCN": "EARFCN"}
     # What else is of one slot says nothing of the others.
-    own = [{*name.split()} for name in slots if name]
+    slot_words = [{*name.split()} for name in slots if name]
     rest = [head for head in sheet.heads if head not in used]
-    kept = [h for h in rest if h in said or not any(words <= {*words_of(h)} for words in own)]
+    common = [h for h in rest if h in said or not any(words <= {*words_of(h)} for words in slot_words)]
     parts = []
     for slot in slots.values():
-        held = (sheet.words(slot["PCI"]) != "") & (sheet.words(slot["RSRP"]) != "")
+        has_cell = (sheet.words(slot["PCI"]) != "") & (sheet.words(slot["RSRP"]) != "")
         of_slot = {head: name for part, name in names.items() if (head := slot.get(part, shared)) is not None}
-        parts.append(sheet.frame.loc[held, [*kept, *of_slot]].rename(columns=of_slot))
+        parts.append(sheet.frame.loc[has_cell, [*common, *of_slot]].rename(columns=of_slot))
     whole = pd.concat(parts).sort_index(kind="stable")
     rows = tuple(sheet.rows[i] for i in whole.index)
     named = list_first([*map(repr, slots)], 3)

@@ -25,8 +25,8 @@ def find_times(sheet: Sheet, used: Container[str | None]) -> tuple[str, ...]:
     texts = {head: pd.Series(sheet.words(head)) for head in heads}
     dates, clocks = ([h for h in heads if _all_match(texts[h], part)] for part in (DATE, CLOCK))
     pairs = [(dates[0], clocks[0])] if dates and clocks else []
-    tried = [*pairs, *((head,) for head in heads if head not in dates)]
-    return next((one for one in tried if read_times(sheet, one) is not None), ())
+    candidates = [*pairs, *((head,) for head in heads if head not in dates)]
+    return next((one for one in candidates if read_times(sheet, one) is not None), ())
 
 
 def read_times(sheet: Sheet, heads: Iterable[str]) -> tuple[np.ndarray, str] | None:
@@ -39,8 +39,8 @@ def read_times(sheet: Sheet, heads: Iterable[str]) -> tuple[np.ndarray, str] | N
     found = _read_numbers(text, " ".join(heads)) or _read_text(text)
     if found is None:
         return None
-    known = found[0][np.isfinite(found[0])]
-    return found[0], found[1] + ", not in order of time" * bool((np.diff(known) < 0).any())
+    seconds = found[0][np.isfinite(found[0])]
+    return found[0], found[1] + ", not in order of time" * bool((np.diff(seconds) < 0).any())
 
 
 def _all_match(text: pd.Series, pattern: str) -> bool:
@@ -67,9 +67,9 @@ def _read_text(text: pd.Series) -> tuple[np.ndarray, str] | None:
     if _all_match(text, CLOCK):
         whole = text.str.replace(r"^(\d+:\d+)(?=$|\.)", r"\1:00", regex=True)
         seconds = pd.to_timedelta(whole, errors="coerce").dt.total_seconds().to_numpy(copy=True)
-        known = np.isfinite(seconds)
+        finite = np.isfinite(seconds)
         # A clock that falls by half a day has passed midnight.
-        seconds[known] += 2 * HALF_DAY_S * np.cumsum(np.diff(seconds[known], prepend=0.0) < -HALF_DAY_S)
+        seconds[finite] += 2 * HALF_DAY_S * np.cumsum(np.diff(seconds[finite], prepend=0.0) < -HALF_DAY_S)
         return seconds, "clock times of a day that is not named"
     first, middle = text.str.extract(r"^(\d+)[-/. ](\d+)").apply(pd.to_numeric).max().tolist()
     day_first = first <= 31 and not (middle > 12 or text.str.contains("[AaPp][Mm]$").any())

@@ -36,12 +36,12 @@ def say_effects(sheet: Sheet, chosen: Chosen, data: Measurements, file_row: np.n
         return [f"{few}, here are {len(links)}: devices, powers or other transmitters would pass unseen"]
     for head, value in find_filled(links, row, words).items():
         other = next(word for word in words[head][row] if word != value)
-        said = f"column {head!r}: levels of rows where it is {value!r} follow their neighbours, without noise"
+        note = f"column {head!r}: levels of rows where it is {value!r} follow their neighbours, without noise"
         how = f"{say_column('run', head)} 'dataset.runs=[\"{other}\"]' leaves them out"
-        notes.append(Caution(f"{said}: filled in, not measured? {how}"))
+        notes.append(Caution(f"{note}: filled in, not measured? {how}"))
     for effect in find_effects(links, row, words):
         head = effect.head
-        left = f"{effect.share:.0%} of what places and stations leave"
+        share = f"{effect.share:.0%} of what places and stations leave"
         if effect.kind == "number":
             factor = f"*{abs(effect.size):g}" * (abs(effect.size) != 1)
             power_text += f"{'+' if effect.size < 0 else '-'}{head}{factor}"
@@ -59,5 +59,5 @@ def say_effects(sheet: Sheet, chosen: Chosen, data: Measurements, file_row: np.n
             how = f"{say_column('station', '+'.join(names))} tells them apart"
             what = "another transmitter for each value"
             how = "a file for each value takes them apart" if wide else how
-        notes.append(Caution(f"column {head!r} is not used and explains {left}: {what}? {how}"))
+        notes.append(Caution(f"column {head!r} is not used and explains {share}: {what}? {how}"))
     return notes

@@ -128,8 +128,8 @@ def read_entries(group: str, of: type[Entry], config: Mapping[str, Any]) -> dict
     for name, entry in config.items():
         if entry is None:
             continue
-        own = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry).items()}
-        entries[str(name)] = from_settings(of, {"name": str(name), **own}, f"{group}.{name}")
+        values = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry).items()}
+        entries[str(name)] = from_settings(of, {"name": str(name), **values}, f"{group}.{name}")
     return entries
 
 
@@ -165,8 +165,8 @@ def compose(
     """
     # A copy: the composed configuration is cached and shared by all draws.
     config = deepcopy(_composed(tuple(overrides)))
-    own = {name: value for name, value in settings.items() if name != "dataset"}
-    OmegaConf.update(config, "dataset", own, merge=True)
+    dataset_settings = {name: value for name, value in settings.items() if name != "dataset"}
+    OmegaConf.update(config, "dataset", dataset_settings, merge=True)
     OmegaConf.update(config, "seed", seed or 0)
     if draw is not None:
         OmegaConf.update(config, "split.seed", draw)
@@ -193,19 +193,19 @@ def load_every_problem(settings: Mapping[str, Any]) -> list[Problem]:
     wanted = wanted_cells(settings)
     splits = read_entries("splits", SplitChoice, settings["splits"])
     problems, absent = list[Problem](), list[str]()
-    for name, own in ((name, own or {}) for name, own in settings["datasets"].items()):
-        given = [path for key, path in own.items() if key in ("root", "file")]
-        paths = [path or fetched_path_or_none(own.get("dataset", name)) for path in given]
-        if own and not any(paths):  # a plugin's dataset may need no path
+    for name, entry in ((name, entry or {}) for name, entry in settings["datasets"].items()):
+        locations = [path for key, path in entry.items() if key in ("root", "file")]
+        paths = [path or fetched_path_or_none(entry.get("dataset", name)) for path in locations]
+        if entry and not any(paths):  # a plugin's dataset may need no path
             absent.append(name)
             continue
-        meant = [
+        choices = [
             split
             for split in splits.values()
             if (not split.datasets or name in split.datasets)
             and (not wanted or any(_may_match(p, name, split.name) for p in wanted))
         ]
-        problems += load_problems(name, own, meant) if meant else []
+        problems += load_problems(name, entry, choices) if choices else []
     if absent:
         how = "left out: say datasets.NAME.root=DIR or .file=FILE, or gsparc data"
         log.warning("%s %s", ", ".join(absent), how)
@@ -283,8 +283,8 @@ class Contender:
 
     def overrides(self, effort: float | None) -> list[str]:
         """Return overrides of train.yaml, but for the seed."""
-        own = self.choose or (f"model={self.name}",)
-        return [*own, *([] if effort is None else [f"effort={effort:g}"])]
+        choice = self.choose or (f"model={self.name}",)
+        return [*choice, *([] if effort is None else [f"effort={effort:g}"])]
 
 
 @dataclass(frozen=True)
@@ -326,8 +326,8 @@ def unlisted_contenders() -> dict[str, Contender]:
     # The file, not the settings: `~methods.gp` on a command line leaves it out.
     file = config_folder() / "compare.yaml"
     listed = load_yaml(file.read_text(encoding="utf-8"), file)["methods"]
-    known = {*listed, *({*built_in_methods()} - {*plain_methods()})}
-    kinds = {name: import_target(path) for name, path in all_methods().items() if name not in known}
+    exclusions = {*listed, *({*built_in_methods()} - {*plain_methods()})}
+    kinds = {name: import_target(path) for name, path in all_methods().items() if name not in exclusions}
     # One that cannot be imported is warned of.
     return {name: Unlisted(name, effort=kind.takes_effort) for name, kind in kinds.items() if kind}
 
@@ -383,9 +383,9 @@ def plan_cells(
 
 def plan_jobs(settings: Mapping[str, Any], cells_dir: Path) -> list[Job]:
     """List the fits that conf/compare.yaml asks for, see `plan_cells`."""
-    own = settings["methods"]
-    unlisted = {name: one for name, one in unlisted_contenders().items() if name not in own}
-    methods = unlisted | read_entries("methods", Contender, own)
+    entries = settings["methods"]
+    unlisted = {name: one for name, one in unlisted_contenders().items() if name not in entries}
+    methods = unlisted | read_entries("methods", Contender, entries)
     for effort in settings["efforts"]:
         POSITIVE.check("efforts", effort)
     problems = load_every_problem(settings)

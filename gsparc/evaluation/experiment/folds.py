@@ -31,11 +31,11 @@ log = logging.getLogger("gsparc.models")  # of which the console shows warnings 
 def effort_settings(config: Mapping[str, Any]) -> dict[str, Any]:
     """Return what of a context decides how much is searched, and on which rows; it makes no object."""
     split = config.get("split")
-    own = split if split is None or isinstance(split, dict) else to_dict(split)
+    values = split if split is None or isinstance(split, dict) else to_dict(split)
     return {
         # `get`: configurations of other commands, and older ones, lack some of these keys.
         "seed": int(config.get("seed", 0)), "effort": float(config.get("effort", 1.0)),
-        "stations": config.get("stations", "auto"), "split": own and split_settings(own),
+        "stations": config.get("stations", "auto"), "split": values and split_settings(values),
     }  # fmt: skip
 
 
@@ -64,8 +64,8 @@ class FoldFits:
 
     def facts(self) -> dict[str, Any]:
         """Return what a summary says of the fits."""
-        told = [note for note in self.notes if not isinstance(note, Caution)]  # those were warnings
-        facts = {"time/train_cpu_s": fmean(self.train_cpu_s), "model/learned": "\n".join(told) or None}
+        notes = [note for note in self.notes if not isinstance(note, Caution)]  # those were warnings
+        facts = {"time/train_cpu_s": fmean(self.train_cpu_s), "model/learned": "\n".join(notes) or None}
         if self.cost.stages:
             facts |= {"time/cost": self.cost.describe(), "time/unused_s": self.cost.unused_s}
         return facts
@@ -87,7 +87,7 @@ def folds_to_resume(ckpt_path: str | None, factory: MethodFactory, split: Split)
     # A file that belongs to no fold says nothing of where the other folds stand.
     if path.is_file() and not {*every} & {*path.parents} and not list(run.glob("fold*")):
         raise ValueError(f"ckpt_path={path}: split={split.name} has {folds} folds, give the run's folder")
-    return [own if own.is_dir() else None for own in every]
+    return [folder if folder.is_dir() else None for folder in every]
 
 
 def fold_contexts(
@@ -128,8 +128,8 @@ def end_curves(
     """
     squared = columns["error_db"] ** 2 if "error_db" in columns else columns.get("mse")
     for number, (context, spent) in enumerate(zip(contexts, seconds, strict=True)):
-        own = [] if squared is None else squared[columns["fold"] == number]
-        error = float(np.nanmean(own)) if np.isfinite(own).any() else None
+        fold_squares = [] if squared is None else squared[columns["fold"] == number]
+        error = float(np.nanmean(fold_squares)) if np.isfinite(fold_squares).any() else None
         context.log_curve(spent, f"{eval_on} rows", error)
 
 

@@ -39,14 +39,14 @@ def command_line_options() -> dict[str, str]:
     if not HydraConfig.initialized():
         return {}
     hydra = HydraConfig.get()
-    said: dict[str, str] = {}
+    words: dict[str, str] = {}
     # Hydra's own grammar: quotes, lists and + or ~ at the head are not to be split by hand.
     for one in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
         path, value = one.key_or_group, one.value()
         inner = dotted_settings(value, f"{path}.") if isinstance(value, dict) else [(path, value)]
-        said |= {name: one.input_line or name for name, _ in inner}
+        words |= {name: one.input_line or name for name, _ in inner}
     # A file of the group `init` is as good as its name.
-    return {"init.name" if path == "init" else path: text.lstrip("+") for path, text in said.items()}
+    return {"init.name" if path == "init" else path: text.lstrip("+") for path, text in words.items()}
 
 
 def options_to_note(config: DictConfig, method: MethodFactory) -> Reads:
@@ -92,11 +92,11 @@ def warn_of_unheeded(reads: Reads, method: Method, data: Measurements) -> str | 
     """
     counted = {"effort": method.takes_effort, "stations": data.site.several}
     reads.noted |= {name for name, heeded in counted.items() if heeded}
-    known = {option.path for option in reads.options}
+    paths = {option.path for option in reads.options}
     why: dict[str, list[str]] = defaultdict(list)
     for path, text in command_line_options().items():
         # Prefixes end at a dot, else `trainer` would count `trainer_x`.
-        judged = path in known or any(f"{path}.".startswith(f"{name}.") for name in COUNTED)
+        judged = path in paths or any(f"{path}.".startswith(f"{name}.") for name in COUNTED)
         if judged and not reads.heeds(path):
             why[_instead(path, method, reads, data)].append(text)
     words = "; ".join(f"{', '.join(one)} ({text})" for text, one in why.items())

@@ -41,11 +41,11 @@ def beside_published(rows: pd.DataFrame, published: pd.DataFrame) -> pd.DataFram
     Both are as of `average_cells`; how far methods are behind the best is of the runs measured here.
     """
     key = [*GROUP, "tested"]
-    own = {tuple(one) for one in rows[key].fillna(-1.0).to_numpy()}
+    row_keys = {tuple(one) for one in rows[key].fillna(-1.0).to_numpy()}
     here = {tuple(one) for one in rows[[*PROBLEM, "tested"]].to_numpy()}
     wanted = [
-        tuple(one) not in own and (one[0], one[1], one[-1]) in here
+        tuple(one) not in row_keys and (one[0], one[1], one[-1]) in here
         for one in published[key].fillna(-1.0).to_numpy()
     ]
-    kept = published[np.array(wanted, bool)]
-    return pd.concat([rows, kept], ignore_index=True) if len(kept) else rows
+    extra_rows = published[np.array(wanted, bool)]
+    return pd.concat([rows, extra_rows], ignore_index=True) if len(extra_rows) else rows

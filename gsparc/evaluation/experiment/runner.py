@@ -81,8 +81,8 @@ class Job:
     def state(self) -> State:
         """What its result is to be of."""
         state = State.from_config(self.config, self.content, self.split.sha256)
-        own = {} if self.learned is None else {"learned": str(self.name)}
-        return replace(state, settings=state.settings | own)
+        extra = {} if self.learned is None else {"learned": str(self.name)}
+        return replace(state, settings=state.settings | extra)
 
     def row(self) -> dict[str, Any]:
         """Return the row of its result in the frame, by the names that it has in the list."""
@@ -117,9 +117,9 @@ def run_list(
         name: of a piece in the log.
         refused: a list that takes the reasons of failed pieces.
     """
-    for number, (made, why) in run_each(partial(_tried, make), pieces, what, **how):
+    for number, (result, why) in run_each(partial(_tried, make), pieces, what, **how):
         if not why:
-            yield pieces[number], made
+            yield pieces[number], result
             continue
         log.log(
             logging.INFO if REFUSED in why else logging.WARNING, "%s is left out: %s",
@@ -221,9 +221,9 @@ def time_by_dataset(filled: pd.DataFrame) -> pd.DataFrame:
     """
     rows = []
     for dataset, here in filled.groupby("dataset", sort=False):
-        own = here[(here.split == here.split.iloc[0]) & here.run.map(lambda run: bool(run.checkpoints))]
+        fits = here[(here.split == here.split.iloc[0]) & here.run.map(lambda run: bool(run.checkpoints))]
         # The first of a method's cells stands for all of its efforts and seeds.
-        first = own.drop_duplicates("method").set_index("method")
+        first = fits.drop_duplicates("method").set_index("method")
         if len(first):
             log.info("%s: timing single queries of every method in turns", dataset)
             files, job = first.run.map(lambda run: run.checkpoints[0]), first.job.iloc[0]

@@ -56,8 +56,8 @@ class Condition:
             return data, fold
         # Both ends of learning: validation rows are measured with the same instrument.
         moved = add_position_errors(data, fold.learned(), self.amount, seed)
-        known = np.full(len(data), self.amount) if self.what == "train_known" else moved.position_std
-        return replace(moved, position_std=known), fold
+        position_std = np.full(len(data), self.amount) if self.what == "train_known" else moved.position_std
+        return replace(moved, position_std=position_std), fold
 
 
 ROW = (
@@ -99,12 +99,12 @@ def plan_rounds(
     learned = dict.fromkeys(one.learned for one in conditions)
     content, jobs = measurements_hash(data), []
     for turn, (variant, config), condition in product(range(rounds), configs.items(), learned):
-        own = OmegaConf.merge(config, {"seed": config.seed + turn})
+        job_config = OmegaConf.merge(config, {"seed": config.seed + turn})
         place = folder / variant / str(turn) / str(condition).replace(" ", "-")
-        change = partial(condition.change_training, seed=own.seed)
+        change = partial(condition.change_training, seed=job_config.seed)
         name = Round(condition.what, condition.amount, variant, turn)
         unchanged = condition.what == "none"
-        jobs.append(Job(name, own, place, data, split, content, learned=None if unchanged else change))  # type: ignore[arg-type]
+        jobs.append(Job(name, job_config, place, data, split, content, learned=None if unchanged else change))  # type: ignore[arg-type]
     return jobs
 
 
@@ -119,14 +119,14 @@ def ask_moved(fits: pd.DataFrame, conditions: Sequence[Condition]) -> pd.DataFra
         if (fit["what"], fit["amount"]) != (condition.learned.what, condition.learned.amount):
             continue
         folds = [condition.change_training(data, fold, fit["seed"])[1] for fold in split.folds]
-        own = {**fit, **asdict(condition), "model": fit["run"].checkpoints[0]}
-        own["rows"] = float(np.mean([len(fold.learned()) for fold in folds]))
+        row = {**fit, **asdict(condition), "model": fit["run"].checkpoints[0]}
+        row["rows"] = float(np.mean([len(fold.learned()) for fold in folds]))
         if condition.what == "query":
             tested = np.concatenate([fold.test for fold in split.folds])
             moved = add_position_errors(data, tested, condition.amount, fit["seed"])
             methods = [loading.load(file)[0] for file in fit["run"].checkpoints]
-            own["value"] = pool_figures(score_methods(methods, moved, split), moved, split)[fit["figure"]]
-        rows.append(own)
+            row["value"] = pool_figures(score_methods(methods, moved, split), moved, split)[fit["figure"]]
+        rows.append(row)
     return pd.DataFrame(rows)
 
 

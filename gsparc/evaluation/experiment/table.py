@@ -101,8 +101,8 @@ def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd
         return pd.DataFrame(columns=ROW).astype({"draws": bool})
     means = ["score_db", "value", *BESIDE, "second_value", "train_s", "train_cpu_s", "load", "gaussians"]
     means += ["memory_mb"]
-    own: list[Row] = filled.to_dict("records")  # type: ignore[assignment]
-    cells = pd.DataFrame([{**row, **_scored(row)} for row in own])
+    records: list[Row] = filled.to_dict("records")  # type: ignore[assignment]
+    cells = pd.DataFrame([{**row, **_scored(row)} for row in records])
     cells = cells.astype({"effort": float})
     # Draws with the same test rows are seeds.
     drawn = cells.groupby(PROBLEM)[["draw", "seed"]].transform("nunique")
@@ -137,8 +137,8 @@ def _with_behind(rows: pd.DataFrame) -> pd.DataFrame:
     for _, here in rows[rows.draws].groupby(PROBLEM):
         # A method that failed on hard draws has an easier mean: it is no best.
         best = here[here.seeds == here.seeds.max()].score_db.idxmax()
-        for row, own in here.results.items():
-            if lead := lead_over_runs(here.results[best], own):
+        for row, results in here.results.items():
+            if lead := lead_over_runs(here.results[best], results):
                 rows.loc[row, ["behind_db", "behind_error_db"]] = lead.ahead_db, lead.error_db
     return rows
 
@@ -185,30 +185,30 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         before = "the same as" if lead.same else f"{lead.ahead_db:.2f} ± {lead.error_db:.2f} dB before"
         lines[0] += f"; {before} {rows[1].method} (standard error over the same {lead.pairs})"
         lines[0] += "" if lead.same else f": they are {'' if lead.sure else 'not '}told apart"
-    own = next((row for row in rows if row.method == ours), None)
-    lead = None if own is None else leads.get(own.method)
+    cell = next((row for row in rows if row.method == ours), None)
+    lead = None if cell is None else leads.get(cell.method)
     figure = heading_of(first.figure)
-    if own is not None and own is not first:
-        gap = f"{ours} is {first.score_db - own.score_db:.2f} dB behind {first.method}"
+    if cell is not None and cell is not first:
+        gap = f"{ours} is {first.score_db - cell.score_db:.2f} dB behind {first.method}"
         lines.append(gap if lead is None or lead.sure else lead.no_difference(first.method, ours, figure))
     if first.method in plain and not block.method.isin(plain).all():
         wins = f"a simple baseline wins: take {first.method} for this data and split"
-        if own is None or lead is None or lead.sure:
-            lines.append(wins if own is not None else f"{ours} was not run: no verdict on it")
+        if cell is None or lead is None or lead.sure:
+            lines.append(wins if cell is not None else f"{ours} was not run: no verdict on it")
     for row in rows[1:]:
-        if own is None or row.method not in plain or row.score_db <= own.score_db:
+        if cell is None or row.method not in plain or row.score_db <= cell.score_db:
             continue
-        ahead = lead_over_runs(row.results, own.results)
+        ahead = lead_over_runs(row.results, cell.results)
         if ahead is None or ahead.sure:
-            lines.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - own.score_db:.2f} dB")
+            lines.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - cell.score_db:.2f} dB")
     # Of a published row the milliseconds are another machine's.
     close = block[(block.score_db >= first.score_db - CLOSE_DB) & block.query_ms.notna() & ~_published(block)]
     if len(close):
         quick = close.loc[close.query_ms.idxmin()]
         near = f"fastest within {CLOSE_DB} dB of the first"
         lines.append(f"{near}: {quick.method}, {quick.query_ms:.3g} ms a query")
-    if given := "; ".join(f"{row.method}: {row.given}" for row in rows if row.given):
-        lines.append(f"given more than places: {given}")
+    if inputs := "; ".join(f"{row.method}: {row.given}" for row in rows if row.given):
+        lines.append(f"given more than places: {inputs}")
     lines += wrong_deviations({row.method: row.chi2 for row in rows}, first.figure)
     if old := ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier):
         lines.append(f"measured with another commit of this program: {old}")
@@ -234,10 +234,10 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
     ]
     mark = np.where(_published(block), " (from beside=)", np.where(block.method == ours, " (ours)", ""))
     rows = block.assign(named=block.method + block.label + mark).to_dict("records")
-    shown = [column for there, column in columns if there]
+    columns_here = [column for there, column in columns if there]
     lead = lead_over_runs(*block.results[:2]) if len(block) > 1 else None
     bold = rows[0]["named"] if lead and lead.sure else None
-    return Table.from_rows(title_of(block), shown, rows, bold=bold)  # type: ignore[arg-type]
+    return Table.from_rows(title_of(block), columns_here, rows, bold=bold)  # type: ignore[arg-type]
 
 
 def _published(block: pd.DataFrame) -> pd.Series:

@@ -64,23 +64,23 @@ def measure_points(
         figures, answers = _score(candidate[1], *how)
         return figures | {"closeness_db": closeness_db(answers, whole)}
 
-    own, whole = _score(candidates[0][1], *how)
-    figure, ways = deciding_figure(own, data.site.scored), list[dict[str, Any]]()
-    first = candidates[0], own | {"closeness_db": closeness_db(whole, whole)}
+    results, whole = _score(candidates[0][1], *how)
+    figure, ways = deciding_figure(results, data.site.scored), list[dict[str, Any]]()
+    first = candidates[0], results | {"closeness_db": closeness_db(whole, whole)}
     others = run_list(score, candidates[1:], "points", name=lambda one: describe_point(one[0]))
-    for (settings, method), own in chain([first], others):
+    for (settings, method), results in chain([first], others):
         knobs = {f"set/{knob}": _cell(value) for knob, value in settings.items()}
-        own |= {"front": 0, "kept_with_model": 0}
+        results |= {"front": 0, "kept_with_model": 0}
         for used in threads:
             label = f"{describe_point(settings)}, {used} thread{'s' * (used > 1)}"
             sizes = {"threads": used, "num_gaussians": method.count_components(), "settings": settings}
-            row = {"label": label, **dict.fromkeys(FACTS.values()), **own, **sizes, **knobs}
+            row = {"label": label, **dict.fromkeys(FACTS.values()), **results, **sizes, **knobs}
             ways.append(row | {"method": method})
     count = len(ways)
     for name, fitted in run_list(lambda one: fit_baseline(one, *how), baselines, "baselines"):
-        own = pool_figures(fitted.scores, data, split)
-        if own[figure] is not None:
-            ways.append({**own, "label": name, "threads": 1, "method": fitted.methods[0]})
+        results = pool_figures(fitted.scores, data, split)
+        if results[figure] is not None:
+            ways.append({**results, "label": name, "threads": 1, "method": fitted.methods[0]})
     rows = pd.DataFrame(ways, dtype=object)
     # Predictors are asked in world coordinates, as a user would.
     places = data.moving[rows_to_score(split.folds[0], eval_on)]
@@ -105,8 +105,8 @@ def _score(method: Method, data: Measurements, split: Split, eval_on: str) -> tu
 def closeness_db(answers: Tensor, whole: Tensor) -> float:
     """Return how near answers (n, ...) are to the full model's [dB], which takes no measurement."""
     # 1e-30: two equal answers, or two of nothing, have no ratio.
-    apart, power = (x.abs().square().sum().item() for x in (answers - whole, whole))
-    return min(10 * math.log10(max(power, 1e-30) / max(apart, 1e-30)), CLOSEST_DB)
+    gap, power = (x.abs().square().sum().item() for x in (answers - whole, whole))
+    return min(10 * math.log10(max(power, 1e-30) / max(gap, 1e-30)), CLOSEST_DB)
 
 
 def find_better(point: Row, others: pd.DataFrame) -> str | None:

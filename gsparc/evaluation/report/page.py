@@ -70,13 +70,13 @@ def make_sections(
     sections = []
     for (dataset, split), group in rows.groupby(PROBLEM, sort=False, dropna=False):
         title, study = f"{dataset}, split {split}", short_settings(group)
-        own = own_rows(study)
-        firsts = own.drop_duplicates("setting")
+        fits = own_rows(study)
+        firsts = fits.drop_duplicates("setting")
         # With one run a setting, spreads over seeds would be empty brackets.
-        several = [tables.table_of_seeds] * (len(firsts) < len(own))
+        several = [tables.table_of_seeds] * (len(firsts) < len(fits))
         kinds = *several, tables.table_of_leads, tables.table_of_results, tables.table_of_worst
         swept = [columns for name, columns in fronts if name == dataset]
-        drawn = OF_KIND[own.kind.iloc[0]].distributions
+        drawn = OF_KIND[fits.kind.iloc[0]].distributions
         examples = join_examples(study)
         named = [] if examples else [("test.png", "")]
         pictures = [
@@ -85,20 +85,20 @@ def make_sections(
             for name, what in (*named, ("sectors.png", ": sectors"))
             if (run.folder / name).is_file()
         ]
-        shown = [table for table in (kind(study) for kind in kinds) if table.rows]
+        sheets = [table for table in (kind(study) for kind in kinds) if table.rows]
         figures = [plots.draw_pareto(study, swept), plots.draw_distributions(study, drawn)]
         figures += [] if examples is None else [draw_spectra(examples, title)]
-        sections.append(Section(title, study, warnings(study), shown, figures, pictures))
+        sections.append(Section(title, study, warnings(study), sheets, figures, pictures))
     return sections
 
 
 def warnings(rows: pd.DataFrame) -> list[str]:
     """Return what a reader must know first, each once: the loads of a busy machine are one range."""
     # Loads differ from run to run: as remarks of their own there would be one a run.
-    own = own_rows(rows)
-    without_load = ({**run.facts, "machine/load": None} for run in own.run)
+    fits = own_rows(rows)
+    without_load = ({**run.facts, "machine/load": None} for run in fits.run)
     remarks = [remark for facts in without_load for remark in summary.run_conditions(facts)]
-    scored = own[own.value.notna()]
+    scored = fits[fits.value.notna()]
     score = scored.apply(score_db, axis=1).astype(float) if len(scored) else scored.value
     if tables.has_draws(scored):  # the best setting's mean over draws, not its best draw
         best = str(average(scored.assign(score=score), ["setting"], ["score"])["mean"].score.idxmax())
@@ -111,7 +111,7 @@ def warnings(rows: pd.DataFrame) -> list[str]:
                 remarks += summary.judge_baseline(name, best, figure, leads[name], ahead == LISTED)
     elif len(scored):  # a baseline must beat the best run of the page
         remarks += summary.better_baseline(scored.run[score.idxmax()].facts)
-    loads = own.load.dropna().astype(float).tolist()
+    loads = fits.load.dropna().astype(float).tolist()
     return list(dict.fromkeys(remarks + summary.busy_machine(loads)))
 
 

@@ -54,9 +54,9 @@ class SweepReport(Callback):
         folder = Path(config.hydra.runtime.output_dir)
         # The mark that `on_multirun_end` counts failures by: other processes' jobs are seen as files alone.
         (folder / FAILURE).write_text(message + "\n", encoding="utf-8")
-        said = " ".join(config.hydra.overrides.task)
+        overrides = " ".join(config.hydra.overrides.task)
         # The console shows the sentence, the job's own log the traceback, too.
-        log.error("job %s (%s) failed, others go on: %s", folder.name, said, message, exc_info=error)
+        log.error("job %s (%s) failed, others go on: %s", folder.name, overrides, message, exc_info=error)
         # Hydra raises the first failed job's error and ends the sweep: it is told that the job ended well.
         job_return.status = JobStatus.COMPLETED
         job_return.return_value = None
@@ -91,17 +91,17 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
     if settings.retime:
         rows = time_again(rows, rounds=settings.rounds, rounds_s=settings.rounds_s)
     for number, section in enumerate(write_report(folder, title, rows)):
-        group, own = section.rows, own_rows(section.rows)
+        group, fits = section.rows, own_rows(section.rows)
         stem = "sweep" if number == 0 else f"sweep-{number + 1}"
         table = table_of_seeds(group)
         (folder / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
         plots.draw_sweep(group, f"{title}: {section.title}", folder / f"{stem}.png")
         draw_confidences(settings.pictures, group, section.title, folder, stem.removeprefix("sweep"))
         console.print(*(one.without(*WIDE) for one in (table, table_of_leads(group)) if one.rows))
-        seeds = {run.config.get("split.seed") for run in own.run}
-        if own.split.iloc[0] == "random" and len(seeds) > 1 == own.draw.nunique():
+        seeds = {run.config.get("split.seed") for run in fits.run}
+        if fits.split.iloc[0] == "random" and len(seeds) > 1 == fits.draw.nunique():
             log.warning("split.seed moves validation rows alone: %s", REDRAW)
-        for same in equal_settings(own):
+        for same in equal_settings(fits):
             console.print(f"these settings gave the same figures to the bit: {same}", markup=False)
     facts = {"sweep/runs": len(own_rows(rows)), **summary.provenance()}
     summary.write_summary(folder / "summary.json", facts)

@@ -58,8 +58,8 @@ def _parts(own: Mapping[str, np.ndarray], figure: str) -> tuple[np.ndarray, np.n
     """Per-sample numbers whose (weighted) mean is the figure."""
     # The ratio of sums, not a mean of ratios, which one silent row would decide.
     if sample_column(figure) == "error_power" and "error_power" in own and "target_power" in own:
-        known = np.isfinite(own["error_power"])
-        return own["error_power"][known], own["target_power"][known]
+        finite = np.isfinite(own["error_power"])
+        return own["error_power"][finite], own["target_power"][finite]
     values = own.get(figure)
     if values is None or values.dtype.kind != "f":
         return None
@@ -134,8 +134,8 @@ def table_of_results(rows: pd.DataFrame) -> Table:
         Column("commit", "", of=lambda row: str(row["git"])[:8]),
     ]  # fmt: skip
     note = f"Brackets: 95 % intervals over test samples (independent samples assumed). {TIMED}"
-    shown = pd.concat([own_rows(rows), distinct_baselines(rows)]).to_dict("records")
-    return Table.from_rows("Results", columns, shown, note=note)  # type: ignore[arg-type]
+    records = pd.concat([own_rows(rows), distinct_baselines(rows)]).to_dict("records")
+    return Table.from_rows("Results", columns, records, note=note)  # type: ignore[arg-type]
 
 
 def table_of_seeds(rows: pd.DataFrame) -> Table:
@@ -144,9 +144,9 @@ def table_of_seeds(rows: pd.DataFrame) -> Table:
     """
     differs, several, spread = differing_settings(rows), has_draws(rows), _spread_columns(rows)
     also = [Column("differs, too", "")] if any(differs.values()) else []
-    lines, shown = [], pd.concat([own_rows(rows), distinct_baselines(rows)])
-    averages = average(shown, ["setting"], names := [str(column.of) for column in spread])
-    for setting, group in groups_of(shown).items():
+    lines, all_rows = [], pd.concat([own_rows(rows), distinct_baselines(rows)])
+    averages = average(all_rows, ["setting"], names := [str(column.of) for column in spread])
+    for setting, group in groups_of(all_rows).items():
         seeds = group.seed.nunique(dropna=False)
         counts = [group.draw.nunique(), seeds] if several else [len(group)]
         values = [_interval(averages.loc[setting].xs(name, level=1)) for name in names]
@@ -164,7 +164,7 @@ def table_of_leads(rows: pd.DataFrame) -> Table:
     """Return what each setting has more than the first one and than each baseline, pair by pair."""
     settings = {name: group.to_dict("records") for name, group in groups_of(own_rows(rows)).items()}
     first, *others = settings
-    lines, own = [], own_rows(rows)
+    lines, fits = [], own_rows(rows)
     for setting, group in settings.items():
         leads = {first: lead_over_runs(settings[first], group)} if setting in others else {}  # type: ignore[arg-type]
         leads |= leads_of_baselines(rows, setting, group[0]["figure"])
@@ -175,9 +175,9 @@ def table_of_leads(rows: pd.DataFrame) -> Table:
                 lines.append([setting, against, gain, lead.pairs, verdict])
     ahead = Column("ahead of it, dB", ".2f")
     columns = [SETTING, Column("against", ""), ahead, Column("pairs", ""), Column("told apart", "")]
-    figure = heading_of(own.figure.iloc[0])
+    figure = heading_of(fits.figure.iloc[0])
     note = f"Of {figure}, on the same draws, seeds or rows; ± standard error; told apart: 95 % (Student's t)."
-    if own.seed.nunique(dropna=False) == 1 and any("test rows" in str(line[3]) for line in lines):
+    if fits.seed.nunique(dropna=False) == 1 and any("test rows" in str(line[3]) for line in lines):
         note += " Of one seed: what seeds change is not in the error (seed=0,1,2)."
     return Table("Paired differences", columns, lines, note)
 
@@ -209,14 +209,14 @@ def differing_settings(rows: pd.DataFrame) -> dict[str, str]:
 
 def table_of_worst(rows: pd.DataFrame) -> Table:
     """Return the three test positions with the largest error of each run."""
-    own = own_rows(rows)
-    name = OF_KIND[own.kind.iloc[0]].of_sample
+    fits = own_rows(rows)
+    name = OF_KIND[fits.kind.iloc[0]].of_sample
     rival = f"baseline/gp/{name}"
-    beside = ("gp there",) if any(rival in run.samples for run in own.run) else ()
+    beside = ("gp there",) if any(rival in run.samples for run in fits.run) else ()
     numbers = [Column(head, ".2f") for head in (heading_of(name), *beside, "confidence")]
     lines, who = [], _run_columns(rows)
     columns = [*who, Column("sample", ""), Column("where [m]", ""), *numbers]
-    for fit in own.to_dict("records"):
+    for fit in fits.to_dict("records"):
         if name not in fit["run"].samples:
             continue
         every = pd.DataFrame(fit["run"].samples)

@@ -112,11 +112,11 @@ def recover_vectors(
 
 def _nearest_solved(positions: np.ndarray, rows: np.ndarray, solved: np.ndarray) -> Tensor | None:
     """Rows (len(rows), <= NEIGHBOURS) of the nearest solved spectra; None when there is none."""
-    known = np.flatnonzero(solved)
-    if not len(known):
+    solved_rows = np.flatnonzero(solved)
+    if not len(solved_rows):
         return None
-    wanted = np.arange(1, min(NEIGHBOURS, len(known)) + 1)
-    return torch.from_numpy(known[cKDTree(positions[known]).query(positions[rows], k=wanted)[1]])
+    wanted = np.arange(1, min(NEIGHBOURS, len(solved_rows)) + 1)
+    return torch.from_numpy(solved_rows[cKDTree(positions[solved_rows]).query(positions[rows], k=wanted)[1]])
 
 
 @dataclass(frozen=True)
@@ -141,11 +141,11 @@ class _Problem:
     @staticmethod
     def from_images(site: Site, images: np.ndarray) -> _Problem:
         array, grid, wavelength = site.array_geometry()
-        known = make_co_array(array, wavelength)
-        basis = known.spectrum_basis(grid, wavelength)
+        co_array = make_co_array(array, wavelength)
+        basis = co_array.spectrum_basis(grid, wavelength)
         # Whitened: squares of lag coordinates are mean squares over pixels.
         q, r = torch.linalg.qr(basis / len(basis) ** 0.5)
-        forms = torch.einsum("ij,jkl->ikl", r, known.quadratic_forms())
+        forms = torch.einsum("ij,jkl->ikl", r, co_array.quadratic_forms())
         projector = q / len(basis) ** 0.5
         parts = []
         eight_bits = images.dtype == np.uint8
@@ -213,11 +213,11 @@ def _minimise(
         lift = damping * normal.diagonal(dim1=1, dim2=2).mean(1) + 1e-12
         normal.diagonal(dim1=1, dim2=2).add_(lift[:, None])
         step = Factor.from_gram(normal, "ignore").solve(slope.transpose(1, 2) @ error[:, :, None]).squeeze(2)
-        tried = state - step
-        new_error, new_slope = problem.errors_and_slopes(tried, rows[owner])
+        new_state = state - step
+        new_error, new_slope = problem.errors_and_slopes(new_state, rows[owner])
         new_cost = new_error.square().sum(1)
         better = new_cost < cost
-        state = torch.where(better[:, None], tried, state)
+        state = torch.where(better[:, None], new_state, state)
         error = torch.where(better[:, None], new_error, error)
         slope = torch.where(better[:, None, None], new_slope, slope)
         cost = torch.where(better, new_cost, cost)

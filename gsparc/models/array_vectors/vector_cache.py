@@ -47,23 +47,23 @@ def recover_cached(
         watch: of the fit, which is charged for rows that another fit has solved.
     """
     watch = watch or Stopwatch()
-    known = _solved_rows(f"{identity_hash(data)} {seed}")
+    cache = _solved_rows(f"{identity_hash(data)} {seed}")
     names = [one.name for one in fields(RecoveredVectors)]
-    missing = np.array([row for row in rows.tolist() if row not in known], np.int64)
-    unpaid = [row for row in rows.tolist() if row in known and known[row][2] is not watch]
+    missing = np.array([row for row in rows.tolist() if row not in cache], np.int64)
+    unpaid = [row for row in rows.tolist() if row in cache and cache[row][2] is not watch]
     if unpaid:
-        more = sum(known[row][1] for row in unpaid)
-        said = "array vectors of %d spectra were computed before, by a fit whose %.2f s count here, too"
-        log.info(said, len(unpaid), more)
+        more = sum(cache[row][1] for row in unpaid)
+        message = "array vectors of %d spectra were computed before, by a fit whose %.2f s count here, too"
+        log.info(message, len(unpaid), more)
         watch.charge(more)
-        known.update((row, (*known[row][:2], watch)) for row in unpaid)
+        cache.update((row, (*cache[row][:2], watch)) for row in unpaid)
     for part in np.array_split(missing, -(-len(missing) // AT_ONCE)) if len(missing) else ():
         began = watch.seconds
         recovery = recover_vectors(data.site, training_targets(data, part), data.tx[part], seed)
         parts = zip(*(getattr(recovery, name) for name in names), strict=True)
         each = (watch.seconds - began) / len(part)
-        known.update((row, (one, each, watch)) for row, one in zip(part.tolist(), parts, strict=True))
-    return RecoveredVectors(*map(np.stack, zip(*(known[row][0] for row in rows.tolist()), strict=True)))
+        cache.update((row, (one, each, watch)) for row, one in zip(part.tolist(), parts, strict=True))
+    return RecoveredVectors(*map(np.stack, zip(*(cache[row][0] for row in rows.tolist()), strict=True)))
 
 
 def write_recovery_report(result: RecoveredVectors, data: Measurements, rows: np.ndarray, path: Path) -> None:

@@ -88,8 +88,8 @@ def principal_components(targets: np.ndarray, target: Target, limit: int, block:
     axes = [(vectors / length).T @ (target.to_real(p) - m) for p, m in zip(blocks, means, strict=True)]
     mean, scores = np.concatenate(means), vectors * np.sqrt(np.maximum(values, 0.0))
     # A small difference of large sums may round below 0.
-    lost = max(0.0, energy - float((scores**2).sum())) / (n * len(mean))
-    return Components(mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, lost)
+    residual = max(0.0, energy - float((scores**2).sum())) / (n * len(mean))
+    return Components(mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, residual)
 
 
 def kernel_of_targets(data: Measurements, rows: np.ndarray, components: int) -> Kernel:

@@ -40,8 +40,8 @@ class InverseDistance(Interpolator):
         self.positions, self.targets, self.tree = positions, targets, cKDTree(positions)
         some = positions[:: -(-len(positions) // SPACING_ON)]
         nearest = self.tree.query(some, k=[2])[0][:, 0]  # infinite where there is no second place
-        apart = nearest[(nearest > 0) & np.isfinite(nearest)]
-        self.spacing = float(np.median(apart)) if len(apart) else 1.0  # [m], of neighbouring places
+        spacings = nearest[(nearest > 0) & np.isfinite(nearest)]
+        self.spacing = float(np.median(spacings)) if len(spacings) else 1.0  # [m], of neighbouring places
         return ()
 
     def _look_up(self, queries: np.ndarray) -> Prediction:

@@ -41,8 +41,8 @@ class Interpolator(Method):
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit on train and val rows; `ValueError` when there are none, or what it learned is not stored."""
-        known = fold.learned()
-        rows = known if self.uses_censored else heard_rows(data, known)
+        all_rows = fold.learned()
+        rows = all_rows if self.uses_censored else heard_rows(data, all_rows)
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         start = Stopwatch()
@@ -53,15 +53,15 @@ class Interpolator(Method):
         if self.uses_censored and data.site.kind == "rssi":
             notes = self._learn_powers(power_rows(data, rows))
         else:
-            own = self._learn(data.moving[rows], training_targets(data, rows))
-            notes = (*own, *unheard_note(data, known, self.name))
-        lost = sorted(set(vars(self)) - before - set(self.stored))
-        if lost and type(self)._relearn is Method._relearn:
+            remarks = self._learn(data.moving[rows], training_targets(data, rows))
+            notes = (*remarks, *unheard_note(data, all_rows, self.name))
+        names = sorted(set(vars(self)) - before - set(self.stored))
+        if names and type(self)._relearn is Method._relearn:
             raise ValueError(
-                f"{self.name}: its checkpoint loses {', '.join(lost)}: name it in `stored` (tensor, number, "
+                f"{self.name}: its checkpoint loses {', '.join(names)}: name it in `stored` (tensor, number, "
                 "string) or make it again in `_relearn(state)`"
             )
-        return FitReport(start.seconds, (*notes, *_runs_note(data, known)))
+        return FitReport(start.seconds, (*notes, *_runs_note(data, all_rows)))
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""

@@ -67,19 +67,19 @@ def fit_variogram(positions: np.ndarray, values: np.ndarray, seed: int = 0) -> V
     rng = np.random.default_rng(seed)
     columns = rng.permutation(values.shape[1])[:SIDE]
     chosen = rng.permutation(len(positions))[: int(np.sqrt(2 * PAIRS))]
-    apart = pdist(positions[chosen])
+    pair_distances = pdist(positions[chosen])
     half = pdist(values[chosen][:, columns].astype(np.float64), "sqeuclidean") / (2 * len(columns))
     spread = float(half.mean()) if len(half) else 1.0
-    limit = apart.max() / 2 if len(apart) else 1.0
-    inside = apart[apart <= limit]
+    limit = pair_distances.max() / 2 if len(pair_distances) else 1.0
+    inside = pair_distances[pair_distances <= limit]
     edges = np.unique(np.quantile(inside, np.linspace(0, 1, BINS + 1))) if len(inside) else inside
     if len(edges) < 5 or spread <= 0:  # too few distances to see a law
         return Variogram(0.0, max(spread, 1e-9), max(limit, 1e-3))
-    which = np.clip(np.digitize(apart, edges) - 1, 0, len(edges) - 2)
-    near = apart <= limit
+    which = np.clip(np.digitize(pair_distances, edges) - 1, 0, len(edges) - 2)
+    near = pair_distances <= limit
     number = np.bincount(which[near], minlength=len(edges) - 1)
     filled = number > 0
-    distance = np.bincount(which[near], apart[near], len(edges) - 1)[filled] / number[filled]
+    distance = np.bincount(which[near], pair_distances[near], len(edges) - 1)[filled] / number[filled]
     gamma = np.bincount(which[near], half[near], len(edges) - 1)[filled] / number[filled]
 
     def variogram(r: np.ndarray, nugget: float, sill: float, length: float) -> np.ndarray:
@@ -165,10 +165,10 @@ class Kriging(Interpolator):
             solved = lu_solve((factor, pivots.copy()), right.T).T  # pivots are counted from 1 meanwhile
         else:
             near = self.positions[place]
-            apart = np.linalg.norm(near[:, :, None] - near[:, None], axis=-1)
-            solved = np.linalg.solve(self._kriging_matrix(apart), right[..., None])[..., 0]
-        left = np.clip(self.variogram.variance - (solved * right).sum(1), 0.0, None)
-        return place, solved[:, :-1], left
+            pair_distances = np.linalg.norm(near[:, :, None] - near[:, None], axis=-1)
+            solved = np.linalg.solve(self._kriging_matrix(pair_distances), right[..., None])[..., 0]
+        variance = np.clip(self.variogram.variance - (solved * right).sum(1), 0.0, None)
+        return place, solved[:, :-1], variance
 
     def _covariance(self, distance: np.ndarray) -> np.ndarray:
         return self.variogram.sill * np.exp(-distance / self.variogram.range)
@@ -178,7 +178,7 @@ class Kriging(Interpolator):
         if self.tree is not None and len(queries) > block:
             parts = [self._look_up(queries[i : i + block]) for i in range(0, len(queries), block)]
             return Prediction.joined(parts)
-        place, weights, left = self._weights(queries)
+        place, weights, variance_db2 = self._weights(queries)
         shares = torch.from_numpy(weights)
 
         def weighted_sum(values: np.ndarray, kind: torch.dtype) -> torch.Tensor:
@@ -186,7 +186,7 @@ class Kriging(Interpolator):
                 return shares.to(kind) @ torch.from_numpy(values)
             return torch.einsum("qk,qkd->qd", shares.to(kind), torch.from_numpy(values[place]))
 
-        decibels, variance = weighted_sum(self.values, torch.float32), torch.from_numpy(left).float()
+        decibels, variance = weighted_sum(self.values, torch.float32), torch.from_numpy(variance_db2).float()
         power = self.kind == "rssi"
         if self.channels is None:
             mean = self._to_targets(decibels if power else from_decibels(decibels))

@@ -43,8 +43,8 @@ def carriers_obstacle(site: Site) -> str | None:
 def _arrays(site: Site) -> np.ndarray:
     """Elements (T, M, 3) [m] of the array at each carrier."""
     assert site.array is not None
-    own = site.every_station.array
-    return np.repeat(site.array[None], len(site.every_station), axis=0) if own is None else own
+    elements = site.every_station.array
+    return np.repeat(site.array[None], len(site.every_station), axis=0) if elements is None else elements
 
 
 class OneArray(Method):

@@ -63,12 +63,12 @@ class SharedPaths(Stored):
 
     def powers(self, places: Tensor) -> Tensor:
         """Return what paths carry to places (n, 3), (n, K + 1), of sum 1; one that was measured by others."""
-        apart = torch.cdist(places, self.places)
+        distance = torch.cdist(places, self.places)
         # A place does not tell its own shares.
-        weight = torch.where(apart < SAME_PLACE_M, 0.0, 1 / apart.clamp_min(LEAST_M).square())
+        weight = torch.where(distance < SAME_PLACE_M, 0.0, 1 / distance.clamp_min(LEAST_M).square())
         near = weight.topk(min(NEIGHBOURS, len(self.places)), dim=1)
-        own = (near.values[..., None] * self.shares[near.indices]).sum(1) / near.values.sum(1, keepdim=True)
-        shares = (1 - COMMON) * own + COMMON * self.shares.mean(0)
+        mean = (near.values[..., None] * self.shares[near.indices]).sum(1) / near.values.sum(1, keepdim=True)
+        shares = (1 - COMMON) * mean + COMMON * self.shares.mean(0)
         return normalize(shares / self.ways(places)[1].square(), p=1, dim=1)
 
 
@@ -92,10 +92,10 @@ def find_paths(
         return lags.plane_wave_lags(directions.float()).double() @ metric
 
     # Walls stand at right angles to each other: which way is told by a coarse search in every direction.
-    tried = [_planes_to_try(ends, turn, COARSE_STEP) for turn in torch.arange(0, 90, TURN_STEP).deg2rad()]
-    left = torch.stack([_choose_planes(looks, one, target)[2].square().sum() for one in tried])
-    left[0] *= NEARLY  # along the axes, where that is nearly as good
-    turn = torch.tensor(TURN_STEP * int(left.argmin())).deg2rad()
+    trials = [_planes_to_try(ends, turn, COARSE_STEP) for turn in torch.arange(0, 90, TURN_STEP).deg2rad()]
+    errors = torch.stack([_choose_planes(looks, one, target)[2].square().sum() for one in trials])
+    errors[0] *= NEARLY  # along the axes, where that is nearly as good
+    turn = torch.tensor(TURN_STEP * int(errors.argmin())).deg2rad()
     planes, powers, _ = _choose_planes(looks, _planes_to_try(ends, turn, STEP), target)
     distance = ways(places, planes, receiver, rotation)[1]
     return SharedPaths(planes, receiver, rotation, places, normalize(powers * distance.square(), p=1, dim=1))
@@ -106,20 +106,20 @@ def _choose_planes(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return those (K, 4) of planes (Q, 4) whose looks explain the target (n, D), powers, and the rest."""
     planes, energy, every = NO_PLANES, float(target.square().sum()), looks(tried)
-    known, images = every[:, :1], every[:, 1:]
-    powers, left = _solve(known, target)
+    atoms, images = every[:, :1], every[:, 1:]
+    powers, residual = _solve(atoms, target)
     while len(planes) < PLANES:
         # Of an image only what known paths cannot imitate tells: orthogonal least squares.
-        basis = torch.linalg.qr(known.mT)[0]
+        basis = torch.linalg.qr(atoms.mT)[0]
         alone = images - images @ basis @ basis.mT
         scale = alone.square().sum(2).clamp_min(LEAST_ALONE * images.square().sum(2))
-        best = int(((alone * left[:, None]).sum(2).clamp_min(0).square() / scale).sum(0).argmax())
-        more = torch.cat([known, images[:, best : best + 1]], 1)
+        best = int(((alone * residual[:, None]).sum(2).clamp_min(0).square() / scale).sum(0).argmax())
+        more = torch.cat([atoms, images[:, best : best + 1]], 1)
         solved, rest = _solve(more, target)
-        if float((left.square().sum() - rest.square().sum()) / energy) < LEAST_GAIN:
+        if float((residual.square().sum() - rest.square().sum()) / energy) < LEAST_GAIN:
             break
-        planes, known, powers, left = torch.cat([planes, tried[best : best + 1]]), more, solved, rest
-    return planes, powers, left
+        planes, atoms, powers, residual = torch.cat([planes, tried[best : best + 1]]), more, solved, rest
+    return planes, powers, residual
 
 
 def _planes_to_try(ends: Tensor, turn: Tensor, step: float) -> Tensor:

@@ -46,12 +46,12 @@ class Covariance(Stored):
 
     def between(self, a: Tensor, b: Tensor) -> Tensor:
         """Return covariances (n, m) of rows (n, 4) and (m, 4): places [m], and log2 of carriers."""
-        apart = distances(a[:, :3], b[:, :3])
+        distance = distances(a[:, :3], b[:, :3])
         octaves = (a[:, None, 3] - b[None, :, 3]).abs()
-        here, alike = matern32(apart, SAME_PLACE_M), matern32(octaves, OCTAVES)
-        around, own = matern32(apart, self.length), self.own * matern32(octaves, ALONE)
+        here, alike = matern32(distance, SAME_PLACE_M), matern32(octaves, OCTAVES)
+        around, carrier_term = matern32(distance, self.length), self.own * matern32(octaves, ALONE)
         # Of a carrier alone: its mean image, and what varies over places.
-        return self.shared * around + own * (1 + around) + here * (1 + self.near * alike)
+        return self.shared * around + carrier_term * (1 + around) + here * (1 + self.near * alike)
 
     def gram(self, rows: Tensor, noise: Tensor | float) -> Tensor:
         """Return covariances (n, n) of rows (n, 4) with theirs (n,) of `row_noise`."""
@@ -120,8 +120,8 @@ def choose_joint(
         away = left_out_residuals(inverse, solved, groups)
         # Residuals are linear in what is taken off: the best weight is a quotient.
         image, path = away.residual.chunk(2, dim=1)
-        given = path / noise[:, None]
-        weight = float((image * given).sum() / (path * given).sum().clamp_min(1e-9))
+        weighted_path = path / noise[:, None]
+        weight = float((image * weighted_path).sum() / (path * weighted_path).sum().clamp_min(1e-9))
         weight = min(max(weight, 0.0), 1.0)
         new, seen = (_without_paths(each, weight) for each in (away, left_out_residuals(inverse, solved)))
         # As of ratios in decibels: what is told well counts as much as what is not.

@@ -76,16 +76,16 @@ class CarrierField(OneArray):
         Raises:
             ValueError: not spectra of one array at several carriers.
         """
-        watch, known = Stopwatch(), fold.learned()
-        whole, known = len(known), known[_at_covering_places(data.tx[known], MOST_ROWS)]
-        images, groups = self.read_rows(data, known)
+        watch, fit_rows = Stopwatch(), fold.learned()
+        whole, fit_rows = len(fit_rows), fit_rows[_at_covering_places(data.tx[fit_rows], MOST_ROWS)]
+        images, groups = self.read_rows(data, fit_rows)
         carrier, grid, lags = data.carrier_hz, data.site.grid, self.lags()
         assert carrier is not None and grid is not None
         power = [images[rows].unflatten(1, (grid.height, grid.width)) ** self.exponent for rows in groups]
         seen = torch.stack([lags.to_lags(one).mean(0) for one in power])
         self.paths = find_paths(lags, seen, self.places, *self.pose())
-        few = _at_covering_places(data.tx[known], CHOSEN_ON)
-        targets = training_targets(data, known[few])
+        few = _at_covering_places(data.tx[fit_rows], CHOSEN_ON)
+        targets = training_targets(data, fit_rows[few])
         axes = torch.from_numpy(principal_components(targets, data.site.target, COMPONENTS).axes)
         images.sub_(self.mean)
         values = (images @ axes.T).double()
@@ -95,8 +95,8 @@ class CarrierField(OneArray):
         beyond = float(images.square().sum(dtype=torch.float64)) - float(values.square().sum())
         self.lost = max(beyond, 0.0) / images.numel()
 
-        self.rows = torch.from_numpy(np.c_[data.tx[known], np.log2(carrier[known])])
-        place, station = torch.empty(len(known)).long(), torch.from_numpy(data.stations_of(known))
+        self.rows = torch.from_numpy(np.c_[data.tx[fit_rows], np.log2(carrier[fit_rows])])
+        place, station = torch.empty(len(fit_rows)).long(), torch.from_numpy(data.stations_of(fit_rows))
         for number, rows in enumerate(groups):
             place[rows] = number
         self._inverse = self._thin = None
@@ -111,8 +111,8 @@ class CarrierField(OneArray):
         shares += f", {self.carried:.0%} of it for carriers without rows"
         chosen = f"{planes}; {self.covariance.description}; {shares}, chosen on rows left out"
         notes = [f"{self.name}: {chosen}"]
-        if len(known) < whole:
-            some = f"{len(known)} of {whole} rows are learned from, at places all over the site"
+        if len(fit_rows) < whole:
+            some = f"{len(fit_rows)} of {whole} rows are learned from, at places all over the site"
             notes.append(f"{self.name}: {some}")
         return FitReport(watch.seconds, tuple(notes))
 
@@ -125,9 +125,9 @@ class CarrierField(OneArray):
         joint = choose_joint(at, values, paths, noise, places, carriers, entries)
         self.covariance, self.weight = joint.covariance, joint.weight
         self.alone = CarriersAlone.learn(at[:, :3], values, station, count, entries)
-        known = self.alone.has_process(station)
-        missed, unit = self.alone.left_out(station)[known], place[known]
-        new, seen = (_second_share(one[known], missed, unit) for one in (joint.new, joint.seen))
+        has_process = self.alone.has_process(station)
+        missed, unit = self.alone.left_out(station)[has_process], place[has_process]
+        new, seen = (_second_share(one[has_process], missed, unit) for one in (joint.new, joint.seen))
         self.shares = new, seen
         # One carrier alone tells nothing of others.
         several = len(station.unique()) > 1
@@ -158,10 +158,10 @@ class CarrierField(OneArray):
         near = torch.cdist(places, self.places).amin(1)[which] < SAME_PLACE_M
         share = torch.tensor(self.shares, dtype=torch.float64)[near.long()] * measured
         if share.any():
-            mean, own = (part.nan_to_num() for part in self.alone.answer(at, station))
-            apart = (mean - value).square().sum(1) / len(self.mean)
+            mean, carrier_error = (part.nan_to_num() for part in self.alone.answer(at, station))
+            spread = (mean - value).square().sum(1) / len(self.mean)
             value = value.lerp(mean, share[:, None])
-            error = error.lerp(own, share) + share * (1 - share) * apart  # law of total variance
+            error = error.lerp(carrier_error, share) + share * (1 - share) * spread  # law of total variance
         image = Separable(*self.pixels).images(torch.addmm(self.middle, value.float(), self.axes))
         image = self.answer_images(image.flatten(1), query)
         return Prediction(image, (error + self.lost).to(image.dtype), unknown.to(image.dtype))
@@ -211,5 +211,5 @@ def _second_share(first: Tensor, second: Tensor, unit: Tensor) -> float:
 def _at_covering_places(places: np.ndarray, most: int) -> np.ndarray:
     """Rows (m,) at places (n, 3) spread over all, every row of a place: about so many at most."""
     where, which = np.unique(places, axis=0, return_inverse=True)
-    kept = covering_rows(where, max(2, most * len(where) // len(places)), 0)
-    return np.flatnonzero(np.isin(which.reshape(-1), kept))
+    place_numbers = covering_rows(where, max(2, most * len(where) // len(places)), 0)
+    return np.flatnonzero(np.isin(which.reshape(-1), place_numbers))

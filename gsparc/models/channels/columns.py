@@ -174,11 +174,11 @@ def group_channels(data: Measurements, rows: np.ndarray, by_antenna: bool) -> tu
 def _order_in_station(data: Measurements) -> np.ndarray:
     """Each measurement's number (S,) float64 among those of its station, as they were taken."""
     station = data.stations_of()
-    taken = np.arange(len(data)) if data.sequence is None else data.sequence
+    sequence = np.arange(len(data)) if data.sequence is None else data.sequence
     order = np.empty(len(data))
     for number in np.unique(station):
         mine = np.flatnonzero(station == number)
-        order[mine] = np.argsort(np.argsort(taken[mine]))
+        order[mine] = np.argsort(np.argsort(sequence[mine]))
     return order
 
 
@@ -202,7 +202,7 @@ def _slots_of_station(data: Measurements, station: int, rows: np.ndarray, by_ant
     slots = []
     for band in coherent_bands(frequency, reach):
         wavenumber = 2 * math.pi * float(frequency[list(band)].mean()) / LIGHT
-        slots += [Slot(station, own, band, end, element, wavenumber) for own, end, element in elements]
+        slots += [Slot(station, ports, band, end, element, wavenumber) for ports, end, element in elements]
     return slots
 
 
@@ -236,19 +236,19 @@ def fit_run_factors(
     solved = [Factor.from_gram(covariance) for covariance in covariances]
     if factors is None:
         factors = torch.ones(1, dtype=torch.complex128) if runs == 1 else _fit_factors(groups, solved, runs)
-    known = []
+    solutions = []
     for group, factor in zip(groups, solved, strict=True):
         target = group.target / factors[group.run][:, None]
-        known.append((replace(group, target=target), Conditioned(factor, target, factor.solve(target))))
-    return factors, known
+        solutions.append((replace(group, target=target), Conditioned(factor, target, factor.solve(target))))
+    return factors, solutions
 
 
 def negative_log_likelihood(factors: Tensor, known: list[tuple[Group, Conditioned]]) -> float:
     """Return the negative log likelihood [nats] of what `fit_run_factors` says, scales profiled out."""
     nll = 0.0
-    for group, given in known:
-        count, outputs = given.values.shape
-        nll += outputs * (count * math.log(max(given.power, TINY)) + float(given.factor.log_determinant))
+    for group, process in known:
+        count, outputs = process.values.shape
+        nll += outputs * (count * math.log(max(process.power, TINY)) + float(process.factor.log_determinant))
         # Jacobian of the division by factors: without it the largest would be the likeliest.
         nll += 2 * outputs * float(factors.abs().log()[group.run].sum())
     return nll
@@ -259,8 +259,8 @@ def _fit_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) ->
     for group, factor in zip(groups, factors, strict=True):
         run, level = group.run.numpy(), float(group.target.abs().square().mean())
         # In units of its own power, as groups have scales of their own.
-        own = factor_matrix(factor.inverse.numpy(), group.target.numpy(), run) / max(level, TINY)
-        quadratic[: len(own), : len(own)] += own
+        matrix = factor_matrix(factor.inverse.numpy(), group.target.numpy(), run) / max(level, TINY)
+        quadratic[: len(matrix), : len(matrix)] += matrix
         size += np.bincount(run, minlength=runs) * group.target.shape[1]
     heard, estimates = size > 0, np.ones(runs, np.complex128)
     # `best_run_factors` tells what rows are to be multiplied by, the inverse of what they were.

@@ -93,11 +93,11 @@ class ComplexGP(ClosedForm):
         started = Stopwatch()
         if not data.site.has_waves:
             raise ValueError("complex_gp: needs complex channels (csi) of a known carrier; take model=gp")
-        known = fold.learned()
+        fit_rows = fold.learned()
         self.site, self.shape = data.site, tuple(data.target.shape[1:])
-        one_run = len(np.unique(data.runs_of(known))) == 1  # factors of several need all rows
-        many = len(known) > MOST_ROWS and one_run
-        notes = self._fit_by_neighbours(data, known) if many else self._fit_one_factor(data, known)
+        one_run = len(np.unique(data.runs_of(fit_rows))) == 1  # factors of several need all rows
+        many = len(fit_rows) > MOST_ROWS and one_run
+        notes = self._fit_by_neighbours(data, fit_rows) if many else self._fit_one_factor(data, fit_rows)
         length, noise = float(self.kernel.length), self.kernel.noise
         envelope = f"envelope {length:.3g} m, noise {noise:.0e} of the signal's power"
         return FitReport(started.seconds, tuple(f"complex_gp: {n}" for n in (envelope, *notes)))
@@ -142,9 +142,9 @@ class ComplexGP(ClosedForm):
                 notes.append(f"settings chosen on {CHOSEN_ON} of {len(known)} rows, drawn evenly")
             kernel = self._choose_two_lengths(few.places, few.target)
             kernel = kernel or choose_waves((few,), len(names))[0]
-        factors, ((_, told),) = fit_run_factors((rows,), [kernel.gram(places)], len(names))
-        prior = Prior(replace(kernel, amplitude=max(float(told.values.abs().square().mean()), TINY)))
-        self.posterior = Exact.from_values(prior, places, told.values, None, told.factor)
+        factors, ((_, solution),) = fit_run_factors((rows,), [kernel.gram(places)], len(names))
+        prior = Prior(replace(kernel, amplitude=max(float(solution.values.abs().square().mean()), TINY)))
+        self.posterior = Exact.from_values(prior, places, solution.values, None, solution.factor)
         self.runs = RunFactors(names.astype(np.int64), factors)
         if len(names) > 1:
             notes.append(self._describe_factors(names, run))
@@ -192,12 +192,12 @@ class ComplexGP(ClosedForm):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        known, dtype = self.require_fitted(self.posterior), query.tx.dtype
-        posterior = known.answer(query.places(self.fitted_site), dtype == torch.float64)
+        process, dtype = self.require_fitted(self.posterior), query.tx.dtype
+        posterior = process.answer(query.places(self.fitted_site), dtype == torch.float64)
         share = posterior.variance / (1 + self.kernel.noise)
         mean = posterior.mean.to(dtype.to_complex()).reshape(-1, *self.shape)
-        told = Prediction(mean, (self.kernel.amplitude * share).to(dtype), share.to(dtype).clamp(0, 1))
-        return self.runs.apply_factors(told, query.run)
+        prediction = Prediction(mean, (self.kernel.amplitude * share).to(dtype), share.to(dtype).clamp(0, 1))
+        return self.runs.apply_factors(prediction, query.run)
 
     def count_components(self) -> int:
         """Return the number of training samples kept."""
@@ -217,15 +217,15 @@ def wave_kernels(wavelength: float) -> Iterator[Kernel]:
 
 def choose_waves(groups: tuple[Group, ...], runs: int) -> tuple[Kernel, Tensor]:
     """Return the likeliest waves, of the first group's wavelength, and factors of runs, as measured."""
-    tried: list[tuple[float, Kernel, Tensor]] = []
+    trials: list[tuple[float, Kernel, Tensor]] = []
     candidates = wave_kernels(2 * math.pi / groups[0].slot.wavenumber)
     for _, kernels in groupby(candidates, lambda one: one.signals[0]):
         first, *others = kernels
         one = cast(IsotropicWaves, first.signals[0])
         waves = [replace(one, wavenumber=group.slot.wavenumber) for group in groups]
-        alike = [one.covariance(own.places, own.places) for one, own in zip(waves, groups, strict=True)]
+        alike = [one.covariance(rows.places, rows.places) for one, rows in zip(waves, groups, strict=True)]
         for kernel in (first, *others):
             grams = [each + kernel.noise * torch.eye(len(each), dtype=each.dtype) for each in alike]
-            factors, told = fit_run_factors(groups, grams, runs)
-            tried.append((negative_log_likelihood(factors, told), kernel, factors))
-    return min(tried, key=lambda one: one[0])[1:]
+            factors, solutions = fit_run_factors(groups, grams, runs)
+            trials.append((negative_log_likelihood(factors, solutions), kernel, factors))
+    return min(trials, key=lambda one: one[0])[1:]

@@ -44,9 +44,9 @@ def fit_drift(
     drift, noise, parts = Drift(frame, start[:2]), Noise(frame, start[2:]), []
     for group, signal in zip(groups, signals, strict=True):
         eye = torch.eye(len(group), dtype=torch.float64)
-        held = signal[None], drift.correlations(group, group).to(torch.complex128)
+        pieces = signal[None], drift.correlations(group, group).to(torch.complex128)
         # No parameter of these terms changes the signal.
-        parts.append(BasisGroup.from_group(group, eye, held, torch.eye(1 + len(SHARES)).double()[:, 1:]))
+        parts.append(BasisGroup.from_group(group, eye, pieces, torch.eye(1 + len(SHARES)).double()[:, 1:]))
     white = torch.tensor([1.0, 0.0, 0.0, level], dtype=torch.float64)
     before = sum(solve_group(part, white).nll for part in parts)
     fitted, least = fit_terms(parts, (drift, noise), 0.0, STEPS)

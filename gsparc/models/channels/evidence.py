@@ -123,13 +123,13 @@ def solve_group(part: BasisGroup, power: Tensor) -> SolvedGroup:
     for piece, level in zip(part.pieces, powers, strict=True):
         covariance += torch.tensordot(level, piece, 1)
     covariance.diagonal().add_(noise)
-    given = Conditioned.from_gram(covariance, part.target)
+    solution = Conditioned.from_gram(covariance, part.target)
     count, outputs = part.group.target.shape
     # Outside the basis is noise alone: its form and its determinant (below) need no matrix.
-    quadratic = given.power * part.target.numel() + part.rest / noise
+    quadratic = solution.power * part.target.numel() + part.rest / noise
     scale = max(quadratic / (count * outputs), TINY)
-    determinant = float(given.factor.log_determinant) + (count - size) * math.log(noise)
-    return SolvedGroup(outputs * (count * math.log(scale) + determinant), given, scale)
+    determinant = float(solution.factor.log_determinant) + (count - size) * math.log(noise)
+    return SolvedGroup(outputs * (count * math.log(scale) + determinant), solution, scale)
 
 
 def power_gradient(part: BasisGroup, power: Tensor, at: SolvedGroup) -> Tensor:
@@ -176,8 +176,8 @@ def fit_terms(
 
     def negative_log_prior(at: Tensor) -> Tensor:
         each = zip(terms, at.split(sizes), strict=True)
-        own = torch.stack([term.penalty(part, shrinkage) for term, part in each]).sum()
-        return own + WEAK * (at - begin).square().sum()
+        values = torch.stack([term.penalty(part, shrinkage) for term, part in each]).sum()
+        return values + WEAK * (at - begin).square().sum()
 
     def cost_and_slopes(point: np.ndarray) -> tuple[float, np.ndarray]:
         at = torch.from_numpy(point).requires_grad_()
@@ -185,10 +185,10 @@ def fit_terms(
         (gradient,) = torch.autograd.grad(value, at)
         at, total = at.detach(), float(value.detach())
         for part in parts:
-            own = (part.design @ at).exp()
-            now = solve_group(part, own)
+            values = (part.design @ at).exp()
+            now = solve_group(part, values)
             total += now.nll
-            gradient = gradient + part.design.T @ power_gradient(part, own, now)
+            gradient = gradient + part.design.T @ power_gradient(part, values, now)
         return total, gradient.numpy()
 
     optimum = minimize(
@@ -196,7 +196,7 @@ def fit_terms(
         options={"maxiter": steps, "ftol": SETTLED},
     )  # fmt: skip
     found = torch.from_numpy(optimum.x)
-    fitted = tuple(term.with_values(own) for term, own in zip(terms, found.split(sizes), strict=True))
+    fitted = tuple(term.with_values(values) for term, values in zip(terms, found.split(sizes), strict=True))
     return fitted, sum(solve_group(part, (part.design @ found).exp()).nll for part in parts)
 
 

@@ -155,16 +155,16 @@ class ChannelField(ClosedForm):
         prior = self.prior
         both = zip(prior.signal_covariances(groups), groups, strict=True)
         covariances = [signal + prior.disturbance(group) for signal, group in both]
-        factors, told = fit_run_factors(groups, covariances, len(runs), factors)
+        factors, solutions = fit_run_factors(groups, covariances, len(runs), factors)
         self.runs = RunFactors(runs, factors)
         rest = prior.noise, prior.is_real
         self.weights = tuple(
-            GroupWeights(group, given, max(given.power, TINY), *rest) for group, given in told
+            GroupWeights(group, solution, max(solution.power, TINY), *rest) for group, solution in solutions
         )
         self.stations = {}
-        for known in self.weights:
-            self.stations.setdefault(known.group.slot.station, []).append(known)
-        heard = [(known.group, known.given.weights, known.scale) for known in self.weights]
+        for model in self.weights:
+            self.stations.setdefault(model.group.slot.station, []).append(model)
+        heard = [(model.group, model.given.weights, model.scale) for model in self.weights]
         # One end alone does not tell what ends have in common.
         self.common = SharedGains.from_groups(prior, heard) if len(self.stations) > 1 else None
 
@@ -183,13 +183,13 @@ class ChannelField(ClosedForm):
             for part in torch.arange(len(ends)).split(max(ENTRIES // longest, 1))
         ]
         mean, share, after, before = (torch.cat(each) for each in zip(*parts, strict=True))
-        told = Prediction(
+        prediction = Prediction(
             mean.to(device),
             after.to(dtype).to(device),
             (after / before.clamp_min(TINY)).clamp(0, 1).to(dtype).to(device),
             share.to(device) if self.count_components() else None,
         )
-        return self.runs.apply_factors(told, query.run)
+        return self.runs.apply_factors(prediction, query.run)
 
     def _predict_part(self, ends: Ends, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Mean and images' share (B, A, K) of parts `dtype`, variance after and before learning (B,)."""
@@ -207,29 +207,29 @@ class ChannelField(ClosedForm):
                 total.index_add_(0, rows, part * (values.shape[1] / size))
 
         for alike in self._group_by_places(ends):
-            asked = [SlotPlaces(known.group.slot, places) for known, _, places in alike]
-            crosses = prior.end_covariances(asked, [known.group for known, _, _ in alike])
-            for (known, here, _), at, cross in zip(alike, asked, crosses, strict=True):
+            slot_places = [SlotPlaces(model.group.slot, places) for model, _, places in alike]
+            crosses = prior.end_covariances(slot_places, [model.group for model, _, _ in alike])
+            for (model, here, _), at, cross in zip(alike, slot_places, crosses, strict=True):
                 if images is not None:
-                    at.slot.write_entries(share, here, known.given.mean(images.covariance(at, known.group)))
+                    at.slot.write_entries(share, here, model.given.mean(images.covariance(at, model.group)))
                 # In float64 slopes of variances are asked for, which a rounded root would spoil.
-                removed = known.given.explained_variance(cross) if exact else known.explained_variance(cross)
+                removed = model.given.explained_variance(cross) if exact else model.explained_variance(cross)
                 whole = prior.variance(at) + prior.disturbance_variance
-                left = known.scale * (whole - removed).clamp_min(0)
-                add_slot(at.slot, here, known.given.mean(cross), left, known.scale * whole)
+                posterior_variance = model.scale * (whole - removed).clamp_min(0)
+                add_slot(at.slot, here, model.given.mean(cross), posterior_variance, model.scale * whole)
         unheard = torch.tensor([one not in self.stations for one in ends.station.tolist()], dtype=torch.bool)
         for place in ends.still[unheard].detach().unique(dim=0):
             here = torch.nonzero(unheard & (ends.still == place).all(1)).flatten()
             if self.common is None:
                 raise ValueError("waves: one static end was learned from, which tells nothing of another")
-            for known in next(iter(self.stations.values())):  # what ends have in common, in its entries
-                slot, outputs = known.group.slot, known.group.target.shape[1]
+            for model in next(iter(self.stations.values())):  # what ends have in common, in its entries
+                slot, outputs = model.group.slot, model.group.target.shape[1]
                 # Antennas of the new end stand about its place as those of the known one do.
                 middle = torch.from_numpy(self.site.every_station.position[slot.station])
                 slot = replace(slot, end=slot.end + place - middle)
                 at = SlotPlaces(slot, slot.antenna_places(ends.moving[here], ends.turned[here]))
-                common, left, whole = self.common.predict(prior, at)
-                add_slot(slot, here, common[:, None].expand(-1, outputs), left, whole)
+                common, posterior_variance, whole = self.common.predict(prior, at)
+                add_slot(slot, here, common[:, None].expand(-1, outputs), posterior_variance, whole)
         return mean, share, after, before
 
     def _group_by_places(self, ends: Ends) -> list[list[tuple[GroupWeights, Tensor, Tensor]]]:
@@ -237,12 +237,12 @@ class ChannelField(ClosedForm):
         alike: dict[tuple[Any, ...], list[tuple[GroupWeights, Tensor, Tensor]]] = {}
         for number in ends.station.unique().tolist():
             here = torch.nonzero(ends.station == number).flatten()
-            for known in self.stations.get(number, ()):
-                slot, learned = known.group.slot, known.group
+            for model in self.stations.get(number, ()):
+                slot, learned = model.group.slot, model.group
                 places = slot.antenna_places(ends.moving[here], ends.turned[here])
                 here_and_there = (to_numpy(one).tobytes() for one in (places, learned.places[:1]))
                 key = slot.wavenumber, learned.displacement_key, *here_and_there
-                alike.setdefault(key, []).append((known, here, places))
+                alike.setdefault(key, []).append((model, here, places))
         return list(alike.values())
 
     def left_out(self) -> LeftOutRows:
@@ -252,15 +252,15 @@ class ChannelField(ClosedForm):
         """
         mean = torch.zeros(len(self.rows), *self.channel, dtype=torch.complex64)
         variance, entries = torch.zeros(len(self.rows)).double(), torch.zeros(len(self.rows)).double()
-        for known in self.require_fitted(self.weights or None):
-            group, outputs = known.group, known.group.target.shape[1]
+        for model in self.require_fitted(self.weights or None):
+            group, outputs = model.group, model.group.target.shape[1]
             other = self.prior.disturbance(group).to(torch.complex128)
-            residual, error = known.given.left_out_signal(other)
+            residual, error = model.given.left_out_signal(other)
             assert error is not None
             predicted = group.target - residual
             group.slot.write_entries(mean, group.rows, predicted * self.runs.factors[group.run][:, None])
             # Weighed by entries of the group, as the sum is divided by those of all groups.
-            level = known.scale * outputs * self.runs.factors[group.run].abs().square()
+            level = model.scale * outputs * self.runs.factors[group.run].abs().square()
             variance.index_add_(0, group.rows, error * level)
             entries.index_add_(0, group.rows, torch.full_like(error, float(outputs)))
         return LeftOutRows(self.rows, mean, (variance / entries.clamp_min(1)).float())

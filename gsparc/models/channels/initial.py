@@ -215,8 +215,8 @@ class _Search:
 
         append_better(self._refit(steps[-1].prior), "powers by likelihood")
         one_end = self.has_static_end  # where both move, what waves have in common is not known
-        known = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
-        direct = (known or not one_end) and wanted.direct
+        has_places = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
+        direct = (has_places or not one_end) and wanted.direct
         if direct or (wanted.constant and one_end):
             append_better(self._add_leakage_and_direct(steps[-1], direct), "leakage and direct wave")
         if wanted.mirrors and steps[-1].prior.find_term(Direct) and count_static_ends(self.every) > 1:
@@ -226,7 +226,7 @@ class _Search:
         if wanted.directions and one_end:
             append_better(self._add_directions(steps[-1]), "directions")
         if count_static_ends(self.every) > 1:
-            self._refit_on_all_ends(steps, known, notes)
+            self._refit_on_all_ends(steps, has_places, notes)
         if wanted.correlated:
             steps.append(self._add_drift(steps[-1], notes))
 
@@ -271,12 +271,12 @@ class _Search:
             prior = prior.with_terms(Leakage(frame, level))
         if direct:
             prior = prior.with_terms(Direct(frame, level.repeat(2)))
-        tried: list[tuple[ChannelPrior, float]] = []
+        fits: list[tuple[ChannelPrior, float]] = []
         for bound in sorted({frame.envelope, LENGTHS[-1] * self.wavelength}):
             for gain in GAINS if direct else GAINS[:1]:
                 trial = prior.change_frame(envelope=bound, gain=gain * self.wavelength)
-                tried.append(fit_powers(self._compress(trial), trial, 0.0, SHORT))
-        return self._move_static_ends(self._refit(min(tried, key=lambda each: each[1])[0]))
+                fits.append(fit_powers(self._compress(trial), trial, 0.0, SHORT))
+        return self._move_static_ends(self._refit(min(fits, key=lambda each: each[1])[0]))
 
     def _move_static_ends(self, candidate: TermCandidate) -> TermCandidate:
         """With static ends where they really are."""
@@ -304,8 +304,8 @@ class _Search:
         heard = images.power.view(2, -1).sum(0) > LEAST * power.sum()
         if bool(heard.all()) or not bool(heard.any()):
             return mirrored
-        kept = replace(images, power=images.power[heard.repeat(2)], planes=images.planes[heard])
-        return self._refit(mirrored.prior.with_terms(kept))
+        heard_images = replace(images, power=images.power[heard.repeat(2)], planes=images.planes[heard])
+        return self._refit(mirrored.prior.with_terms(heard_images))
 
     def _add_directions(self, before: TermCandidate) -> TermCandidate:
         """With unequal powers of directions, which start equal; weak ones are told from none no longer."""
@@ -319,8 +319,8 @@ class _Search:
         steps.append(wide._refit(steps[-1].prior))
         steps.append(wide._move_static_ends(steps[-1]))
         if known and self.settings.directions:
-            asked = self.settings
-            tied = wide._refit(self._set_directions(steps[-1].prior, asked.tied, asked.narrow, asked.knots))
+            setup = self.settings
+            tied = wide._refit(self._set_directions(steps[-1].prior, setup.tied, setup.narrow, setup.knots))
             steps.append(wide._choose(steps[-1], tied, "directions by angles to ends", notes))
 
     def _set_directions(
@@ -337,15 +337,15 @@ class _Search:
 
     def _add_drift(self, before: TermCandidate, notes: list[str]) -> TermCandidate:
         groups = drift.sample_stretches(self.every)
-        known = before.prior.signal_covariances(groups)
-        prior, gain = drift.fit_drift(groups, known, before.prior)
+        signals = before.prior.signal_covariances(groups)
+        prior, gain = drift.fit_drift(groups, signals, before.prior)
         errors = np.zeros((2, 1 + len(DEPTHS)))
-        for group, signal in zip(groups, known, strict=True):
+        for group, signal in zip(groups, signals, strict=True):
             for sums, at in zip(errors, (before.prior, prior), strict=True):
                 other = at.disturbance(group).to(torch.complex128)
-                given = Conditioned.from_gram(signal + other, group.target)
-                left = [given.left_out_signal(other, rows)[0] for rows in _left_out_groupings(group.places)]
-                sums += [float(error.abs().square().mean()) / len(groups) for error in left]
+                gp = Conditioned.from_gram(signal + other, group.target)
+                residuals = [gp.left_out_signal(other, rows)[0] for rows in _left_out_groupings(group.places)]
+                sums += [float(error.abs().square().mean()) / len(groups) for error in residuals]
         worth = math.log(sum(2 * group.target.numel() for group in groups))  # of two powers
         after = TermCandidate(prior, worth - gain, errors[1])
         start = replace(before, nll=0.0, errors=errors[0])

@@ -97,10 +97,10 @@ class _Searcher:
             turned = normal + share * turn * moves[:, :2] @ axes
             turned = turned / turned.norm(dim=1, keepdim=True)
             shifted = away - normal @ middle + share * shift * moves[:, 2]
-            tried = torch.cat([turned, (shifted + turned @ middle)[:, None]], 1)
-            gains = self.plane_gains(self.probes, tried)
+            planes = torch.cat([turned, (shifted + turned @ middle)[:, None]], 1)
+            gains = self.plane_gains(self.probes, planes)
             best = int(gains.argmax()) // len(LEVELS)
-            plane, level = tried[best], LEVELS[int(gains[best].argmax())]
+            plane, level = planes[best], LEVELS[int(gains[best].argmax())]
             (normal, away), gain = (plane[:-1], plane[-1]), float(gains[best].max())
         return plane, level, gain
 

@@ -73,11 +73,11 @@ class Probe:
 
     def add_wave(self, wave: Tensor, level: float) -> Probe:
         """Return the probe with a wave (n,) of some power among the terms."""
-        own = self.root @ (self.root.mH @ wave) - self.downdate @ (self.downdate.mH @ wave)
-        own = own + (wave - self.basis @ (self.basis.mH @ wave)) / self.noise
-        share = level / (1 + level * float((wave.conj() @ own).real))
-        alpha = self.alpha - share * own[:, None] * (wave.conj() @ self.alpha)[None]
-        return replace(self, alpha=alpha, downdate=torch.cat([self.downdate, share**0.5 * own[:, None]], 1))
+        dual = self.root @ (self.root.mH @ wave) - self.downdate @ (self.downdate.mH @ wave)
+        dual = dual + (wave - self.basis @ (self.basis.mH @ wave)) / self.noise
+        share = level / (1 + level * float((wave.conj() @ dual).real))
+        alpha = self.alpha - share * dual[:, None] * (wave.conj() @ self.alpha)[None]
+        return replace(self, alpha=alpha, downdate=torch.cat([self.downdate, share**0.5 * dual[:, None]], 1))
 
 
 def likelihood_gains(

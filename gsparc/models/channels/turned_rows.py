@@ -35,11 +35,11 @@ class FullPowerGP(ComplexGP):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        told = super().predict(query)
-        assert told.variance is not None
-        power = told.mean.abs().square().flatten(1).mean(1).clamp_min(TINY_POWER)
-        level = (1 + COHERENT * told.variance / power).sqrt()
-        return replace(told, mean=told.mean * level.view(-1, *[1] * (told.mean.dim() - 1)))
+        prediction = super().predict(query)
+        assert prediction.variance is not None
+        power = prediction.mean.abs().square().flatten(1).mean(1).clamp_min(TINY_POWER)
+        level = (1 + COHERENT * prediction.variance / power).sqrt()
+        return replace(prediction, mean=prediction.mean * level.view(-1, *[1] * (prediction.mean.dim() - 1)))
 
 
 class TurnedNeighbours(InverseDistance, ClosedForm):
@@ -54,10 +54,10 @@ class TurnedNeighbours(InverseDistance, ClosedForm):
         notes = super()._learn(positions, targets)
         self.scale = 1.0
         if len(positions) > 2:
-            tried = covering_rows(positions, TRIED, 0)
-            mean, spread = self._turn_nearest(positions[tried], skip=1)
-            turned = mean * align_factors(mean, targets[tried], self._tones, self._freedom)[:, None]
-            missed = (np.abs(turned - targets[tried]) ** 2).mean()
+            sample_rows = covering_rows(positions, TRIED, 0)
+            mean, spread = self._turn_nearest(positions[sample_rows], skip=1)
+            turned = mean * align_factors(mean, targets[sample_rows], self._tones, self._freedom)[:, None]
+            missed = (np.abs(turned - targets[sample_rows]) ** 2).mean()
             self.scale = float(missed / max(spread.mean(), TINY_POWER))
         return notes
 

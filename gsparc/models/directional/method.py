@@ -64,12 +64,12 @@ class DirectionalGP(SourcesInFrame):
         require_static_phase(data.site, self.name)
         if data.directions is None:
             raise ValueError("directional_gp: needs directions of arrival; this dataset has none")
-        known = fold.learned()
-        if len(known) > MAX_RECEIVERS:
-            known = np.sort(np.random.default_rng(self.seed).choice(known, MAX_RECEIVERS, replace=False))
-        places = data.rx_position[known].astype(np.float64)
+        rows = fold.learned()
+        if len(rows) > MAX_RECEIVERS:
+            rows = np.sort(np.random.default_rng(self.seed).choice(rows, MAX_RECEIVERS, replace=False))
+        places = data.rx_position[rows].astype(np.float64)
         rays = Rays.from_receivers(
-            places, [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in known]
+            places, [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in rows]
         )
         clusters = triangulate(rays, self.seed)
         seen = torch.from_numpy(clusters.seen_points(rays))
@@ -78,10 +78,10 @@ class DirectionalGP(SourcesInFrame):
             raise ValueError("directional_gp: the directions of arrival do not intersect at any source")
         order = seen[:, sources].sum(0).argsort(descending=True, stable=True)
         sources = sources[order[: SearchSettings.max_sources]]
-        everything = rows_of_measurements(data, known, self.row_limit, self.seed)
+        everything = rows_of_measurements(data, rows, self.row_limit, self.seed)
         self.frame = SourceFrame.from_rows(data.site, data.target.shape[1], everything)
         points, covariance = (torch.from_numpy(v)[sources] for v in (clusters.points, clusters.covariance))
-        at = {int(row): k for k, row in enumerate(known)}
+        at = {int(row): k for k, row in enumerate(rows)}
         seen = seen[:, sources] if self.visibility else torch.ones_like(seen[:, sources])
         self.posterior = SightedSources(
             self.frame.normalise(everything),

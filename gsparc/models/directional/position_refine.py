@@ -154,15 +154,15 @@ class PositionRefinement:
         """
         outputs = self.rows.target.shape[1]
         for _ in range(POWER_UPDATES):
-            given = condition_with_noise(self.sum_source_covariances(), self.noise, self.rows.target)
-            explained = (given.weights.conj() * (self.terms @ given.weights)).real.sum((1, 2))
-            due = outputs * (given.factor.inverse.conj() * self.terms).real.sum((1, 2))
+            solution = condition_with_noise(self.sum_source_covariances(), self.noise, self.rows.target)
+            explained = (solution.weights.conj() * (self.terms @ solution.weights)).real.sum((1, 2))
+            due = outputs * (solution.factor.inverse.conj() * self.terms).real.sum((1, 2))
             self.power = self.power * (explained / due.clamp_min(TINY)).clamp(1 / MAX_RATIO, MAX_RATIO)
             self.power = self.power.clamp_max(MAX_POWER * float(self.power.median())).clamp_min(TINY)
-            residual = float(given.weights.abs().square().sum())
-            ratio = residual / (outputs * float(given.factor.inverse.diagonal().real.sum()))
+            residual = float(solution.weights.abs().square().sum())
+            ratio = residual / (outputs * float(solution.factor.inverse.diagonal().real.sum()))
             self.noise = max(self.noise * min(max(ratio, 1 / MAX_RATIO), MAX_RATIO), MIN_NOISE)
-        return given.nll
+        return solution.nll
 
     def _refine_source(self, k: int) -> None:
         """Position and covariance of source k given its rays, the channels and all other sources."""
@@ -207,10 +207,10 @@ class ConditionalLikelihood:
 
     def __init__(self, refinement: PositionRefinement, k: int) -> None:
         rows, prior = refinement.rows, refinement.prior
-        given = condition_with_noise(refinement.sum_source_covariances(k), refinement.noise, rows.target)
+        solution = condition_with_noise(refinement.sum_source_covariances(k), refinement.noise, rows.target)
         in_view = torch.nonzero(refinement.visible[:, k] > 0).flatten()
-        self.rows, self.alpha = rows.select_rows(in_view), given.weights[in_view]
-        self.inverse = given.factor.inverse[in_view[:, None], in_view]
+        self.rows, self.alpha = rows.select_rows(in_view), solution.weights[in_view]
+        self.inverse = solution.factor.inverse[in_view[:, None], in_view]
         self.power, self.centre = float(refinement.power[k]), prior.points[k]
         self.precision = torch.linalg.inv(prior.covariance[k])
 
@@ -234,10 +234,10 @@ class ConditionalLikelihood:
         best, step_scale = self.log_posterior(points), torch.ones(len(points), dtype=torch.float64)
         for _ in range(STEPS):
             step, _ = self._steps_and_covariances(points)
-            tried = points + step_scale[:, None] * step
-            log_posterior = self.log_posterior(tried)
+            trial_points = points + step_scale[:, None] * step
+            log_posterior = self.log_posterior(trial_points)
             better = log_posterior > best
-            points = torch.where(better[:, None], tried, points)
+            points = torch.where(better[:, None], trial_points, points)
             best = torch.where(better, log_posterior, best)
             step_scale = torch.where(better, 1.0, step_scale / 3)
         return points, self._steps_and_covariances(points)[1]
@@ -246,12 +246,12 @@ class ConditionalLikelihood:
         """Gauss-Newton steps (m, 3) at positions (m, 3), and covariances (m, 3, 3) by Fisher information."""
         waves = spherical_waves(self.rows, points)  # (n, m)
         whitened = self.inverse @ waves
-        known = (waves.conj() * whitened).real.sum(0) + 1 / self.power
-        gain = (waves.mH @ self.alpha) / known[:, None]  # (m, R)
+        gain_precision = (waves.conj() * whitened).real.sum(0) + 1 / self.power
+        gain = (waves.mH @ self.alpha) / gain_precision[:, None]  # (m, R)
         phase_vectors = wave_vectors(points, self.rows.position, self.rows.frequency).float()  # (m, n, 3)
         slope = waves.T[:, :, None] * phase_vectors * -1j
         along = torch.einsum("nm,mnc->mc", whitened.conj(), slope)
-        visible = self.inverse @ slope - whitened.T[:, :, None] * (along / known[:, None])[:, None]
+        visible = self.inverse @ slope - whitened.T[:, :, None] * (along / gain_precision[:, None])[:, None]
         power = gain.abs().square().sum(1)[:, None, None]
         fisher = 2 * (power * (slope.mH @ visible).real).double()
         residual = self.alpha - whitened.T[:, :, None] * gain[:, None]  # K^-1 (y - a g), (m, n, R)

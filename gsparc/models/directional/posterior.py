@@ -153,16 +153,16 @@ class SightedSources:
         coherent, correlation = (self._coherence(), {each: self._gain_correlation(each) for each in KERNELS})
         for _ in range(ROUNDS):
             covariance = self._cross_covariance(self.waves, coherent, power)
-            tried = {
+            fits = {
                 each: condition_with_noise(covariance * shared, each.noise, self.rows.target)
                 for each, shared in correlation.items()
             }
-            kernel, conditioned = min(tried.items(), key=lambda one: one[1].nll)
+            kernel, conditioned = min(fits.items(), key=lambda one: one[1].nll)
             # E |g_k|^2 of the constant part, over outputs (Rasmussen and Williams, eq. 2.25 and 2.26)
             prior = power * kernel.constant
             mean = prior[:, None] * (self.waves.mH @ conditioned.weights)
-            known = (conditioned.factor.root @ self.waves).abs().square().sum(0)
-            power = (mean.abs().square().mean(1) + prior - prior.square() * known).clamp_min(TINY)
+            information = (conditioned.factor.root @ self.waves).abs().square().sum(0)
+            power = (mean.abs().square().mean(1) + prior - prior.square() * information).clamp_min(TINY)
         return replace(self, power=power, kernel=kernel)
 
     def arrival_at(self, places: Tensor, frequency: Tensor, probability: Tensor | None = None) -> Arrival:
@@ -207,9 +207,9 @@ class SightedSources:
         cross = self._cross_covariance(waves, at.retained, self.power) * at.correlation
         predicted, inverse = self.conditioned.mean(cross), self.conditioned.factor.inverse
         for group in rows_of_groups(self.observer.numpy()):
-            own, _ = left_out_group(inverse, self.conditioned.weights, group)
+            residual, _ = left_out_group(inverse, self.conditioned.weights, group)
             # Weights without rows S are `K^-1 y - (K^-1)_:S (K^-1_SS)^-1 (K^-1 y)_S`: no other factor.
-            predicted[group] -= cross[group] @ (inverse[:, group] @ own)
+            predicted[group] -= cross[group] @ (inverse[:, group] @ residual)
         return predicted
 
     def _gain_correlation(self, kernel: GainKernel) -> Tensor:
@@ -230,8 +230,8 @@ class SightedSources:
         real, imag = total.real.contiguous(), total.imag.contiguous()
         buffer = torch.empty_like(real)
         for k, coherent in zip(uncertain.tolist(), retained, strict=True):
-            own, other = (torch.view_as_real(one[:, k].contiguous()) for one in (power * waves, self.waves))
-            real.addcmul_(torch.mm(own, other.T, out=buffer), coherent)
-            turned = torch.stack([own[:, 1], -own[:, 0]], 1)
+            query, other = (torch.view_as_real(one[:, k].contiguous()) for one in (power * waves, self.waves))
+            real.addcmul_(torch.mm(query, other.T, out=buffer), coherent)
+            turned = torch.stack([query[:, 1], -query[:, 0]], 1)
             imag.addcmul_(torch.mm(turned, other.T, out=buffer), coherent)
         return torch.complex(real, imag)

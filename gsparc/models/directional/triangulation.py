@@ -177,10 +177,10 @@ def _step_points(
     identity = np.eye(points.shape[1])
     across = (identity - towards[:, :, None] * towards[:, None, :]) * (weight / away**2)[:, :, None]
     wrong = np.einsum("pcd,pd->pc", across, rays.direction[ray] * away)
-    known, pull = np.zeros((len(points), *identity.shape)), np.zeros_like(points)
-    np.add.at(known, k, across)
+    information, pull = np.zeros((len(points), *identity.shape)), np.zeros_like(points)
+    np.add.at(information, k, across)
     np.add.at(pull, k, wrong)
-    covariance = np.linalg.inv(known + identity / REACH_M**2)
+    covariance = np.linalg.inv(information + identity / REACH_M**2)
     return points + np.einsum("kcd,kd->kc", covariance, pull), covariance
 
 
@@ -188,9 +188,9 @@ def _are_distinct(points: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Whether each point (K,) differs from all before it by more than their errors."""
     mask = np.ones(len(points), bool)
     for k in range(1, len(points)):
-        apart = points[:k] - points[k]
-        whitened = np.linalg.solve(covariance[:k] + covariance[k], apart[..., None])[..., 0]
-        mask[k] = not bool((((apart * whitened).sum(1) < SAME_SIGMAS**2) & mask[:k]).any())
+        offset = points[:k] - points[k]
+        whitened = np.linalg.solve(covariance[:k] + covariance[k], offset[..., None])[..., 0]
+        mask[k] = not bool((((offset * whitened).sum(1) < SAME_SIGMAS**2) & mask[:k]).any())
     return mask
 
 
@@ -222,20 +222,20 @@ def _refine_point(rays: Rays, point: np.ndarray, error: float) -> tuple[np.ndarr
 
 def _find_points(rays: Rays, mask: np.ndarray, error: float, rng: np.random.Generator) -> list[np.ndarray]:
     """New points of the mask rays."""
-    left = rays.select_rays(mask)
-    proposed = _midpoints(left, error, rng, PAIRS, CANDIDATES)
+    rest = rays.select_rays(mask)
+    proposed = _midpoints(rest, error, rng, PAIRS, CANDIDATES)
     if not len(proposed):
         return []
-    gain = np.maximum(_log_ratio(left.squared_error(proposed), error), 0).astype(np.float32)
+    gain = np.maximum(_log_ratio(rest.squared_error(proposed), error), 0).astype(np.float32)
     score, points, failed = gain.sum(1), [], 0
     while failed < MAX_FAILURES and score.max() > MIN_EVIDENCE:
         top = int(score.argmax())
-        near = left.select_rays(left.squared_error(proposed[top : top + 1])[0] < (GATE_SIGMAS * error) ** 2)
+        near = rest.select_rays(rest.squared_error(proposed[top : top + 1])[0] < (GATE_SIGMAS * error) ** 2)
         point, evidence = _refine_point(near, proposed[top], error)
         assigned = gain[top] > 0
         if evidence >= MIN_EVIDENCE:
             points.append(point)
-            assigned |= _log_ratio(left.squared_error(point[None])[0], error) > 0
+            assigned |= _log_ratio(rest.squared_error(point[None])[0], error) > 0
         else:
             failed += 1
         score -= gain[:, assigned].sum(1)

@@ -51,12 +51,12 @@ class VisibilityGP:
     @staticmethod
     def from_visibility(places: Tensor, seen: Tensor) -> VisibilityGP:
         """Learn from the visibility of K sources at n receivers."""
-        apart, mean = torch.cdist(places, places), seen.mean(0)
+        distance, mean = torch.cdist(places, places), seen.mean(0)
         length, weights = torch.full_like(mean, LENGTHS_M[-1]), torch.zeros_like(seen)
         left_out = mean.expand_as(seen).clone()  # without a better kernel the mean
         best = (left_out - seen).square().mean(0)
-        for tried in LENGTHS_M:
-            values, vectors = torch.linalg.eigh(matern32_of_squares((apart / tried).square()))
+        for length_m in LENGTHS_M:
+            values, vectors = torch.linalg.eigh(matern32_of_squares((distance / length_m).square()))
             turned = vectors.T @ (seen - mean)
             for noise in NOISES:
                 shrunk = 1 / (values.clamp_min(0) + noise)
@@ -66,7 +66,7 @@ class VisibilityGP:
                 error = (predicted - seen).square().mean(0)
                 better = error < best
                 best = torch.where(better, error, best)
-                length[better], weights[:, better] = tried, alpha[:, better]
+                length[better], weights[:, better] = length_m, alpha[:, better]
                 left_out[:, better] = predicted[:, better]
         return VisibilityGP(places, seen, length, weights, left_out)
 

@@ -40,17 +40,17 @@ def find_element_factors(rows: Rows, scene: SourceScene) -> Tensor | None:
     assert rows.array is not None and rows.element is not None
     scene = replace(scene, phase=None)
     conditioned = GainPosterior(rows, scene).conditioned
-    known, run = np.unique(rows.element.numpy(), return_inverse=True)
+    elements, run = np.unique(rows.element.numpy(), return_inverse=True)
     inverse = conditioned.factor.inverse.to(torch.complex128).numpy()
     quadratic = factor_matrix(inverse, rows.target.to(torch.complex128).numpy(), run)
     estimate = best_run_factors(quadratic, rows.target.shape[1] * np.bincount(run))
     each = np.ones(len(rows.array), np.complex128)
-    each[known] = estimate / estimate[0]
+    each[elements] = estimate / estimate[0]
     factors = torch.from_numpy(each.astype(np.complex64))
     target = rows.target * factors[rows.element, None]
     scale = target.abs().square().mean().sqrt()  # sources absorb a common factor
     nll = GainPosterior(replace(rows, target=target / scale), scene).nll
     jacobian = 2 * float((factors.abs().log()[rows.element] - scale.log()).double().sum())
     gain = conditioned.nll - (nll - jacobian)
-    cost = (len(known) - 1) * math.log(len(rows))
+    cost = (len(elements) - 1) * math.log(len(rows))
     return factors if gain > cost else None

@@ -166,9 +166,9 @@ def merge_equal_paths(paths: QueryPaths) -> QueryPaths:
     # A source is where the first query sees it: it stands still.
     places = unit[:1] * (LIGHT * delay[:1].mean(1))[..., None]
     first = (torch.cdist(places, places) < LIGHT / carrier_hz / 2).int().argmax(2).flatten()
-    kept, number = first.unique(return_inverse=True)
-    summed = gain.new_zeros(*gain.shape[:2], len(kept)).index_add_(2, number, gain)
-    return QueryPaths(summed, delay[..., kept], unit[:, kept], carrier_hz)
+    sources, number = first.unique(return_inverse=True)
+    summed = gain.new_zeros(*gain.shape[:2], len(sources)).index_add_(2, number, gain)
+    return QueryPaths(summed, delay[..., sources], unit[:, sources], carrier_hz)
 
 
 def require_static_phase(site: Site, name: str) -> None:

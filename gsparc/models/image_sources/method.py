@@ -130,8 +130,8 @@ class ImageSourceGP(SourcesInFrame):
             # Search 0 is the one looked at, and it leaves out the first group (`_kept`).
             group = self._groups[0][:: -(-len(self._groups[0]) // LOOKED_AT)]
             look = partial(self._log_look, context.race, group, data.batch(group), [])
-        given = None if self.start is None else (self.start[0] - self.frame.middle, self.start[1])
-        members = self._run_searches(row_sets, settings, effort, look, given)
+        warm_start = None if self.start is None else (self.start[0] - self.frame.middle, self.start[1])
+        members = self._run_searches(row_sets, settings, effort, look, warm_start)
         if calibrated:
             again = self._calibrate_antennas(data, row_sets[members[0].number], members[0].scene)
             if again is not data:
@@ -226,9 +226,9 @@ class ImageSourceGP(SourcesInFrame):
         for turn, group in enumerate(self._groups):
             if mine := [one for one in members if one.number % len(self._groups) == turn]:
                 # As many rows as the process that answers has: fewer would err more than it does.
-                apart = self._draw(data, self._rows_of_search(known, turn), limit)
+                others = self._draw(data, self._rows_of_search(known, turn), limit)
                 rows.append(group)
-                means.append(copy.copy(self)._set_members(apart, mine).predict(data.batch(group)).mean)
+                means.append(copy.copy(self)._set_members(others, mine).predict(data.batch(group)).mean)
         if not rows:
             return None
         mean = torch.cat(means)

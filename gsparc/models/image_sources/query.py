@@ -173,5 +173,5 @@ class RowVariance:
         product = torch.bmm(here.mT, there.flatten(2).transpose(0, 1)).unflatten(2, (2, -1))
         cross = torch.addcmul(self.along * product, product.flip(1, 2), self.across)
         prior = here.square().sum(2) @ self.power + self.noise
-        known = (cross.flatten(2).flatten(0, 1) @ self.root).square().sum(1)
-        return (prior - known.view(-1, 2).sum(1)).clamp_min(0), prior
+        reduction = (cross.flatten(2).flatten(0, 1) @ self.root).square().sum(1)
+        return (prior - reduction.view(-1, 2).sum(1)).clamp_min(0), prior

@@ -121,9 +121,9 @@ def find_orthogonal_walls(scene: SourceScene) -> Tensor | None:
     first, second = torch.triu_indices(len(sources), len(sources), 1)
     candidates = []
     for direction in triad:
-        apart = sources[second] - sources[first]
-        along = apart @ direction
-        across = (apart - along[:, None] * direction).norm(dim=1)
+        displacement = sources[second] - sources[first]
+        along = displacement @ direction
+        across = (displacement - along[:, None] * direction).norm(dim=1)
         fits = (across < torch.maximum(allowed[first], allowed[second])) & (
             along.abs() > 2 * MIN_IMAGE_SHIFT_M
         )
@@ -131,12 +131,12 @@ def find_orthogonal_walls(scene: SourceScene) -> Tensor | None:
         candidates += [torch.cat([direction, offset[None]]) for offset in offsets]
     chosen, explained = scene.planes[:0], 1.0
     for _ in range(MOST_WALLS):
-        tried = [torch.cat([chosen, plane[None]]) for plane in candidates]
-        gains = [_count_explained(scene, planes, allowed) for planes in tried]
+        plane_sets = [torch.cat([chosen, plane[None]]) for plane in candidates]
+        gains = [_count_explained(scene, planes, allowed) for planes in plane_sets]
         if not gains or max(gains) < explained + 0.8:
             break
         best = gains.index(max(gains))
-        chosen, explained = tried[best], gains[best]
+        chosen, explained = plane_sets[best], gains[best]
     return chosen if len(chosen) else None
 
 
@@ -192,13 +192,13 @@ def reassign_to_walls(scene: SourceScene, walls: Tensor) -> SourceScene:
 
 def prune_sources(rows: Rows, scene: SourceScene, min_gain: float) -> SourceScene:
     """Drop sources that gain under `min_gain` nats, twice with a plane of their own, or `out_of_steps`."""
-    posterior, kept = GainPosterior(rows, scene), list(range(len(scene.sequences)))
-    for i in sorted(kept[1:], key=lambda i: float(scene.log_amplitude[i])):
+    posterior, ids = GainPosterior(rows, scene), list(range(len(scene.sequences)))
+    for i in sorted(ids[1:], key=lambda i: float(scene.log_amplitude[i])):
         if out_of_steps():
             break
-        sole_user = any(sum(index in scene.sequences[j] for j in kept) == 1 for index in scene.sequences[i])
-        lost = posterior.nll_without_source(kept.index(i)) - posterior.nll
-        if lost < (2 * min_gain if sole_user else min_gain):
-            kept.remove(i)
-            posterior = GainPosterior(rows, scene.select_sources(kept))
-    return scene.select_sources(kept)
+        sole_user = any(sum(index in scene.sequences[j] for j in ids) == 1 for index in scene.sequences[i])
+        loss = posterior.nll_without_source(ids.index(i)) - posterior.nll
+        if loss < (2 * min_gain if sole_user else min_gain):
+            ids.remove(i)
+            posterior = GainPosterior(rows, scene.select_sources(ids))
+    return scene.select_sources(ids)

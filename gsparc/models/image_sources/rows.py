@@ -131,11 +131,11 @@ def rows_of_measurements(data: Measurements, index: np.ndarray, limit: int, seed
         measured = np.ones((antennas, tones), bool) if data.mask is None else data.mask[row]
         for e in few_rows.draw_rows(per, most, rng) if most < per else range(per):
             # Antennas of unknown places are outputs of one row, so that a tone must be measured at all.
-            known = np.flatnonzero(measured[e] if per > 1 else measured.all(0))
-            count = min(wanted, len(known))
+            bins = np.flatnonzero(measured[e] if per > 1 else measured.all(0))
+            count = min(wanted, len(bins))
             if count == 0:
                 continue
-            comb = known[np.floor((np.arange(count) + rng.random()) * len(known) / count).astype(int)]
+            comb = bins[np.floor((np.arange(count) + rng.random()) * len(bins) / count).astype(int)]
             # `element` names the static end's antenna.
             at, target = np.repeat(moving_end(place[e, None]), count, 0), values[e, comb][:, None]
             target = target if per > 1 else values[:, comb].T

@@ -154,8 +154,8 @@ class SourceScene:
         """Return other sequences over the planes: up to `order` with one more at the end, and all pairs."""
         indices = range(len(self.planes))
         more = [(*w, i) for w in self.sequences if len(w) < order for i in indices if not w or w[-1] != i]
-        known = set(self.sequences)
-        return [w for w in dict.fromkeys(more + all_sequences([*indices], 2)) if w not in known]
+        sequences = set(self.sequences)
+        return [w for w in dict.fromkeys(more + all_sequences([*indices], 2)) if w not in sequences]
 
     def replace_sequences(self, sequences: Iterable[Reflections]) -> SourceScene:
         """Return other sequences over the same planes, of gains that are not known."""

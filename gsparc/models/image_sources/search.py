@@ -167,8 +167,8 @@ class Search:
         if not more.sequences:
             return 0
         scores, amplitude = gains_and_amplitudes(GainPosterior(self.rows, scene), more.images(self.rows))
-        apart = 0.5 * self.wavelength
-        chosen = select_separated(more.sources, scores, apart, limit, SEQUENCE_SCORE, scene.sources)
+        spacing = 0.5 * self.wavelength
+        chosen = select_separated(more.sources, scores, spacing, limit, SEQUENCE_SCORE, scene.sources)
         if chosen:
             self.scene = scene.add_sequences([more.sequences[i] for i in chosen], amplitude[chosen])
         return len(chosen)
@@ -184,8 +184,8 @@ class Search:
             if number and out_of_steps():
                 break
             spread = partial(self._antenna_images, parent)
-            apart = 0.5 * self.wavelength
-            found = find_sources_in_box(posterior, self.box, apart, FREE_PER_ROUND, self.generator, spread)
+            spacing = 0.5 * self.wavelength
+            found = find_sources_in_box(posterior, self.box, spacing, FREE_PER_ROUND, self.generator, spread)
             found = [source for source in found if source[1] >= FREE_SCORE]
             for position, _, amplitude in found:
                 sequence, plane = self._best_parent_and_plane(position, posterior)

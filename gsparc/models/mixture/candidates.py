@@ -69,12 +69,12 @@ def make_bearings(init: InitSettings, clutter: bool, context: FitContext, **more
 def _search_arguments(init: InitSettings, clutter: bool, context: FitContext) -> dict[str, Any]:
     """What `ImageSourceGP` takes, of the settings of an initialiser."""
     names = ("searches", "search_rows", "rows", "margin", "max_sources", "order")
-    own = {name: getattr(init, name) for name in names}
-    own["searches"] = max(round(context.effort * init.searches), 1)
+    arguments = {name: getattr(init, name) for name in names}
+    arguments["searches"] = max(round(context.effort * init.searches), 1)
     for name in ("search_rows", "rows"):
         # Factoring a covariance of n rows takes n^3.
-        own[name] = max(round(context.effort ** (1 / 3) * getattr(init, name)), 8)
-    return {**own, "clutter": clutter, "offsets": init.snapshot, "seed": context.seed}
+        arguments[name] = max(round(context.effort ** (1 / 3) * getattr(init, name)), 8)
+    return {**arguments, "clutter": clutter, "offsets": init.snapshot, "seed": context.seed}
 
 
 CANDIDATES: dict[str, Candidate] = {

@@ -61,7 +61,7 @@ class LearnsTogether(MethodFactory):
                 "together",
                 "no station of the test rows was heard: what stations share answers for them",
             )
-        known = heard_rows(data, fold.learned())
-        if len(known) > ONE_FACTOR:
-            return "each", f"{len(known)} rows are more than one factor holds ({ONE_FACTOR})"
+        rows = heard_rows(data, fold.learned())
+        if len(rows) > ONE_FACTOR:
+            return "each", f"{len(rows)} rows are more than one factor holds ({ONE_FACTOR})"
         return "together", "powers at all stations share a law of distance"

@@ -112,8 +112,8 @@ class Mixture(LearnsTogether, ClosedForm):
         # Places are refined by slopes of predictions: of one end that moves, with phases that rows share.
         site, phases = data.site, data.site.phase_reference != "neighbours"
         heeds = site.kind != "spectrum" and site.static_end is not None and phases
-        known = fold.learned()
-        if (std := position_errors(data, known, self.position_std, heeds)) is not None:
+        fit_rows = fold.learned()
+        if (std := position_errors(data, fit_rows, self.position_std, heeds)) is not None:
             return self._fit_twice(parts, init, data, fold, context, std)
         return self._solve(parts, init, data, fold, context)
 
@@ -149,8 +149,8 @@ class Mixture(LearnsTogether, ClosedForm):
         """
         watch = Stopwatch()
         log.info("training in closed form: init=%s", " and ".join(parts))
-        known, several = np.sort(fold.learned()), len(parts) > 1
-        self.runs = _estimate_run_factors(data, known, context)
+        fit_rows, several = np.sort(fold.learned()), len(parts) > 1
+        self.runs = _estimate_run_factors(data, fit_rows, context)
         data = self.runs.remove_factors(data)
         stages = {"factors of runs": watch.seconds} if len(self.runs) > 1 else {}
         cut = cut_folds(data, fold, context.split, fit_candidates.GROUPS, context.seed) if several else None
@@ -166,7 +166,7 @@ class Mixture(LearnsTogether, ClosedForm):
         self.site, self.init_s = data.site, watch.seconds
         self.explained = self._explained_share(data, fold, several)
         if several or self.explained is not None:  # else it is of these rows already
-            self.condition(data, known)
+            self.condition(data, fit_rows)
         log.info("%d Gaussians from init=%s", self.count_gaussians, self.description)
         seconds = watch.seconds
         stages |= {name: report.seconds for name, report in reports.items()}
@@ -186,8 +186,8 @@ class Mixture(LearnsTogether, ClosedForm):
         batch = data.batch(fold.val)
         result = self.predict(batch).explained
         assert result is not None
-        own, target = (data.site.target.in_error_unit(one) for one in (result, batch.target))
-        return explained_variance(own, target, data.site.kind != "csi")
+        prediction, target = (data.site.target.in_error_unit(one) for one in (result, batch.target))
+        return explained_variance(prediction, target, data.site.kind != "csi")
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """Condition every member on the same rows."""
@@ -208,8 +208,8 @@ class Mixture(LearnsTogether, ClosedForm):
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; what members disagree about is added to their variances."""
         self.require_fitted(self.members or None)
-        told = Prediction.joined([self._mix_predictions(part) for part in query.split(QUERY_CHUNK)])
-        return self.runs.apply_factors(told, query.run)
+        prediction = Prediction.joined([self._mix_predictions(part) for part in query.split(QUERY_CHUNK)])
+        return self.runs.apply_factors(prediction, query.run)
 
     def _mix_predictions(self, query: Query) -> Prediction:
         """In the phase and level of the largest run."""
@@ -218,8 +218,8 @@ class Mixture(LearnsTogether, ClosedForm):
             return result[0]
         pairs = list(zip(self.weights, result, strict=True))
         # Members are in closed form, and state both.
-        told = [(weight, one.mean, cast(Tensor, one.variance)) for weight, one in pairs]
-        mean, variance = mixture_moments(told)
+        moments = [(weight, one.mean, cast(Tensor, one.variance)) for weight, one in pairs]
+        mean, variance = mixture_moments(moments)
         unknown = torch.stack([weight * cast(Tensor, one.unknown) for weight, one in pairs]).sum(0)
         parts = [weight * one.explained for weight, one in pairs if one.explained is not None]
         variance, unknown = (each.to(mean.real.dtype) for each in (variance, unknown))
@@ -242,11 +242,11 @@ class Mixture(LearnsTogether, ClosedForm):
 
         What other solutions and the residual add to channels is in no path.
         """
-        made = [(weight, one) for weight, one in self.weighted_members() if isinstance(one, HasPaths)]
-        if not made:
+        members = [(weight, one) for weight, one in self.weighted_members() if isinstance(one, HasPaths)]
+        if not members:
             raise ValueError("its channels are not made of paths")
-        gains, delays, units, carriers = zip(*(method.paths(query) for _, method in made), strict=True)
-        gain = torch.cat([weight * own for (weight, _), own in zip(made, gains, strict=True)], dim=2)
+        gains, delays, units, carriers = zip(*(method.paths(query) for _, method in members), strict=True)
+        gain = torch.cat([weight * part for (weight, _), part in zip(members, gains, strict=True)], dim=2)
         delay, unit, carrier = torch.cat(delays, dim=2), torch.cat(units, dim=1), carriers[0]
         return merge_equal_paths(QueryPaths(gain, delay, unit, carrier))
 

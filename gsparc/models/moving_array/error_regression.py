@@ -74,9 +74,9 @@ class ImageErrors(Stored):
             power: (m,) mean square of the predicted images.
         """
         error, nearest = self.error_and_nearest(far, features)
-        known = matern32((nearest - self.farthest).clamp_min(0), self.reach)
-        variance = known * (error * power).clamp_max(self.prior) + (1 - known) * self.prior
-        return 1 - known / (1 + error), variance
+        correlation = matern32((nearest - self.farthest).clamp_min(0), self.reach)
+        variance = correlation * (error * power).clamp_max(self.prior) + (1 - correlation) * self.prior
+        return 1 - correlation / (1 + error), variance
 
     def error_and_nearest(self, far: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
         """Return the expected |e|^2 / |h|^2 (m,) near rows, and distances (m,) [m]; see `expected`.
@@ -100,11 +100,11 @@ def fit_errors(
     """
     errors = relative_error.clamp_min(LEAST_ERROR).log()
     rows = torch.from_numpy(rows_with_nearest(places, np.arange(len(places)), NEIGHBOURS))
-    others, near, known = rows[:, 1:], rows[:, :NEIGHBOURS], torch.from_numpy(places)
-    distance = (known[others] - known[:, None]).norm(dim=2).float()
-    columns = _columns(kernel, distance, _precision(kernel, known[others]), errors[others], features)
+    others, near, positions = rows[:, 1:], rows[:, :NEIGHBOURS], torch.from_numpy(places)
+    distance = (positions[others] - positions[:, None]).norm(dim=2).float()
+    columns = _columns(kernel, distance, _precision(kernel, positions[others]), errors[others], features)
     regression = RelativeErrorRegression.from_rows(columns, relative_error)
-    precision, farthest = (_precision(kernel, known[near]), max(float(distance[:, 0].max()), LEAST_M))
+    precision, farthest = (_precision(kernel, positions[near]), max(float(distance[:, 0].max()), LEAST_M))
     return ImageErrors(near, precision, errors, regression, kernel, farthest, reach, prior)
 
 

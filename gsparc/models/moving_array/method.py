@@ -129,9 +129,9 @@ class MovingArrayField(Differentiable, ClosedForm):
         power = self._fit_powers(spectra, sources)
         modelled = self._fit_trend(spectra, sources, power, self._choose_kernel(spectra, sources, power))
         rows = _spread_rows(len(positions), self.rest_rows)
-        left, kernel = error_and_likeliest_kernel(positions[rows], spectra.values[rows] - modelled[rows])
+        misfit, kernel = error_and_likeliest_kernel(positions[rows], spectra.values[rows] - modelled[rows])
         self._fit_residual(spectra, modelled, kernel, targets)
-        error, count = left / targets[0].size, self.count_components()
+        error, count = misfit / targets[0].size, self.count_components()
         note = f"{self.name}: {count} sources, leave-one-out error {error:.4g}"
         fitted = f"length {kernel.length:.3g} m and noise {kernel.noise:.3g}, chosen on {len(rows)} rows"
         return (note, f"{self.name}: residual of {fitted}, {len(self.residual.axes)} components")
@@ -153,11 +153,11 @@ class MovingArrayField(Differentiable, ClosedForm):
         Raises:
             ValueError: neither is a spectrum of the declared array.
         """
-        exponent, left = pixel_exponent(self.lags(), self._to_images(targets[_spread_rows(len(targets), 16)]))
-        if left > MAX_UNEXPLAINED:
+        exponent, rest = pixel_exponent(self.lags(), self._to_images(targets[_spread_rows(len(targets), 16)]))
+        if rest > MAX_UNEXPLAINED:
             raise ValueError(
                 f"{self.name}: the declared array cannot have measured these spectra "
-                f"({left:.0%} of their energy is outside its lags)"
+                f"({rest:.0%} of their energy is outside its lags)"
             )
         return exponent
 
@@ -187,8 +187,8 @@ class MovingArrayField(Differentiable, ClosedForm):
 
     def _fit_trend(self, spectra: Spectra, sources: Tensor, power: np.ndarray, kernel: Kernel) -> Tensor:
         """Fit the trend of powers (n, K); its left-out images (n, R)."""
-        self.found, left = fit_trend(sources, kernel, spectra.places, power)
-        return self._render_coefficients(spectra, sources, torch.from_numpy(left).float())
+        self.found, trend_power = fit_trend(sources, kernel, spectra.places, power)
+        return self._render_coefficients(spectra, sources, torch.from_numpy(trend_power).float())
 
     def _render_coefficients(self, spectra: Spectra, sources: Tensor, power: Tensor) -> Tensor:
         """Images (n, R) of sources of powers (n, K)."""
@@ -206,8 +206,8 @@ class MovingArrayField(Differentiable, ClosedForm):
         errors = {}
         for length in self.trend.lengths:
             kernel = Kernel.from_length(length * diagonal, self.trend.noise)
-            left = torch.from_numpy(fit_trend(sources, kernel, some.places, power[rows])[1]).float()
-            missed = some.values - self._render_coefficients(some, sources, left)
+            trend_power = torch.from_numpy(fit_trend(sources, kernel, some.places, power[rows])[1]).float()
+            missed = some.values - self._render_coefficients(some, sources, trend_power)
             errors[kernel] = error_and_likeliest_kernel(some.places, missed)[0]
         return min(errors, key=lambda kernel: errors[kernel])
 

@@ -105,14 +105,14 @@ def find_sources(
     low, high = receivers.min(0).values, receivers.max(0).values
     far = settings.reach * float((high - low).norm())
     low, high = low - far, high + far
-    known = receivers[:0] if first is None else first[None].float()
+    anchors = receivers[:0] if first is None else first[None].float()
 
     def residual_lags(lags: Tensor, receivers: Tensor, sources: Tensor) -> Tensor:
         """Return residual lags (n, Q) of sources of the best powers."""
         atoms = space.plane_wave_lags(bearings(sources, receivers, rotation))
         return lags - sum_lags(nonnegative_powers(lags, atoms, settings.ridge), atoms)
 
-    positions, residual = known, residual_lags(lags, receivers, known) if len(known) else lags
+    positions, residual = anchors, residual_lags(lags, receivers, anchors) if len(anchors) else lags
     energy = float(residual.square().sum())
     while len(positions) < settings.sources:
         candidates = draw_in_box(low, high, settings.candidates, generator)
@@ -126,23 +126,23 @@ def find_sources(
         before, energy = energy, float(residual.square().sum())
         if energy > (1 - settings.least_gain) * before:
             break
-    if settings.steps == 0 or len(positions) == len(known):
+    if settings.steps == 0 or len(positions) == len(anchors):
         return positions
     # Powers are optimal at every step, so that their derivative does not enter the gradient.
-    free = positions[len(known) :].clone().requires_grad_(True)
+    free = positions[len(anchors) :].clone().requires_grad_(True)
     optimiser = torch.optim.Adam([free], lr=settings.rate)
     for step in range(settings.steps):
         progress = step / settings.steps
         optimiser.param_groups[0]["lr"] = settings.rate * (1 + math.cos(math.pi * progress)) / 2
         # As many receivers a step on every site, so that its time is bounded.
         some = torch.randperm(len(receivers), generator=generator)[:SEEN_AT_ONCE]
-        residual = residual_lags(lags[some], receivers[some], torch.cat([known, free]))
+        residual = residual_lags(lags[some], receivers[some], torch.cat([anchors, free]))
         # A share of the energy: levels of spectra must not matter beside Adam's epsilon.
         loss = residual.square().sum() / lags[some].square().sum()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-    return torch.cat([known, free.detach()])
+    return torch.cat([anchors, free.detach()])
 
 
 def _best_separated(

@@ -108,8 +108,8 @@ class CalibratedRayTracer(Checked, Method):
         # Measurements are local, the tracer's scene is in world coordinates.
         places, measured = data.moving[rows] + data.site.origin, _measured_decibels(data, rows)
         tracer = self._loaded_tracer()
-        own = used_materials(tracer)
-        start = own if self.start == "scene" else dict.fromkeys(own, GENERIC)
+        materials = used_materials(tracer)
+        start = materials if self.start == "scene" else dict.fromkeys(materials, GENERIC)
         # Before the replay, whose first powers are those under the start's materials.
         apply_materials(tracer, start)
         # Paths are traced once: materials change what they carry, not where they run.

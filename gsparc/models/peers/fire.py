@@ -48,9 +48,9 @@ class Coder(Network):
     def forward(self, query: Query) -> Tensor:
         """Return channels (B, A, K) from the query's uplink."""
         assert query.uplink is not None
-        own, scale = self.unit_uplink_and_level(query.uplink)
-        downlink, _ = self.downlink_and_divergence(own.flatten(0, 1))
-        return downlink.view(*own.shape[:2], -1) * scale
+        uplink, scale = self.unit_uplink_and_level(query.uplink)
+        downlink, _ = self.downlink_and_divergence(uplink.flatten(0, 1))
+        return downlink.view(*uplink.shape[:2], -1) * scale
 
     def unit_uplink_and_level(self, uplink: Tensor) -> tuple[Tensor, Tensor]:
         """Return uplinks (B, A, L) of antennas that answer, at unit power, and their level (B, 1, 1)."""
@@ -61,14 +61,14 @@ class Coder(Network):
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the mean squared error () of unit channels, and the code's divergence by its weight."""
         assert batch.uplink is not None
-        own, scale = self.unit_uplink_and_level(batch.uplink)
+        uplink, scale = self.unit_uplink_and_level(batch.uplink)
         # As many antennas of snapshots as there are snapshots, whatever the array: steps cost alike.
-        pick = torch.randint(own.shape[0] * own.shape[1], (len(own),), generator=generator)
+        pick = torch.randint(uplink.shape[0] * uplink.shape[1], (len(uplink),), generator=generator)
         # Snapshots have arbitrary phase: rotating both ends augments the data.
-        angle = 2 * math.pi * torch.rand(len(own), 1, generator=generator)
+        angle = 2 * math.pi * torch.rand(len(uplink), 1, generator=generator)
         turn = torch.polar(torch.ones_like(angle), angle)
-        noise = torch.randn(len(own), self.code, generator=generator)
-        guess, divergence = self.downlink_and_divergence(own.flatten(0, 1)[pick] * turn, noise)
+        noise = torch.randn(len(uplink), self.code, generator=generator)
+        guess, divergence = self.downlink_and_divergence(uplink.flatten(0, 1)[pick] * turn, noise)
         missed = guess - (batch.target / scale).flatten(0, 1)[pick] * turn
         return missed.abs().square().mean() + self.weight * divergence.mean()
 

@@ -68,14 +68,14 @@ class DirectedRays(Network):
     def march(self, places: Tensor, goals: Tensor, likely: Tensor, rng: torch.Generator | None) -> Tensor:
         """Return channels (B,) of rays from places (B, 3) to goals (B, P, 3) [m], those likely (B, P)."""
         towards = goals - places[:, None]
-        apart = towards.norm(dim=-1, keepdim=True).clamp_min(NEAR)
-        heading = towards / apart
+        distance = towards.norm(dim=-1, keepdim=True).clamp_min(NEAR)
+        heading = towards / distance
         half = self.samples // 2
         shape = (*heading.shape[:2], half)
         jitter = torch.full((2, *shape), 0.5) if rng is None else torch.rand((2, *shape), generator=rng)
         steps = torch.arange(half)
         coarse = NEAR + (self.far - NEAR) * (steps + jitter[0]) / half
-        fine = (apart - AROUND + 2 * AROUND * (steps + jitter[1]) / half).clamp_min(NEAR / 2)
+        fine = (distance - AROUND + 2 * AROUND * (steps + jitter[1]) / half).clamp_min(NEAR / 2)
         depth = torch.cat([coarse, fine], -1).sort(-1).values
         points = places[:, None, None] + depth[..., None] * heading[:, :, None]
         turn = self.heading(heading)[:, :, None].expand(-1, -1, self.samples, -1)

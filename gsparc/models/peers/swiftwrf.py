@@ -103,8 +103,8 @@ class PlanarGaussians(GaussianNetwork):
         towards = self.base + (self.centres.unsqueeze(-2) @ self.axes).squeeze(-2)
         means = receiver.position + towards / towards.norm(dim=-1, keepdim=True) @ receiver.rotation.mT
         turned = turn_about_normal(self.frames, self.angles[None, :, None] / 2)[0].numpy()
-        own = Rotation.from_matrix(receiver.rotation.numpy())
-        quats = own * Rotation.from_quat(turned, scalar_first=True)
+        rotation = Rotation.from_matrix(receiver.rotation.numpy())
+        quats = rotation * Rotation.from_quat(turned, scalar_first=True)
         widths = self.log_widths.exp().double().numpy()
         return GaussianCloud(
             means.double().numpy(), np.column_stack([widths, np.full(len(widths), FLAT)]),

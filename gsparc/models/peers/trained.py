@@ -59,8 +59,8 @@ class KnownSite:
     def reach(self) -> float:
         """Extent of the scene [m]: from the static end to the far side of the box."""
         still, (low, high) = self.site.static_position, self.box
-        apart = 0.0 if still is None else float((torch.from_numpy(still) - (low + high) / 2).norm())
-        return max(apart + float((high - low).norm()) / 2, 1.0)
+        distance = 0.0 if still is None else float((torch.from_numpy(still) - (low + high) / 2).norm())
+        return max(distance + float((high - low).norm()) / 2, 1.0)
 
 
 class Network(nn.Module):
@@ -139,15 +139,15 @@ class TrainedPeer(Method):
         """Steps that are asked for, else of as many samples as usual, times the effort."""
         if asked is not None:
             return asked
-        own = effort.factor * self.usual_steps[kind] * type(self).batch_size / self.batch_size
-        return max(round(own), 1)
+        steps = effort.factor * self.usual_steps[kind] * type(self).batch_size / self.batch_size
+        return max(round(steps), 1)
 
     def describe_fit(self, data: Measurements, effort: Effort, steps: int | None = None) -> str:
         """See `MethodFactory`."""
-        asked, kind = self.max_steps if steps is None else steps, data.site.kind
-        if asked is None and kind not in self.usual_steps:
+        step_count, kind = self.max_steps if steps is None else steps, data.site.kind
+        if step_count is None and kind not in self.usual_steps:
             return ""  # `fit` says why
-        return f"{self._count_steps(kind, effort, asked)} steps of {self.batch_size} samples"
+        return f"{self._count_steps(kind, effort, step_count)} steps of {self.batch_size} samples"
 
     def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
         """Return tensors computed from the training rows (n,) before training; stored with the weights."""
@@ -161,24 +161,24 @@ class TrainedPeer(Method):
             RuntimeError: the loss became NaN or infinite.
         """
         kinds, kind = tuple(self.usual_steps), data.site.kind
-        own = replace(fold, train=np.r_[fold.train, fold.val], val=fold.val[:0]) if self.learn_val else fold
-        rows = np.sort(own.train)
+        split = replace(fold, train=np.r_[fold.train, fold.val], val=fold.val[:0]) if self.learn_val else fold
+        rows = np.sort(split.train)
         if kind not in kinds:
             raise ValueError(f"{self.name}: predicts {' and '.join(kinds)}; this dataset holds {kind}")
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         origin = Origin.from_fit(data, fold, context)
         context = replace(context, seed=self.seed, batch_size=self.batch_size, datamodule=None)
-        asked = requested_steps(context, len(rows), self.max_steps)
+        step_count = requested_steps(context, len(rows), self.max_steps)
         watch = Stopwatch()
         L.seed_everything(self.seed, verbose=False)
         self.site, self.precomputed = data.site, self.precompute(data, rows)
         self.network = self.makes(_make_scene(data, rows), self)
         if context.resume is not None:
             origin.require_same(read_interrupted(context.resume))
-        module = self.module(self._count_steps(kind, context.counts, asked), context.run_dir)
+        module = self.module(self._count_steps(kind, context.counts, step_count), context.run_dir)
         files = GsparcCheckpointIO(self, context.config_yaml, origin.to_extra())
-        trainer, batches = make_trainer(module, data, replace(own, train=rows), context, files, watch)
+        trainer, batches = make_trainer(module, data, replace(split, train=rows), context, files, watch)
         with interruptible(trainer, batches):
             trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
         result = read_trainer_result(trainer, watch)
@@ -194,7 +194,7 @@ class TrainedPeer(Method):
         return NetworkModule(network, network.scene.site, rates, steps, run_dir, self._rate_group)
 
     def _rate_group(self, name: str) -> tuple[str, float]:
-        kind = max((known for known in self.rates if name.startswith(known)), key=len, default="other")
+        kind = max((prefix for prefix in self.rates if name.startswith(prefix)), key=len, default="other")
         return kind, self.rates.get(kind, self.rate)
 
     def fitted(self) -> Network:

@@ -85,29 +85,31 @@ class PowerField(ClosedForm):
         self.site, self.fringes = data.site, None
         notes = self._choose_priors(data, rows, context.counts)
         self.condition(data, rows)
-        own = tuple(one for one in self.trend.more if isinstance(one, UserTerm))
-        if own and self.powers is not None and isinstance(self.powers.posterior, Exact):
-            notes = (*describe_weights(self.powers.posterior, own), *notes)
+        user_terms = tuple(one for one in self.trend.more if isinstance(one, UserTerm))
+        if user_terms and self.powers is not None and isinstance(self.powers.posterior, Exact):
+            notes = (*describe_weights(self.powers.posterior, user_terms), *notes)
         return FitReport(watch.seconds, notes)
 
     def _choose_priors(self, data: Measurements, rows: np.ndarray, effort: Effort) -> tuple[str, ...]:
         """Set the priors and waves; what must be said of them."""
         seen, site, chosen_on = power_rows(data, rows), data.site, effort.chosen_on
         # Checked once: a query has no time for it, nor has `torch.func`.
-        own = tuple(UserTerm.from_site(t, site).centre(torch.from_numpy(seen.places)) for t in self.own_terms)
+        terms = tuple(
+            UserTerm.from_site(t, site).centre(torch.from_numpy(seen.places)) for t in self.own_terms
+        )
         if self.walls is not None:
             walls = walls_in_frame(self.walls, site.origin, site.static_position)
             # A law goes through so few rows exactly, and leaves next to no variance.
-            told = int((~seen.silent).sum()) >= LAW_NEEDS
-            rest = subtract_means(seen, own)
-            law, notes = fit_site_law(rest, site) if told else (None, ())
-            trend = add_terms_to_trend(rest, replace(trend_about_rows(rest, law), more=(walls,)), own)
+            has_law = int((~seen.silent).sum()) >= LAW_NEEDS
+            rest = subtract_means(seen, terms)
+            law, notes = fit_site_law(rest, site) if has_law else (None, ())
+            trend = add_terms_to_trend(rest, replace(trend_about_rows(rest, law), more=(walls,)), terms)
             best = choose_candidate(seen, [MeanLaw(trend, 0.0, ())], self.seed, chosen_on)
             self.priors = ((1.0, best.prior),)
-            about = "a distance law" if told else f"a constant, with fewer than {LAW_NEEDS} rows"
+            about = "a distance law" if has_law else f"a constant, with fewer than {LAW_NEEDS} rows"
             note = f"losses in {len(walls.sizes)} known walls and floors, about {about}"
             return (note, *notes, *best.notes)
-        found, said = candidate_priors(seen, site, self.seed, chosen_on, own), list[str]()
+        found, remarks = candidate_priors(seen, site, self.seed, chosen_on, terms), list[str]()
         self.priors = ((1.0, found[0].prior),)
         # A level that silent rows are below is no power that waves could be fitted to.
         if self.waves and not seen.silent.any() and resolves_wavelength(seen.places, site.wavelength):
@@ -117,11 +119,11 @@ class PowerField(ClosedForm):
             self.fringes, note = fit_fringes(
                 seen.subset(order), rows[order], found[0].prior, site.wavelength, self.seed, effort.fringes
             )
-            said.append(note)
+            remarks.append(note)
             if self.fringes is not None:  # their share was learned beside this process
                 return (found[0].description, *found[0].notes, note)
         self.priors, notes = mix_candidates(seen, found, self.seed, chosen_on)
-        return (*notes, *said)
+        return (*notes, *remarks)
 
     @property
     def trend(self) -> Trend:

@@ -60,8 +60,8 @@ class Blend(Stored):
         there = ((distance - near) / max(far - near, TINY_M)).clamp(0.0, 1.0)
         inside = ((BEYOND[1] - distance / wavelength) / (BEYOND[1] - BEYOND[0])).clamp(0.0, 1.0)
         share = (self.share[0] + (self.share[1] - self.share[0]) * there) * inside
-        left = self.left[0] + (self.left[1] - self.left[0]) * there
-        return share, 1 + (left - 1) * inside
+        ratio = self.left[0] + (self.left[1] - self.left[0]) * there
+        return share, 1 + (ratio - 1) * inside
 
 
 @dataclass(frozen=True)
@@ -157,15 +157,15 @@ def fit_fringes(
     for k, part in enumerate(parts):
         fold[part] = k
     fold[order[:probes]] = -1
-    kept = np.sort(order[: probes + count])
-    every, rows, numbers, group, fold = rows, rows.subset(kept), numbers[kept], squares[kept], fold[kept]
+    index = np.sort(order[: probes + count])
+    every, rows, numbers, group, fold = rows, rows.subset(index), numbers[index], squares[index], fold[index]
     level = float(to_decibels(from_decibels(rows.decibels).mean()))
     basis = make_basis(rows.places[fold >= 0], wavelength)
     columns = basis.columns(rows.places)
     if count < ROWS_PER_WAVE * columns.shape[1]:
         return None, f"no fringes: {count} rows are too few for {columns.shape[1]} coherent waves"
     error, distance = (
-        one[kept] for one in _errors_and_distances(every, [*parts, order[:probes]], plain, seed)
+        one[index] for one in _errors_and_distances(every, [*parts, order[:probes]], plain, seed)
     )
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
@@ -221,12 +221,12 @@ def _errors_and_distances(
         at = full.near.tree.query(rows.places)[1]
     for part in parts:
         fit = np.setdiff1d(at, at[part]) if big else np.setdiff1d(np.arange(len(rows.places)), part)
-        known: Posterior = (
+        posterior: Posterior = (
             full.subset(fit, seed) if big else condition_on_powers(rows.subset(fit), prior, seed)[0].posterior
         )
         places = torch.from_numpy(rows.places[part])
-        error[part] = known.mean_at(places)[:, 0].numpy() - rows.decibels[part]
-        distance[part] = known.nearest_distance(places).numpy()
+        error[part] = posterior.mean_at(places)[:, 0].numpy() - rows.decibels[part]
+        distance[part] = posterior.nearest_distance(places).numpy()
     return error, distance
 
 
@@ -240,17 +240,17 @@ def _fit_blend(
     gram = errors[:, :, None] * errors[:, None]
     # Less what would go if all solutions answered, as they do at new places.
     gram[:, 1, 1] -= _excess_variance(powers, fold, blind)
-    shares, left, gains = [], [], []
+    shares, ratios, gains = [], [], []
     # Rows of a square left out err together and count as one; probes among rows err alone.
     for chosen, alike in ((probes, 1.0), (~probes, len(group) / len(np.unique(group)))):
         mean = gram[chosen].mean(0)
         plain = max(float(mean[0, 0]), TINY)
         # A prior of equal shares, of a deviation of `SPREAD`, is an error that each has of its own.
-        own = plain * alike / chosen.sum() / (2 * SPREAD**2) * np.eye(2)
-        weights = best_weights(mean + own)
+        penalty = plain * alike / chosen.sum() / (2 * SPREAD**2) * np.eye(2)
+        weights = best_weights(mean + penalty)
         both = float(weights @ mean @ weights)
         shares.append(float(weights[1]))
-        left.append(both / plain)
+        ratios.append(both / plain)
         gains.append(plain - both)
     middle = (float(np.median(distance[probes])), float(np.median(distance[~probes])))
-    return Blend(middle, (shares[0], shares[1]), (left[0], left[1])), gains[1]
+    return Blend(middle, (shares[0], shares[1]), (ratios[0], ratios[1])), gains[1]

@@ -37,8 +37,8 @@ def to_terms(terms: Any) -> tuple[Columns, ...]:
         if not isinstance(one, Columns):
             raise ValueError(f"model.terms: {one!r} is not a gsparc.processes.term.Columns")
         if type(one).__module__ == MAIN:
-            said = "a saved model opens only where it is defined; move it to a file"
-            log.warning("model.terms: %s is of a notebook or script: %s", type(one).__name__, said)
+            advice = "a saved model opens only where it is defined; move it to a file"
+            log.warning("model.terms: %s is of a notebook or script: %s", type(one).__name__, advice)
     return result
 
 
@@ -155,15 +155,15 @@ def subtract_means(rows: PowerRows, terms: Sequence[UserTerm]) -> PowerRows:
 def add_terms_to_trend(rows: PowerRows, trend: Trend, terms: tuple[UserTerm, ...]) -> Trend:
     """Return a trend of rows less the terms' means, with the terms, in units of what it leaves of rows."""
     heard = rows.heard_rows
-    left = heard.decibels - trend.mean(torch.from_numpy(heard.places)).numpy()
-    unit = float(left.std()) or 1.0
+    residual = heard.decibels - trend.mean(torch.from_numpy(heard.places)).numpy()
+    unit = float(residual.std()) or 1.0
     return set_term_unit(replace(trend, more=(*trend.more, *terms)), unit)
 
 
 def set_term_unit(trend: Trend, deviation: float) -> Trend:
     """Return a trend whose users' terms are relative to a process of this deviation [dB]."""
-    own = (replace(one, unit=deviation) if isinstance(one, UserTerm) else one for one in trend.more)
-    return replace(trend, more=tuple(own)) if trend.more else trend
+    terms = (replace(one, unit=deviation) if isinstance(one, UserTerm) else one for one in trend.more)
+    return replace(trend, more=tuple(terms)) if trend.more else trend
 
 
 class LearnedWeights(str):
@@ -180,8 +180,8 @@ class LearnedWeights(str):
     @classmethod
     def from_numbers(cls, name: str, numbers: np.ndarray, rest: str = "") -> Self:
         """Put them into words."""
-        said = ", ".join(f"{w:.3g} +- {d:.2g}" for w, d in numbers[:2].T)
-        result = cls(f"{name}: {said}{rest}")
+        text = ", ".join(f"{w:.3g} +- {d:.2g}" for w, d in numbers[:2].T)
+        result = cls(f"{name}: {text}{rest}")
         result.name, result.numbers = name, numbers
         return result
 
@@ -192,8 +192,8 @@ def describe_weights(posterior: Exact, terms: tuple[UserTerm, ...]) -> list[Lear
     columns = posterior.prior.columns(at)
     weights, scale = (columns.T @ posterior.weights)[:, 0], posterior.prior.kernel.amplitude
     # Of weights of unit variance, times the amplitude: 1 - C^T K^-1 C.
-    left = (scale * (1 - posterior.factor.whiten(columns).square().sum(0)).clamp_min(0)).sqrt()
-    numbers = torch.stack([weights, left, torch.zeros_like(left), torch.full_like(left, scale**0.5)]).numpy()
+    std = (scale * (1 - posterior.factor.whiten(columns).square().sum(0)).clamp_min(0)).sqrt()
+    numbers = torch.stack([weights, std, torch.zeros_like(std), torch.full_like(std, scale**0.5)]).numpy()
     sizes = [one.columns(at[:1]).shape[1] for one in terms]
     parts = np.split(numbers[:, -sum(sizes) :], np.cumsum(sizes)[:-1], 1)
     kinds = [type(one.term).__name__ for one in terms]
@@ -219,14 +219,14 @@ def pool_station_weights(notes: Sequence[str]) -> dict[str, str]:
         deviation, wide = np.maximum(deviation, CERTAIN), np.maximum(wide, CERTAIN)
         # What rows say alone: the prior is taken out of each, and counts once.
         precision = np.maximum(deviation**-2.0 - wide**-2.0, TINY)
-        told = (means / deviation**2 - before / wide**2) / precision
-        own, total = wide[0] ** -2.0, precision.sum(0)
-        centre = (precision * told).sum(0) / total
-        excess = (precision * (told - centre) ** 2).sum(0) - (len(same) - 1)
+        estimates = (means / deviation**2 - before / wide**2) / precision
+        prior_precision, total = wide[0] ** -2.0, precision.sum(0)
+        centre = (precision * estimates).sum(0) / total
+        excess = (precision * (estimates - centre) ** 2).sum(0) - (len(same) - 1)
         between = np.sqrt(np.maximum(excess / np.maximum(total - (precision**2).sum(0) / total, TINY), 0.0))
         precision = 1 / (1 / precision + between**2)
-        both = own + precision.sum(0)
-        mean, error = (own * before[0] + (precision * told).sum(0)) / both, both**-0.5
+        both = prior_precision + precision.sum(0)
+        mean, error = (prior_precision * before[0] + (precision * estimates).sum(0)) / both, both**-0.5
         rest = f" (of {len(same)} stations, which differ by {', '.join(f'{b:.2g}' for b in between)}"
         if len(same) >= POOLED_FROM and len(mean) == 1:
             rest += f"; prior_db=[{mean[0]:.3g}, {np.hypot(error, between)[0]:.2g}] tells each of the others"

@@ -112,8 +112,8 @@ class KernelCandidate:
         """One line of the settings."""
         law = self.trend.law
         mean = "a constant" if law is None else f"a distance law of exponent {law.exponent:.3g}"
-        known = any(isinstance(one, UserTerm) and isinstance(one.term, PriorMap) for one in self.trend.more)
-        return f"{self.kernel.description}, about {mean}{' and a share of the map' * known}"
+        has_map = any(isinstance(one, UserTerm) and isinstance(one.term, PriorMap) for one in self.trend.more)
+        return f"{self.kernel.description}, about {mean}{' and a share of the map' * has_map}"
 
 
 def candidate_priors(
@@ -176,10 +176,10 @@ def mix_candidates(
     for sides in SPANS:
         gram += _relative_gram([_errors_without_squares(one, sides) for one in posteriors]) / len(SPANS)
     share = best_weights(gram)
-    kept = [(float(share[k]), candidates[k]) for k in np.argsort(-share, kind="stable") if share[k]]
-    said = [f"{weight:.0%} of {one.description}" for weight, one in kept]
-    notes = dict.fromkeys(note for _, one in kept for note in one.notes)
-    return tuple((weight, one.prior) for weight, one in kept), (*said, *notes)
+    mixture = [(float(share[k]), candidates[k]) for k in np.argsort(-share, kind="stable") if share[k]]
+    texts = [f"{weight:.0%} of {one.description}" for weight, one in mixture]
+    notes = dict.fromkeys(note for _, one in mixture for note in one.notes)
+    return tuple((weight, one.prior) for weight, one in mixture), (*texts, *notes)
 
 
 def _relative_gram(errors: list[np.ndarray]) -> np.ndarray:
@@ -315,8 +315,8 @@ def _select_doubtful(rows: PowerRows, base: KernelCandidate) -> PowerRows:
     view = rows.view(base.trend, base.kernel)
     gram, values = base.kernel.amplitude * view.gram(base.kernel), view.values
     silent, most = (torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT))
-    known = ConditionalGaussian.from_gram(gram, values[:, 0], silent)
-    doubt = torch.from_numpy(rows.side)[silent] * known.z_score(values[silent, 0])
+    gaussian = ConditionalGaussian.from_gram(gram, values[:, 0], silent)
+    doubt = torch.from_numpy(rows.side)[silent] * gaussian.z_score(values[silent, 0])
     used = ~rows.silent
     used[np.flatnonzero(rows.silent)[doubt.argsort()[:most]]] = True
     return rows.subset(np.flatnonzero(used))

@@ -140,13 +140,13 @@ def solve_emissions(
     model.emission.weight2.copy_(readout.mT.unsqueeze(-1).float())
     model.emission.bias2.copy_(mean.unsqueeze(-1).float())
     first = parts[0]
-    own = rows[: len(first.outputs)]
-    places = torch.from_numpy(data.moving[own]).float().double()
-    features = whitened_features(places, process.prior.length, process.prior.noise, "matern32", len(own))
+    chunk = rows[: len(first.outputs)]
+    places = torch.from_numpy(data.moving[chunk]).float().double()
+    features = whitened_features(places, process.prior.length, process.prior.noise, "matern32", len(chunk))
     inverse = features.weigh.mT @ features.weigh
     if model.error is not None:
         model.error.set_error_law(*_error_law(first, inverse, process.prior.noise, mean))
-    return _leave_out(first, inverse, data.moving[own], mean)
+    return _leave_out(first, inverse, data.moving[chunk], mean)
 
 
 def _emissions(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: Tensor) -> ImageEmissions:

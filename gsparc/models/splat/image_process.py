@@ -109,28 +109,28 @@ class ImageProcess(LearnedField):
         """Weigh a process of the same rows by validation rows and, of spectra, training rows left out."""
         if not self.plain:
             return
-        process, left = GaussianProcess(), self._left_out  # a dozen validation rows decide by chance
+        process, left_out = GaussianProcess(), self._left_out  # a dozen validation rows decide by chance
         process.condition(data, fold.train)
-        if not self.count_components() or (left is None and len(fold.val) < LEAST_HELD):
+        if not self.count_components() or (left_out is None and len(fold.val) < LEAST_HELD):
             few = f"{len(fold.val)} held-out rows do not tell whether Gaussians gain"
             log.info("%s: a Gaussian process alone", few if self.count_components() else "no Gaussians")
             self._average = process, 1.0
             return
-        held, val = [], fold.val[:: -(-len(fold.val) // MOST_HELD) or 1]
+        triples, val = [], fold.val[:: -(-len(fold.val) // MOST_HELD) or 1]
         if len(val):
             batch = data.batch(val)
             answers = (self.predict(batch).mean, process.predict(batch).mean, batch.target)
-            held.append([data.site.target.in_error_unit(one).detach() for one in answers])
-        if left is not None:
-            held.append([torch.from_numpy(one) for one in left.beside_process(self._apart)])
-        own, _, target = held[0]
-        self.explained = explained_variance(own, target, data.site.kind != "csi")
-        gram = np.concatenate([error_products(both, target) for *both, target in held])
+            triples.append([data.site.target.in_error_unit(one).detach() for one in answers])
+        if left_out is not None:
+            triples.append([torch.from_numpy(one) for one in left_out.beside_process(self._apart)])
+        prediction, _, target = triples[0]
+        self.explained = explained_variance(prediction, target, data.site.kind != "csi")
+        gram = np.concatenate([error_products(both, target) for *both, target in triples])
         gram = relative_to_row(gram) if data.site.kind == "spectrum" else gram
         weight = float(choose_weights(gram, np.arange(len(gram)), SURE, LEAST_GAIN, FEW_ROWS)[1])
         log.info(
             "%d held-out rows, %d training rows without their neighbours: weight of a Gaussian process %.2f",
-            len(val), 0 if left is None else len(left.centres), weight,
+            len(val), 0 if left_out is None else len(left_out.centres), weight,
         )  # fmt: skip
         self._average = (process, weight) if weight else None
 
@@ -140,11 +140,11 @@ class ImageProcess(LearnedField):
         """See `Method.predict`."""
         if self._average is not None and not self.count_components():
             return self._average[0].predict(query)
-        own = super().predict(query)
+        field = super().predict(query)
         if self._average is None:
-            return own
+            return field
         process, weight = self._average  # its variance is most of its cost, and the field has one of its own
-        return replace(own, mean=self.fitted_site.target.blend(own.mean, process.mean_at(query), weight))
+        return replace(field, mean=self.fitted_site.target.blend(field.mean, process.mean_at(query), weight))
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`; a process alone has gradients."""

@@ -67,10 +67,10 @@ class LeftOut(Stored):
         """
         if distance is None:
             return 0
-        apart = cdist(self.positions[self.centres], self.positions)
+        separation = cdist(self.positions[self.centres], self.positions)
         # A row is not its own neighbour.
-        apart[np.arange(len(apart)), self.centres] = np.inf
-        beyond = [np.where(apart > gap, apart, np.inf).min(1) for gap in self.gaps]
+        separation[np.arange(len(separation)), self.centres] = np.inf
+        beyond = [np.where(separation > gap, separation, np.inf).min(1) for gap in self.gaps]
         medians = np.array([np.median(nearest) for nearest in beyond])
         # By ratio: twice as far and half as far are equally wrong.
         return int(np.argmin(np.abs(np.log(medians + LEAST) - np.log(distance + LEAST))))

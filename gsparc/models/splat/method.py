@@ -162,13 +162,13 @@ class LearnedField(Method):
         from all of them, with the confidence of the first.
         """
         origin = Origin.from_fit(data, fold, context)
-        left = None if context.resume is None else read_interrupted(context.resume)
-        if left is not None:
-            origin.require_same(left)
-        marks = {} if left is None else left.extra
+        stored_model = None if context.resume is None else read_interrupted(context.resume)
+        if stored_model is not None:
+            origin.require_same(stored_model)
+        marks = {} if stored_model is None else stored_model.extra
         watch = Stopwatch(*(float(marks.get(name, 0.0)) for name in ("spent_s", "spent_cpu_s")))
         self._begin_fit(data, fold, marks)
-        for stage in self._plan_stages(data, fold, context, left):
+        for stage in self._plan_stages(data, fold, context, stored_model):
             module = self._start_stage(stage, data, watch)
             if module is None:
                 continue
@@ -218,8 +218,8 @@ class LearnedField(Method):
         self.site, self._ends = data.site, _static_end_position(data, int(fold.train[0]))
         if data.site.kind == "csi":
             if np.isnan([data.tx, data.rx_position]).any():
-                lost = f"{data.site.name} does not say where its static end is"
-                raise ValueError(f"{self.name}: {lost}; take model=complex_gp")
+                fault = f"{data.site.name} does not say where its static end is"
+                raise ValueError(f"{self.name}: {fault}; take model=complex_gp")
             self._shape = (data.target.shape[1], data.target.shape[2])
         self.choices, reasons = resolve_auto(self.settings, self.init.name, data.site)
         for reason in reasons:
@@ -247,11 +247,11 @@ class LearnedField(Method):
         assert self.choices is not None
         solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
         watched = _hold_out_third(data, fold, context) if few else fold
-        asked = gradient_stage.requested_steps(context, len(watched.train), self.most_steps)
+        step_count = gradient_stage.requested_steps(context, len(watched.train), self.most_steps)
         usual = context.counts.steps_after_solving if solved else context.counts.steps
-        steps = usual if asked is None else asked
+        steps = usual if step_count is None else step_count
         log.info(
-            "steps=%s%d: a start %s", "auto -> " if asked is None else "", steps,
+            "steps=%s%d: a start %s", "auto -> " if step_count is None else "", steps,
             "in closed form" if solved else f"from init={self.choices.init}",
         )  # fmt: skip
         refits = resumed is not None and resumed.extra.get("stage") == "refit"
@@ -261,7 +261,7 @@ class LearnedField(Method):
             watching = not self.keep_best or len(watched.val) > 0 or not solved
             if steps and watching:
                 # Steps that somebody asks for are all taken.
-                yield Stage("train", watched, context, steps, PATIENCE if asked is None else None)
+                yield Stage("train", watched, context, steps, PATIENCE if step_count is None else None)
             if solved and (few or not watching):
                 self._paying = 0  # by so few rows steps would be chosen by chance
             if solved and (self._paying == 0 or not steps):
@@ -514,25 +514,25 @@ class LearnedField(Method):
             return self.label
         hidden, count = self.settings.emission.hidden, len(self.model.gaussians)
         kind = "array process" if self.settings.response.array else "process of images"
-        made = f"networks of {hidden} hidden units in {count} Gaussians" if hidden else f"{count} Gaussians"
-        made = f"{kind} through {made}" if self.choices.closed_form else made
+        text = f"networks of {hidden} hidden units in {count} Gaussians" if hidden else f"{count} Gaussians"
+        text = f"{kind} through {text}" if self.choices.closed_form else text
         if self.choices.init == "vectors" and not self.steps and self.site is not None:
             enough = ENOUGH * len(self.site.array_geometry()[0])
-            made += f" ({enough} or more answer alike)" * (count >= enough)
-        kept = "all" if self.steps == self.steps_taken else self.steps or "none"
-        return made + (
-            f", {self.steps_taken} gradient steps, {kept} kept" if self.steps_taken else ", no gradient steps"
+            text += f" ({enough} or more answer alike)" * (count >= enough)
+        part = "all" if self.steps == self.steps_taken else self.steps or "none"
+        return text + (
+            f", {self.steps_taken} gradient steps, {part} kept" if self.steps_taken else ", no gradient steps"
         )
 
     def facts(self) -> dict[str, float | int | str | None]:
         """See `Method.facts`."""
-        own = super().facts()
+        facts = super().facts()
         if self.choices is not None:
             chosen = {"init": self.choices.init, "encoding": self.choices.encoding}
             chosen |= {"activation": self.choices.activation, "steps": str(self.steps_taken)}
-            own |= {"model/choices": ", ".join(f"{name}={value}" for name, value in chosen.items())}
-            own |= {"model/init": self.choices.init}
-        return own | {
+            facts |= {"model/choices": ", ".join(f"{name}={value}" for name, value in chosen.items())}
+            facts |= {"model/init": self.choices.init}
+        return facts | {
             "model/steps": self.steps, "model/steps_taken": self.steps_taken, "time/init_s": self.init_s,
         }  # fmt: skip
 
@@ -544,11 +544,11 @@ def _train_on_all(fold: Fold) -> Fold:
 
 def _hold_out_third(data: Measurements, fold: Fold, context: FitContext) -> Fold:
     """With a third of the rows for validation, cut as the test is; all are learned from in the end."""
-    known = np.sort(fold.learned())
-    if len(known) < THIRDS * LEAST_HELD:
+    fit_rows = np.sort(fold.learned())
+    if len(fit_rows) < THIRDS * LEAST_HELD:
         return fold
     cut = cut_folds(data, fold, context.split, THIRDS, context.seed).folds[0]
-    return Fold(np.setdiff1d(known, cut.test), cut.test, fold.test)
+    return Fold(np.setdiff1d(fit_rows, cut.test), cut.test, fold.test)
 
 
 def _validation_distance(data: Measurements, fold: Fold) -> float | None:

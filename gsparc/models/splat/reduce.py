@@ -107,13 +107,13 @@ def distil_features(model: GaussianModel, share: float) -> None:
     """
     emission, old = model.emission, model.emission.encoding
     places, length, noise = old.anchors.double(), old.length, old.noise
-    own = correlation(places, places, length, old.kernel)
-    own.diagonal().add_(noise)
+    gram = correlation(places, places, length, old.kernel)
+    gram.diagonal().add_(noise)
     count, width, channels = emission.weight2.shape
     weights = emission.weight2.permute(1, 0, 2).reshape(width, count * channels).double()
     chosen = pivoted_rows(places, length, 0.0, old.kernel, math.ceil(share * len(places)))
     features = place_features(places[chosen], places, length, noise, old.kernel)
-    result = features.weigh @ (own @ (old.whitening.double() @ weights))
+    result = features.weigh @ (gram @ (old.whitening.double() @ weights))
     prior = Smoothness(features.places.float(), length, noise, old.kernel, features.whitening.float())
     few = PositionEncoding(old.settings, torch.as_tensor(model.site.query_box), prior)
     emission.encoding = few.to(old.anchors.device)

@@ -139,10 +139,10 @@ class UplinkField(UplinkMethod):
         mean = mean_delay(uplink)
         straight = uplink * phasor(mean[:, None] * aperture.tones)[:, None]
         chunks = zip(straight.split(CHUNK), noise.split(CHUNK), strict=True)
-        found, left = zip(*(self.search(*chunk) for chunk in chunks), strict=True)
+        found, residuals = zip(*(self.search(*chunk) for chunk in chunks), strict=True)
         sources = Sources(*map(torch.cat, zip(*(vars(part).values() for part in found), strict=True)))
         return SearchedSnapshots(
-            replace(sources, delay=sources.delay + mean[:, None]), torch.cat(left), uplink, noise
+            replace(sources, delay=sources.delay + mean[:, None]), torch.cat(residuals), uplink, noise
         )
 
     def _set_search(self, site: Site, settings: SearchSettings) -> None:
@@ -169,8 +169,8 @@ class UplinkField(UplinkMethod):
         """See `Method.restore`."""
         self.site = site
         self._set_search(site, SearchSettings(**state["search"]))
-        said = state["error_model"]
-        self.error_model = None if said is None else RelativeErrorRegression.read(said)
+        error_state = state["error_model"]
+        self.error_model = None if error_state is None else RelativeErrorRegression.read(error_state)
 
     def count_components(self) -> int:
         """Return the number of sources of a snapshot."""

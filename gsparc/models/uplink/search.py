@@ -69,7 +69,7 @@ class Sources:
         """Return the expected squared error per entry (B,) of `response`, to first order in the places."""
         count = self.gain.shape[1]
         gram = SourceColumns.from_sources(self.direction, self.delay, aperture).gram()
-        own = (gram[:, :count, :count] * self.gain_covariance.transpose(1, 2)).sum((1, 2)).real
+        gain_variance = (gram[:, :count, :count] * self.gain_covariance.transpose(1, 2)).sum((1, 2)).real
         # Derivatives by directions and delays: of the gains, and of the steering vectors times the gains.
         gains = repeat_per_coordinate(self.gain)
         slopes = gram[:, count:, count:] * gains[:, None] * gains.conj()[..., None]
@@ -77,7 +77,7 @@ class Sources:
         from_gains = self.gain_slopes.mH @ (gram[:, :count, :count] @ self.gain_slopes)
         from_positions = (slopes + from_gains).real + 2 * mixed.real
         from_positions = (from_positions * self.position_covariance).sum((1, 2))
-        return (own + from_positions).clamp_min(0) / (len(aperture.places) * len(aperture.tones))
+        return (gain_variance + from_positions).clamp_min(0) / (len(aperture.places) * len(aperture.tones))
 
 
 @dataclass(frozen=True)

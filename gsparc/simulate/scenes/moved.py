@@ -63,14 +63,14 @@ def move_solids(solids: Sequence[Solid], moves: Sequence[Move]) -> tuple[list[So
             result.append(box(f"new_{number}", move.material, *np.array(move.box_m, float)))
             changed.append(len(result) - 1)
             continue
-        own = [k for k, one in enumerate(result) if one.name.startswith(move.name)]
-        if not own:
+        matches = [k for k, one in enumerate(result) if one.name.startswith(move.name)]
+        if not matches:
             names = [one.name for one in solids]
-            said = suggest_name(move.name, names) or f"; there are {list_first(names, MOST_NAMED)}"
-            raise ValueError(f"moved: no object's name begins with {move.name!r}{said}")
-        for k in own:
+            hint = suggest_name(move.name, names) or f"; there are {list_first(names, MOST_NAMED)}"
+            raise ValueError(f"moved: no object's name begins with {move.name!r}{hint}")
+        for k in matches:
             there, by = result[k].keep_out, np.array(move.by_m, float)
             keep_out = None if there is None else there + by
             result[k] = replace(result[k], vertices=result[k].vertices + by, keep_out=keep_out)
-        changed += own
+        changed += matches
     return result, [result[k] for k in dict.fromkeys(changed)]

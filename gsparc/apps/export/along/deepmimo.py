@@ -41,13 +41,13 @@ def write_scenario(folder: Path, predictor: Predictor, place: np.ndarray) -> tup
     strongest, towards, delay = top(power), top(paths.direction), top(paths.delay_s[:, 0])
     away = LIGHT * delay[..., None] * towards  # from a place to the source
     normal = place[:, None] + away - still
-    apart = np.linalg.norm(normal, axis=-1, keepdims=True)
-    direct = apart[..., 0] < DIRECT_M
-    normal /= np.maximum(apart, DIRECT_M)
+    distance = np.linalg.norm(normal, axis=-1, keepdims=True)
+    direct = distance[..., 0] < DIRECT_M
+    normal /= np.maximum(distance, DIRECT_M)
     # The path leaves the static end as its mirror image leaves the source; where it meets the mirror:
     turned = 2 * (towards * normal).sum(-1, keepdims=True) * normal
     leaves = np.where(direct[..., None], 0, turned) - towards
-    share = 1 - apart / 2 / np.maximum((away * normal).sum(-1, keepdims=True), 1e-9)
+    share = 1 - distance / 2 / np.maximum((away * normal).sum(-1, keepdims=True), 1e-9)
     meets = np.where(direct[..., None] | (share <= 0), np.nan, place[:, None] + share * away)
     silent = strongest <= 0
     arrays = {

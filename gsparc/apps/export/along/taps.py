@@ -103,14 +103,14 @@ def write_taps(predictor: Predictor, way: Trajectory, how: Mapping[str, Any], fi
     line = fit_taps(predictor, way, how["taps"], how["rate_hz"], how["antennas"])
     units = {"time_s": "s", f"{site.moving_end}_position": "m", "delay_s": "s", "doppler_hz": "Hz"}
     delay_s = (line.first + np.arange(line.gain.shape[2])) / line.rate_hz
-    known = (line.time_s, way.places_at(line.time_s), delay_s, line.doppler_hz())
-    arrays = dict(zip(units, known, strict=True)) | {"gain": line.gain}
+    axes = (line.time_s, way.places_at(line.time_s), delay_s, line.doppler_hz())
+    arrays = dict(zip(units, axes, strict=True)) | {"gain": line.gain}
     about = {"rate_hz": line.rate_hz, "carrier_hz": line.carrier_hz, "residual": line.residual}
     write_raw(file, Raw(arrays, about, units))
     # 1e-30 is -300 dB: no residual at all has no decibels.
-    left, worst = 10 * np.log10(np.maximum([line.residual, line.worst], 1e-30))
+    error_db, worst = 10 * np.log10(np.maximum([line.residual, line.worst], 1e-30))
     return {
-        "taps/count": line.gain.shape[2], "taps/rate_hz": line.rate_hz, "taps/residual_db": float(left),
+        "taps/count": line.gain.shape[2], "taps/rate_hz": line.rate_hz, "taps/residual_db": float(error_db),
         "taps/worst_db": float(worst), "taps/early_s": delay_s[0],
     }  # fmt: skip
 
@@ -152,13 +152,13 @@ def fit_taps(
     taps, turns = min(taps, len(tones)), (tones - carrier) / rate_hz
     first = _first(ask(places[:: max(len(places) // CHUNK, 1)][:CHUNK]), turns, taps)
     columns, solve = _atoms(turns, first, taps)
-    gains, left, power = [], [], []
+    gains, errors, power = [], [], []
     for start in range(0, len(places), CHUNK):
         channel = ask(places[start : start + CHUNK])
         gains.append((channel @ solve.T).astype(np.complex64))
-        left.append(np.square(np.abs(gains[-1] @ columns.T - channel)).sum((1, 2)))
+        errors.append(np.square(np.abs(gains[-1] @ columns.T - channel)).sum((1, 2)))
         power.append(np.square(np.abs(channel)).sum((1, 2)))
-    error, total = np.concatenate(left), np.concatenate(power)
+    error, total = np.concatenate(errors), np.concatenate(power)
     if not total.all():
         at = places[int(np.argmin(total))].round(2).tolist()
         raise ValueError(f"the model predicts no power at {at} m, far from every measurement")
@@ -169,8 +169,8 @@ def fit_taps(
 def _atoms(turns: np.ndarray, first: int, taps: int) -> tuple[np.ndarray, np.ndarray]:
     """Taps to tones (K, L), and tones to taps (L, K), at tones (K,) in turns per sample."""
     columns = np.exp(-2j * np.pi * turns[:, None] * (first + np.arange(taps)))
-    known = columns.conj().T @ columns + RIDGE * len(turns) * np.eye(taps)
-    return columns, np.linalg.solve(known, columns.conj().T)
+    gram = columns.conj().T @ columns + RIDGE * len(turns) * np.eye(taps)
+    return columns, np.linalg.solve(gram, columns.conj().T)
 
 
 def _first(channel: np.ndarray, turns: np.ndarray, taps: int) -> int:
@@ -178,9 +178,9 @@ def _first(channel: np.ndarray, turns: np.ndarray, taps: int) -> int:
     rows = channel.reshape(-1, channel.shape[-1])[:FITTED]
     if len(turns) == 1:
         return 0
-    apart = int(np.clip(round(1 / np.diff(np.sort(turns)).min()), taps, 8192))  # then delays come again
-    profile = np.square(np.abs(rows @ np.exp(2j * np.pi * turns[:, None] * np.arange(apart)))).sum(0)
-    energy = np.convolve(np.concatenate([profile, profile])[: apart + taps - 1], np.ones(taps), "valid")
+    period = int(np.clip(round(1 / np.diff(np.sort(turns)).min()), taps, 8192))  # then delays come again
+    profile = np.square(np.abs(rows @ np.exp(2j * np.pi * turns[:, None] * np.arange(period)))).sum(0)
+    energy = np.convolve(np.concatenate([profile, profile])[: period + taps - 1], np.ones(taps), "valid")
     middle = int(energy.argmax())
 
     def residual(first: int) -> float:
@@ -190,4 +190,4 @@ def _first(channel: np.ndarray, turns: np.ndarray, taps: int) -> int:
     # The profile's maximum is within a few samples of the best, which least squares then decides.
     best = min(range(middle - 4, middle + 5), key=residual)
     # In the second half of the period a delay is nearer as a negative one.
-    return best if best < apart / 2 or apart <= taps else best - apart
+    return best if best < period / 2 or period <= taps else best - period

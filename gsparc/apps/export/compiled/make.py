@@ -92,12 +92,12 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
 
 def _squares(form: Predictor, model: Predictor, places: np.ndarray) -> np.ndarray:
     """Squared error, and what it is divided by, of each local place (2, n) in terms of `FIGURES`."""
-    own, whole = (ask_model(one, places).reshape(len(places), -1) for one in (form, model))
+    answers, whole = (ask_model(one, places).reshape(len(places), -1) for one in (form, model))
     if model.site.kind == "rssi":
         # A power of 0 has no decibels; 1e-30 is far below any receiver's noise.
         whole = np.maximum(whole, 1e-30)
-        own, whole = 10 * np.log10(np.maximum(own / whole, SILENT)), np.zeros_like(whole)
-    squared, power = (np.square(np.abs(one).astype(np.float64)).mean(1) for one in (own - whole, whole))
+        answers, whole = 10 * np.log10(np.maximum(answers / whole, SILENT)), np.zeros_like(whole)
+    squared, power = (np.square(np.abs(one).astype(np.float64)).mean(1) for one in (answers - whole, whole))
     return np.stack([squared, power if model.site.kind == "csi" else np.ones(len(places))])
 
 
@@ -226,8 +226,8 @@ def near_places(site: Site, count: int, seed: int) -> np.ndarray:
 
 def ask_model(predictor: Predictor, places: np.ndarray) -> np.ndarray:
     """Return the model's answers (B, ...), powers linear, at local places (B, 3) or (B, 6) [m]."""
-    asked = [predictor.site.world_ends(places[i : i + 64]) for i in range(0, len(places), 64)]
-    return np.concatenate([predictor.predict_linear(**ends).mean.numpy() for ends in asked])
+    queries = [predictor.site.world_ends(places[i : i + 64]) for i in range(0, len(places), 64)]
+    return np.concatenate([predictor.predict_linear(**ends).mean.numpy() for ends in queries])
 
 
 def sample_model(predictor: Predictor, places: np.ndarray) -> Measurements:

@@ -84,8 +84,8 @@ def _trees(near: Neighbourhood, most: int) -> tuple[np.ndarray, np.ndarray, np.n
     for rows, neighbours in near.split_by_density(most):
         # Depth such that leaves have about LEAF rows.
         depth = max(0, math.ceil(math.log2(len(rows) / LEAF)))
-        own, tree = _tree(near.places[rows], depth)
-        order.append(rows[own])
+        tree_order, tree = _tree(near.places[rows], depth)
+        order.append(rows[tree_order])
         sets.append((len(rows), min(neighbours, len(rows)), depth))
         boxes.append(tree.ravel())
     return np.concatenate(order), np.array(sets, np.int64), np.concatenate(boxes)

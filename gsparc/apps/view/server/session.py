@@ -268,8 +268,8 @@ class Session:
             if first:
                 self._legends()
             suffix = "" if plane.stride == 1 else f", so far one of {plane.stride**2} computed"
-            said = f"{int(grid.inside.sum())} cells of {grid.step:.3g} m{suffix}"
-            self.progress.content = f"{said}, {time.perf_counter() - begin:.1f} s"
+            text = f"{int(grid.inside.sum())} cells of {grid.step:.3g} m{suffix}"
+            self.progress.content = f"{text}, {time.perf_counter() - begin:.1f} s"
             yield
 
     def _legends(self) -> None:

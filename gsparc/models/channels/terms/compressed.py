@@ -26,8 +26,8 @@ def get_or_make(cache: Cache, key: Hashable, make: Callable[[], T]) -> T:
     """Return what is kept by a key, made the first time."""
     if key not in cache:
         cache[key] = make()
-    kept: T = cache[key]
-    return kept
+    value: T = cache[key]
+    return value
 
 
 def change_basis(matrix: Tensor, columns: Tensor) -> Tensor:

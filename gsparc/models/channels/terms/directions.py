@@ -101,8 +101,8 @@ class Directions(ChannelTerm):
 
     def design(self, slot: Slot) -> Tensor:
         """Return the knots' weights beside the powers', see `ChannelTerm`."""
-        own = super().design(slot)
-        return torch.cat([own, self.knot_weights([slot])[0]], 1) if len(self.towards) else own
+        columns = super().design(slot)
+        return torch.cat([columns, self.knot_weights([slot])[0]], 1) if len(self.towards) else columns
 
     def parameters(self) -> Tensor:
         """Return logarithms of powers, then of factors (M + J,), see `Term`."""

@@ -99,11 +99,11 @@ def find_small_mirrors(unexplained: UnexplainedRows, limit: int) -> list[SmallMi
     `MOST_CELLS` are larger. Whether to go on is asked (`raise_if_cancelled`) after each size of rectangle.
     """
     rows, room = unexplained.rows, unexplained.room
-    known = unexplained.scene.planes[unexplained.scene.walls]
+    walls = unexplained.scene.planes[unexplained.scene.walls]
     wavelength = LIGHT / float(rows.frequency.mean())
     mirrors: list[SmallMirror] = []
     normals: list[Tensor] = []
-    for plane in known:
+    for plane in walls:
         normal, _ = hesse_form(plane)
         if any((normal @ other).abs() >= PARALLEL for other in normals):
             continue
@@ -113,7 +113,7 @@ def find_small_mirrors(unexplained: UnexplainedRows, limit: int) -> list[SmallMi
             float(ends[0]) - BEHIND, float(ends[1]) + BEHIND, STEP * wavelength, dtype=torch.float64
         )
         candidates = torch.cat([normal.expand(len(offsets), -1), offsets[:, None]], 1)
-        many = 1 + 2 * len(known)
+        many = 1 + 2 * len(walls)
         count = math.prod(_count_cells(room, plane_tangents(candidates[0]), CELL)) * many * len(candidates)
         if count > MAX_CELLS:
             log.info("no search for small mirrors: %.0e raster cells at this site and wavelength", count)
@@ -121,7 +121,7 @@ def find_small_mirrors(unexplained: UnexplainedRows, limit: int) -> list[SmallMi
         cell = CELL * math.sqrt(max(count / MOST_CELLS, 1.0))
         each = max(math.prod(_count_cells(room, plane_tangents(candidates[0]), cell)), len(rows)) * many
         blocks = candidates.split(max(1, int(BLOCK_CELLS / each)))
-        parts = [_best_rectangles(unexplained, block, known, cell) for block in blocks]
+        parts = [_best_rectangles(unexplained, block, walls, cell) for block in blocks]
         total, corners = (torch.cat(part) for part in zip(*parts, strict=True))
         for number in total.topk(min(2 * limit, len(total))).indices.tolist():
             mirrors.append(SmallMirror(candidates[number], corners[number], float(total[number])))
@@ -143,8 +143,8 @@ def _best_rectangles(
         at = ((met @ along.T - low) / cell).floor().long()
         inside = (at >= 0).all(-1) & (at < torch.tensor(cells)).all(-1) & (met[..., 0] == met[..., 0])
         index = (at[..., 0] * cells[1] + at[..., 1]).clamp(0, cells[0] * cells[1] - 1)
-        own, blank = arriving.conj() * alpha, torch.zeros(len(candidates), cells[0] * cells[1])
-        values = (own.real, own.imag, arriving.abs().square() * scale, torch.ones(()))
+        correlation, blank = arriving.conj() * alpha, torch.zeros(len(candidates), cells[0] * cells[1])
+        values = (correlation.real, correlation.imag, arriving.abs().square() * scale, torch.ones(()))
         binned = [blank.scatter_add(1, index, (value * inside).float()).view(-1, *cells) for value in values]
         tables.append(binned)
     stacked = (torch.stack(each).cumsum(-1).cumsum(-2) for each in zip(*tables, strict=True))

@@ -115,8 +115,8 @@ class ClutterLikelihood:
         """Return a scorer of candidates, with the constant parts at their posterior means removed."""
         columns = self.columns(visible_share, log_amplitude)
         inner, seen = _gram_and_product(columns, self.white)
-        own = Factor.from_gram(inner)
-        mean, projection = own.solve(seen[:, None])[:, 0].float(), own.whiten(columns.T.double()).float()
+        chol = Factor.from_gram(inner)
+        mean, projection = chol.solve(seen[:, None])[:, 0].float(), chol.whiten(columns.T.double()).float()
         gains = mean * self.share * log_amplitude.exp()
         return CandidateScorer(self.root, projection, self.white - columns @ mean, gains)
 
@@ -219,6 +219,6 @@ def _gram_and_product(columns: Tensor, white: Tensor) -> tuple[Tensor, Tensor]:
 
 def _nll(columns: Tensor, white: Tensor, determinant: float) -> Tensor:
     inner, seen = _gram_and_product(columns, white)
-    own = Factor.from_gram(inner)
-    explained = white.double().square().sum() - own.whiten(seen[:, None]).square().sum()
-    return determinant + 0.5 * (own.log_determinant + explained)
+    chol = Factor.from_gram(inner)
+    explained = white.double().square().sum() - chol.whiten(seen[:, None]).square().sum()
+    return determinant + 0.5 * (chol.log_determinant + explained)

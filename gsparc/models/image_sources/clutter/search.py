@@ -192,16 +192,16 @@ class _ClutterSearcher:
 
     def _try_patches(self) -> None:
         """Try patches on infinite mirrors."""
-        left, patches = self._unexplained_rows(), []
+        residual_rows, patches = self._unexplained_rows(), []
         for number in set(range(len(self.scene.planes))) - set(self.scene.clutter.plane):
-            patch, score = find_patch(left, number)
+            patch, score = find_patch(residual_rows, number)
             patches.append((score, number, patch))
         for score, number, patch in sorted(patches, key=lambda f: -f[0]):
             if score < MIN_GAIN:
                 break
-            own = [k for k, sequence in enumerate(self.scene.sequences) if number in sequence]
+            numbers = [k for k, sequence in enumerate(self.scene.sequences) if number in sequence]
             louder = self.scene.log_amplitude.clone()
-            louder[own] = louder[own].clamp_min(float(louder.median()))
+            louder[numbers] = louder[numbers].clamp_min(float(louder.median()))
             clutter = self.scene.clutter.add_patch(patch, number)
             trial = replace(self.scene, log_amplitude=louder, clutter=clutter)
             self._try_scene(trial, PATCH, refactor=True)

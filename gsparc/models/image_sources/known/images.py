@@ -142,8 +142,8 @@ class Mirrors:
             shadow = 1 - visible_share(paths, one, self.planes)
             if plane in used or float(shadow.max()) > HIDES:
                 numbers.append(number)
-        kept = tuple(clutter.plane[i] for i in numbers)
-        return replace(clutter, patches=clutter.patches[numbers], plane=kept)
+        planes = tuple(clutter.plane[i] for i in numbers)
+        return replace(clutter, patches=clutter.patches[numbers], plane=planes)
 
     def _expected_powers(
         self, sequences: list[Reflections], transmitter: Tensor, places: Tensor, hidden: bool
@@ -175,8 +175,8 @@ class Mirrors:
 def walls_in_frame(walls: SceneWalls, origin: np.ndarray, static_end: np.ndarray | None) -> Walls:
     """Return walls and boxes of a file for paths to the end that stands (3,) local [m]; None: both move."""
     faces = [face for low, high in walls.boxes for face in box_faces(low, high)]
-    known = Mirrors.from_walls(SceneWalls((*walls.faces, *faces), walls.boxes[:0]), origin)
-    planes, patches = known.planes[list(known.clutter.plane)], known.clutter.patches.double()
+    mirrors = Mirrors.from_walls(SceneWalls((*walls.faces, *faces), walls.boxes[:0]), origin)
+    planes, patches = mirrors.planes[list(mirrors.clutter.plane)], mirrors.clutter.patches.double()
     normal, offset = hesse_form(planes)
     axes = torch.cat([normal[None], plane_tangents(planes).double()]).movedim(0, 1)
     corners = torch.cat([offset, patches.chunk(2, 1)[0]], 1)
@@ -197,8 +197,8 @@ def _group_by_plane(faces: list[np.ndarray]) -> list[tuple[np.ndarray, list[np.n
         normal = polygon_normal(face)
         normal = normal / np.linalg.norm(normal)
         for (*other, offset), members in planes:
-            apart = np.abs(face @ other - offset).max()
-            if abs(float(normal @ other)) > PARALLEL and apart < SAME_PLANE_M:
+            distance = np.abs(face @ other - offset).max()
+            if abs(float(normal @ other)) > PARALLEL and distance < SAME_PLANE_M:
                 members.append(face)
                 break
         else:

@@ -62,14 +62,14 @@ class KnownWallsGP(ImageSourceGP):
     ) -> list[Member]:  # fmt: skip
         """The images in the walls, refined; no search, so that nothing is looked at or started from."""
         rows = row_sets[0]
-        given = self._initial_scene(rows, settings)
+        layout = self._initial_scene(rows, settings)
 
         def negative_log_prior(scene: SourceScene) -> Tensor:
             assert scene.phase is not None
-            near = walls_prior_cost(given.planes, given.sequences, scene.planes, scene.log_amplitude)
-            return near + prior.negative_log_density(scene.phase, given.sequences)
+            near = walls_prior_cost(layout.planes, layout.sequences, scene.planes, scene.log_amplitude)
+            return near + prior.negative_log_density(scene.phase, layout.sequences)
 
-        scene = estimate_phases(rows, given, QUADRATURE, self.noise_floor)
+        scene = estimate_phases(rows, layout, QUADRATURE, self.noise_floor)
         scene = learn_visibility(rows, scene, self.kernel)
         prior = ReflectionPhasePrior.from_scene(scene)
         scene = refine_scene(rows, scene, settings.final_steps, negative_log_prior)
@@ -157,5 +157,5 @@ def walls_prior_cost(
     turned = (normal - given_normal).square().sum() / TURNED**2
     order = torch.tensor([float(len(sequence)) for sequence in sequences])
     law = torch.stack([torch.ones_like(order), order], 1)
-    left = log_amplitude - law @ (torch.linalg.pinv(law) @ log_amplitude)
-    return (moved + turned + left.square().sum() / LOG_AMPLITUDE_STD**2) / 2
+    residual = log_amplitude - law @ (torch.linalg.pinv(law) @ log_amplitude)
+    return (moved + turned + residual.square().sum() / LOG_AMPLITUDE_STD**2) / 2

@@ -163,8 +163,8 @@ class JointPowerField(ClosedForm):
         exact = query.tx.dtype == torch.float64
         for of, inflation, chosen in ((posterior, 1.0, heard), (elsewhere, self.inflation, ~heard)):
             if chosen.any():
-                mean[chosen], left = of.answer(places[chosen], number[chosen], exact)
-                spread[chosen], share[chosen] = inflation * left, left / self.whole
+                mean[chosen], variance = of.answer(places[chosen], number[chosen], exact)
+                spread[chosen], share[chosen] = inflation * variance, variance / self.whole
         share = (share + self._law_share(moving_end(places))).clamp_max(1.0)
         mean, spread, share = (part.to(query.tx.dtype) for part in (mean, spread, share))
         return Prediction(*linear_moments(mean, spread), share)
@@ -188,8 +188,8 @@ class JointPowerField(ClosedForm):
         for one in number.unique().tolist():
             at = (number == one).nonzero()[:, 0]
             of, inflation = (posterior, 1.0) if one in posterior.processes else (elsewhere, self.inflation)
-            mean[:, at], left = of.predict_joint(places[:, at], one)
-            covariance[:, at[:, None], at] = inflation * left
+            mean[:, at], block = of.predict_joint(places[:, at], one)
+            covariance[:, at[:, None], at] = inflation * block
             kernel = self.own.prior(one).kernel
             noise[at] = inflation * kernel.amplitude * kernel.noise
         return JointLevels(mean, covariance, noise)
@@ -303,8 +303,8 @@ class JointPowerField(ClosedForm):
         """
         if self._reach is None:
             posterior, _ = self._require_posteriors()
-            known = torch.cat([moving_end(one.rows) for one in posterior.processes.values()]).numpy()
-            self._reach = cKDTree(known), max(REACH * float(np.linalg.norm(np.ptp(known, axis=0))), TINY_M)
+            places = torch.cat([moving_end(one.rows) for one in posterior.processes.values()]).numpy()
+            self._reach = cKDTree(places), max(REACH * float(np.linalg.norm(np.ptp(places, axis=0))), TINY_M)
         tree, reach = self._reach
         far = nearest_distance(tree, moving)
         law = max(1 - self.own.variance / self.whole, 0.0)

@@ -71,10 +71,10 @@ class StationPriors:
                 wide = replace(prior.known_trend, more=(*prior.known_trend.more, shared))
                 # Each sector of a site has a level of its own, which its silent rows bound.
                 least = LEAST_SILENT * len(np.unique(extra_columns(part.places), axis=0))
-                known = condition_on_powers(part, Prior(prior.kernel, wide), seed, least)[0].posterior
-                assert isinstance(known, Exact)
-                told = known.extra <= TOLD
-                places, values, extra = known.rows[told], known.given_values()[told], known.extra[told]
+                process = condition_on_powers(part, Prior(prior.kernel, wide), seed, least)[0].posterior
+                assert isinstance(process, Exact)
+                mask = process.extra <= TOLD
+                places, values, extra = process.rows[mask], process.given_values()[mask], process.extra[mask]
             result[number] = Exact.from_values(prior, places, values, extra)
         return SharedTermsPosterior(result, self.never, terms.columns)
 
@@ -98,16 +98,16 @@ def learn_station_priors(rows: StationRows, seed: int) -> tuple[StationPriors, l
         narrow, (_, kernel) = kernel, fit_kernel_by_evidence(kernel, parts, EVIDENCE_LOOKS)
         wider = kernel.amplitude / narrow.amplitude
         for number, one in priors.items():
-            own = replace(kernel, amplitude=wider * one.kernel.amplitude)
-            priors[number] = Prior(own, trend)
+            kernel_here = replace(kernel, amplitude=wider * one.kernel.amplitude)
+            priors[number] = Prior(kernel_here, trend)
     for number in numbers:
         if some_silent:
             some = whole.select_station(number).draw_stretches(ENDS_FROM, seed).view(trend)
-            _, own = fit_kernel_by_evidence(priors[number].kernel, [some], EVIDENCE_LOOKS)
+            _, kernel_here = fit_kernel_by_evidence(priors[number].kernel, [some], EVIDENCE_LOOKS)
         else:
             some = heard.select_station(number).thin_rows(ENDS_ON, seed).view(trend)
-            _, own = fit_kernel_by_left_out([kernel], [some])
-        priors[number] = Prior(replace(own, amplitude=max(own.amplitude, LEAST_DB2)), trend)
+            _, kernel_here = fit_kernel_by_left_out([kernel], [some])
+        priors[number] = Prior(replace(kernel_here, amplitude=max(kernel_here.amplitude, LEAST_DB2)), trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
     return StationPriors(Prior(kernel, trend), priors), notes
 

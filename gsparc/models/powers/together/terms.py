@@ -97,11 +97,11 @@ def places_and_notes(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, 
     site, notes = data.site, []
     places = np.array(site.every_station.position, np.float64)
     for number in np.flatnonzero(~np.isfinite(places).all(1)):
-        own = rows[data.stations_of(rows) == number]
-        if len(own):
-            places[number] = locate_still_end(power_rows(data, own))
-            said = say_estimated(places[number] + site.origin)
-            notes.append(f"the place of station {site.every_station.shown[number]} {said}")
+        station_rows = rows[data.stations_of(rows) == number]
+        if len(station_rows):
+            places[number] = locate_still_end(power_rows(data, station_rows))
+            text = say_estimated(places[number] + site.origin)
+            notes.append(f"the place of station {site.every_station.shown[number]} {text}")
     return places, tuple(notes)
 
 
