@@ -68,6 +68,17 @@ def suggest_name(name: str, known: Iterable[str], cutoff: float = 0.5) -> str:
     return f"; did you mean {close[0]!r}?" if close else ""
 
 
+def absent(path: Path) -> str:
+    """Say that there is no such file; of a folder what reads it.
+
+    >>> absent(Path("nothing.npz"))
+    'nothing.npz: no such file'
+    """
+    if path.is_dir():
+        return f"{path}: a folder, which dataset=rfid (argos, ...) dataset.root={path} reads; no file"
+    return f"{path}: no such file"
+
+
 def explain_error(error: BaseException) -> str:
     """Say what another library calls wrong, on one line, without what only a programmer could do about it."""
     if isinstance(error, RecursionError):

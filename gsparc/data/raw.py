@@ -31,7 +31,7 @@ from numpy.lib.format import read_array_header_2_0 as header_2
 from scipy.io import loadmat, netcdf_file
 
 from gsparc.data.blocks import BIG, is_big, iterate_bytes, machine_memory, map_from_disk
-from gsparc.data.errors import DataError, explain_error, readable
+from gsparc.data.errors import DataError, absent, explain_error, readable
 from gsparc.data.files import check_fetched, whole_file
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
@@ -75,7 +75,7 @@ def read_raw(path: str | Path) -> Raw:
     """
     path = Path(path)
     if not path.is_file():
-        raise DataError(f"{path}: no such file; expected *.npz, *.h5 or *.mat")
+        raise DataError(f"{absent(path)}; expected *.npz, *.h5 or *.mat")
     readers = {".npz": _read_npz, ".mat": _read_mat}
     readers |= dict.fromkeys(HDF5_SUFFIXES, _read_hdf5) | dict.fromkeys(NETCDF_SUFFIXES, _read_netcdf)
     if path.suffix.lower() not in readers:

@@ -80,10 +80,12 @@ def test_facts_beside_the_content_hash_are_of_an_origin(spectra_file, halfway, w
 
 
 def test_weights_to_start_from_beside_a_run_to_go_on_from_are_those_it_began_with(
-    spectra_file, halfway, tmp_path
+    spectra_file, halfway, tmp_path, caplog
 ):
     often, start = "callbacks.checkpoint.interval=10", f"init_from={halfway.checkpoints[0]}"
-    train(short(spectra_file, start, often), tmp_path / "begun")
+    with caplog.at_level("WARNING"):
+        train(short(spectra_file, start, often), tmp_path / "begun")
+    assert "its model learned from these data" in caplog.text  # validation rows among them, nobody said
     on = f"ckpt_path={tmp_path / 'begun' / 'last.ckpt'}"
     assert train(short(spectra_file, start, on), tmp_path / "on")
     with pytest.raises(ValueError, match=r"was trained with init_from=.*model\.ckpt \(here None\)"):
@@ -133,7 +135,7 @@ def test_training_starts_from_given_weights_on_rows_of_another_campaign(halfway,
     """Another campaign's box, and with it the origin of local coordinates, is never quite the same."""
     new = spectra(tmp_path / "new.npz", rows=55)
     before = weights(halfway.checkpoints[0])
-    after = {}
+    after: dict = {}
     for name, more in {"still": FROZEN, "on": ()}.items():
         config = short(new, f"init_from='{halfway.checkpoints[0]}'", "trainer.max_steps=1", *more)
         _, objects = train(config, tmp_path / name)

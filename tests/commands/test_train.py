@@ -159,6 +159,14 @@ def test_options_without_effect_are_said_and_stored(spectra_file, tmp_path, monk
 # -- the objective of a search --------------------------------------------------------------------------
 
 
+def test_the_folder_of_one_run_was_ignored_in_a_sweep(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    folder = f"hydra.run.dir={tmp_path / 'mine'}"
+    answer = knock(main, "train.py", ["-m", "seed=0,1", "dataset=rfid_sim", "model=mean", folder])
+    assert answer.status == 1 and "say hydra.sweep.dir=FOLDER" in "".join(answer.out)
+    assert not (tmp_path / "mine").exists()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("way", [(), ("-m", "seed=0,1")], ids=["a run", "a sweep"])
 def test_the_objective_is_for_searches_alone(tmp_path, way):
@@ -195,5 +203,5 @@ def test_the_title_of_a_table_did_not_say_the_draw_of_the_split(tmp_path):
 def test_the_title_named_a_seed_where_the_release_named_the_test_rows(tmp_path):
     """`split random (split.seed=2)`, and the seed had moved validation rows alone."""
     said = said_of_a_draw(tmp_path, split_train=np.arange(40), split_test=np.arange(40, 60))
-    assert "split random (the release's test rows), test, seed 0" in said
-    assert "random (the release's test rows): 36 training" in said and "(split.seed" not in said
+    assert "split random (the test rows that its files name), test, seed 0" in said
+    assert "random (the test rows that its files name): 36 training" in said and "(split.seed" not in said

@@ -210,11 +210,22 @@ def _complete(config: DictConfig) -> None:
         )
 
 
+def _refuse_folder_of_one_run() -> None:
+    """Raise ValueError where jobs of a multirun are given the folder of one run, which Hydra ignores."""
+    own = HydraConfig.get()
+    names = {word.lstrip("+").partition("=")[0] for word in own.overrides.hydra}
+    if own.mode == RunMode.MULTIRUN and "hydra.run.dir" in names and "hydra.sweep.dir" not in names:
+        raise ValueError(
+            "hydra.run.dir is the folder of one run; these are several: say hydra.sweep.dir=FOLDER"
+        )
+
+
 def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], object]:
     @wraps(task)
     def wrapped(config: DictConfig) -> object:
         logging.captureWarnings(True)  # now that there is a log
         try:
+            _refuse_folder_of_one_run()
             if "model" in config:
                 _complete(config)
             return task(config)

@@ -94,9 +94,14 @@ def _data(config: DictConfig, known: Measurements | None) -> DataModule:
             config.dataset[key] = str(Path(location).resolve())
     if start is not None:
         try:
-            module.measurements = align_to_site(module.measurements, checkpoint.read(start).site, whole=True)
+            site = checkpoint.read(start).site
+            same = site.sha256 == module.measurements.site.sha256
+            module.measurements = align_to_site(module.measurements, site, whole=True)
         except ValueError as error:
             raise ValueError(f"init_from={start}: {error}") from None
+        if same:
+            learned = "its model learned from these data, perhaps from rows that validate here"
+            log.warning("init_from=%s: %s: choices made on them are too sure", start, learned)
     return module
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from gsparc.data.errors import Caution, DataError, Problems, name_row_ranges, readable
+from gsparc.data.errors import Caution, DataError, Problems, absent, name_row_ranges, readable
 from gsparc.data.files import check_content, check_fetched, check_line_length
 from gsparc.data.raw import ARRAY_SUFFIXES
 from gsparc.data.tables import is_table
@@ -345,7 +345,7 @@ def read_sheet(path: str | Path, problems: Problems | None = None) -> Sheet:
     """
     path = Path(path)
     if not path.is_file():
-        raise DataError(f"{path}: no such file; expected a table, or arrays (*{', *'.join(ARRAY_SUFFIXES)})")
+        raise DataError(f"{absent(path)}; expected a table, or arrays (*{', *'.join(ARRAY_SUFFIXES)})")
     if not is_table(path):
         raise DataError(f"{path}: expected a table (csv, parquet, json, ...), no arrays")
     check_fetched(path)
