@@ -62,21 +62,6 @@ def blocked(tmp_path_factory):
     return data, field, notes
 
 
-def test_left_out_rows_are_predicted_without_them():
-    data = town(30)
-    field = small_field(data)
-    rows = np.arange(25)
-    field.condition(data, rows)
-    found = field.left_out()
-    assert np.array_equal(found.rows, rows)
-    for i in (0, 7, 24):
-        field.condition(data, np.delete(rows, i))
-        batch = data.batch(np.array([i]))
-        told = field.predict(batch)
-        assert torch.allclose(found.mean[i], told.mean[0], rtol=1e-4)
-        assert torch.allclose(found.variance[i], told.variance[0], rtol=1e-4)
-
-
 def test_settings_are_chosen_on_rows_that_no_clock_counts():
     """A busy machine chose on fewer rows: 5.573 dB beside two loops, 5.580 alone."""
     chosen = [FitContext(effort=effort).counts for effort in (1e-3, 1.0, 8.0)]
