@@ -95,21 +95,6 @@ def test_slopes_of_the_likelihood_which_refining_raises(make):
     assert GainPosterior(rows, refine.refine_scene(rows, scene, 8)).nll < nll
 
 
-def test_packed_queries_equal_the_processes():
-    members = [GainPosterior(_rows(), _phased(t)) for t in (0.1, 0.6)]
-    tones = torch.tensor([2.40e9, 2.42e9, 2.44e9], dtype=torch.float64)
-    queries = torch.rand(7, 3, dtype=torch.float64) * 3
-    means, _, _ = EnsembleMeans(members).predict(queries, tones)
-    bare, variance, prior = EnsembleMeans(members, variance_rows=0).predict(queries, tones)
-    assert torch.equal(bare, means) and variance.tolist() == [0] * 7 and prior.tolist() == [1] * 7
-    for member, mean in zip(members, means, strict=True):
-        found = gains(member, queries)
-        for f, tone in enumerate(tones):
-            asked = Rows(queries, tone.expand(7), torch.empty(7, 0), torch.arange(7))
-            expected = (spherical_waves(asked, member.scene.sources)[:, :, None] * found).sum(1)
-            torch.testing.assert_close(mean[:, :, f], expected, rtol=1e-3, atol=1e-4)
-
-
 def test_variance_is_that_of_the_joint_gaussian():
     """Schur complement of the covariance of rows and query together."""
     rows, scene = _rows(), _phased()
