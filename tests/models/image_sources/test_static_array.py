@@ -19,7 +19,7 @@ from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import refine_scene
 from gsparc.models.image_sources.rows import rows_of_measurements, static_array
 from gsparc.models.image_sources.scene import KernelVisibility, SourceScene, spherical_waves
-from gsparc.physics.mirror_planes import bisector, reflect
+from gsparc.physics.mirror_planes import bisector, image_rotations, images, reflect
 from gsparc.physics.waves import LIGHT
 from gsparc.training.context import FitContext
 
@@ -91,6 +91,27 @@ def test_paths_of_each_antenna_sum_to_the_prediction(four):
         torch.from_numpy(data.moving[fold.test[:5]])[:, None] - antennas, dim=-1
     )
     assert (delay[:, :, 0] * LIGHT - direct).abs().max() < 0.01
+
+
+def test_orientation_of_first_and_second_order():
+    """Mirrors in planes of any slant: the image of an antenna is that of the centre plus Q a."""
+    draws = torch.Generator().manual_seed(0)
+    planes = torch.randn(3, 4, generator=draws, dtype=torch.float64)
+    centre, antenna = torch.randn(2, 3, generator=draws, dtype=torch.float64)
+    sequences = [(), (0,), (2,), (0, 1), (2, 1)]
+    turned = image_rotations(planes, sequences)
+    torch.testing.assert_close(
+        images(centre + antenna, planes, sequences),
+        images(centre, planes, sequences) + turned @ antenna,
+    )
+    normal = planes[0, :3] / planes[0, :3].norm()
+    householder = torch.eye(3, dtype=torch.float64) - 2 * torch.outer(normal, normal)
+    torch.testing.assert_close(turned[1], householder)
+    torch.testing.assert_close(torch.linalg.det(turned), torch.tensor([1.0, -1, -1, 1, 1]).double())
+    halfway = bisector(centre, images(centre, planes, sequences)[1])
+    torch.testing.assert_close(
+        reflect(centre + antenna, halfway), images(centre + antenna, planes, sequences)[1]
+    )
 
 
 def _rows_and_scene():
