@@ -50,7 +50,7 @@ def test_dense_receivers_tell_and_far_away_nothing_is_said(dense):
 
 
 @pytest.mark.slow
-def test_many_rows_are_told_by_the_nearest(dense, tmp_path, monkeypatch):
+def test_many_rows_are_told_by_the_nearest(dense, monkeypatch):
     data, fold, whole, _ = dense
     monkeypatch.setattr(complex_gp, "MOST_ROWS", 100)
     near, notes = _fit(data, fold)
@@ -62,10 +62,6 @@ def test_many_rows_are_told_by_the_nearest(dense, tmp_path, monkeypatch):
     assert errors[0] < 1.5 * errors[1] < 0.4, errors
     missed = (said.mean - batch.target).abs().square().mean()
     assert 0.2 < said.variance.mean() / missed < 5
-    torch.save(near.state(), tmp_path / "state.pt")
-    again = ComplexGP()
-    again.restore(data.site, torch.load(tmp_path / "state.pt", weights_only=True))
-    assert torch.equal(again.predict(batch).mean, said.mean)
 
 
 def test_places_visited_again_hid_all_others_from_the_nearest_rows(monkeypatch):

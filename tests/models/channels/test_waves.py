@@ -126,16 +126,6 @@ def test_flat_places_get_a_half_sphere():
     assert abs(spread_directions(torch.randn(30, 3, dtype=torch.float64), K, 12)[:, 2].sign().sum()) < 12
 
 
-def test_covariance_is_hermitian_and_its_diagonal_the_prior():
-    data = _sent(60)
-    field = _whole(data, correlated=True)
-    group = group_channels(data, np.arange(40), True)[0]
-    (signal,) = field.prior.signal_covariances([group])
-    torch.testing.assert_close(signal, signal.mH)
-    torch.testing.assert_close(signal.diagonal().real, field.prior.variance(group))
-    assert torch.linalg.eigvalsh(signal + field.prior.disturbance(group)).min() > 0
-
-
 def test_slopes_of_the_evidence_and_what_compression_costs():
     data = _sent(120, diffuse=1.0, side=0.3)
     prior = _prior(data, envelope=2.0)

@@ -23,7 +23,6 @@ from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.mixture.candidates import CANDIDATES
 from gsparc.models.mixture.methods import ImageSources
 from gsparc.models.terms import EffectSettings
-from gsparc.processes.kernel import matern32_of_squares
 from gsparc.training.context import FitContext
 
 
@@ -118,21 +117,6 @@ def test_visibility_is_predicted_without_the_receiver():
     query = torch.tensor([[0.5, 2.0, 2.0], [3.5, 2.0, 2.0]], dtype=torch.float64)
     probability = fitted.probability_seen(query)[:, 0]
     assert float(probability[0]) > 0.8 and float(probability[1]) < 0.2
-
-
-def test_visibility_at_queries_is_the_sum_over_each_sources_kernel():
-    rng = torch.manual_seed(0)
-    places = torch.rand(20, 3, generator=rng, dtype=torch.float64)
-    seen = (torch.rand(20, 4, generator=rng) < 0.5).double()
-    length = torch.tensor([0.1, 0.8, 0.1, 3.2], dtype=torch.float64)
-    weights = torch.randn(20, 4, generator=rng, dtype=torch.float64) * 0.1
-    fitted = VisibilityGP(places, seen, length, weights, seen)
-    queries = torch.rand(3, 3, generator=rng, dtype=torch.float64)
-    apart = torch.cdist(queries, places)
-    each = [
-        matern32_of_squares((apart / length[k]) ** 2) @ weights[:, k] + seen[:, k].mean() for k in range(4)
-    ]
-    torch.testing.assert_close(fitted.probability_seen(queries), torch.stack(each, 1).clamp(0, 1))
 
 
 def test_paths_sum_to_the_prediction(pillar):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from gains import gains, phased
-from rooms import PILLAR, WAVELENGTH, shoebox
+from rooms import PILLAR, WAVELENGTH
 
 from gsparc.models.image_sources.clutter import finite_mirrors, search
 from gsparc.models.image_sources.clutter.blocking import Clutter, plane_tangents, visible_share
@@ -16,7 +16,6 @@ from gsparc.models.image_sources.clutter.boxes import find_occluding_box
 from gsparc.models.image_sources.clutter.finite_mirrors import find_patch, find_small_mirrors
 from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, UnexplainedRows
 from gsparc.models.image_sources.clutter.search import find_clutter
-from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.known.method import ReflectionPhasePrior
 from gsparc.models.image_sources.query import EnsembleMeans
@@ -71,35 +70,6 @@ def _table() -> tuple[torch.Tensor, Clutter]:
     return torch.cat([WALLS, TABLE[None]]), Clutter(torch.zeros(0, 6), patch[None], (6,))
 
 
-def test_a_box_hides_what_the_exact_simulator_says():
-    told, _, _ = shoebox(150, pillar=True, snr_db=60.0)
-    scene = _scene(_boxed(_box()), order=2)
-    places = torch.from_numpy(told.rx.copy())
-    seen = visible_share(scene.unfolding.paths(places), scene.clutter, scene.planes).T.numpy()
-    true = told.images.mirror_points(told.tx[0])
-    at_noise_floor = 0.0
-    for k, source in enumerate(scene.sources.numpy()):
-        image = np.linalg.norm(true - source, axis=1).argmin()
-        assert np.linalg.norm(true[image] - source) < 1e-6
-        at_noise_floor += ((seen[:, k] > 0.5) == told.visible[:, image]).mean() / len(scene.sequences)
-    assert at_noise_floor > 0.98  # the rest are chords shorter than the margin
-
-
-def test_legs_reach_from_receiver_to_transmitter_over_the_walls():
-    places = _rows(20).position
-    paths = Unfolding(TRANSMITTER, WALLS, ((0, 2), (2,))).paths(places)
-    torch.testing.assert_close(paths.start[:, :, 0], places.float().expand(2, -1, -1))
-    torch.testing.assert_close(paths.end[:, :, -1], TRANSMITTER.float().expand(2, 20, 3))
-    torch.testing.assert_close(paths.end[:, :, :-1], paths.start[:, :, 1:])
-    assert paths.valid.all()
-    scene = SourceScene(TRANSMITTER, WALLS, ((0, 2), (2,)), torch.zeros(2), 0.0)
-    straight = torch.cdist(scene.sources, places)
-    length = (paths.end - paths.start).norm(dim=-1).sum(-1)
-    torch.testing.assert_close(length.double(), straight, rtol=1e-4, atol=1e-4)
-    behind = torch.tensor([[-1.0, 1.0, 1.0]], dtype=torch.float64)
-    assert not Unfolding(TRANSMITTER, WALLS, ((0,),)).paths(behind).valid.any()
-
-
 def test_a_patch_reflects_inside_only_and_hides_what_is_behind():
     planes, clutter = _table()
     scene = SourceScene(TRANSMITTER, planes, ((), (6,)), torch.zeros(2), 0.0, clutter=clutter)
@@ -125,15 +95,6 @@ def test_batched_queries_and_variance_include_clutter():
         torch.testing.assert_close(mean[:, :, 0], expected, rtol=1e-3, atol=1e-4)
     bare = EnsembleMeans(members[1:]).predict(queries, tone)[1]
     assert not torch.allclose(variance, bare)
-
-
-def test_residual_is_the_same_likelihood():
-    rows = replace(_rows(30), target=torch.randn(30, 1, dtype=torch.complex64))
-    residual = ClutterLikelihood(rows, phased(_scene(_boxed(_box())), torch.arange(7.0)))
-    scene = residual.scene
-    seen = scene.visible_share(rows.position).T
-    expected = GainPosterior(rows, residual.scene).nll
-    assert residual.nll(seen, scene.log_amplitude).item() == pytest.approx(expected, rel=1e-4)
 
 
 def test_score_is_what_the_best_multiple_gains():
@@ -185,18 +146,6 @@ def _beside_a_table(count: int) -> tuple[UnexplainedRows, Clutter]:
     true = SourceScene(TRANSMITTER, planes, sequences, torch.zeros(len(sequences)), -4.0, clutter=clutter)
     rows = _truth(true, _rows(count))
     return _unexplained(rows, _bare()), clutter
-
-
-def test_candidates_are_met_where_unfolded_paths_meet_them():
-    """By itself, after a wall, and before one."""
-    rows, planes = _rows(40), torch.cat([WALLS[:1], TABLE[None]])
-    found = finite_mirrors._waves_and_meetings(rows, TRANSMITTER, TABLE[None], WALLS[:1])
-    for (_, met), (word, corner) in zip(found, (((1,), 0), ((0, 1), 0), ((1, 0), 1)), strict=True):
-        paths = Unfolding(TRANSMITTER, planes, (word,)).paths(rows.position)
-        seen = torch.isfinite(met[0, :, 0]) & paths.valid[0]
-        apart = (met[0, seen] - paths.end[0, seen, corner]).norm(dim=1)
-        # Both orders of perpendicular mirrors have one image; few places see it in the second.
-        assert len(apart) and (apart < 1e-3).float().mean() > 0.9
 
 
 def test_a_table_top_is_found_by_its_reflections():

@@ -1,7 +1,5 @@
 """The two processes against brute force: covariance, leave-one-out, gradients, and each against the other."""
 
-from dataclasses import replace
-
 import pytest
 import torch
 from gains import gains, phased
@@ -62,17 +60,6 @@ def test_without_a_source_is_the_scene_less_that_source_and_its_plane():
     assert less.sequences == ((), (0,)) and len(less.planes) == 1
 
 
-def test_quadrature_one_is_the_circular_process():
-    """Up to a constant of the number of rows."""
-    rows, scene = _rows(2), _scene()
-    differences = []
-    for noise in (-1.0, 0.5):
-        circular = replace(scene, log_noise=noise)
-        turned = replace(_phased(quadrature=1.0), log_noise=noise)
-        differences.append(GainPosterior(rows, circular).nll - GainPosterior(rows, turned).nll)
-    assert differences[0] == pytest.approx(differences[1], abs=1e-2)
-
-
 @pytest.mark.parametrize("quadrature", [0.1, 1.0])
 def test_left_out_by_refitting_without_the_receiver(quadrature):
     rows, scene = _rows(), _phased(quadrature)
@@ -108,21 +95,6 @@ def test_slopes_of_the_likelihood_which_refining_raises(make):
     assert GainPosterior(rows, refine.refine_scene(rows, scene, 8)).nll < nll
 
 
-def test_packed_queries_equal_the_processes():
-    members = [GainPosterior(_rows(), _phased(t)) for t in (0.1, 0.6)]
-    tones = torch.tensor([2.40e9, 2.42e9, 2.44e9], dtype=torch.float64)
-    queries = torch.rand(7, 3, dtype=torch.float64) * 3
-    means, _, _ = EnsembleMeans(members).predict(queries, tones)
-    bare, variance, prior = EnsembleMeans(members, variance_rows=0).predict(queries, tones)
-    assert torch.equal(bare, means) and variance.tolist() == [0] * 7 and prior.tolist() == [1] * 7
-    for member, mean in zip(members, means, strict=True):
-        found = gains(member, queries)
-        for f, tone in enumerate(tones):
-            asked = Rows(queries, tone.expand(7), torch.empty(7, 0), torch.arange(7))
-            expected = (spherical_waves(asked, member.scene.sources)[:, :, None] * found).sum(1)
-            torch.testing.assert_close(mean[:, :, f], expected, rtol=1e-3, atol=1e-4)
-
-
 def test_variance_is_that_of_the_joint_gaussian():
     """Schur complement of the covariance of rows and query together."""
     rows, scene = _rows(), _phased()
@@ -138,20 +110,8 @@ def test_variance_is_that_of_the_joint_gaussian():
     inverse = GainPosterior(both, scene).conditioned.factor.inverse
     block = inverse[[COUNT, 2 * COUNT + 1]][:, [COUNT, 2 * COUNT + 1]]
     assert variance.item() == pytest.approx(torch.linalg.inv(block).trace().item(), rel=1e-3)
-
-
-def test_variances_of_many_queries_are_those_of_each_alone():
-    tones = torch.tensor([2.4e9], dtype=torch.float64)
-    queries = torch.rand(5, 3, dtype=torch.float64, generator=torch.manual_seed(1)) * 3
-    query = EnsembleMeans([GainPosterior(_rows(), _phased()), GainPosterior(_rows(), _phased(0.7))], 10)
-    _, variance, prior = query.predict(queries, tones)
-    alone = [query.predict(one[None], tones)[1:] for one in queries]
-    torch.testing.assert_close(
-        torch.stack([variance, prior], 1), torch.cat([torch.stack(p, 1) for p in alone])
-    )
-    whole = EnsembleMeans([GainPosterior(_rows(), _phased())]).predict(queries, tones)[1]
-    assert bool((variance >= whole - 1e-5).all())  # fewer rows know less
-    assert bool((variance <= prior).all())
+    _, less, prior = EnsembleMeans([GainPosterior(rows, scene)], 10).predict(query, tone)
+    assert variance - 1e-5 <= less <= prior  # fewer rows know less
 
 
 @pytest.mark.parametrize("extent", [5.0, 500.0, 20_000.0])

@@ -14,7 +14,7 @@ from scenes import error, fold_of
 from gsparc.data.own import from_arrays
 from gsparc.models.image_sources.backprojection import gains_and_amplitudes, rough_gains
 from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, _nll
-from gsparc.models.image_sources.gp_likelihood import GainPosterior, estimate_phases
+from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import refine_scene
 from gsparc.models.image_sources.rows import rows_of_measurements, static_array
@@ -209,13 +209,3 @@ def test_an_interrupt_ends_all_searches(tmp_path, monkeypatch, caplog):
     with pytest.raises(KeyboardInterrupt):
         ImageSourceGP(searches=2, margin=8.0).fit(data, fold, FitContext(tmp_path))
     assert "search 1 of 2" not in caplog.text  # said at its end
-
-
-def test_one_antenna_is_a_case_of_several():
-    """The same likelihood with an array of one antenna at the static end's place."""
-    rows, scene = _rows_and_scene()
-    mine = rows.select_rows(torch.nonzero(rows.element == 0).flatten())
-    alone = replace(mine, array=None, element=None)
-    assert GainPosterior(mine, scene).nll == pytest.approx(GainPosterior(alone, scene).nll, rel=1e-4)
-    one, other = (GainPosterior(each, estimate_phases(each, scene, 0.4, 1e-5)).nll for each in (mine, alone))
-    assert one == pytest.approx(other, rel=1e-4)

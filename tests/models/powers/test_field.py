@@ -2,7 +2,6 @@
 
 import copy
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,10 +12,7 @@ from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.walls import read_walls
 from gsparc.models.powers.field import PowerField
-from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import Nearest
-from gsparc.processes.prior import Prior
-from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext
 
 STATION = (5.0, 20.0, 3.0)
@@ -41,16 +37,6 @@ def db(power: torch.Tensor) -> np.ndarray:
     return 10 * np.log10(power.numpy().astype(float)).reshape(-1)
 
 
-def small_field(data: Measurements, two: bool = True) -> PowerField:
-    """Invented settings."""
-    kernel = (
-        Kernel.from_lengths((3.0, 12.0), (0.4, 0.6), 0.2, 9.0) if two else Kernel.from_length(5.0, 0.2, 9.0)
-    )
-    field = PowerField()
-    field.site, field.priors = data.site, ((1.0, Prior(kernel, Trend(-70.0))),)
-    return field
-
-
 @pytest.fixture(scope="module")
 def blocked(tmp_path_factory):
     """A town of 260 rows with a known wall, and the field of 160 of them."""
@@ -60,21 +46,6 @@ def blocked(tmp_path_factory):
     field, notes = fitted_to(PowerField(walls=read_walls(file)), data, rows)
     field.condition(data, rows)
     return data, field, notes
-
-
-def test_left_out_rows_are_predicted_without_them():
-    data = town(30)
-    field = small_field(data)
-    rows = np.arange(25)
-    field.condition(data, rows)
-    found = field.left_out()
-    assert np.array_equal(found.rows, rows)
-    for i in (0, 7, 24):
-        field.condition(data, np.delete(rows, i))
-        batch = data.batch(np.array([i]))
-        told = field.predict(batch)
-        assert torch.allclose(found.mean[i], told.mean[0], rtol=1e-4)
-        assert torch.allclose(found.variance[i], told.variance[0], rtol=1e-4)
 
 
 def test_settings_are_chosen_on_rows_that_no_clock_counts():
@@ -121,20 +92,3 @@ def test_walls_stay_where_each_place_is_told_by_the_nearest(blocked, monkeypatch
     again = read_back(near)
     assert torch.equal(again.predict(batch).mean, near.predict(batch).mean)
     assert torch.equal(again.left_out().mean, near.left_out().mean)
-
-
-def test_left_out_rows_are_told_from_silent_ones_at_their_place(monkeypatch):
-    """Among very many rows the nearest to a row could be a silent one of the same place."""
-    one = town(150, walls=False)
-    twice = np.tile(np.arange(150), 2)
-    places = one.moving[twice] + one.site.origin
-    decibels = np.asarray(db(torch.from_numpy(one.target[twice])), float)
-    decibels[150:] -= 1e-6  # no copies
-    data = from_arrays({"rx_position": places, "tx_position": STATION, "rssi_db": decibels}, {"name": "town"})
-    silent = np.arange(300) >= 150
-    data = replace(data, mask=~silent[:, None], censored=silent)
-    monkeypatch.setattr("gsparc.processes.powers.MOST_ROWS", 100)
-    field = small_field(data, two=False)
-    field.condition(data, np.arange(300))
-    assert isinstance(field.powers.posterior, Nearest) and len(field.at) == 150
-    assert (field.powers.posterior.noise[field.at] <= field.powers.kernel.noise).all()
