@@ -77,7 +77,7 @@ METHODS = {
 }  # fmt: skip
 OTHERS = "<>8H"  # marks of methods without an entry
 TOGETHER = "_together"  # ends the name of a method that serves all stations at once
-PUBLISHED = "published_"  # begins the name of one at its published size
+PUBLISHED = "full_size_"  # begins the name of one at its published size
 
 
 def style_of(method: str) -> MethodStyle:
