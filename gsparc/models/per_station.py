@@ -40,6 +40,9 @@ from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
+# Facts of copies that add up, as seconds do; other numbers are averaged.
+COUNTS = ("model/num_gaussians", "model/steps", "model/steps_taken")
+
 UNHEARD = NOBODY  # the copy for all that were never heard
 
 
@@ -330,7 +333,7 @@ class PerStation(Method):
         return sum(copy.count_components() for copy in self._copies.values())
 
     def facts(self) -> dict[str, float | int | str | None]:
-        """Sum over copies what counts or costs, and average shares; initialisers of all are named."""
+        """Sum over copies what counts or costs, and average other numbers; initialisers of all are named."""
         result = [copy.facts() for copy in self._copies.values()]
         if not result:
             return super().facts()
@@ -347,8 +350,7 @@ def _combine_facts(facts: list[Any], name: str) -> float | int | str | None:
         return None
     if isinstance(values[0], str):
         return ", ".join(dict.fromkeys(values))
-    # Shares are averaged; counts and seconds of the copies add up.
-    return float(np.mean(values)) if name == "model/variance_explained" else sum(values)
+    return sum(values) if name in COUNTS or name.startswith("time/") else float(np.mean(values))
 
 
 def _to_station_query(site: Site, query: Query) -> Query:

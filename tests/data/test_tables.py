@@ -129,7 +129,9 @@ def test_midnight_passes_and_a_date_stands_beside_its_clock(write, refused):
 
 def test_columns_of_levels_in_db_did_not_say_how_dbm_are_asked_for(write):
     notes = parse_table(write("x,y,AP1,AP2\n1,2,-80,-70\n4,5,-81,-71\n")).notes
-    assert any("taken as rssi_db [dB] of the stations" in n and n.endswith("(maps in dBm: unit=dBm)") for n in notes)
+    assert any(
+        "taken as rssi_db [dB] of the stations" in n and n.endswith("(maps in dBm: unit=dBm)") for n in notes
+    )
 
 
 def test_levels_without_a_unit_were_said_to_be_in_dbm(write):

@@ -19,7 +19,7 @@ from gsparc.evaluation.baselines import baselines_for
 from gsparc.evaluation.evaluate import evaluate
 from gsparc.evaluation.experiment.folds import fit_folds, fold_contexts
 from gsparc.evaluation.scores import score_methods
-from gsparc.models import checkpoint, loading
+from gsparc.models import checkpoint, loading, per_station
 from gsparc.models.fitting import fit_or_resume
 from gsparc.models.per_station import PerStation, station_site, stations_of_fold, wrap_per_station
 from gsparc.models.registry import method_class
@@ -223,3 +223,9 @@ def test_a_station_at_an_unknown_place_answered_for_all(town, fold, tmp_path):
     method.site = replace(town.site, stations=replace(town.site.stations, position=places))
     rows = fold.test[expected.numpy() != 1]
     assert (method._stations_of_query(town.batch(rows)) == expected[expected != 1]).all()
+
+
+def test_ratios_of_a_method_were_added_over_stations():
+    figures = {"model/steps": 3, "time/init_s": 0.5, "model/exponent": 2.0, "model/init": "rays"}
+    combined = {name: per_station._combine_facts([value] * 2, name) for name, value in figures.items()}
+    assert combined == {"model/steps": 6, "time/init_s": 1.0, "model/exponent": 2.0, "model/init": "rays"}
