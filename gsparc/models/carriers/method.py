@@ -107,6 +107,7 @@ class CarrierField(OneArray):
         self.left = factor.solve(values - self.weight * paths)
         self.alone = self.alone.condition(self.rows[:, :3], values, station)
         planes = f"{len(self.paths.planes)} mirror planes, weight of paths {self.weight:.2g}"
+        planes = planes if self.weight else "paths explain nothing here"
         shares = "{:.0%} of new places and {:.0%} of known ones by carriers alone".format(*self.shares)
         shares += f", {self.carried:.0%} of it for carriers without rows"
         chosen = f"{planes}; {self.covariance.description}; {shares}, chosen on rows left out"
