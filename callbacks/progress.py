@@ -45,7 +45,7 @@ class StepProgress(L.Callback):
         )
         self._bar.start()
         self._began = self._told_s = None
-        stage = "refit " if module.run_dir.name == "refit" else ""  # again, on validation rows too
+        stage = "again, on all rows " if module.run_dir.name == "refit" else ""
         self._bar.add_task(stage, total=trainer.max_steps, completed=trainer.global_step, figures="")
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:

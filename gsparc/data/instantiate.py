@@ -76,7 +76,8 @@ def refuse_foreign(path: Any) -> None:
     if isinstance(target, type) and target.__module__.startswith("gsparc."):
         return  # before plugins are looked for: that reads the notes of all installed packages
     if not any(path in plugins(group).values() for group in OF_FILES):
-        raise ValueError(f"the file asks to run {path!r}, which is not a class of gsparc; refused")
+        instead = "refused; where it is a plugin's, install that package here"
+        raise ValueError(f"the file asks to run {path!r}, which is not a class of gsparc; {instead}")
 
 
 GROUPS = {"model": "gsparc.models", "dataset": "gsparc.datasets"}
@@ -87,6 +88,20 @@ PLAIN = (bool, int, float, str, list, dict, type(None))
 def plugins(group: str) -> dict[str, str]:
     """Return the import path `module.Class` of every plugin: of `model`, `dataset` or `terms`."""
     return {point.name: f"{point.module}.{point.attr}" for point in entry_points(group=OF_FILES[group])}
+
+
+def plugin_node(group: str, name: str) -> dict[str, Any]:
+    """Return `config_node` of the class of a plugin.
+
+    Raises:
+        DataError: it cannot be imported; the message is what went wrong in it, on one line.
+    """
+    points = {point.name: point for point in entry_points(group=OF_FILES[group])}
+    try:
+        return config_node(points[name].load())
+    except Exception as error:  # whatever another package does when it is imported
+        reason = (str(error).strip() or "without a word").splitlines()[0]
+        raise DataError(f"{type(error).__name__}: {reason}") from error
 
 
 def config_node(kind: type) -> dict[str, Any]:

@@ -18,8 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 
-from gsparc.data.errors import Severe, warning_kind
-from gsparc.data.instantiate import cause_of, suggest_or_list
+from gsparc.data.errors import DataError, Severe, warning_kind
+from gsparc.data.instantiate import GROUPS, cause_of, plugin_node, plugins, suggest_or_list
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 CONFIGS = "pkg://gsparc.conf"
@@ -99,6 +99,11 @@ def error_in_one_line(error: BaseException) -> str:
             part, _, choice = choice.rpartition("/")
             there = ", ".join(error.options)
             return f"{group}/{part}={choice}: no such choice; there are {there} (is its plugin installed?)"
+        if group in GROUPS and (path := plugins(group).get(choice)):
+            try:
+                plugin_node(group, choice)
+            except DataError as failed:
+                return f"{group}={choice}: its plugin ({path}) cannot be imported: {failed}"
         hint = suggest_or_list(choice, list_choices(group) or list(error.options))
         return f"{group}={choice}: no such choice{hint}"
     if isinstance(error, errors.OverrideParseException):

@@ -181,7 +181,7 @@ def set_earlier_aside(run_dir: Path, *begun_from: str | None) -> None:
     paths = [Path(path).resolve() for path in begun_from if path]
     goes_on = any(run_dir.resolve() in (path, *path.parents) for path in paths)
     if set_aside(run_dir, *LEFT[: 1 if goes_on else None]):
-        log.info("%s: results of an earlier run are kept as NAME.earlier", run_dir)
+        log.info("%s: files of an earlier run are kept as NAME.earlier", run_dir)
 
 
 def edited(record: Mapping[str, Any]) -> list[str]:

@@ -242,11 +242,14 @@ def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]
     # False for NaN: methods without a std have no such figure. 1e-12: answers may be exact.
     far = {n: max(x, 1e-12) for n, x in chi2.items() if x is not None and (x < low or x > high)}
     factors = [(n, max(x, 1 / x) ** 0.5, "large" if x < 1 else "small") for n, x in far.items()]
-    faults = ", ".join(f"of {name} is {times:.2g} times too {side}" for name, times, side in factors)
+    faults = ", ".join(
+        f"of {name} is {times:.2g} times too {side} ({CALIBRATION} {chi2[name]:.2g})"
+        for name, times, side in factors
+    )
     tested = "gsparc map ckpt=FILE has tested intervals"
     if not figure.startswith("rmse"):  # for spectra and channels there are thresholds alone
         tested = "gsparc calibrate ckpt=FILE tests which answers to accept"
-    meaning = f"{CALIBRATION} is 1 where std, the stated uncertainty, is right: std {faults}"
+    meaning = f"stated uncertainty: std {faults}, where 1 is right"
     return [f"{meaning}; it orders answers, but is no error bar here; {tested}"] if faults else []
 
 

@@ -107,6 +107,12 @@ class ReportSteps(L.Callback):
         """Go on from there."""
         self.watch.charge(float(state["seconds"]), float(state.get("cpu_seconds", 0.0)))
 
+    def on_train_start(self, trainer: L.Trainer, module: NetworkModule) -> None:  # type: ignore[override]
+        """Say from which step a resumed run goes on."""
+        if trainer.global_step and trainer.is_global_zero:
+            path, steps = trainer.ckpt_path, (trainer.global_step, module.total_steps)
+            log.info("gradient steps: going on after step %d of %d, as %s left them", *steps, path)
+
     def on_fit_end(self, trainer: L.Trainer, module: NetworkModule) -> None:  # type: ignore[override]
         """Save, also after a checkpoint with every step done.
 
@@ -282,7 +288,7 @@ def read_trainer_result(trainer: L.Trainer, watch: Stopwatch) -> TrainerResult:
     best_step = int(metrics[KEPT]) if KEPT in metrics else None
     steps = int(metrics[TAKEN])
     timers = [c for c in trainer.callbacks if isinstance(c, L.callbacks.Timer)]  # type: ignore[attr-defined]
-    if not any((timer.time_remaining() or 0) <= 0 for timer in timers):
+    if steps >= trainer.max_steps or not any((timer.time_remaining() or 0) <= 0 for timer in timers):
         return TrainerResult(best_step, steps, ())
     ended = f"trainer.max_time ended training after {steps} of {trainer.max_steps} steps"
     log.warning("%s", ended)

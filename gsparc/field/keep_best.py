@@ -66,7 +66,7 @@ class KeepBest(L.Callback):
             return
         trainer.callback_metrics[KEPT] = torch.tensor(self.step, dtype=torch.float64)  # leaves a process
         steps = trainer.global_step
-        if module.solved and len(self.start):
+        if module.solved and len(self.start) and self.step:
             log.info(
                 "%d gradient steps moved the squared error of %d held-out rows from %.4g to %.4g; "
                 "experiment=field starts at random: there another loss or callback makes a difference",

@@ -37,6 +37,16 @@ def test_one_line_of_80_columns_says_how_far_and_how_good(screen):
     assert "…" not in line
 
 
+def test_the_second_stage_was_called_a_refit(screen):
+    bar, (trainer, module) = StepProgress(), run()
+    trainer.callback_metrics = {"train/task_loss": 0.0123}  # no rows are left to validate on
+    bar.on_train_start(trainer, SimpleNamespace(count=500, run_dir=Path("run/refit"), pace=None))
+    bar.on_train_batch_end(trainer, module)
+    bar.on_train_end(trainer, module)
+    line = screen.export_text().strip().splitlines()[-1]
+    assert "again, on all rows 400/400" in line and "500 Gaussians" in line and "…" not in line
+
+
 def test_an_exception_gives_the_terminal_back(screen):
     bar, (trainer, module) = StepProgress(), run(3)
     bar.on_train_start(trainer, module)

@@ -160,6 +160,14 @@ def test_ctrl_c_while_a_command_runs_is_said_with_status_130(task, line, monkeyp
         other.submit(logging.getLogger("gsparc.never.asked.either").isEnabledFor, 20).result(timeout=5)
 
 
+def test_ctrl_c_in_a_multirun_was_told_to_go_on_with_one_of_its_jobs(monkeypatch, tmp_path):
+    monkeypatch.setattr("gsparc.commands.train.task", with_advice)
+    words = "-m", "dataset=rfid", "model=gsparc", "seed=0,1", f"hydra.sweep.dir={tmp_path}"
+    answer = gsparc("train", *words)
+    kept = "error: interrupted; finished jobs are kept: the same command goes on with the others"
+    assert (answer.status, answer.err[-1]) == (130, kept)
+
+
 def test_ctrl_c_while_plugins_are_looked_for_was_a_traceback(monkeypatch):
     monkeypatch.setattr("gsparc.commands.shared.cli.offer_plugins", Mock(side_effect=KeyboardInterrupt))
     answer = gsparc("train", "dataset=rfid", "model=gsparc")

@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from campaigns import compose, spectra
+from hydra import initialize_config_module
 from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.errors import MissingConfigException
 from invented import invent
@@ -17,11 +19,12 @@ from scipy.spatial import cKDTree
 import gsparc
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.shared.plugins import offer_plugins
+from gsparc.commands.shared.settings import to_dict
 from gsparc.commands.train import train
 from gsparc.data.load import datamodule
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import error_in_one_line
-from gsparc.evaluation.experiment.cells import unlisted_contenders
+from gsparc.evaluation.experiment.cells import load_every_problem, unlisted_contenders
 from gsparc.models.registry import build, method_class
 from gsparc.training.context import FitContext
 
@@ -70,6 +73,19 @@ def test_a_method_and_a_dataset_of_another_package(installed, tmp_path):
     assert again.facts["test/rmse_db"] == facts["test/rmse_db"]
 
 
+@pytest.mark.parametrize("words", [["dataset=corridor"], ["dataset=corridor", "count=40"]])
+def test_a_plugins_dataset_without_a_path_was_left_out_of_a_comparison(installed, words):
+    """`+datasets.corridor.dataset=corridor`, as the page has it: `no dataset has a path` was the answer."""
+    installed(EXAMPLES / "own-method")
+    more = ["splits.random.datasets=[corridor]", "only=['corridor/random/*']"]
+    config = compose(*(f"+datasets.corridor.{word}" for word in words), *more, config="compare")
+    GlobalHydra.instance().clear()
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        (problem,) = load_every_problem(to_dict(config))
+    assert (problem.dataset, problem.split) == ("corridor", "random")
+    assert len(words) == 1 or len(problem.data) == 40
+
+
 def test_a_plugin_was_no_nearest_name(installed):
     """`model=nearest_kk` was answered with `nearest` beside an installed `nearest_k`."""
     installed(EXAMPLES / "own-method")
@@ -94,17 +110,23 @@ def test_a_method_that_could_not_answer_once_stored_was_trained(installed):
 
 
 def test_without_the_plugin_its_checkpoint_is_refused(installed, tmp_path):
-    refused("refused", build, {"_target_": "own_method.NearestK"}, trusted=False)
+    refused("install that package here", build, {"_target_": "own_method.NearestK"}, trusted=False)
     refused("no method is called 'nearest_k'", method_class, "nearest_k")
 
 
-def test_a_broken_plugin_is_warned_of(installed, tmp_path):
+def test_a_broken_plugin_is_warned_of_and_named_where_it_is_chosen(installed, tmp_path, caplog):
+    """Six lines of a Python warning, then `no such choice; did you mean 'broken_off'?`."""
     project = tmp_path / "broken"
     project.mkdir()
     entry = '[project.entry-points."gsparc.models"]\nbroken = "no_such_module:Nothing"\n'
     (project / "pyproject.toml").write_text(f'[project]\nname = "broken"\nversion = "1"\n{entry}')
-    with pytest.warns(UserWarning, match=r"plugin broken \(no_such_module.Nothing\) is left out"):
-        installed(project)
+    installed(project)
+    reason = "ModuleNotFoundError: No module named 'no_such_module'"
+    assert caplog.messages == [f"plugin broken (no_such_module.Nothing) is left out: {reason}"]
+    with pytest.raises(MissingConfigException) as error:
+        compose("model=broken")
+    said = f"model=broken: its plugin (no_such_module.Nothing) cannot be imported: {reason}"
+    assert error_in_one_line(error.value) == said
 
 
 def test_a_third_party_library_as_a_plugin(installed, tmp_path):

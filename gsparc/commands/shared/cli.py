@@ -169,6 +169,14 @@ def _began_as_interrupt(error: BaseException | None) -> bool:
     return any(isinstance(one, KeyboardInterrupt) for one in list_causes(error))
 
 
+def _multirun_advice() -> str:
+    """How all jobs of a multirun go on, in the same folder."""
+    hydra_config = HydraConfig.get()
+    told = any(word.startswith("hydra.sweep.dir=") for word in hydra_config.overrides.hydra)
+    again = "the same command" if told else f"the same command with hydra.sweep.dir={hydra_config.sweep.dir}"
+    return f"interrupted; finished jobs are kept: {again} goes on with the others"
+
+
 def _message_of(error: BaseException) -> str:
     """One line; of a launcher whose job has died, with what to do."""
     if isinstance(error, InUse | KeyboardInterrupt):
@@ -229,6 +237,10 @@ def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], obje
             if "model" in config:
                 _complete(config)
             return task(config)
+        except KeyboardInterrupt as stopped:
+            if HydraConfig.get().mode == RunMode.RUN:
+                raise
+            raise KeyboardInterrupt(_multirun_advice()) from stopped  # a job's own is of that job alone
         except Exception as error:
             if HydraConfig.get().mode == RunMode.RUN:
                 raise _Failed(error) from error

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-import warnings
+import logging
 from importlib import resources
 from typing import Any
 
 from hydra.core.config_store import ConfigStore
-from hydra.utils import get_class
 
-from gsparc.data.instantiate import GROUPS, config_node, plugins
+from gsparc.data.errors import DataError
+from gsparc.data.instantiate import GROUPS, plugin_node, plugins
 from gsparc.simulate.scenes.shipped import list_shipped_scenes, shipped_scene_settings
+
+log = logging.getLogger(__name__)
 
 
 def offer_plugins() -> None:
@@ -21,9 +23,9 @@ def offer_plugins() -> None:
     for group in GROUPS:
         for name, path in plugins(group).items():
             try:
-                defaults = config_node(get_class(path))
-            except Exception as error:  # whatever another package does when it is imported
-                warnings.warn(f"plugin {name} ({path}) is left out: {error}", stacklevel=1)
+                defaults = plugin_node(group, name)
+            except DataError as error:
+                log.warning("plugin %s (%s) is left out: %s", name, path, error)
                 continue
             shared: dict[str, Any] = {"name": name, "batch_size": 16} if group == "dataset" else {}
             if group == "model" and "seed" in defaults:

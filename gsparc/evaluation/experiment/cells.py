@@ -196,7 +196,7 @@ def load_every_problem(settings: Mapping[str, Any]) -> list[Problem]:
     for name, entry in ((name, entry or {}) for name, entry in settings["datasets"].items()):
         locations = [path for key, path in entry.items() if key in ("root", "file")]
         paths = [path or fetched_path_or_none(entry.get("dataset", name)) for path in locations]
-        if entry and not any(paths):  # a plugin's dataset may need no path
+        if paths and not any(paths):  # a plugin's dataset may need none, whatever else is said of it
             absent.append(name)
             continue
         choices = [

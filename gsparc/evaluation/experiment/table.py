@@ -229,7 +229,7 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
         (figure.startswith("nmse"), Column(figure, ".3g" if draws else ".4g", of=value)),
         (True, Column(block.second_figure.iloc[0], of="second_value")),
         *((block[n].notna().any(), figure_column(beside, of=n)) for n, beside in BESIDE.items()),
-        (not draws, Column("seeds, same split", "d", of="seeds")),
+        (not draws and (block.seeds > 1).any(), Column("seeds, same split", "d", of="seeds")),
         *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),
     ]
     mark = np.where(_published(block), " (from beside=)", np.where(block.method == ours, " (ours)", ""))

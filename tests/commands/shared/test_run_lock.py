@@ -15,7 +15,7 @@ from gsparc.commands.listing import COMMANDS
 from gsparc.commands.shared import run_lock
 from gsparc.commands.shared.run_lock import HOLDER, LOCK, RunLock, hold_folder, locked, release_folders
 from gsparc.commands.train import train
-from gsparc.evaluation.ledger import LEFT
+from gsparc.evaluation.ledger import LEFT, set_earlier_aside
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.results import read_run
 from gsparc.models import checkpoint
@@ -143,6 +143,13 @@ def test_what_a_run_goes_on_from_is_not_set_aside(tmp_path):
     with pytest.raises(ValueError):
         train(compose(f"ckpt_path={tmp_path / 'model.ckpt'}"), tmp_path)
     assert {path.name for path in tmp_path.glob("*.json*")} == {"summary.json.earlier", "split.json"}
+
+
+def test_a_split_alone_was_called_results(tmp_path, caplog):
+    caplog.set_level("INFO")
+    (tmp_path / "split.json").write_text("{}")
+    set_earlier_aside(tmp_path)
+    assert caplog.messages == [f"{tmp_path}: files of an earlier run are kept as NAME.earlier"]
 
 
 def test_half_written_files_of_killed_runs_stayed_for_ever(tmp_path):

@@ -41,6 +41,12 @@ def test_rows_average_over_seeds_and_stand_in_blocks_best_first():
     assert gsparc.seeds == 2 and gsparc.query_ms == 0.5 and np.isnan(gsrf.query_ms)
 
 
+def test_a_column_of_single_seeds_told_nothing():
+    first, _, alone = split_by_problem(averages(FOUND))
+    assert "seeds, same split" in markdown([first], "gsparc")
+    assert "seeds, same split" not in markdown([alone], "gsparc")
+
+
 def test_draws_are_paired_with_the_best_and_have_standard_errors():
     """The spread over draws is of the rows: what two methods differ by on the same rows is known better."""
     facts = {"test/interval/coverage_90": 0.8, "test/outage/brier": 0.0125}
