@@ -28,7 +28,7 @@ ARROWS = {
     "models": "conf data field ops physics processes simulate training",
     "prediction": "data field models ops physics processes training",
     "apps.locate": "data evaluation models prediction processes",
-    "evaluation": "conf data models prediction processes simulate training",
+    "evaluation": "conf data field models prediction processes simulate training",
     "apps.maps": "data evaluation models prediction processes",
     "apps.export": "data field models ops physics prediction processes training",
     "apps.link": "data evaluation models physics prediction processes simulate",
