@@ -161,7 +161,7 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     if above := facts.get(f"{prefix}/heard_above_db"):
         rest.append(
             f"{GIVEN_HEARD}; maps and predict show them listed or not, {above:.1f} dB lower in the mean: "
-            "compare these with levels of all cells (a scanner), not of lists"
+            "compare maps and predictions with levels of all cells (a scanner), not of lists"
         )
     if unlisted := facts.get(f"{prefix}/unlisted"):
         rest.append(f"off, or gone? expected in lists and in none: {unlisted}")

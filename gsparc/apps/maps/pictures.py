@@ -226,8 +226,8 @@ def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
     areas = [row for row in zip(listed["colour"], listed["station"], listed["share"], strict=True) if row[2]]
     for colour, word, _ in areas[:MOST_COLOURS]:
         axis.plot([], [], "s", color=colour, label=word)
-    if len(listed["number"]) > MOST_COLOURS:
-        fewer = f"{len(listed['number']) - MOST_COLOURS} more, that serve less: {file_name(layer, '.csv')}"
+    if len(areas) > MOST_COLOURS:
+        fewer = f"{len(areas) - MOST_COLOURS} more, that serve less: {file_name(layer, '.csv')}"
         axis.plot([], [], " ", label=fewer)
 
 
