@@ -68,12 +68,14 @@ def usual_loss(way: Tensor) -> Tensor:
     return 5 * SHARED[0] * way.square().sum(1).clamp_min(1.0).log10()
 
 
-def describe_use(used: bool, cells: int = 0) -> str:
-    """Say whether a map from before is used, of so many cells; 0: of one station."""
-    whose = f" for {cells} cells" * bool(cells)
-    return f"the map from before is {'used' if used else 'left out'}{whose}" + (
-        "" if used else ": rows are likelier without it"
-    )
+def describe_use(used: bool, cells: int) -> str:
+    """Say whether the map from before is used, of so many cells.
+
+    >>> describe_use(False, 12)
+    'the map from before is left out for 12 cells: rows are likelier without it'
+    """
+    how = "used" if used else "left out"
+    return f"the map from before is {how} for {cells} cells{'' if used else ': rows are likelier without it'}"
 
 
 @dataclass(frozen=True)

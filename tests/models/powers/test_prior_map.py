@@ -13,7 +13,7 @@ from gsparc.data.own import from_arrays
 from gsparc.data.prior_levels import read_prior_levels
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.powers import prior_map
-from gsparc.models.powers.prior_map import NetworkMaps, PriorMap
+from gsparc.models.powers.prior_map import NetworkMaps, PriorMap, describe_use
 from gsparc.models.powers.together.network import find_sectors
 from gsparc.processes.sectors import NO_AZIMUTH
 
@@ -248,5 +248,12 @@ def test_maps_of_a_networks_cells_help_and_those_of_another_do_not(tmp_path):
     found = [gsparc.fit(**one.arrays(6), **more) for more in ({}, *settings)]
     error = [np.sqrt(np.mean((model.rssi(rx=asked) - truth) ** 2)) for model in found]
     assert error[1] < 0.95 * error[0] and error[2] < 1.02 * error[0], error
+    said = [model.method.facts()["model/learned"] for model in found]
+    uses = [
+        "from before" not in said[0],
+        describe_use(True, 30) in said[1],
+        describe_use(False, 30) in said[2],
+    ]
+    assert all(uses), said  # the console did not say it
     right.unlink()
     np.testing.assert_allclose(gsparc.load(path).rssi(rx=asked), found[1].rssi(rx=asked), atol=1e-3)
