@@ -69,7 +69,7 @@ def read_prior_maps(
     if not maps:
         raise faults[0] if faults else DataError(f"model.prior={path}: no level is known in it")
     if stations == ("",) and len(maps) == 1:
-        return [(0, True, *maps.values())]
+        return [(0, True, next(iter(maps.values())))]
     found = list[tuple[int, bool, Levels]]()
     for number, names in enumerate(own):
         sites = [site_name(name) for name in names]

@@ -152,7 +152,7 @@ def evaluate(
             facts |= {f"{room}/{ahead}{key}": value for key, value in lead.facts().items()}
     facts |= {f"{room}/train_s": float(np.mean(other.train_s)) for room, other in others.items()}
     facts[f"{eval_on}/unlisted"] = describe_never_listed(scores, data)
-    if len(off := unlisted_stations(scores, data).index.astype(int)):
+    if off := [int(number) for number in unlisted_stations(scores, data).index]:
         # Rows of lists that they do not fill are judged by other levels: it is no choice of rows alone.
         rest = pool_figures(score_methods(methods, data, split, eval_on, learned, off=off), data, split)
         facts |= {f"{eval_on}/{name}{WITHOUT_OFF}": rest.get(name) for name in OF_LISTS}
