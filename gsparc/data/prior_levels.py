@@ -2,33 +2,53 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+import re
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
 from gsparc.data.datasets.own import read_own
-from gsparc.data.errors import DataError
+from gsparc.data.errors import Caution, DataError, list_first
+from gsparc.data.links.stations import site_name
 from gsparc.data.own import interpret
 from gsparc.data.schema import Measurements
+from gsparc.data.tables import is_table
 
+log = logging.getLogger(__name__)
+
+Levels = tuple[np.ndarray, np.ndarray]  # places (M, 2) [m], world, and levels (M,) [dB] there
 BAND = "power_db"  # of the strongest station, as `gsparc map` writes; with a name behind it of one of several
 MOST = 4_000_000  # levels: they are kept with a model
 ABOUT_M = 100.0  # least distance from the box of rows and stations that levels are kept within [m]
 
 
-def read_prior_levels(
-    path: str | Path, data: Measurements, station: str | None = None
-) -> tuple[np.ndarray, np.ndarray]:
+def read_prior_levels(path: str | Path, data: Measurements, station: str = "") -> Levels:
     """Return places (M, 2) [m] in the world coordinates of the measurements, and levels (M,) [dB] there.
 
     Args:
         path: *.tif, or what `dataset=own` reads.
         data: measurements, which the levels must overlap.
-        station: whose levels are wanted where the file has those of several.
+        station: whose levels are wanted, as it is shown; empty: the measurements are of one station.
 
     Raises:
         DataError: no such file, no levels, none of this station, or of another place.
+    """
+    return read_prior_maps(path, data, (station,))[0][2]
+
+
+def read_prior_maps(
+    path: str | Path, data: Measurements, stations: Sequence[str]
+) -> list[tuple[int, bool, Levels]]:
+    """Return number, whether it is of the station and not of its site, and levels, of stations with a map.
+
+    Args:
+        path, data: see `read_prior_levels`.
+        stations: (T,) as they are shown; those without a map are warned of.
+
+    Raises:
+        DataError: as `read_prior_levels`, of none of them.
     """
     path = Path(path)
     if path.suffix == ".ckpt":
@@ -37,8 +57,51 @@ def read_prior_levels(
         raise DataError(
             f"model.prior={path}: no such file; a GeoTIFF is needed, or a table of places and powers"
         )
-    read = _read_raster if path.suffix in (".tif", ".tiff") else _read_rows
-    points, level = read(path, data, station)
+    own = [names_of_station(shown) for shown in stations]
+    every = {name for names in own for name in names if name}
+    read = _read_raster(path, data) if path.suffix in (".tif", ".tiff") else _read_rows(path, data, every)
+    maps, faults = dict[str, Levels](), list[DataError]()
+    for name, points, level in read:
+        try:
+            maps[name] = _near_rows(path, data, points, level)
+        except DataError as error:
+            faults.append(error)
+    if not maps:
+        raise faults[0] if faults else DataError(f"model.prior={path}: no level is known in it")
+    if stations == ("",) and len(maps) == 1:
+        return [(0, True, next(iter(maps.values())))]
+    found = list[tuple[int, bool, Levels]]()
+    for number, names in enumerate(own):
+        sites = [site_name(name) for name in names]
+        match = next(((one, one in names) for one in (*names, *sites) if one in maps), None)
+        found += [] if match is None else [(number, match[1], maps[match[0]])]
+    if not found:
+        shown = list_first(stations) or "one station"
+        advice = f"call bands of a GeoTIFF `{BAND} NAME`, columns of a table NAME, as the measurements do"
+        if list(maps) == [""]:
+            raise DataError(
+                f"model.prior={path}: one map of no station's name, and there are several: as of a best "
+                f"server it tells nothing of {shown}; {advice}"
+            )
+        raise DataError(f"model.prior={path}: of {list_first([*maps], 12)}, not of {shown}; {advice}")
+    with_map = {number for number, *_ in found}
+    if lacking := [shown for number, shown in enumerate(stations) if number not in with_map]:
+        log.warning("model.prior=%s: no map of %s", path, list_first(lacking))
+    return found
+
+
+def names_of_station(shown: str) -> tuple[str, ...]:
+    """Return all names of a station as it is shown, of which a file may have any.
+
+    >>> names_of_station("W03-2 (150)"), names_of_station("roof")
+    (('W03-2 (150)', 'W03-2', '150'), ('roof',))
+    """
+    both = re.fullmatch(r"(.+) \((.+)\)", shown)
+    return (shown, *both.groups()) if both else (shown,)
+
+
+def _near_rows(path: Path, data: Measurements, points: np.ndarray, level: np.ndarray) -> Levels:
+    """What is known about rows and stations; `DataError` where that is nothing, or too much."""
     finite = np.isfinite(level) & np.isfinite(points).all(1)
     if not finite.any():
         raise DataError(f"model.prior={path}: no level is known in it")
@@ -65,15 +128,8 @@ def _extent(points: np.ndarray) -> np.ndarray:
     return np.stack([points.min(0), points.max(0)], 1)
 
 
-def _number(names: Sequence[str], station: str | None, path: Path) -> int:
-    """The place of a station among the names of a file; of one name that."""
-    if len(names) > 1 and station not in names:
-        raise DataError(f"model.prior={path}: of {', '.join(names)}, not of {station or 'one station'}")
-    return 0 if len(names) == 1 or station is None else list(names).index(station)
-
-
-def _read_raster(path: Path, data: Measurements, station: str | None) -> tuple[np.ndarray, np.ndarray]:
-    """Centres of squares and their levels, of the band of a station, of `BAND`, or of the first band."""
+def _read_raster(path: Path, data: Measurements) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield name, centres of squares and their levels, of named bands, else of `BAND` or of the first."""
     try:
         import rasterio
         from rasterio.warp import transform
@@ -81,33 +137,41 @@ def _read_raster(path: Path, data: Measurements, station: str | None) -> tuple[n
         raise DataError(f"model.prior={path}: needs rasterio; pip install 'gsparc[maps]'") from None
     with rasterio.open(path) as file:
         titles = [str(title or "") for title in file.descriptions]
-        bands = {
-            title.removeprefix(f"{BAND} "): k
-            for k, title in enumerate(titles)
-            if title.startswith(f"{BAND} ")
-        }
-        band = titles.index(BAND) if BAND in titles else 0
-        band = bands[list(bands)[_number(list(bands), station, path)]] if bands else band
-        level = file.read(band + 1, masked=True).astype(float).filled(np.nan).ravel()
+        one = {"": titles.index(BAND) if BAND in titles else 0}
+        bands = {t.removeprefix(f"{BAND} "): k for k, t in enumerate(titles) if t.startswith(f"{BAND} ")}
         row, column = np.mgrid[: file.height, : file.width]
         x, y = file.transform @ (column.ravel() + 0.5, row.ravel() + 0.5)
-        crs, origin = file.crs, data.site.georeference
-    if crs is None:
-        return np.c_[x, y], level
-    if origin is None:
-        raise DataError(f"model.prior={path}: it has a place on Earth, which the measurements do not state")
-    longitude, latitude = (np.asarray(one) for one in transform(crs, "EPSG:4326", x, y))
-    return origin.from_degrees(latitude, longitude), level
+        points, crs, origin = np.c_[x, y], file.crs, data.site.georeference
+        if crs is not None and origin is None:
+            raise DataError(
+                f"model.prior={path}: it has a place on Earth, which the measurements do not state"
+            )
+        if crs is not None and origin is not None:
+            longitude, latitude = (np.asarray(one) for one in transform(crs, "EPSG:4326", x, y))
+            points = origin.from_degrees(latitude, longitude)
+        for name, band in (bands or one).items():
+            yield name, points, file.read(band + 1, masked=True).astype(float).filled(np.nan).ravel()
 
 
-def _read_rows(path: Path, data: Measurements, station: str | None) -> tuple[np.ndarray, np.ndarray]:
-    """Places and levels of a table or an npz."""
-    rows = interpret(read_own(path), path).data
+def _read_rows(
+    path: Path, data: Measurements, stations: Collection[str]
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield name, places and levels of each station of a table, whose heads may be their names, or an npz."""
+    if is_table(path):
+        from gsparc.data.tables.read import parse_table  # here, as pandas takes half a second to import
+
+        raw = parse_table(path, stations=stations)
+        for note in [note for note in raw.notes if isinstance(note, Caution) and "not used" in note]:
+            log.warning("model.prior=%s: %s", path, note)
+    else:
+        raw = read_own(path)
+    rows = interpret(raw, path).data
     if not rows.site.maps_levels:
         raise DataError(f"model.prior={path}: no powers of one end that moves")
-    of_station = rows.stations_of() == _number(rows.site.every_station.shown, station, path)
-    points = (rows.moving + rows.site.origin)[of_station, :2]
     theirs, ours = rows.site.georeference, data.site.georeference
-    if theirs is not None and ours is not None:
-        points = ours.from_degrees(*theirs.to_degrees(points))
-    return points, rows.site.target.to_real(rows.target[of_station])[:, 0].astype(float)
+    for number, name in enumerate(rows.site.every_station.name):
+        of_station = rows.stations_of() == number
+        points = (rows.moving + rows.site.origin)[of_station, :2]
+        if theirs is not None and ours is not None:
+            points = ours.from_degrees(*theirs.to_degrees(points))
+        yield name, points, rows.site.target.to_real(rows.target[of_station])[:, 0].astype(float)

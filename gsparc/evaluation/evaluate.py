@@ -15,10 +15,15 @@ from gsparc.data.assemble import identity_hash
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, hash_indices
 from gsparc.evaluation.baselines import FittedBaseline, baselines_for, fit_baseline
-from gsparc.evaluation.by_station import describe_never_listed, describe_new, station_columns
+from gsparc.evaluation.by_station import (
+    describe_never_listed,
+    describe_new,
+    station_columns,
+    unlisted_stations,
+)
 from gsparc.evaluation.examples import FILE, Examples
 from gsparc.evaluation.intervals import pool_figures
-from gsparc.evaluation.metric_formats import judged_by, paired_values
+from gsparc.evaluation.metric_formats import OF_LISTS, WITHOUT_OFF, judged_by, paired_values
 from gsparc.evaluation.paired import lead_over_rows
 from gsparc.evaluation.scores import Scores, rows_to_score, score_methods, unseen_runs
 from gsparc.evaluation.summary import write_samples
@@ -147,6 +152,10 @@ def evaluate(
             facts |= {f"{room}/{ahead}{key}": value for key, value in lead.facts().items()}
     facts |= {f"{room}/train_s": float(np.mean(other.train_s)) for room, other in others.items()}
     facts[f"{eval_on}/unlisted"] = describe_never_listed(scores, data)
+    if off := [int(number) for number in unlisted_stations(scores, data).index]:
+        # Rows of lists that they do not fill are judged by other levels: it is no choice of rows alone.
+        rest = pool_figures(score_methods(methods, data, split, eval_on, learned, off=off), data, split)
+        facts |= {f"{eval_on}/{name}{WITHOUT_OFF}": rest.get(name) for name in OF_LISTS}
     facts[f"{eval_on}/new"] = None if learned is None else describe_new(learned[0], data)
     decided = scores.dominant_row()
     if decided and data.row_names:

@@ -135,6 +135,7 @@ def best_phase_of_runs(method: Method, data: Measurements, rows: np.ndarray, run
 def score_methods(
     methods: Sequence[Method], data: Measurements, split: Split, eval_on: str = "test",
     learned: tuple[Measurements, Split] | None = None, means: list[Tensor] | None = None,
+    off: Sequence[int] = (),
 ) -> Scores:  # fmt: skip
     """Predict the chosen rows of every fold with that fold's method.
 
@@ -148,6 +149,7 @@ def score_methods(
         eval_on: `train`, `val` or `test`.
         learned: what the methods learned from, where it is not `data` and `split`.
         means: which the mean of every batch is added to.
+        off: stations that are not scored and fill no list of the strongest.
 
     Raises:
         ValueError: another number of methods than folds, an empty subset, a prediction with NaN.
@@ -155,6 +157,7 @@ def score_methods(
     if len(methods) != len(split.folds):
         raise ValueError(f"{len(methods)} methods for the {len(split.folds)} folds of split={split.name}")
     every, samples = [rows_to_score(fold, eval_on) for fold in split.folds], []
+    every = [rows[~np.isin(data.stations_of(rows), off)] for rows in every] if len(off) else every
     missing: list[pd.DataFrame] = []
     learned_data, before = learned or (data, split)
     limited = (learned_data.censored_side(before.folds[0].train) > 0).any()
@@ -187,6 +190,8 @@ def score_methods(
                 level = power_in_decibels(scored["prediction"], variance)
             there, queries = learned_data.subset(learned_rows), data.subset(rows)
             lists = strongest_lists(there)
+            if lists is not None and len(off):
+                lists.level[:, off] = np.nan
             if lists is not None and are_lists:
                 scored["strongest_told"] = strongest_told(method, lists, queries)
                 missing.append(never_listed(method, lists, data.subset(np.concatenate(every)), queries))

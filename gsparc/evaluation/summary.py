@@ -28,7 +28,9 @@ from gsparc.evaluation.metric_formats import (
     GIVEN_HEARD,
     LISTED,
     OF_KIND,
+    OF_LISTS,
     WITH_SILENT,
+    WITHOUT_OFF,
     judged_by,
     main_figure,
     number_format,
@@ -160,11 +162,14 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
     if above := facts.get(f"{prefix}/heard_above_db"):
         rest.append(
-            f"{GIVEN_HEARD}; maps and predict show them listed or not, {above:.1f} dB lower in the mean: "
-            "compare these with levels of all cells (a scanner), not of lists"
+            f"{GIVEN_HEARD}; maps and predict show levels listed or not, {above:.1f} dB lower in the mean: "
+            "compare maps with levels of all cells (a scanner), not with lists"
         )
     if unlisted := facts.get(f"{prefix}/unlisted"):
         rest.append(f"off, or gone? expected in lists and in none: {unlisted}")
+        without = {name: facts.get(f"{prefix}/{name}{WITHOUT_OFF}") for name in OF_LISTS}
+        if said := [f"{name} {value:.2f}" for name, value in without.items() if value is not None]:
+            rest.append(f"figures above count these cells; without them: {', '.join(said)}")
     if new := facts.get(f"{prefix}/new"):
         rest.append(f"heard for the first time, with lists that should have held it: {new}")
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""

@@ -21,6 +21,7 @@ from gsparc.evaluation.by_station import (
     worst_stations,
 )
 from gsparc.evaluation.evaluate import evaluate
+from gsparc.evaluation.metric_formats import OF_LISTS, WITHOUT_OFF
 from gsparc.evaluation.scores import Scores, score_methods
 from gsparc.evaluation.summary import remarks, results_table
 from gsparc.models.method import Method, Prediction
@@ -281,3 +282,20 @@ def test_a_station_that_was_off_went_unseen(off):
     told = law_db(judged.moving[strongest.index] + judged.site.origin).argmax(1)
     share = float((strongest.station == told).mean())
     assert best_server(scores, judged) == {"best_server": pytest.approx(share)}
+
+
+def test_figures_of_a_drive_counted_cells_that_were_off():
+    """Rows of the others are judged given that dead cells fill lists, whose own rows count."""
+    learned, judged = lists_along(0), lists_along(1, (3, 4))
+    rows, none = np.arange(len(judged)), np.zeros(0, int)
+    whole, taught = (
+        Split("", (Fold(*parts),)) for parts in ((none, none, rows), (np.arange(len(learned)), none, none))
+    )
+    facts = evaluate(
+        TrueLaw(learned.site), None, align_to_site(judged, learned.site), whole, baselines=[],
+        learned=(learned, taught), timed=False,
+    ).facts  # fmt: skip
+    for figure in OF_LISTS[:2]:
+        assert facts[f"test/{figure}{WITHOUT_OFF}"] < facts[f"test/{figure}"] - 0.1
+    text = "\n".join(remarks(facts))
+    assert f"figures above count these cells; without them: {OF_LISTS[0]} " in text

@@ -28,7 +28,7 @@ MOST_OVERLAP = 5.0  # stations that the colours end with
 UNKNOWN = "#AAAAAA"  # of values that are not known
 INCHES = 7.0  # longer side of the map
 NAMED = 15  # stations; of more only their marks are drawn
-MOST_COLOURS = 10
+MOST_COLOURS, MOST_LISTED = 10, 15  # a line for "5 more" would say no less than their names
 SHADES = (0.0, 0.45, -0.35, 0.7, -0.6)  # of the stations of a site: towards white, or black
 BESIDE = 2  # cells between areas that must not have one colour
 DEEP = 0.025  # of the map's longer side, from the edge of an area that its name is written on
@@ -224,10 +224,11 @@ def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
                   path_effects=from_above.OUTLINE)  # fmt: skip
     listed = layer.class_table()
     areas = [row for row in zip(listed["colour"], listed["station"], listed["share"], strict=True) if row[2]]
-    for colour, word, _ in areas[:MOST_COLOURS]:
+    more = len(areas) - MOST_COLOURS if len(areas) > MOST_LISTED else 0
+    for colour, word, _ in areas[: len(areas) - more]:
         axis.plot([], [], "s", color=colour, label=word)
-    if len(listed["number"]) > MOST_COLOURS:
-        fewer = f"{len(listed['number']) - MOST_COLOURS} more, that serve less: {file_name(layer, '.csv')}"
+    if more:
+        fewer = f"{more} more, that serve less: {file_name(layer, '.csv')}"
         axis.plot([], [], " ", label=fewer)
 
 

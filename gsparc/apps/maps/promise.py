@@ -204,8 +204,8 @@ def map_notes(
         caveat = "they are the model's own deviations, and no place is refused as too far from data"
         return [*notes, f"intervals are not tested: {caveat}"]
     tested = f"tested on {coverage.rows} heard rows of {coverage.blocks} held-out blocks"
-    outcome = f"{coverage.share:.1%} of these rows held, {coverage.width_db:.1f} dB wide in their mean"
-    of_map = f"in the map {figures['map/width_db']:.1f} dB, the strongest's over predicted squares"
+    outcome = f"{coverage.share:.1%} of these rows held, {coverage.width_db:.1f} dB wide in the mean"
+    of_map = f"on the map those of the strongest station are {figures['map/width_db']:.1f} dB wide"
     notes.append(f"{field.share:.0%} intervals, {tested}: {outcome}; {of_map}")
     if figures["map/refused"]:
         squares = f"{figures['map/refused']} of {int(field.grid.inside.sum())} squares"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -35,6 +35,7 @@ def parse_table(
     path: str | Path,
     columns: Mapping[str, object] = {},
     stations_file: str | Path | None = None,
+    stations: Collection[str] = (),
 ) -> Raw:
     """Read the arrays of a table; notes say what was guessed.
 
@@ -43,6 +44,7 @@ def parse_table(
         columns: column by quantity (`heads.KINDS`) where a guess will not do; a number stands for all rows,
             a pattern with a `*` for a column per station.
         stations_file: a second table: name, x, y, z or latitude, longitude, height of each station.
+        stations: names in place of such a list: where heads hold them, no others are levels.
 
     Raises:
         DataError: all problems, with row and column.
@@ -57,6 +59,8 @@ def parse_table(
     if listed is not None:
         parts = {head: heads.station_in_head(head) for head in sheet.heads}
         listed, labelled = listed.match_heads(parts)
+    elif stations:
+        sheet, labelled = _name_levels(sheet, stations)
     chosen = choose_columns(sheet, columns, labelled)
     # Everything after this trusts the choice of columns, so its problems are raised alone.
     sheet.problems.raise_if_any()
@@ -72,6 +76,22 @@ def parse_table(
         about["unit"] = power.unit.name
     explain = partial(say_effects, sheet, chosen)
     return Raw(arrays, about, notes=tuple(sheet.notes), explain=explain)
+
+
+def _name_levels(sheet: Sheet, stations: Collection[str]) -> tuple[Sheet, dict[str, str]]:
+    """Return a table with levels of these stations alone, if heads name any, and names by these heads."""
+    roles = {head: heads.parse_head(head).role for head in sheet.heads}
+    free = [head for head, role in roles.items() if role in (*heads.LEVELS, "station", None)]
+    parts = {head: (heads.station_in_head(head), head) for head in free}
+    found = {head: one for head, names in parts.items() for one in names if one in stations}
+    others = [head for head in free if found and head not in found and roles[head] in heads.LEVELS]
+    if others:
+        which = list_first([*map(repr, others)])
+        sheet.notes.append(Caution(f"columns {which} are of no station that was measured, and not used"))
+    frame = sheet.frame.drop(columns=others)
+    if len(found) == 1 and "station" not in roles.values():  # a single column is of no station by itself
+        frame = frame.assign(station=next(iter(found.values())))
+    return replace(sheet, frame=frame), found
 
 
 UNKNOWN_ASU, MOST_GSM = 99, 31  # arbitrary strength units (3GPP TS 27.007, 8.5); LTE counts up to 97

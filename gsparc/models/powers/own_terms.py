@@ -69,7 +69,7 @@ class OwnTerms:
         heeded.count_reads("model.prior")
         if data.site.several:
             return (*self.terms, NetworkMaps.from_file(self.prior, data))
-        station = data.site.name.rpartition(OF_STATION)[2]
+        station = data.site.name.rpartition(OF_STATION)[2] if OF_STATION in data.site.name else ""
         return (*self.terms, PriorMap.from_levels(*read_prior_levels(self.prior, data, station)))
 
 

@@ -18,9 +18,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.data.errors import DataError
-from gsparc.data.links.stations import site_name
-from gsparc.data.prior_levels import read_prior_levels
+from gsparc.data.prior_levels import read_prior_maps
 from gsparc.data.schema import Measurements
 from gsparc.processes.places import moving_end, other_end
 from gsparc.processes.sectors import ROUND, SHARED, Sectors, sector_of
@@ -70,6 +68,16 @@ def usual_loss(way: Tensor) -> Tensor:
     return 5 * SHARED[0] * way.square().sum(1).clamp_min(1.0).log10()
 
 
+def describe_use(used: bool, cells: int) -> str:
+    """Say whether the map from before is used, of so many cells.
+
+    >>> describe_use(False, 12)
+    'the map from before is left out for 12 cells: rows are likelier without it'
+    """
+    how = "used" if used else "left out"
+    return f"the map from before is {how} for {cells} cells{'' if used else ': rows are likelier without it'}"
+
+
 @dataclass(frozen=True)
 class NetworkMaps(Columns):
     """Maps of a network's stations as a mean, less the law of distance that a network has before any row.
@@ -86,23 +94,13 @@ class NetworkMaps(Columns):
     @classmethod
     def from_file(cls, path: str | Path, data: Measurements) -> Self:
         """Read the map of each station, or of its site; `DataError` where there is none, see there."""
-        assert data.site.stations is not None
-        found, said = list[tuple[int, bool, PriorMap]](), DataError("")
-        for number, name in enumerate(data.site.stations.shown):
-            for named in dict.fromkeys((name, site_name(name))):
-                try:
-                    world, levels = read_prior_levels(path, data, named)
-                except DataError as error:
-                    said = error
-                    continue
-                points, level = map(torch.from_numpy, (world - data.site.origin[:2], levels))
-                before = found[-1][2].points if found else points
-                # Squares of one raster are stored once.
-                points = before if torch.equal(points, before) else points
-                found.append((number, named == name, PriorMap(points, level)))
-                break
-        if not found:
-            raise said
+        found = list[tuple[int, bool, PriorMap]]()
+        for number, own, (world, levels) in read_prior_maps(path, data, data.site.every_station.shown):
+            points, level = map(torch.from_numpy, (world - data.site.origin[:2], levels))
+            before = found[-1][2].points if found else points
+            # Squares of one raster are stored once.
+            points = before if torch.equal(points, before) else points
+            found.append((number, own, PriorMap(points, level)))
         return cls(tuple(found))
 
     def put_under(self, network: Sectors, places: np.ndarray) -> Sectors:

@@ -325,6 +325,17 @@ def test_a_legend_of_ten_cells_did_not_say_that_others_serve_less(drawn, predict
     assert "14 more, that serve less: best_server.csv" in words
 
 
+def test_a_legend_of_twelve_cells_left_two_out(drawn, predictor):
+    field = predict_map(predictor, step_m=4.0)
+    number = np.arange(field.grid.inside.size).reshape(field.grid.inside.shape) % 12
+    legend = pictures.Legend("", -0.5, 11.5)
+    pictures.draw_layer(
+        field, pictures.Layer("best_server", 1.0 * number, legend, tuple("abcdefghijkl")), "unused.png", ""
+    )
+    words = [text.get_text() for text in drawn[0].legends[0].get_texts()]
+    assert {*"abcdefghijkl"} <= {*words} and not any("more" in word for word in words)
+
+
 def test_the_curve_of_a_plan_was_a_flat_line(drawn, predictor):
     """Its axis began at 0 dB."""
     plan = plan_measurements(predictor, 4)

@@ -13,7 +13,7 @@ from gsparc.data.own import from_arrays
 from gsparc.data.prior_levels import read_prior_levels
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.powers import prior_map
-from gsparc.models.powers.prior_map import NetworkMaps, PriorMap
+from gsparc.models.powers.prior_map import NetworkMaps, PriorMap, describe_use
 from gsparc.models.powers.together.network import find_sectors
 from gsparc.processes.sectors import NO_AZIMUTH
 
@@ -148,7 +148,7 @@ def network_rasters(path, level, names):
     how = {"width": side, "height": side, "dtype": "float64", "driver": "GTiff", "count": len(names)}
     with rasterio.open(path, "w", transform=from_origin(0, 2500, 125, 125), **how) as file:
         file.write(level[:, : len(names)].T.reshape(-1, side, side)[:, ::-1])
-        file.descriptions = [f"power_db {name}" for name in names]
+        file.descriptions = [name and f"power_db {name}" for name in names]
     return path
 
 
@@ -180,8 +180,62 @@ def test_a_network_has_a_map_of_a_cell_or_of_a_site(tmp_path):
     assert "say stations=each" in Powers(prior=path).why_not(from_arrays(both))
 
 
+def network_table(path, level, heads):
+    """A table of places, and of levels of a cell in each column."""
+    table, named = np.c_[NET_SQUARES, level[:, : len(heads)]], ",".join(["x_m", "y_m", *heads])
+    np.savetxt(path, table, delimiter=",", header=named, comments="")
+    return path
+
+
+@pytest.fixture(scope="module")
+def by_pci():
+    """A network whose drive speaks of PCIs, and whose list of names, and its levels."""
+    one = draw_network(1, 0, 60, NET_SQUARES)
+    labels = [f"{t // 3}-{t % 3}" for t in range(30)]
+    names = {"station_label": np.array(labels), "station_name": np.array([f"{300 + t}" for t in range(30)])}
+    return from_arrays(one.arrays(6) | names), one.truth
+
+
+@pytest.mark.parametrize("head", ["{0}-{1}", "{0}-{1} [dBm]", "{2}", "RSRP {2}", "PCI {2}"])
+def test_a_wide_table_of_a_map_lost_cells_and_was_not_read_by_pci(tmp_path, by_pci, head, caplog):
+    data, level = by_pci
+    heads = [head.format(t // 3, t % 3, 300 + t) for t in range(30)]
+    found = NetworkMaps.from_file(network_table(tmp_path / "wide.csv", level, heads), data)
+    # A map of a cell has its pattern: as `0-1 (301)` it was taken for one of the whole site.
+    assert [one[:2] for one in found.maps] == [(t, True) for t in range(30)]
+    known = found.maps[7][2].level.numpy()
+    np.testing.assert_allclose(known - known.mean(), level[:, 7] - level[:, 7].mean(), atol=1e-3)
+    assert not caplog.text
+
+
+def test_cells_without_a_map_and_columns_of_no_cell_are_warned_of(tmp_path, by_pci, caplog):
+    data, level = by_pci
+    heads = ["0-0", *[f"0-{t} [dBm]" for t in range(1, 3)], "9-7 [dBm]"]
+    found = NetworkMaps.from_file(network_table(tmp_path / "few.csv", level, heads), data)
+    assert [number for number, *_ in found.maps] == [0, 1, 2]
+    assert "no map of 1-0 (303), 1-1 (304)" in caplog.text
+    assert "columns '9-7 [dBm]' are of no station that was measured" in caplog.text
+    one = NetworkMaps.from_file(network_table(tmp_path / "one.csv", level, ["304"]), data)
+    assert [number for number, *_ in one.maps] == [4]
+
+
+def test_one_map_without_a_name_was_taken_for_that_of_every_cell(tmp_path, rasters, by_pci):
+    data, level = by_pci
+    refused(
+        r"one map of no station's name, .* best server .*power_db NAME",
+        NetworkMaps.from_file, network_rasters(tmp_path / "best.tif", level, [""]), data,
+    )  # fmt: skip
+    rows = draw(12, 103)
+    both = {"rssi": np.c_[measured(rows), measured(rows)], "tx": None, "station_name": ["a", "c"]}
+    posts = {"station_position": np.array([POST, POST])}
+    refused("one map of no station's name", fit, rows, rasters / "right.tif", **both, **posts)
+    foreign = network_table(tmp_path / "foreign.csv", level, ["X1 [dBm]", "X2 [dBm]"])
+    refused("of X1, X2, not of 0-0 .300., .* call bands", NetworkMaps.from_file, foreign, data)
+
+
 @pytest.mark.slow
-def test_maps_of_a_networks_cells_help_and_those_of_another_do_not(tmp_path):
+def test_maps_of_a_networks_cells_help_and_those_of_another_do_not(tmp_path, caplog):
+    caplog.set_level("INFO")
     asked = np.random.default_rng(0).uniform(0, 2500, (100, 2))
     one, path = draw_network(1, 0, 60, np.r_[NET_SQUARES, asked]), tmp_path / "model.ckpt"
     names = [f"{t // 3}-{t % 3}" for t in range(30)]
@@ -195,5 +249,6 @@ def test_maps_of_a_networks_cells_help_and_those_of_another_do_not(tmp_path):
     found = [gsparc.fit(**one.arrays(6), **more) for more in ({}, *settings)]
     error = [np.sqrt(np.mean((model.rssi(rx=asked) - truth) ** 2)) for model in found]
     assert error[1] < 0.95 * error[0] and error[2] < 1.02 * error[0], error
+    assert all(describe_use(used, 30) in caplog.text for used in (True, False))  # it was not said
     right.unlink()
     np.testing.assert_allclose(gsparc.load(path).rssi(rx=asked), found[1].rssi(rx=asked), atol=1e-3)

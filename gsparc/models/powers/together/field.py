@@ -25,7 +25,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import JointLevels, Prediction
-from gsparc.models.powers.prior_map import NetworkMaps
+from gsparc.models.powers.prior_map import NetworkMaps, describe_use
 from gsparc.models.powers.together.learning import (
     LEAST_STATIONS,
     TRIED_EACH,
@@ -109,8 +109,8 @@ class JointPowerField(ClosedForm):
                 known, own, said = learn_network(used, maps.put_under(network, self.places), names, self.seed)
                 if used_maps := known > evidence:
                     prior, remarks = own, said
-                of = f"maps of {len(maps.maps)} sectors are {'used' if used_maps else 'left out'}"
-                remarks.append(f"{of}: the log evidence of rows gains {known - evidence:.3g} by them")
+                # Second: a table shows the first few.
+                remarks.insert(1, describe_use(used_maps, len(maps.maps)))
             self.own = StationPriors(prior, {})
         self.asks_visibility = network is None and len(used.stations) >= LEAST_STATIONS
         most, largest = rows_per_station(len(used.stations)), int(np.bincount(used.station).max())

@@ -268,10 +268,9 @@ def _note_untested(
     alike = misfit - misfit[:, len(TURNS) // 2, None] <= sure[:, None]
     farthest = torch.where(alike & (trend.table[:, :1] != NO_AZIMUTH), TURNS.abs(), 0.0).amax(1)
     blind = [t for t in farthest.argsort(descending=True, stable=True) if farthest[t] >= CONTRADICTED_DEG]
-    each = [f"{names[t]} ({min(float(farthest[t] + TURNS.diff()[0]), 180):.0f})" for t in blind]
-    said = f"of {len(blind)} of {len(names)} sectors: {list_first(each, 30)}"
-    told = f"to {CONTRADICTED_DEG:g} degrees, as rows tell them to those in brackets only"
-    return [f"azimuths not tested {told}, {said}"] if blind else []
+    each = [f"{names[t]} {min(float(farthest[t] + TURNS.diff()[0]), 180):.0f} degrees" for t in blind]
+    told = f"the drive would not show errors of azimuths ({len(blind)} of {len(names)}) smaller than these"
+    return [f"{told}: {list_first(each, 30)}"] if blind else []
 
 
 def _note_turned(given: Tensor, found: Tensor, names: tuple[str, ...]) -> list[str]:
