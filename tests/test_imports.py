@@ -30,7 +30,7 @@ ARROWS = {
     "apps.locate": "data evaluation models prediction processes",
     "evaluation": "conf data field models prediction processes simulate training",
     "apps.maps": "data evaluation models prediction processes",
-    "apps.export": "data field models ops physics prediction processes training",
+    "apps.export": "data field models ops physics prediction processes",
     "apps.link": "data evaluation models physics prediction processes simulate",
     "apps.view": "apps.maps data evaluation prediction processes",
     "callbacks": "data evaluation field processes training",
