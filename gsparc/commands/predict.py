@@ -32,7 +32,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         before += f": {' to '.join(f'{end:.4g}' for end in ends)} {predictor.unit}"
     before += f", {empty} predictions empty" if (empty := facts["predict/empty"]) else ""
     before += f"; predictions in {facts['out']}"
-    if promise is None and predictor.site.target.in_decibels:
+    if promise is None and predictor.site.target.is_level:
         before += "; deviations are the model's own: gsparc map ckpt=FILE tests them, then ask again"
     before += "; summary "
     return finish_run(run_dir, facts | {"ckpt": str(config.ckpt)}, before=before)

@@ -56,7 +56,7 @@ def task(config: DictConfig) -> None:
         files = f"{needed} open files may be needed, {allowed} are allowed"
         raise SettingError(f"connections={limits.connections}: {files}; say ulimit -n {needed}")
     predictor = load(config.ckpt, unit=config.unit).select_station(config.station)
-    site, powers = predictor.site, predictor.site.target.in_decibels
+    site, powers = predictor.site, predictor.site.target.is_level
     # Powers of all stations are one answer; channels and spectra are of one station each.
     if site.static_end is None or (site.stations and not powers):
         raise DataError("serve: one end that stands still is needed; of several stations say station=NAME")

@@ -43,7 +43,7 @@ class Convention:
 
 def known_array(data: Measurements) -> np.ndarray | None:
     """Return places (A, 3) [m] of the channel's antennas, receiver frame; None where they are unknown."""
-    array = data.site.array if data.site.kind == "csi" else None
+    array = data.site.array if data.site.target.is_complex else None
     return array if array is not None and len(array) == data.target.shape[1] else None
 
 
@@ -51,9 +51,9 @@ def traits(data: Measurements) -> set[str]:
     """Return what measurements are, as far as conventions ask for it."""
     grid, shape = data.site.grid, data.target.shape[1:]
     # Degrees are no feet; heights beside them may be.
-    metres = data.site.georeference is None and data.site.kind != "spectrum"
-    placed = {"metres": metres, "heights": data.site.kind != "spectrum" and bool(np.ptp(data.moving[:, 2]))}
-    if data.site.kind == "rssi":
+    metres = data.site.georeference is None and not data.site.target.is_image
+    placed = {"metres": metres, "heights": not data.site.target.is_image and bool(np.ptp(data.moving[:, 2]))}
+    if data.site.target.is_level:
         holds = {}
     elif grid is None:
         tones, square, antennas = shape[1] > 1, 1 < shape[0] == shape[1], known_array(data) is not None
@@ -62,7 +62,7 @@ def traits(data: Measurements) -> set[str]:
         # Of the file, or of its transpose: no `grid_deg` says otherwise.
         plain = grid in (SphereGrid.hemisphere(*shape), SphereGrid.hemisphere(*shape[::-1]))
         holds = {"spectra": True, "above": grid.first_elevation >= 0, "hemisphere": plain}
-    turned = {"turned": data.site.kind != "rssi" and bool((data.rx_rotation != np.eye(3)).any())}
+    turned = {"turned": not data.site.target.is_level and bool((data.rx_rotation != np.eye(3)).any())}
     return {name for name, flag in {**holds, **placed, **turned}.items() if flag}
 
 

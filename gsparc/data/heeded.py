@@ -63,15 +63,15 @@ def record_reads(reads: Reads) -> Iterator[None]:
     """Note in `reads` what is read meanwhile, here and in processes that `executor.run_each` starts."""
     global _reads
     before, _reads = _reads, reads
-    kinds: Any = {option.kind for option in reads.options}
-    for kind in kinds:
-        kind.__getattribute__ = _noting(kind, [one for one in reads.options if one.kind is kind])
+    classes: Any = {option.kind for option in reads.options}
+    for owner in classes:
+        owner.__getattribute__ = _noting(owner, [one for one in reads.options if one.kind is owner])
     try:
         yield
     finally:
         _reads = before
-        for kind in kinds:
-            del kind.__getattribute__
+        for owner in classes:
+            del owner.__getattribute__
 
 
 def _noting(kind: type, options: Sequence[Option]) -> Callable[[Any, str], Any]:

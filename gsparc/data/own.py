@@ -27,7 +27,7 @@ from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, read_raw, write_raw
 from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, OTHER, Links, Measurements, Site
 from gsparc.data.selection import WHOLE, Selection
-from gsparc.data.target import Kind
+from gsparc.data.target import TARGETS, Kind
 from gsparc.data.units import LINEAR, PowerUnit
 
 log = logging.getLogger(__name__)
@@ -136,7 +136,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
             check.read_positions(name, None)
         check.problems.raise_if_any()
     assert values is not None
-    rows = len(values)
+    rows, facts = len(values), TARGETS[kind]
     of_rows = {name: raw.arrays.get(name) for name in OF_ROWS}
     row_names = check.name_rows(rows, links.stations)
     ends = {end: check.read_positions(f"{end}_position", rows) for end in ("rx", "tx")}
@@ -144,17 +144,17 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     given_mask = check.read_mask(raw.arrays[measured].shape, of_rows["censored"])
     mask = None if given_mask is None else given_mask.reshape(values.shape)
     named = str(raw.attributes.get("conventions", "")).split()
-    if kind == "csi" and check.fits_exchanged(*values.shape[1:]):
+    if facts.is_complex and check.fits_exchanged(*values.shape[1:]):
         if "exchange_axes" not in named:
             fits = f"rows of shape {values.shape[1:]} fit frequencies and antennas with their axes exchanged"
             check.refuse("csi", f"{fits}; say dataset.exchange_axes=true")
         named = [one for one in named if one != "exchange_axes"]  # it is done here
         values, mask = values.swapaxes(1, 2), None if mask is None else mask.swapaxes(1, 2)
-    frequency, carrier = check.read_frequencies(values.shape[2] if kind == "csi" else None)
+    frequency, carrier = check.read_frequencies(values.shape[2] if facts.is_complex else None)
     # Transposed images: their grid is that of the axes as they will be.
     turned = values.shape[:0:-1] if "transposed" in named else values.shape[1:]
-    grid = check.read_grid(*turned) if kind == "spectrum" else None
-    antennas = values.shape[1] if kind == "csi" and values.shape[1] > 1 else None
+    grid = check.read_grid(*turned) if facts.is_image else None
+    antennas = values.shape[1] if facts.is_complex and values.shape[1] > 1 else None
     array = check.read_real("array_position", (antennas, 3))
     if array is not None:
         antenna = [f"antenna {i}" for i in range(len(array))]
@@ -176,14 +176,14 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     # Copies, as broadcast views are read-only.
     rx, tx = (np.broadcast_to(np.asarray(ends[end]), (rows, 3)).copy() for end in ("rx", "tx"))
     directions = _directions(check, offsets, rx, rotation)
-    if kind == "spectrum" and min(values.shape[1:]) < SSIM_WINDOW:
+    if facts.is_image and min(values.shape[1:]) < SSIM_WINDOW:
         check.notes.append(
             f"images of {values.shape[1]} x {values.shape[2]} pixels are smaller than SSIM's window of "
             f"{SSIM_WINDOW} x {SSIM_WINDOW}: losses are L1 alone, ssim_gauss is undefined"
         )
     site = Site(
         kind=kind, static_end=static_end, grid=grid, array=array, carrier_hz=carrier,
-        subcarriers_hz=frequency if kind == "csi" else None, stations=links.stations,
+        subcarriers_hz=frequency if facts.is_complex else None, stations=links.stations,
         georeference=links.georeference, **about,
     )  # fmt: skip
     provenance = {str(k): str(v) for k, v in raw.attributes.items() if k not in OWN_ATTRIBUTES} | stated
@@ -193,7 +193,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     )  # fmt: skip
     # Conventions turn values before they are scaled: the constant is that of what is stored.
     data = convert_conventions(data, named)
-    if kind == "csi":
+    if facts.is_complex:
         _note_plane(check, tx if static_end == "rx" else rx, carrier)
     target, scale = _scaled(measured, data.target, data.mask, data.censored)
     # A damaged row of 1e300 overflows float32 once it is divided by the others' scale: it is named.
@@ -244,17 +244,18 @@ def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, An
 def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
     """The measurement as (S, H, W), (S, A, K) or (S, 1), and its kind; None when unusable."""
     kind: Kind = "spectrum" if name == "spectrum" else "csi" if name == "csi" else "rssi"
-    array = check.read_array(name, *([(None,)] if kind == "rssi" else FIELDS[name].shapes))
+    facts = TARGETS[kind]
+    array = check.read_array(name, *([(None,)] if facts.is_level else FIELDS[name].shapes))
     if array is None:
         return None, kind
-    if kind == "csi" and array.size:
+    if facts.is_complex and array.size:
         array = array.reshape(len(array), -1, array.shape[-1] if array.ndim > 1 else 1)
-    if is_big(array) and kind != "rssi" and len(array) > 1 and "mask" not in check.raw.arrays:
+    if is_big(array) and not facts.is_level and len(array) > 1 and "mask" not in check.raw.arrays:
         return array, kind  # its blocks are cast where they are read
     # Magnitudes of complex64 overflow, units of 1e-42 are lost.
-    if kind == "rssi" or array.dtype.kind in "fc":
+    if facts.is_level or array.dtype.kind in "fc":
         array = array.astype(np.complex128 if array.dtype.kind == "c" else np.float64)
-    if kind == "rssi":
+    if facts.is_level:
         array = array[:, None]
     if len(array) < 2 or array.size == 0:
         fault = f"shape {array.shape} holds too little; expected two rows or more"

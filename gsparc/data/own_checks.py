@@ -14,6 +14,7 @@ from gsparc.data.assemble import check_positions
 from gsparc.data.errors import Problems, list_first, suggest_name
 from gsparc.data.raw import Raw, numbered_rows
 from gsparc.data.schema import FIELDS, HOLDS, MEASUREMENTS, POWER, Stations, TrainTest
+from gsparc.data.target import TARGETS, Kind
 from gsparc.ops import SphereGrid
 
 # From long wave (100 kHz) to the far infrared: what lies outside was mostly given in MHz or GHz.
@@ -165,19 +166,19 @@ class Checker:
             )
         return array
 
-    def read_devices(self, rows: int, kind: str) -> tuple[tuple[str, ...] | None, np.ndarray | None]:
+    def read_devices(self, rows: int, kind: Kind) -> tuple[tuple[str, ...] | None, np.ndarray | None]:
         """Return names (D,) of devices and which of them measured each row (S,) int64; None where none is."""
         array = self.read_array("device", (rows,))
         if array is None:
             return None, None
-        if kind != "rssi":
+        if not TARGETS[kind].is_level:
             self.refuse("device", f"goes with powers, not with {kind}")
         names, device = np.unique(array.astype(str), return_inverse=True)
         return tuple(names.tolist()), device.reshape(-1).astype(np.int64)
 
-    def read_sequence(self, rows: int, kind: str) -> np.ndarray | None:
+    def read_sequence(self, rows: int, kind: Kind) -> np.ndarray | None:
         """Return numbers (S,) int64 of powers in the order of their times; None: as they stand."""
-        time = self.read_array("time_s", (rows,)) if kind == "rssi" else None
+        time = self.read_array("time_s", (rows,)) if TARGETS[kind].is_level else None
         if time is None or not np.isfinite(time).all() or (np.diff(time) >= 0).all():
             return None
         return np.argsort(np.argsort(time, kind="stable"))

@@ -212,7 +212,7 @@ class Site:
     def scored(self) -> Scored:
         """The figures of merit that tell of it; rows with factors of their own are aligned first."""
         # Only channels have phases: powers and spectra are the same under any factor.
-        return "aligned csi" if self.kind == "csi" and self.freedom != "none" else self.kind
+        return "aligned csi" if self.target.is_complex and self.freedom != "none" else self.kind
 
     def need_phase(self, what: str) -> None:
         """Raise `ValueError` where rows have phases of their own, so that `what` cannot be told."""
@@ -278,12 +278,12 @@ class Site:
     @property
     def maps_levels(self) -> bool:
         """Whether these are powers of one end that moves: levels over its places."""
-        return self.kind == "rssi" and len(self.moving_ends) == 1
+        return self.target.is_level and len(self.moving_ends) == 1
 
     @property
     def has_waves(self) -> bool:
         """Whether these are complex channels at a known carrier."""
-        return self.kind == "csi" and self.carrier_hz is not None
+        return self.target.is_complex and self.carrier_hz is not None
 
     @property
     def moving_ends(self) -> tuple[End, ...]:
@@ -305,7 +305,7 @@ class Site:
         """Why these spectra cannot be modelled through the receive array; None when they can."""
         array = np.zeros((0, 3)) if self.array is None else self.array
         faults = {
-            f"targets are {self.kind}, not spectra on a grid": self.kind != "spectrum" or self.grid is None,
+            f"targets are {self.kind}, not spectra on a grid": not self.target.is_image or self.grid is None,
             # Plane waves at fixed elements: with a moving array each row would have another manifold.
             "the receiver moves; its array must be static": self.static_end != "rx",
             "the dataset declares no antenna array": len(array) < 2,

@@ -26,7 +26,7 @@ class Target(ABC):
         axes: of an array of them, rows among them.
         is_complex: whether entries have a phase.
         is_image: whether its entries lie beside each other, as directions.
-        in_decibels: whether errors are counted in decibels, as of what is one level.
+        is_level: whether it is one received level, whose errors are counted in decibels.
     """
 
     kind: ClassVar[Kind]
@@ -36,7 +36,7 @@ class Target(ABC):
     axes: ClassVar[int] = 3
     is_complex: ClassVar[bool] = False
     is_image: ClassVar[bool] = False
-    in_decibels: ClassVar[bool] = False
+    is_level: ClassVar[bool] = False
 
     @abstractmethod
     def describe(self, count: int, shape: tuple[int, ...]) -> str:
@@ -125,7 +125,7 @@ class Power(Target):
     """Received powers (1,), linear; their errors are of decibels."""
 
     kind, called = "rssi", "powers"
-    in_decibels = True
+    is_level = True
     exponent = 1
     axes = 2
 

@@ -106,7 +106,7 @@ def predict_file(
             places, int(far.sum()), len(far), margin, say_height_error(world, site, far),
             queries.rows[int(np.argmax(far))],
         )  # fmt: skip
-    power = site.power_unit(predictor.unit) if site.target.in_decibels else None
+    power = site.power_unit(predictor.unit) if site.target.is_level else None
     if tested is not None and power is not None and predictions.said.variance is not None:
         local = site.local_places(world)[predictions.place]
         predictions = _with_tested(predictions, local, power, tested)

@@ -267,7 +267,7 @@ def _columns(scores: Scores, data: Measurements) -> dict[str, Any]:
         "confidence": scores.confidence, "variance": scores.variance * data.site.target_scale**2,
         **scores.samples, **paired_values(scores.samples),
     }  # fmt: skip
-    if data.site.target.in_decibels:
+    if data.site.target.is_level:
         levels = {"predicted_db": scores.samples["prediction"], "measured_db": scores.samples["target"]}
         columns |= {name: 10 * np.log10(np.where(power > 0, power, np.nan)) for name, power in levels.items()}
     of_row = data.stations_of(scores.row)

@@ -88,7 +88,7 @@ def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, 
     Of stations held out also the errors left after a constant of each.
     """
     figures = scores.figures()
-    if not data.site.target.in_decibels:
+    if not data.site.target.is_level:
         figures |= reduced_chi_squared(scores, data)
     else:
         figures |= rmse_with_silent(scores, data) | power_intervals(scores, data) | best_server(scores, data)

@@ -62,7 +62,7 @@ def draw_predictions(
         return save(draw_spectra(examples, title), path, 100)
     predicted, true = predict_rows(method, data, rows).mean.numpy(), data.targets(rows).numpy()
     scale = data.site.target_scale
-    unit = data.site.level_unit if data.site.target.in_decibels else "dB"
+    unit = data.site.level_unit if data.site.target.is_level else "dB"
     measured = data.censored_side(rows) == 0  # of a silent row the target is its level
     draw_points(true[measured] * scale, predicted[measured] * scale, title, path, unit)
 

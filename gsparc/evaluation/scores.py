@@ -182,7 +182,7 @@ def score_methods(
         back = np.argsort(np.concatenate(order))
         scored = {name: values[back] for name, values in metric.compute().items()} | outputs
         learned_rows = np.sort(taught.learned(eval_on))
-        if method.name == "nearest" and data.site.target.in_decibels and data.station is not None:
+        if method.name == "nearest" and data.site.target.is_level and data.station is not None:
             scored["served"] = levels_of_nearest_moment(learned_data.subset(learned_rows), data.subset(rows))
         if limited:
             variance = scored["variance"] * data.site.target_scale**2

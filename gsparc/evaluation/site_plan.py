@@ -90,7 +90,7 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
     heard = np.ones(power.shape, bool) if data.mask is None else data.mask.reshape(power.shape)
     heard = heard | (data.censored_side() < 0)[:, None]  # in saturation, too
     row, entry = np.nonzero(heard & (power > 0))
-    in_decibels, value = data.site.target.in_decibels, power[row, entry]
+    in_decibels, value = data.site.target.is_level, power[row, entry]
     # Powers of channels are averaged linearly, levels of a station in decibels.
     value = 10 * np.log10(value) if in_decibels else value
     each = [which[row], data.stations_of(row) if in_decibels else which[row]]

@@ -119,10 +119,10 @@ class GaussianModel(nn.Module):
         shape: tuple[int, int] | None = None,
     ) -> None:
         super().__init__()
-        averaged = site.kind == "csi" and settings.response.channel == "mean"
-        signed = (site.kind == "csi" and not averaged) or settings.response.array
+        averaged = site.target.is_complex and settings.response.channel == "mean"
+        signed = (site.target.is_complex and not averaged) or settings.response.array
         if signed and settings.emission.activation != "linear":
-            what = "channels are signed" if site.kind == "csi" else "fields at an array are signed"
+            what = "channels are signed" if site.target.is_complex else "fields at an array are signed"
             raise ValueError(
                 f"model.emission.activation={settings.emission.activation}: {what}, choose linear (or auto)"
             )
@@ -161,7 +161,7 @@ class GaussianModel(nn.Module):
         site, settings, means = self.site, self.settings.response, self.gaussians.means.detach()
         if settings.array:
             return ArrayResponse(site, settings.pattern)
-        if site.kind != "csi":
+        if not site.target.is_complex:
             return None
         if settings.channel == "mean":
             return MeanResponse(antennas, subcarriers)
@@ -176,15 +176,15 @@ class GaussianModel(nn.Module):
     def channels(self) -> int:
         """Real outputs of each emission network: one power, one complex gain, or one of each channel."""
         settings = self.settings.response
-        if self.site.kind == "csi" and settings.channel == "mean":
+        if self.site.target.is_complex and settings.channel == "mean":
             return 2 * math.prod(self.shape)
-        complex_image = self.site.kind == "spectrum" and settings.image != "power"
+        complex_image = self.site.target.is_image and settings.image != "power"
         return 2 if settings.array or complex_image else self.site.target.numbers
 
     @property
     def tells_unknown(self) -> bool:
         """Whether the emission's features tell what training positions leave unknown."""
-        return self.site.kind == "spectrum" and self.emission.encoding.tells_share
+        return self.site.target.is_image and self.emission.encoding.tells_share
 
     @full_precision
     def unknown_shares(self, tx: Tensor, rx: Pose) -> Tensor | None:
@@ -198,7 +198,7 @@ class GaussianModel(nn.Module):
         """Return attenuated emissions a_i s_i (B, N, C): tx (B, 3) [m], one or B receiver poses."""
         distance = self.relative_distances(tx)
         emitted = self.emission(self.site.moving(tx, rx), distance)
-        if self.site.kind == "spectrum" and self.settings.response.image == "real":
+        if self.site.target.is_image and self.settings.response.image == "real":
             emitted = emitted[..., :1]  # nothing reads the imaginary part
         attenuation = self.attenuation(distance)
         return emitted if attenuation is None else emitted * attenuation.unsqueeze(-1)
@@ -217,7 +217,7 @@ class GaussianModel(nn.Module):
     def forward(self, tx: Tensor, rx: Pose) -> Rendered:
         """Predict at tx (B, 3) [m] and one shared or B receiver poses."""
         features = self.emissions(tx, rx)
-        if self.site.kind == "spectrum":
+        if self.site.target.is_image:
             raster = self.rasterize(features, rx)
             unknown = self.unknown_shares(tx, rx)
             return Rendered(self.to_spectra(raster.image, unknown), raster, unknown)
@@ -279,7 +279,7 @@ class GaussianModel(nn.Module):
         return SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
 
     def _raster_options(self) -> dict[str, Any]:
-        settings, image = self.settings.raster, self.site.kind == "spectrum"
+        settings, image = self.settings.raster, self.site.target.is_image
         least = settings.alpha_cutoff if image else settings.relative_cutoff
         return {
             "grid": self.grid,

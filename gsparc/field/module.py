@@ -108,7 +108,7 @@ class NetworkModule(L.LightningModule):
         errors = squared_error(mean, batch, self.site.target)
         figures = {"val/error": errors.mean()}
         error = (mean - batch.target).abs().square().flatten(1).mean(1)
-        if self.site.kind != "spectrum":
+        if not self.site.target.is_image:
             figures["val/mse"] = error.mean()
         else:
             if fits_ssim_window(mean):
@@ -134,7 +134,7 @@ class NetworkModule(L.LightningModule):
     def predict_step(self, batch: Batch, step: int) -> Tensor:
         """Return targets (B, ...) in stored units, spectra within [0, 1]."""
         mean = self.mean(batch)
-        return mean.clamp(0, 1) if self.site.kind == "spectrum" else mean
+        return mean.clamp(0, 1) if self.site.target.is_image else mean
 
     def test_step(self, batch: Batch, step: int) -> None:
         """Log the squared error of test rows; `gsparc evaluate` has all figures."""

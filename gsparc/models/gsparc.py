@@ -64,26 +64,26 @@ def choose(data: Measurements, settings: Gsparc, quiet: bool = False) -> Method:
             (terms.array, ArrayProcess),
             (True, ImageProcess),
         )
-        kind = next(kind for called, kind in table if called)
-        for remark in settings.own_terms.said if kind is not Powers else ():
+        method_class = next(one for called, one in table if called)
+        for remark in settings.own_terms.said if method_class is not Powers else ():
             raise ValueError(f"{remark} of received powers; the target is {site.kind} here")
-        rendered = issubclass(kind, ImageProcess)
-        if (rendered and hides is False) or (kind is Bearings and hides is True):
+        rendered = issubclass(method_class, ImageProcess)
+        if (rendered and hides is False) or (method_class is Bearings and hides is True):
             why = "rasterized Gaussians always occlude each other"
             why = "spectra of a moving array hide nothing" if hides else why
             raise ValueError(f"model.effects.visibility={str(hides).lower()} is not possible: {why}")
         reasons, options = [*terms.reasons], [*terms.options, *["model.field.count"] * (not count)]
-        if kind in (UplinkField, CarrierField) or site.phase_reference == "neighbours":
+        if method_class in (UplinkField, CarrierField) or site.phase_reference == "neighbours":
             options = []  # whatever is said, it is one method
-        elif kind is Channels:
+        elif method_class is Channels:
             why = "no Gaussians are asked for" if terms.phase else terms.obstacle or "no phase is asked for"
             reasons.append(f"the residual is all there is: {why}")
-        method = settings.create_as(import_path(kind))
+        method = settings.create_as(import_path(method_class))
         if rendered:
             options += ["init.name"] * (init.name in ("auto", "diffuse"))
-            options += ["model.effects.image"] * (switches.image is True and site.kind == "csi")
+            options += ["model.effects.image"] * (switches.image is True and site.target.is_complex)
         # Mixtures count it where a candidate hangs on it; powers always have their process.
-        options += ["model.effects.residual"] * (rendered or (kind is Channels and plain))
+        options += ["model.effects.residual"] * (rendered or (method_class is Channels and plain))
     if quiet:
         return method
     heeded.count_reads(*options)
@@ -128,7 +128,7 @@ class Gsparc(LearnsTogether):
         """See `MethodFactory`."""
         method = choose(data, self, quiet=True)
         how = method.describe_fit(data, effort, steps) or "in closed form"
-        paper = "; the paper's recipe: paper=gsparc" if data.site.kind != "rssi" else ""
+        paper = "; the paper's recipe: paper=gsparc" if not data.site.target.is_level else ""
         return f"{method.name}, {how}{paper}"
 
     def create_for(self, data: Measurements) -> Method:
@@ -142,15 +142,15 @@ class Gsparc(LearnsTogether):
 
     def create_as(self, target: str) -> Method:
         """See `MethodFactory`; under its own name."""
-        alike = {import_path(kind): kind for kind in (UplinkField, CarrierField)}
+        alike = {import_path(one): one for one in (UplinkField, CarrierField)}
         if target in alike:
             return alike[target]()
-        solved = {import_path(kind): kind for kind in (ImageSources, Channels, Powers, Bearings)}
+        solved = {import_path(one): one for one in (ImageSources, Channels, Powers, Bearings)}
         if target in solved:
             alone = not self.rendered.settings.field.count
             terms: dict[str, Any] = vars(self.own_terms) if solved[target] is Powers else {}
             return solved[target](self.switches, self.position_std, self.init, residual_alone=alone, **terms)
-        rendered = {import_path(kind): kind for kind in (ArrayProcess, ImageProcess)}
+        rendered = {import_path(one): one for one in (ArrayProcess, ImageProcess)}
         if target not in rendered:
             raise ValueError(f"model=gsparc makes no {target}: train again")
         # `ArrayProcess` sets it again.

@@ -41,7 +41,7 @@ class RunFactors(Stored):
     @staticmethod
     def has_several_runs(data: Measurements, rows: np.ndarray) -> bool:
         """Tell whether rows (n,) are channels of more than one run."""
-        return data.site.kind == "csi" and len(np.unique(data.runs_of(rows))) > 1
+        return data.site.target.is_complex and len(np.unique(data.runs_of(rows))) > 1
 
     def __len__(self) -> int:
         return len(self.runs)

@@ -72,9 +72,8 @@ def resolve_terms(
     """
     site = data.site
     networks = f"emission.hidden={hidden}" if hidden else None
-    placed = (
-        f"init={init.name}" if init.name in ("sphere", "uniform", "grid") and site.kind != "rssi" else None
-    )
+    seeded = init.name in ("sphere", "uniform", "grid") and not site.target.is_level
+    placed = f"init={init.name}" if seeded else None
     request = networks or placed  # asks for Gaussians that are rendered
     distance = falls and init.name != "vectors"
     obstacles = {
@@ -84,7 +83,7 @@ def resolve_terms(
         "moving_array": array_obstacle(site, "tx", "the receiver stands still")
         or (request and f"{request} asks for rendered Gaussians"),
         "phase": phase_obstacle(data) or (request and f"{request} asks for rendered Gaussians"),
-        "power": None if site.kind == "rssi" else f"the target is {site.kind}",
+        "power": None if site.target.is_level else f"the target is {site.kind}",
     }
     on, reasons, options = {}, list[str](), list[str]()
     for name, obstacle in obstacles.items():
@@ -99,7 +98,7 @@ def resolve_terms(
     if init.name == "scene":
         _refuse_scene(data, switches, obstacles, on, count)
     rendered = request is not None or switches.image is True
-    options += ["model.loss.snapshot"] if site.kind == "csi" else []
+    options += ["model.loss.snapshot"] if site.target.is_complex else []
     obstacle = obstacles["phase"]
     return Terms(
         **on, rendered=rendered, obstacle=obstacle, reasons=tuple(reasons), options=tuple(options)
@@ -119,11 +118,11 @@ def _refuse_scene(
         why = obstacles[term] or f"model.effects.{term}=false"
     elif not count:
         why = "model.field.count=0 is the residual alone"
-    elif site.kind == "rssi" and site.several:
+    elif site.target.is_level and site.several:
         why = "known walls are of one station's model; say stations=each"
-    elif site.kind == "rssi" and site.static_end is not None and site.static_position is None:
+    elif site.target.is_level and site.static_end is not None and site.static_position is None:
         why = "the dataset does not say where the static end is"
-    elif site.kind == "rssi" and switches.visibility is False:
+    elif site.target.is_level and switches.visibility is False:
         why = "of received powers walls only hide, which model.effects.visibility=false turns off"
     if why is not None:
         raise ValueError(f"init=scene is not possible: {why}")
@@ -131,7 +130,7 @@ def _refuse_scene(
 
 def array_obstacle(site: Site, static_end: str, wrong_end_message: str) -> str | None:
     """Say why spectra arise in no array of a receiver that stands (`rx`) or moves (`tx` stands)."""
-    if site.kind != "spectrum":
+    if not site.target.is_image:
         return f"the target is {site.kind}, not a spectrum"
     if site.static_end != static_end:
         return wrong_end_message
@@ -144,7 +143,7 @@ def array_obstacle(site: Site, static_end: str, wrong_end_message: str) -> str |
 def phase_obstacle(data: Measurements) -> str | None:
     """Say why channels have no carrier phase that tells of places; None where they have."""
     site = data.site
-    if site.kind != "csi":
+    if not site.target.is_complex:
         return f"the target is {site.kind}, which carries no phase"
     if site.several:
         return "several stations are learned together, for which sources are not searched"

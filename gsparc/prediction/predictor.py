@@ -199,7 +199,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
 
     def _answer_unit(self, unit: str | None) -> PowerUnit:
         """The unit that answers are wanted in."""
-        if self.site.kind == "rssi":
+        if self.site.target.is_level:
             return self.site.power_unit(unit or self._unit)
         if unit or self._unit:
             raise ValueError(f"unit={unit or self._unit}: goes with powers, not with {self.site.kind}")
@@ -243,7 +243,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         >>> bool((predictor.predict_linear(rx=[2.0, 1.0, 1.5]).mean > 0).all())  # no decibels
         True
         """
-        return self.predict(tx, rx, unit=LINEAR if self.site.kind == "rssi" else None)
+        return self.predict(tx, rx, unit=LINEAR if self.site.target.is_level else None)
 
     def std(self, tx: Any = None, rx: Any = None, *, unit: str | None = None) -> Any:
         """Return the expected root mean square error of an entry, in the unit of the answers and float32.
@@ -277,7 +277,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         """
         # 0 where both ends move: then there is no station that a query could leave out.
         has_station = {"tx": tx, "rx": rx}.get(self.site.static_end or "", 0) is not None
-        if has_station or self.site.kind != "rssi" or self.site.stations is None:
+        if has_station or not self.site.target.is_level or self.site.stations is None:
             return ask(self)
         # One call for all stations where the method has one, else a call for each.
         every = self.method.all_stations() if isinstance(self.method, PerStation) else None

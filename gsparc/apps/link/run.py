@@ -41,7 +41,7 @@ class LinkStudy:
     def __init__(self, run: Opened, settings: Mapping[str, Any]) -> None:
         self.method, self.data, self.fold = run.methods[0], run.data, run.split.folds[0]
         site, self.antenna, self.shape = run.data.site, int(settings["antenna"]), settings["pusch"]
-        if site.kind != "csi" or site.subcarriers_hz is None:
+        if not site.target.is_complex or site.subcarriers_hz is None:
             raise ValueError(f"gsparc link needs complex channels with their frequencies, not {site.kind}")
         site.need_phase("gsparc link")
         RULES.check("rule", settings["rule"])

@@ -46,7 +46,7 @@ def locate(
         ValueError: values of another kind or shape, both ends move, or a model without variance.
     """
     site = predictor.site
-    if site.kind == "rssi" and not np.iscomplexobj(values):
+    if site.target.is_level and not np.iscomplexobj(values):
         # By way of stored units: users give levels in the unit that answers come in.
         stored = site.power_unit(unit or predictor.unit).stored(torch.as_tensor(values))
         values = stored * site.target_scale

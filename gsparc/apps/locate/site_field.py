@@ -61,7 +61,7 @@ class SiteField:
         if prediction.variance is None:
             raise ValueError(f"locate: {self.predictor.method.name} states no variance of what is heard")
         mean, variance = flatten_targets(prediction.mean), prediction.variance.double()[:, None]
-        if site.kind == "spectrum":
+        if site.target.is_image:
             return HeardMoments(mean.double(), variance)
         mean, variance = site.target.moments_in_error_unit(mean, variance)
         number = torch.complex128 if site.target.is_complex else torch.float64

@@ -88,12 +88,12 @@ def snapshots_of_values(
     """
     heard = torch.as_tensor(values)
     count, each = site.stations and len(site.stations), site.target.axes
-    ndim = each if count is None or site.kind == "rssi" else each + 1
+    ndim = each if count is None or site.target.is_level else each + 1
     shaped = heard.ndim == ndim and (not count or heard.shape[1] == count)
     if heard.is_complex() != site.target.is_complex or not shaped:
         stations = "" if count is None else f" of {count} stations"
         raise ValueError(f"locate: values {tuple(heard.shape)} {heard.dtype} are no {site.kind}{stations}")
-    if silent is not None and (site.kind != "rssi" or np.shape(silent) != tuple(heard.shape)):
+    if silent is not None and (not site.target.is_level or np.shape(silent) != tuple(heard.shape)):
         raise ValueError(f"locate: silent {np.shape(silent)} is not like powers {tuple(heard.shape)}")
     if torch.isnan(heard.real).flatten(1).all(1).any():
         raise ValueError("locate: there is a snapshot in which nothing was heard")

@@ -59,18 +59,18 @@ def predict_answer(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answ
     Raises:
         ValueError: a place that cannot be.
     """
-    site, kind = predictor.site, predictor.site.kind
+    site, facts = predictor.site, predictor.site.target
     prediction = predictor.predict_linear(**{end: np.atleast_2d(place) for end, place in ends.items()})
     mean = prediction.mean[0].numpy()
     known = site.every_station.position[0] + site.origin
     still: dict[str, np.ndarray] = {} if np.isnan(known).any() else {site.still_end: known}
     level = spread = None
-    if kind != "spectrum":
-        level, spread = (float(value[0]) for value in predicted_levels(prediction, kind))
+    if not facts.is_image:
+        level, spread = (float(value[0]) for value in predicted_levels(prediction, site.kind))
     return Answer(
         {**still, **ends}, level, spread,
         None if prediction.confidence is None else float(prediction.confidence[0]),
-        mean if kind == "spectrum" else None, mean if kind == "csi" else None,
+        mean if facts.is_image else None, mean if facts.is_complex else None,
         _rays(predictor, ends),
     )  # fmt: skip
 

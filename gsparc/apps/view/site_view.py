@@ -94,7 +94,7 @@ class SiteView:
     def sphere(self, name: str | None) -> Sphere | None:
         """Return directions of a spectrum; None of other kinds."""
         site = self.viewed.site
-        return Sphere.from_site(site, self.extent(name)) if site.kind == "spectrum" and site.grid else None
+        return Sphere.from_site(site, self.extent(name)) if site.target.is_image and site.grid else None
 
     def initial_places(self, name: str | None) -> dict[str, np.ndarray]:
         """Return world places (3,) where the ends that move first stand."""

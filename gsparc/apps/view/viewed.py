@@ -95,7 +95,7 @@ class Viewed:
         data, number = self.data, self.site.every_station.name.index(station or "")
         rows = np.flatnonzero(data.stations_of() == number)
         places = data.moving[rows][:, -3:] + data.site.origin
-        if data.site.kind == "spectrum":
+        if data.site.target.is_image:
             chunks = (rows[i : i + CHUNK] for i in range(0, len(rows), CHUNK))
             values = np.concatenate([data.targets(part).flatten(1).mean(1).numpy() for part in chunks])
             label = "mean of a measured spectrum"
@@ -103,7 +103,7 @@ class Viewed:
             values, side = levels.measured_levels(data, rows)
             # What lay below its level was not heard: it has no colour, only a place.
             values[side > 0] = np.nan
-            what = "received power" if data.site.kind == "rssi" else "power of a channel"
+            what = "received power" if data.site.target.is_level else "power of a channel"
             label = f"measured {what} [{self.site.level_unit}]"
         return Measured(places, values, label)
 

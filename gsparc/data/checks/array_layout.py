@@ -31,7 +31,7 @@ def layout_warnings(data: Measurements) -> list[str]:
     """Name the grid or plane that spectra seem to be of instead of the declared ones."""
     site = data.site
     first = np.flatnonzero(data.stations_of() == 0)
-    if site.kind != "spectrum" or site.grid is None or site.array is None or not len(first):
+    if not site.target.is_image or site.grid is None or site.array is None or not len(first):
         return []
     carrier = site.carrier_hz if data.carrier_hz is None else float(data.carrier_hz[first[0]])
     if carrier is None or np.linalg.matrix_rank(site.array - site.array[0]) < 2:
@@ -75,7 +75,7 @@ def _unexplained(data: Measurements, array: np.ndarray) -> float:
 
 def carrier_warnings(data: Measurements) -> list[str]:
     """Name what several carriers at the same places tell: shifted rows, a mirrored azimuth."""
-    if data.site.kind != "spectrum" or data.carrier_hz is None or data.place is None:
+    if not data.site.target.is_image or data.carrier_hz is None or data.place is None:
         return []
     stations, places = data.site.every_station, int(data.place.max()) + 1
     step = max(1, data.target[0].size // PIXELS)

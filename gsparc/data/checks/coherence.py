@@ -69,7 +69,7 @@ def estimate_coherence(data: Measurements) -> Coherence | None:
     Rows are compared within a run, and all antennas or stations of a moment as one. Nothing is drawn.
     """
     site = data.site
-    if site.kind != "csi" or site.wavelength is None or data.uplink is not None:
+    if not site.target.is_complex or site.wavelength is None or data.uplink is not None:
         return None
     few = max(MOST_ENTRIES // (len(site.every_station) * data.target[0].size), 1)
     rows = Snapshots.from_rows(data, np.arange(min(len(data), few)))
@@ -109,7 +109,7 @@ def set_freedom(data: Measurements, align: str) -> Measurements:
         SettingError: no such freedom, or one of what are no channels.
     """
     choice("auto", *FREEDOMS).check("dataset.align", align)
-    if data.site.kind != "csi":
+    if not data.site.target.is_complex:
         if align not in ("auto", "none"):
             raise SettingError(f"dataset.align={align}: is for channels, these are {data.site.kind}")
         return data

@@ -68,17 +68,17 @@ class Score:
 
 def convention_warnings(data: Measurements) -> list[str]:
     """Name the convention that rows seem to follow instead of the declared one, and what mends it."""
-    kind = data.site.kind
-    if kind == "rssi":
+    facts = data.site.target
+    if facts.is_level:
         return _rivals_of_places(data)
     whole, labels = _arrayed(data)
     rows = _drawn(whole)
     few, drawn, labels = data.subset(rows[:1]), whole.subset(rows), labels[rows]
-    zeros = _zeros(drawn) if kind == "csi" and len(rows) else []  # none where an end is at an unknown place
+    zeros = _zeros(drawn) if facts.is_complex and len(rows) else []
     entries = drawn.target.shape[2] * (1 if known_array(drawn) is None else drawn.target.shape[1])
-    if len(rows) < FEWEST[kind]:
+    if len(rows) < FEWEST[facts.kind]:
         return zeros
-    if kind == "csi":
+    if facts.is_complex:
         return [*zeros, *_rivals(mask_zero_tones(drawn), few, labels)] if entries >= COHERENT else zeros
     return _rivals(drawn, few, labels) + _decibels(drawn)
 
@@ -87,7 +87,7 @@ def _arrayed(data: Measurements) -> tuple[Measurements, np.ndarray]:
     """Rows, and labels (S,) int64 of those with one phase; stations heard at one place become an array."""
     stations = data.site.every_station
     run, station = data.runs_of(), data.stations_of()
-    single = data.site.kind == "csi" and data.target.shape[1] == 1
+    single = data.site.target.is_complex and data.target.shape[1] == 1
     if data.place is None or len(stations) < COHERENT or not single:
         return data, run * (int(station.max()) + 1) + station
     heard = Snapshots.from_rows(data, np.arange(len(data)))
@@ -100,16 +100,16 @@ def _arrayed(data: Measurements) -> tuple[Measurements, np.ndarray]:
 
 def _drawn(data: Measurements) -> np.ndarray:
     """Rows (n,) at places of their own, drawn at random; channels half a wavelength apart."""
-    place, kind = np.hstack([data.tx, data.rx_position]), data.site.kind
+    place, facts = np.hstack([data.tx, data.rx_position]), data.site.target
     rows = np.flatnonzero(np.isfinite(place).all(axis=1))
     order = np.random.default_rng(0).permutation(rows)[: 20 * ROWS]
     if not len(order):
         return order
     side = float(np.ptp(place[order], axis=0).max()) / ROWS + 1e-9
-    side = side if kind == "spectrum" else max(side, LIGHT / float(data.site.tones().mean()) / 2)
+    side = side if facts.is_image else max(side, LIGHT / float(data.site.tones().mean()) / 2)
     cells = np.floor((place[order] - place[order].min(axis=0)) / side)
     first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
-    return order[first[: min(ROWS, max(LEAST, ENTRIES[kind] // data.target[0].size))]]
+    return order[first[: min(ROWS, max(LEAST, ENTRIES[facts.kind] // data.target[0].size))]]
 
 
 def _zeros(data: Measurements) -> list[str]:
@@ -123,16 +123,16 @@ def _zeros(data: Measurements) -> list[str]:
 
 def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[str]:
     """A warning where a rival fits far better than what is declared, with those that fit as well."""
-    kind, declared = data.site.kind, _score(data, labels)
+    facts, declared = data.site.target, _score(data, labels)
     rivals: dict[str, Score] = {}
     for name in _tried(few):
         with suppress(ValueError):  # a grid turned beyond a pole
             placed = convert_conventions(data, [name])
             # Within a wavelength all places are one: whatever does not move fits.
-            if kind == "spectrum" or np.ptp(placed.moving, axis=0).max() > LIGHT / placed.site.tones().mean():
+            if facts.is_image or np.ptp(placed.moving, axis=0).max() > LIGHT / placed.site.tones().mean():
                 one = _score(placed, labels)
                 delayed = one.fit > ONE_DELAY and (one.rows - declared.rows).mean() > CLEAR
-                if one.fit > FIT[kind] and (delayed or name != "delays_removed"):
+                if one.fit > FIT[facts.kind] and (delayed or name != "delays_removed"):
                     rivals[name] = one
     best = max(rivals.values(), key=lambda one: one.log_likelihood, default=declared)
     if _of_most_groups(best.rows - declared.rows, data) + (best.phases - declared.phases) / 2 <= RATIO:
@@ -196,7 +196,7 @@ def _of_most_groups(gain: np.ndarray, data: Measurements) -> float:
 
 
 def _score(data: Measurements, labels: np.ndarray) -> Score:
-    return _spectra(data) if data.site.kind == "spectrum" else _channels(data, data.site.tones(), labels)
+    return _spectra(data) if data.site.target.is_image else _channels(data, data.site.tones(), labels)
 
 
 def _channels(data: Measurements, tones: np.ndarray, labels: np.ndarray) -> Score:

@@ -20,7 +20,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
     tones = np.zeros(1) if site.subcarriers_hz is None else site.subcarriers_hz
     weak, strong = (int((data.censored_side() == side).sum()) for side in (1, -1))
     # Wavelengths and stored scales tell who reads powers nothing.
-    paths, scale, powers = data.directions, site.target_scale, site.kind == "rssi"
+    paths, scale, powers = data.directions, site.target_scale, site.target.is_level
     lines = [
         ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
         ("kind", f"{site.kind}: {_targets(data)}"),
@@ -69,7 +69,7 @@ def summarise(data: Measurements, split: Split) -> list[tuple[str, str]]:
 def _carrier(site: Site) -> str:
     if np.isnan(site.carriers).any():
         unknown = "unknown; give frequency_hz, and effects that need the phase become available"
-        return "" if site.target.in_decibels else unknown  # of powers the phase is unknown in any case
+        return "" if site.target.is_level else unknown  # of powers the phase is unknown in any case
     carriers = [f"{hertz / 1e9:.6g}" for hertz in np.unique(site.carriers)]
     if len(carriers) > 1:
         return f"{list_first(carriers)} GHz, one for each station"

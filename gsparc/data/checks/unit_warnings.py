@@ -31,7 +31,7 @@ def unit_warnings(data: Measurements) -> list[str]:
         still = np.zeros((0, 2)) if site.stations is None else site.stations.position[:, :2] + site.origin[:2]
         mixed = {"rows": _find_other_unit(places[1][:, :2]), "stations": _find_other_unit(still)}
         hints = [f"of {who} {hint}" for who, hint in mixed.items() if hint] or hints
-        if site.kind != "csi":  # an array's antennas stand close together
+        if not site.target.is_complex:  # an array's antennas stand close together
             hints += _compare_reaches(still, places[1][:, :2])
     if site.array is not None and site.wavelength is not None:
         reach = float(np.ptp(site.array, axis=0).max())
@@ -46,7 +46,7 @@ def unit_warnings(data: Measurements) -> list[str]:
         # Steps in radians taken for degrees: the columns then span 2 pi degrees.
         if abs(turn / (2 * np.pi) - 1) < 0.02:
             hints.append(f"the columns span {turn:.3g} degrees, a full circle in radians; convert grid_deg")
-    if site.kind == "rssi" and (data.target > 0).all():
+    if site.target.is_level and (data.target > 0).all():
         spread = 10 * float(np.log10(data.target.max() / data.target.min()))
         # Linear powers taken for dB are all next to 0 dB: 10^(1e-9 / 10) is 1; so are hundredths of decibels.
         if 0 < spread < NARROW_DB and len(np.unique(data.target)) >= LEAST:

@@ -107,15 +107,15 @@ CAMPAIGNS: tuple[type[Campaign], ...] = (Techtile, Powder, BLE, NeWRF, TechtileP
 def dataset_by_arrays(raw: Raw) -> type[Campaign] | None:
     """Return the campaign that a file with these arrays is of; None: of none of them."""
     # By its arrays rather than its name: files are renamed, arrays are not.
-    return next((kind for kind in CAMPAIGNS if kind.marks and kind.marks <= set(raw.arrays)), None)
+    return next((one for one in CAMPAIGNS if one.marks and one.marks <= set(raw.arrays)), None)
 
 
 def dataset_by_path(path: Path) -> type[Campaign] | None:
     """Return the campaign that a release, file or folder, is of; None: of none of them."""
-    for kind in CAMPAIGNS:
-        inside = kind.inside and path.is_dir() and any(path.glob(kind.inside))
-        if inside or path.suffix.lower() in kind.suffixes:
-            return kind
+    for campaign in CAMPAIGNS:
+        inside = campaign.inside and path.is_dir() and any(path.glob(campaign.inside))
+        if inside or path.suffix.lower() in campaign.suffixes:
+            return campaign
     return None
 
 

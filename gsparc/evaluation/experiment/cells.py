@@ -110,7 +110,7 @@ class Problem:
     @property
     def network(self) -> bool:
         """Whether stations are sectors of a network, which `gsparc` learns together in any case."""
-        return self.data.site.target.in_decibels and find_sectors(self.data) is not None
+        return self.data.site.target.is_level and find_sectors(self.data) is not None
 
     @property
     def scene(self) -> bool:
@@ -271,11 +271,11 @@ class Contender:
 
     def serves(self, problem: Problem) -> bool:
         """Return whether it can take part."""
-        kind = not self.kinds or problem.kind in self.kinds
-        kind &= not self.problems or any(fnmatchcase(problem.name, pattern) for pattern in self.problems)
+        suits = not self.kinds or problem.kind in self.kinds
+        suits &= not self.problems or any(fnmatchcase(problem.name, pattern) for pattern in self.problems)
         # Booleans compare as 0 and 1: what a method needs, the problem must have.
         needs = problem.stations >= self.stations and problem.scene >= self.scene
-        return kind and needs and self.networks >= problem.network
+        return suits and needs and self.networks >= problem.network
 
     def reads(self, problem: Problem) -> str:
         """Return what it is given beside places; "" for nothing."""
@@ -327,9 +327,9 @@ def unlisted_contenders() -> dict[str, Contender]:
     file = config_folder() / "compare.yaml"
     listed = load_yaml(file.read_text(encoding="utf-8"), file)["methods"]
     exclusions = {*listed, *({*built_in_methods()} - {*plain_methods()})}
-    kinds = {name: import_target(path) for name, path in all_methods().items() if name not in exclusions}
+    classes = {name: import_target(path) for name, path in all_methods().items() if name not in exclusions}
     # One that cannot be imported is warned of.
-    return {name: Unlisted(name, effort=kind.takes_effort) for name, kind in kinds.items() if kind}
+    return {name: Unlisted(name, effort=method.takes_effort) for name, method in classes.items() if method}
 
 
 def plan_cells(

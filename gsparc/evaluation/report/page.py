@@ -74,7 +74,7 @@ def make_sections(
         firsts = fits.drop_duplicates("setting")
         # With one run a setting, spreads over seeds would be empty brackets.
         several = [tables.table_of_seeds] * (len(firsts) < len(fits))
-        kinds = *several, tables.table_of_leads, tables.table_of_results, tables.table_of_worst
+        builders = *several, tables.table_of_leads, tables.table_of_results, tables.table_of_worst
         swept = [columns for name, columns in fronts if name == dataset]
         drawn = OF_KIND[fits.kind.iloc[0]].distributions
         examples = join_examples(study)
@@ -85,7 +85,7 @@ def make_sections(
             for name, what in (*named, ("sectors.png", ": sectors"))
             if (run.folder / name).is_file()
         ]
-        sheets = [table for table in (kind(study) for kind in kinds) if table.rows]
+        sheets = [table for table in (build(study) for build in builders) if table.rows]
         figures = [plots.draw_pareto(study, swept), plots.draw_distributions(study, drawn)]
         figures += [] if examples is None else [draw_spectra(examples, title)]
         sections.append(Section(title, study, warnings(study), sheets, figures, pictures))

@@ -22,7 +22,7 @@ from gsparc.training.stopwatch import Stopwatch
 
 def _runs_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
     """What a reader must know of channels of several runs that are learned as if they were of one."""
-    count = len(np.unique(data.runs_of(rows))) if data.site.kind == "csi" else 0
+    count = len(np.unique(data.runs_of(rows))) if data.site.target.is_complex else 0
     note = (
         f"channels of {count} runs, each with a factor of its own, are taken as one; dataset.runs=[...] keeps"
     )
@@ -50,7 +50,7 @@ class Interpolator(Method):
         self.site, self.shape, self.seen = data.site, tuple(data.target.shape[1:]), len(rows)
         # What learning adds must be stored: a checkpoint that lost it would fail only when it is read.
         before = set(vars(self))
-        if self.uses_censored and data.site.kind == "rssi":
+        if self.uses_censored and data.site.target.is_level:
             notes = self._learn_powers(power_rows(data, rows))
         else:
             remarks = self._learn(data.moving[rows], training_targets(data, rows))

@@ -27,7 +27,7 @@ from gsparc.training.context import FitContext
 def carriers_obstacle(site: Site) -> str | None:
     """Return why spectra of this site are not those of one array at several carriers; None where they are."""
     stations = site.every_station
-    if site.kind != "spectrum" or stations.carrier_hz is None:
+    if not site.target.is_image or stations.carrier_hz is None:
         return "targets are no spectra at several carriers"
     if site.static_end != "rx" or np.ptp(stations.position, axis=0).max() > SAME_PLACE_M:
         return "receivers at several places"

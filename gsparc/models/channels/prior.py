@@ -35,9 +35,9 @@ class ChannelPrior(Stored):
 
     def with_terms(self, *terms: ChannelTerm) -> ChannelPrior:
         """Return the prior with these in place of their kinds; those without powers are left out."""
-        kinds = {type(term): term for term in (*self.terms, *terms)}
+        by_class = {type(term): term for term in (*self.terms, *terms)}
         # In the order of `KINDS`: parameters of terms stand one after the other in vectors.
-        ordered = (kinds[kind] for kind in dict.fromkeys([*KINDS, *kinds]) if kind in kinds)
+        ordered = (by_class[one] for one in dict.fromkeys([*KINDS, *by_class]) if one in by_class)
         return ChannelPrior(tuple(term for term in ordered if len(term.power)))
 
     def change_frame(self, **numbers: Any) -> ChannelPrior:

@@ -173,7 +173,7 @@ def merge_equal_paths(paths: QueryPaths) -> QueryPaths:
 
 def require_static_phase(site: Site, name: str) -> None:
     """Raise a `ValueError` in a method's name for data that sources with carrier phase cannot explain."""
-    if site.kind != "csi":
+    if not site.target.is_complex:
         raise ValueError(f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")
     if site.static_position is None:
         raise ValueError(f"{name}: {site.name} lacks its static place: give it, or take model=complex_gp")

@@ -29,7 +29,7 @@ class LearnsTogether(MethodFactory):
     def learns_jointly(self, site: Site) -> bool:
         """Tell whether stations share a field: of powers, or channels of a known carrier with phases."""
         waves = site.has_waves and len(site.moving_ends) == 1
-        return (waves and site.phase_reference != "neighbours") or site.target.in_decibels
+        return (waves and site.phase_reference != "neighbours") or site.target.is_level
 
     def why_each(self, data: Measurements) -> str | None:
         """Return why several stations cannot be learned together; None where they can."""
@@ -50,9 +50,9 @@ class LearnsTogether(MethodFactory):
             return "each", why
         if not self.learns_jointly(data.site) or self.init.name == "scene":
             return "each", ""
-        if data.site.kind == "spectrum":
+        if data.site.target.is_image:
             return "together", "carriers at one place have the same paths"
-        if data.site.kind == "csi":
+        if data.site.target.is_complex:
             return "together", "channels at all stations share waves and the frame of places"
         if find_sectors(data) is not None:
             return "together", "sectors of a network share a law, a pattern and the shadowing of their sites"

@@ -53,7 +53,7 @@ class Channels(Mixture):
 
     def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""
-        return None if data.site.kind == "csi" else f"the target is {data.site.kind}, not channels"
+        return None if data.site.target.is_complex else f"the target is {data.site.kind}, not channels"
 
 
 class Powers(Mixture):
@@ -93,7 +93,7 @@ class Powers(Mixture):
         """See `Mixture`."""
         if data.site.several and (why := self.why_each(data)) is not None:
             return f"{why}; say stations=each"
-        return None if data.site.kind == "rssi" else f"the target is {data.site.kind}, not received powers"
+        return None if data.site.target.is_level else f"the target is {data.site.kind}, not received powers"
 
 
 class Bearings(Mixture):

@@ -111,7 +111,7 @@ class Mixture(LearnsTogether, ClosedForm):
             read_walls(self.init.file)  # its errors come before anything is computed
         # Places are refined by slopes of predictions: of one end that moves, with phases that rows share.
         site, phases = data.site, data.site.phase_reference != "neighbours"
-        heeds = site.kind != "spectrum" and site.static_end is not None and phases
+        heeds = not site.target.is_image and site.static_end is not None and phases
         fit_rows = fold.learned()
         if (std := position_errors(data, fit_rows, self.position_std, heeds)) is not None:
             return self._fit_twice(parts, init, data, fold, context, std)
@@ -187,7 +187,7 @@ class Mixture(LearnsTogether, ClosedForm):
         result = self.predict(batch).explained
         assert result is not None
         prediction, target = (data.site.target.in_error_unit(one) for one in (result, batch.target))
-        return explained_variance(prediction, target, data.site.kind != "csi")
+        return explained_variance(prediction, target, not data.site.target.is_complex)
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """Condition every member on the same rows."""

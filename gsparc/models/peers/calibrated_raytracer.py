@@ -79,7 +79,7 @@ class CalibratedRayTracer(Checked, Method):
         site = data.site
         if site.kind not in self.kinds:
             return f"{self.name}: needs received powers or channels, not {site.kind}"
-        if site.kind == "csi" and data.target.shape[1] != 1:
+        if site.target.is_complex and data.target.shape[1] != 1:
             return f"{self.name}: needs channels of one antenna"
         if site.static_position is None or not np.isfinite(site.static_position).all():
             return f"{self.name}: needs one end that stands still at a known place"
@@ -123,7 +123,7 @@ class CalibratedRayTracer(Checked, Method):
         # Without paths in training, what is weakest there is the best guess of what lies deeper.
         self._silent_db = float(np.median(measured[~reached]) if not reached.all() else measured.min())
         # Powers tell a gain in decibels; channels need its phase too.
-        if data.site.kind == "csi":
+        if data.site.target.is_complex:
             self._factor = self._best_factor(data, rows)
         return FitReport(begin.seconds, self._describe_fit(len(rows) - int(reached.sum())))
 
@@ -148,7 +148,7 @@ class CalibratedRayTracer(Checked, Method):
         """See `Method.predict`; `ValueError` before `fit` or `restore`."""
         site, learned = self.fitted_site, self.require_fitted(self.learned)
         paths = self._trace(query.places(site).detach().numpy())
-        if site.kind == "csi":
+        if site.target.is_complex:
             return Prediction(torch.from_numpy((self._channels(paths) * self._factor).astype(np.complex64)))
         power = paths.received_power()
         # No path is -inf dB, which the silent level replaces.

@@ -87,7 +87,7 @@ def rendering_options(scene: KnownSite) -> tuple[SphereGrid, dict[str, Any]]:
     """Return grid and cut-off: spectra bring their grid; channels see the sphere, cut off relatively."""
     grid = scene.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
     least = RasterSettings().relative_cutoff
-    return grid, {} if scene.site.kind == "spectrum" else {"cutoff": Cutoff(least, relative=True)}
+    return grid, {} if scene.site.target.is_image else {"cutoff": Cutoff(least, relative=True)}
 
 
 def render_each(

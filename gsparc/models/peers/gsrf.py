@@ -52,7 +52,7 @@ class ComplexGaussians(GaussianNetwork):
             # The constant term: Gaussians begin by radiating alike to all sides.
             self.coefficients[:, 0, 0] += 0.3
         self.response: nn.Parameter | None = None
-        if scene.site.kind == "csi":  # of each Gaussian at every antenna and tone
+        if scene.site.target.is_complex:  # of each Gaussian at every antenna and tone
             response = torch.zeros(count, *scene.shape, 2)
             response[..., 0] = 1
             self.response = nn.Parameter(response)

@@ -37,7 +37,7 @@ class Radiators(Network):
 
     def __init__(self, scene: KnownSite, settings: NGRF) -> None:
         super().__init__(scene, settings.count)
-        site, count, name, spectrum = scene.site, self.count, settings.name, scene.site.kind == "spectrum"
+        site, count, name, spectrum = scene.site, self.count, settings.name, scene.site.target.is_image
         if site.subcarriers_hz is None and site.carrier_hz is None:
             raise ValueError(f"{name}: the dataset declares no frequency, waves have no phase without")
         if spectrum and (site.array is None or scene.receiver is None):

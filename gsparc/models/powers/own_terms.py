@@ -196,10 +196,11 @@ def describe_weights(posterior: Exact, terms: tuple[UserTerm, ...]) -> list[Lear
     numbers = torch.stack([weights, std, torch.zeros_like(std), torch.full_like(std, scale**0.5)]).numpy()
     sizes = [one.columns(at[:1]).shape[1] for one in terms]
     parts = np.split(numbers[:, -sum(sizes) :], np.cumsum(sizes)[:-1], 1)
-    kinds = [type(one.term).__name__ for one in terms]
-    # Several of one kind are told apart by their order.
-    order = [kinds[: k + 1].count(kind) for k, kind in enumerate(kinds)]
-    names = [f"{kind} {n}" if kinds.count(kind) > 1 else kind for kind, n in zip(kinds, order, strict=True)]
+    classes = [type(one.term).__name__ for one in terms]
+    # Several of one class are told apart by their order.
+    order = [classes[: k + 1].count(name) for k, name in enumerate(classes)]
+    counted = zip(classes, order, strict=True)
+    names = [f"{name} {n}" if classes.count(name) > 1 else name for name, n in counted]
     return [
         LearnedWeights.from_numbers(name, one.weight_prior[1] * part + [[one.weight_prior[0]], [0]] * 2)
         for name, one, part in zip(names, terms, parts, strict=True)

@@ -45,7 +45,7 @@ def resolve_auto(settings: ModelSettings, init: InitName, site: Site) -> tuple[C
     Raises:
         ValueError: a closed-form start that these settings or data do not allow.
     """
-    emission, spectra, static = settings.emission, site.kind == "spectrum", site.static_end == "rx"
+    emission, spectra, static = settings.emission, site.target.is_image, site.static_end == "rx"
     notes: list[str] = []
 
     def choose(name: str, setting: str, choice: str, reason: str) -> str:
@@ -73,14 +73,14 @@ def resolve_auto(settings: ModelSettings, init: InitName, site: Site) -> tuple[C
     reason = "a closed-form start" if started else f"the target is {site.kind}"
     if through_array:
         fitting["spectrum"], reason = "linear", "fields at an array are signed"
-    if emission.log_distance and site.kind != "csi":
+    if emission.log_distance and not site.target.is_complex:
         fitting[site.kind], reason = "sigmoid", "log_distance=true"
     activation = choose("activation", emission.activation, fitting[site.kind], reason)
     bias = emission.init_bias
     if bias == AUTO:
         # 500 softplus units of 0.7 each would start at 300 times the mean power.
         bias = 0.0
-        if site.kind == "rssi" and activation == "softplus":
+        if site.target.is_level and activation == "softplus":
             count = max(settings.field.count, 1)
             # Inverse of softplus, at 1 / count.
             bias = math.log(math.expm1(1 / count))

@@ -124,9 +124,9 @@ class ImageProcess(LearnedField):
         if left_out is not None:
             triples.append([torch.from_numpy(one) for one in left_out.beside_process(self._apart)])
         prediction, _, target = triples[0]
-        self.explained = explained_variance(prediction, target, data.site.kind != "csi")
+        self.explained = explained_variance(prediction, target, not data.site.target.is_complex)
         gram = np.concatenate([error_products(both, target) for *both, target in triples])
-        gram = relative_to_row(gram) if data.site.kind == "spectrum" else gram
+        gram = relative_to_row(gram) if data.site.target.is_image else gram
         weight = float(choose_weights(gram, np.arange(len(gram)), SURE, LEAST_GAIN, FEW_ROWS)[1])
         log.info(
             "%d held-out rows, %d training rows without their neighbours: weight of a Gaussian process %.2f",

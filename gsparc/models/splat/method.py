@@ -200,9 +200,10 @@ class LearnedField(Method):
 
     def _refuse_site(self, site: Site) -> None:
         """Raise `ValueError`, one line, where it has no such field."""
-        if self.settings.response.channel != "mean" or (site.kind != "rssi" and site.static_end is not None):
+        one_end = not site.target.is_level and site.static_end is not None
+        if self.settings.response.channel != "mean" or one_end:
             return
-        why = "the target is powers" if site.kind == "rssi" else "both ends move"
+        why = "the target is powers" if site.target.is_level else "both ends move"
         raise ValueError(
             f"{self.name}: the paper's field is of spectra and channels between an end that stands and one "
             f"that moves; here {why}: take model=gsparc without paper="
@@ -216,7 +217,7 @@ class LearnedField(Method):
         """
         self._refuse_site(data.site)
         self.site, self._ends = data.site, _static_end_position(data, int(fold.train[0]))
-        if data.site.kind == "csi":
+        if data.site.target.is_complex:
             if np.isnan([data.tx, data.rx_position]).any():
                 fault = f"{data.site.name} does not say where its static end is"
                 raise ValueError(f"{self.name}: {fault}; take model=complex_gp")
@@ -224,7 +225,7 @@ class LearnedField(Method):
         self.choices, reasons = resolve_auto(self.settings, self.init.name, data.site)
         for reason in reasons:
             log.info("%s", reason)
-        if data.site.kind == "csi" and self.choices.activation == "sigmoid":
+        if data.site.target.is_complex and self.choices.activation == "sigmoid":
             log.warning(
                 "%s: a sigmoid is positive, so that real and imaginary parts of these channels cannot be "
                 "negative; model.emission.activation=signed_sigmoid is the smallest change that can be",
@@ -443,7 +444,7 @@ class LearnedField(Method):
     ) -> Prediction:
         result = model(tx, rx) if frozen is None else frozen.render(model, tx, rx)
         mean = result.mean
-        if model.site.kind == "spectrum":
+        if model.site.target.is_image:
             mean = mean.clamp(0, 1) if mean.dtype == torch.float64 else mean.clamp_(0, 1)
         if model.error is not None and result.unknown is not None:
             return Prediction(mean, *model.error(result.unknown))
@@ -454,7 +455,7 @@ class LearnedField(Method):
     def frozen_at(self, rx: Pose) -> FrozenView | FrozenArray | None:
         """Return the matrix of the static receiver, made anew after an edit; None for any other pose."""
         model, static = self.fitted_model(), self._static_receiver()
-        if model.site.kind != "spectrum" or static is None or rx.batched:
+        if not model.site.target.is_image or static is None or rx.batched:
             return None
         if not (torch.equal(rx.position, static.position) and torch.equal(rx.rotation, static.rotation)):
             return None

@@ -71,7 +71,7 @@ def reduce_field(method: LearnedField, settings: Settings, measured: dict[str, T
         return Interpolated(twin, grid, stride) if stride > 1 else twin
     if stride == 1:
         return twin
-    if site.kind != "spectrum":  # visibility is measured on fewer directions, nothing to fill in
+    if not site.target.is_image:  # visibility is measured on fewer directions, nothing to fill in
         rows = FULL_SPHERE_ROWS // stride
         model.site = replace(site, grid=SphereGrid.full_sphere(rows, 2 * rows))
         return twin

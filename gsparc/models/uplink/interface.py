@@ -61,7 +61,7 @@ class UplinkMethod(Method):
         return uplink[:, torch.from_numpy(np.asarray(self.fitted_site.antennas))]
 
     def _require_uplink(self, data: Measurements) -> Site:
-        if data.site.kind != "csi" or data.uplink is None or data.site.antennas is None:
+        if not data.site.target.is_complex or data.uplink is None or data.site.antennas is None:
             raise ValueError(
                 f"{self.name}: reads a fresh uplink, and {data.site.name} has none (dataset=argos does)"
             )

@@ -132,7 +132,7 @@ def fit_taps(
         ValueError: another model, no rate, a band wider than the rate, or silence.
     """
     site = predictor.site
-    if site.kind != "csi" or site.static_end is None:
+    if not site.target.is_complex or site.static_end is None:
         raise ValueError("to=taps: channels with one end that stands still are needed")
     tones = site.tones()
     if rate_hz is None and len(tones) == 1:

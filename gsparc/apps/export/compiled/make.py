@@ -65,7 +65,7 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
     method, site = predictor.method, predictor.site
     if isinstance(method, PerStation):
         raise ValueError(f"station= is needed, one of {', '.join(site.every_station.name)}")
-    if site.static_end is None and site.kind != "rssi":
+    if site.static_end is None and not site.target.is_level:
         advice = "take a model of powers, or one end that stands still"
         raise ValueError(f"to=c: channels and spectra of two moving ends have no compiled form; {advice}")
     # An exact form is not measured: its error is that of rounding to float32.
@@ -81,9 +81,9 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
     squared, power = np.concatenate(parts, axis=1)
     # The worst may be near the station, the mean is over random places alone.
     found = np.array([squared[:count].mean(), squared.max()]) / max(power[:count].mean(), 1e-300)
-    error, worst = np.maximum(np.sqrt(found) if site.kind == "rssi" else found, 1e-12).tolist()
+    error, worst = np.maximum(np.sqrt(found) if site.target.is_level else found, 1e-12).tolist()
     figure = f"{FIGURES[site.kind]} {error:.2g} at {count} random places, {worst:.2g} at the worst"
-    if site.kind == "rssi":
+    if site.target.is_level:
         away, _ = _squares(form.predictor, predictor, far_places(site, 256, seed + 4))
         rms, most = np.sqrt([away.mean(), away.max()])
         figure += f", outside their box {rms:.2g}, {most:.2g} at the worst"
@@ -93,12 +93,12 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
 def _squares(form: Predictor, model: Predictor, places: np.ndarray) -> np.ndarray:
     """Squared error, and what it is divided by, of each local place (2, n) in terms of `FIGURES`."""
     answers, whole = (ask_model(one, places).reshape(len(places), -1) for one in (form, model))
-    if model.site.kind == "rssi":
+    if model.site.target.is_level:
         # A power of 0 has no decibels; 1e-30 is far below any receiver's noise.
         whole = np.maximum(whole, 1e-30)
         answers, whole = 10 * np.log10(np.maximum(answers / whole, SILENT)), np.zeros_like(whole)
     squared, power = (np.square(np.abs(one).astype(np.float64)).mean(1) for one in (answers - whole, whole))
-    return np.stack([squared, power if model.site.kind == "csi" else np.ones(len(places))])
+    return np.stack([squared, power if model.site.target.is_complex else np.ones(len(places))])
 
 
 _NAMES = dict(enumerate((
@@ -128,7 +128,7 @@ def compile_exactly(method: Method, site: Site) -> Form | None:
 
 
 def _rendered(method: LearnedField, site: Site) -> Form | None:
-    if site.kind != "spectrum" or site.static_position is None:
+    if not site.target.is_image or site.static_position is None:
         return None
     rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
     place = torch.from_numpy(np.asarray(site.static_position, np.float32))
@@ -150,9 +150,9 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
     own_form = _rendered(alone, site) if isinstance(alone, LearnedField) else None
     if alone is not None and own_form is not None:
         return replace(own_form, predictor=Predictor(alone, site))
-    if site.kind == "spectrum":
+    if site.target.is_image:
         raise ValueError(f"{method.name}: of spectra only rendered Gaussians can be compiled (model=gsparc)")
-    sources = _sources_of(method) if site.kind == "csi" else None
+    sources = _sources_of(method) if site.target.is_complex else None
     places = random_places(site, ANSWERED[site.kind], seed)
     if sources is None:  # the law of distance that goes on outside the box
         places = np.concatenate([places, far_places(site, len(places) // FAR_SHARE, seed)])

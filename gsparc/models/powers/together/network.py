@@ -115,7 +115,7 @@ def relabel_by_site(rows: StationRows, network: Sectors) -> StationRows:
 
 def check_azimuths(data: Measurements, seed: int = 0) -> list[str]:
     """Return what `learn_network` says of azimuths; nothing where `data` are of no network."""
-    if data.site.kind != "rssi" or data.station is None or len(data) < LEAST_TESTED:
+    if not data.site.target.is_level or data.station is None or len(data) < LEAST_TESTED:
         return []
     every = np.arange(len(data))
     places, _ = places_and_notes(data, every)
