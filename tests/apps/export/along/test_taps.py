@@ -9,21 +9,16 @@ import gsparc
 from gsparc.apps.export.along.taps import Trajectory, fit_taps
 from gsparc.commands import export
 from gsparc.data.raw import read_raw
-from gsparc.data.schema import LIGHT
+from gsparc.data.schema import LIGHT, Site
 from gsparc.models import checkpoint
 from gsparc.prediction.channels import Paths
 
 CARRIER = 3.5e9
 
 
-class Site:
-    kind, static_end, moving_end, name = "csi", "tx", "rx", "two rays"
-
-    def __init__(self, tones):
-        self._tones = tones
-
-    def tones(self):
-        return self._tones
+def site_of(tones: np.ndarray) -> Site:
+    """A transmitter that stands still, at these tones [Hz]."""
+    return Site("two rays", "csi", "tx", None, None, CARRIER, tones)
 
 
 class Rays:
@@ -32,7 +27,7 @@ class Rays:
     sources = np.array([[0.0, 0, 5], [0, -40, 5], [-55.0, 0, 5]])
 
     def __init__(self, tones, with_paths=False):
-        self.site, self.with_paths = Site(tones), with_paths
+        self.site, self.with_paths = site_of(tones), with_paths
 
     def csi(self, tx=None, rx=None):
         return self._paths(rx).channel(self.site.tones())
