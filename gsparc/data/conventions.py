@@ -19,6 +19,7 @@ from gsparc.data.limits import choice
 from gsparc.data.schema import LIGHT, OTHER, End, Measurements
 from gsparc.data.units import UNITS
 from gsparc.ops import SphereGrid
+from gsparc.physics.decibels import from_decibels
 
 FOOT = UNITS["ft"].factor
 Change = Callable[[Measurements], Measurements]
@@ -191,7 +192,7 @@ CONVENTIONS = {
     "azimuth_180": Convention("azimuth from -180 degrees", "spectra", _azimuth(-math.pi)),
     "azimuth_north": Convention("azimuth from the y axis", "spectra", _azimuth(math.pi / 2)),
     "decibels": Convention("decibels", "spectra",
-                           _values(lambda v: 10 ** (v.astype(np.float64) / 10)), False),
+                           _values(lambda v: from_decibels(v.astype(np.float64))), False),
 }  # fmt: skip
 
 

@@ -29,6 +29,7 @@ from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, OTHER, Links, Meas
 from gsparc.data.selection import WHOLE, Selection
 from gsparc.data.target import TARGETS, Kind
 from gsparc.data.units import LINEAR, PowerUnit
+from gsparc.physics.decibels import from_decibels
 
 log = logging.getLogger(__name__)
 
@@ -381,7 +382,7 @@ def _scaled(
     if values.dtype == np.uint8:
         return values, 1.0 if values.any() else 0.0
     if name == "rssi_db":
-        values = 10 ** (values / 10) * (1 if mask_or_level is None else mask_or_level)
+        values = from_decibels(values) * (1 if mask_or_level is None else mask_or_level)
     if name == "spectrum":
         highest = peak_magnitudes(values)
         largest = float(highest[~find_strong_outliers(highest)].max(initial=0.0))

@@ -21,6 +21,7 @@ from gsparc.data.links.stations import find_station
 from gsparc.data.row_order import find_copies, hash_rows
 from gsparc.data.schema import FIELDS, Stations, list_arrays_with_axis
 from gsparc.data.spacing import group_visits
+from gsparc.physics.decibels import to_decibels
 
 FROM_ROW = " from row "  # in the name of a station that another one became by a step of its level
 FEWEST = 2  # rows of a dataset
@@ -137,7 +138,7 @@ def select(arrays: Arrays, measured: str, stations: Stations | None, part: Selec
             raise DataError(f"{option}: {source} holds {measured}; expected powers, rssi or rssi_db")
         with np.errstate(divide="ignore", invalid="ignore"):
             # A power of 0 is minus infinity, below every level; NaN compares as False and stays missing.
-            level = 10 * np.log10(arrays[measured]) if measured == "rssi" else arrays[measured]
+            level = to_decibels(arrays[measured]) if measured == "rssi" else arrays[measured]
             arrays = kept(option, np.logical_not(level < part.min_rssi_db))
     arrays = kept("copies of other rows (same places, station and values)", ~_copies(arrays, measured))
     if part.max_rows is not None:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.physics.decibels import RELATIVE_DB, TINY_POWER, finite_decibels
+from gsparc.physics.decibels import RELATIVE_DB, TINY_POWER, finite_decibels, from_decibels
 
 Kind = Literal["spectrum", "csi", "rssi"]
 Values = TypeVar("Values", np.ndarray, Tensor)
@@ -139,7 +139,7 @@ class Power(Target):
 
     def to_targets(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
         """See `Target.to_targets`."""
-        return 10 ** (rows.reshape(len(rows), *shape) / 10)
+        return from_decibels(rows.reshape(len(rows), *shape))
 
     def entry_variance(self, variance: Tensor, mean: Tensor) -> Tensor:
         """Carry decibels to linear power, to first order; see `Target.entry_variance`."""

@@ -10,7 +10,7 @@ import numpy as np
 from torch import Tensor
 
 from gsparc.data.files import read_shipped_table
-from gsparc.physics.decibels import RELATIVE_DB
+from gsparc.physics.decibels import RELATIVE_DB, from_decibels, to_decibels
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class PowerUnit:
     def values(self, stored: Tensor) -> Tensor:
         """Return powers in the unit, like `stored`; levels are -inf of silence and NaN of what is less."""
         if self.decibels:
-            return 10 * stored.double().log10() + self.raised_db
+            return to_decibels(stored.double()) + self.raised_db
         return stored if self.scale == 1 else stored * self.scale
 
     def variance(self, stored: Tensor, variance: Tensor) -> Tensor:
@@ -122,9 +122,9 @@ class PowerUnit:
     def stored(self, values: Tensor) -> Tensor:
         """Invert `values`, in float64."""
         values = values.double()
-        return 10 ** ((values - self.raised_db) / 10) if self.decibels else values / self.scale
+        return from_decibels(values - self.raised_db) if self.decibels else values / self.scale
 
 
 def power_in_decibels(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean and deviation (n,) [dB] of powers of `mean` and `variance` (n,), linear and above 0."""
-    return 10 * np.log10(mean), RELATIVE_DB * np.sqrt(variance) / mean
+    return to_decibels(mean), RELATIVE_DB * np.sqrt(variance) / mean

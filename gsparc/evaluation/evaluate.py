@@ -29,6 +29,7 @@ from gsparc.evaluation.scores import Scores, rows_to_score, score_methods, unsee
 from gsparc.evaluation.summary import write_samples
 from gsparc.models.fitting import common_label
 from gsparc.models.method import Method
+from gsparc.physics.decibels import to_decibels
 from gsparc.prediction import timing
 from gsparc.prediction.timing import ClockSettings, query_calls, time_beside_copy, time_interleaved
 
@@ -269,7 +270,7 @@ def _columns(scores: Scores, data: Measurements) -> dict[str, Any]:
     }  # fmt: skip
     if data.site.target.is_level:
         levels = {"predicted_db": scores.samples["prediction"], "measured_db": scores.samples["target"]}
-        columns |= {name: 10 * np.log10(np.where(power > 0, power, np.nan)) for name, power in levels.items()}
+        columns |= {name: to_decibels(np.where(power > 0, power, np.nan)) for name, power in levels.items()}
     of_row = data.stations_of(scores.row)
     columns |= {head: np.array(names)[of_row] for head, names in data.site.every_station.named.items()}
     for end in data.site.moving_ends[:-1]:

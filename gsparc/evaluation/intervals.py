@@ -10,6 +10,7 @@ from gsparc.data.units import power_in_decibels
 from gsparc.evaluation.by_station import best_server, rmse_after_constants
 from gsparc.evaluation.metric_formats import CALIBRATION, WITH_SILENT
 from gsparc.evaluation.scores import Scores
+from gsparc.physics.decibels import to_decibels
 from gsparc.processes.uncertainty import coverage_and_width, half_width
 
 SHARE = 0.9  # of the truth that an interval is to hold
@@ -39,7 +40,7 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     if heard.any():
         moments = [scores.samples[n][valid] for n in ("heard_db", "heard_std_db") if n in scores.samples]
         middle, spread = (part[heard] for part in moments or (mean_db, spread_db))
-        error = 10 * np.log10(power[heard]) - middle
+        error = to_decibels(power[heard]) - middle
         coverage, width = coverage_and_width(error, half_width(SHARE) * spread)
         figures |= {"interval/coverage_90": coverage, "interval/width_db": width}
         figures |= {CALIBRATION: float(np.mean((error / spread) ** 2))}

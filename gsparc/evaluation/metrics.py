@@ -17,6 +17,8 @@ from scipy.ndimage import gaussian_filter
 from skimage.metrics import structural_similarity
 from torch import Tensor
 
+from gsparc.physics.decibels import to_decibels
+
 log = logging.getLogger(__name__)
 
 DB_CAP = 100.0  # a perfect prediction has no finite ratio; 100 dB is beyond any float32 target
@@ -274,7 +276,7 @@ def _db(signal: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """10 log10(signal / noise) within +-DB_CAP; NaN where there is no signal or nothing is known."""
     with np.errstate(divide="ignore", invalid="ignore"):
         # A difference of logarithms: the ratio of 1e-200 and 1e200 is no float64.
-        ratio = 10 * (np.log10(signal) - np.log10(noise))
+        ratio = to_decibels(signal) - to_decibels(noise)
     return np.where(signal > 0, np.clip(np.where(noise == 0, np.inf, ratio), -DB_CAP, DB_CAP), np.nan)
 
 

@@ -24,6 +24,7 @@ from gsparc.evaluation.given_heard import (
 from gsparc.evaluation.metric_formats import OF_KIND
 from gsparc.evaluation.metrics import power_errors
 from gsparc.models.method import Method, predict_in_batches
+from gsparc.physics.decibels import from_decibels
 
 SUBSETS = ("train", "val", "test")
 # 64 spectra of 90 x 360 pixels take 8 MB in float32, and their targets as much.
@@ -203,7 +204,7 @@ def score_methods(
     row = np.concatenate(every)
     pooled |= errors_with_silent(pooled, row, data)
     if "heard_db" in pooled:
-        pooled |= power_errors(10 ** (pooled["heard_db"] / 10), pooled["target"])
+        pooled |= power_errors(from_decibels(pooled["heard_db"]), pooled["target"])
     return Scores(
         kind=data.site.scored,
         fold=np.repeat(np.arange(len(every)), [len(rows) for rows in every]),

@@ -10,6 +10,7 @@ import numpy as np
 from gsparc.evaluation.drawing import panels, save
 from gsparc.evaluation.from_above import draw_stations, draw_values, draw_walls, legend_below, set_bounds
 from gsparc.evaluation.table import Column, Table
+from gsparc.physics.decibels import to_decibels
 from gsparc.simulate.campaign import Outcome
 from gsparc.simulate.raytracer import RayTracer
 from gsparc.simulate.scenes.shipped import list_shipped_scenes
@@ -38,7 +39,7 @@ def draw_floor_plan(outcome: Outcome, path: Path) -> None:
     # A mark's area [points^2] shrinks with the number of places, within what is seen and not hidden.
     size = float(np.clip(6000 / len(places), 2, 40))
     bar: dict[str, Any] = {"location": "bottom", "shrink": 0.8}
-    at, level = places[reached, :2], 10 * np.log10(heard[reached])
+    at, level = places[reached, :2], to_decibels(heard[reached])
     draw_values(axes[0], at, level, size, 0.01, label="received power [dB]", **bar)
     draw_values(axes[1], at, spread[reached] * 1e9, size, 0.01, label="delay spread [ns]", **bar)
     if changed is not None:

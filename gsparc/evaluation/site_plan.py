@@ -31,6 +31,7 @@ from gsparc.evaluation.from_above import (
     legend_below,
     set_bounds,
 )
+from gsparc.physics.decibels import to_decibels
 
 NAMED = 15  # stations; of more only their number is said
 MOST_JUMPS = 4  # stations in the second column: those that change most
@@ -92,14 +93,14 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
     row, entry = np.nonzero(heard & (power > 0))
     in_decibels, value = data.site.target.is_level, power[row, entry]
     # Powers of channels are averaged linearly, levels of a station in decibels.
-    value = 10 * np.log10(value) if in_decibels else value
+    value = to_decibels(value) if in_decibels else value
     each = [which[row], data.stations_of(row) if in_decibels else which[row]]
     level = pd.Series(value).groupby(each).mean().groupby(level=0).max().reindex(range(count)).to_numpy()
     if in_decibels:
         of = " of the strongest station" if several else ""
         return level, f"received power{of} [{data.site.level_unit}]"
     with np.errstate(divide="ignore"):
-        return 10 * np.log10(level), "mean channel power" + (" of all stations" if several else "") + " [dB]"
+        return to_decibels(level), "mean channel power" + (" of all stations" if several else "") + " [dB]"
 
 
 def draw_site(

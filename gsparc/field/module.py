@@ -21,6 +21,7 @@ from gsparc.field.losses import LossSettings, fits_ssim_window, ssim, task_loss
 from gsparc.field.model import GaussianModel, Rendered
 from gsparc.field.optimizer import OptimizerSettings, RateOf, optimizer_for, scheduler_for
 from gsparc.ops import UnsoundGaussian
+from gsparc.physics.decibels import to_decibels
 
 
 class NonFiniteLoss(RuntimeError):
@@ -113,7 +114,7 @@ class NetworkModule(L.LightningModule):
         else:
             if fits_ssim_window(mean):
                 figures["val/ssim_gauss"] = ssim(mean, batch.target).mean()
-            figures["val/psnr_db"] = (-10 * error.clamp_min(1e-12).log10()).mean()
+            figures["val/psnr_db"] = -to_decibels(error.clamp_min(1e-12)).mean()
         self._looks.append((errors, figures))
         self.log_dict(figures, batch_size=size, prog_bar=True)
         # Dashboards get the seconds beside every figure too.

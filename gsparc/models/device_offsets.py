@@ -15,6 +15,7 @@ import numpy as np
 from gsparc.data.errors import list_first
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.processes.few_rows import first_rows
 from gsparc.processes.level_field import fit_level_field
 
@@ -32,7 +33,7 @@ def take_off_devices(data: Measurements, fold: Fold) -> Measurements:
     if data.device is None or data.site.device_names is None:
         return data
     names, rows = data.site.device_names, fold.train[data.censored_side(fold.train) == 0]
-    level = 10 * np.log10(np.maximum(data.target[rows, 0].astype(np.float64), np.finfo(np.float32).tiny))
+    level = to_decibels(np.maximum(data.target[rows, 0].astype(np.float64), np.finfo(np.float32).tiny))
     station = data.stations_of(rows)
     most = int(np.clip(MOST_ROWS / len(np.unique(station)), LEAST_OF_STATION, MOST_OF_STATION))
     order = np.random.default_rng(0).permutation(len(rows))
@@ -55,7 +56,7 @@ def without_devices(data: Measurements, site: Site) -> Measurements:
     """Return rows less the offsets that a site knows, and as its; as they are where they name no devices."""
     if data.device is None or site.device_levels is None:
         return data
-    factor = 10 ** (-site.device_levels[data.device, 0] / 10)
+    factor = from_decibels(-site.device_levels[data.device, 0])
     target = (data.target * factor[:, None]).astype(data.target.dtype)
     noise = None if data.noise_variance is None else data.noise_variance * (factor**2).astype(np.float32)
     levels = replace(data.site, device_levels=site.device_levels)

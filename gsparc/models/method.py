@@ -21,7 +21,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud, SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.data.target import Kind
-from gsparc.physics.decibels import RELATIVE_DB
+from gsparc.physics.decibels import RELATIVE_DB, from_decibels
 from gsparc.physics.row_factors import align_factors
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
@@ -63,7 +63,7 @@ class Prediction:
         if site.device_levels is None:
             return self
         levels, shape = torch.from_numpy(site.device_levels)[torch.as_tensor(device)].reshape(-1, 2), [1] * 3
-        factor, spread = (10 ** (levels[:, 0] / 10)).to(self.mean.dtype), levels[:, 1].to(self.mean.dtype)
+        factor, spread = from_decibels(levels[:, 0]).to(self.mean.dtype), levels[:, 1].to(self.mean.dtype)
         many = factor.reshape(-1, *shape[: self.mean.ndim - 1])
         mean, variance, explained = self.mean * many, self.variance, self.explained
         if variance is not None:

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-Powers = TypeVar("Powers", np.ndarray, Tensor)
+Values = TypeVar("Values", np.ndarray, Tensor)
+Powers = TypeVar("Powers", np.ndarray, Tensor, float)
 RELATIVE_DB = 10 / math.log(10)  # decibels of a small relative change of a power
 TINY_POWER = 1e-30  # -300 dB; only so that a logarithm exists
 
@@ -32,12 +33,12 @@ def from_decibels(level: Powers) -> Powers:
     return 10 ** (level / 10)
 
 
-def finite_decibels(power: Powers) -> Powers:
+def finite_decibels(power: Values) -> Values:
     """Return levels (...) [dB] of powers (...), of none the least that has a logarithm.
 
     >>> finite_decibels(np.array([0.0, 100.0]))
     array([-300.,   20.])
     """
     if isinstance(power, Tensor):
-        return 10 * power.clamp_min(TINY_POWER).log10()
-    return 10 * np.log10(np.maximum(power, power.dtype.type(TINY_POWER)))
+        return to_decibels(power.clamp_min(TINY_POWER))
+    return to_decibels(np.maximum(power, power.dtype.type(TINY_POWER)))

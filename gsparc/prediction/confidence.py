@@ -19,6 +19,7 @@ from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import kernel_of_targets
 from gsparc.models.method import Method, Prediction, predict_with_threads
+from gsparc.physics.decibels import from_decibels
 from gsparc.prediction.query import Queries, match_input
 from gsparc.processes.factor import Factor
 from gsparc.processes.few_rows import draw_rows
@@ -74,7 +75,7 @@ class Guarantee(Stored, Checked):
 
     def is_bad(self, relative_error: np.ndarray) -> np.ndarray:
         """Tell whether predictions (n,) are bad."""
-        return relative_error > 10 ** (self.limit_db / 10)
+        return relative_error > from_decibels(self.limit_db)
 
 
 @dataclass(frozen=True)

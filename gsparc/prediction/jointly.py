@@ -10,6 +10,7 @@ import torch
 from gsparc.data.schema import Site
 from gsparc.models.method import HasJoint, HasProcess, JointLevels, Method
 from gsparc.models.station_views import OneStationView
+from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.query import Queries
 
 TOGETHER, UNREAD = 64, 1e12  # places at a time; variance of what is not measured [dB^2]
@@ -81,7 +82,7 @@ class JointMixin:
         if moving.dim() == 2:
             moving = moving[:, None].expand(-1, len(stations), 3)
         level, covariance, noise = (part.numpy() for part in known.predict_joint(moving, stations))
-        return JointLevels(level + 10 * np.log10(self.site.target_scale), covariance, noise)
+        return JointLevels(level + to_decibels(self.site.target_scale), covariance, noise)
 
     def covariance(self, tx: Any = None, rx: Any = None) -> tuple[np.ndarray, float]:
         """Return the covariance (B, B) of the power's errors at B places, and a measurement's noise [dB^2].

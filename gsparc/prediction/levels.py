@@ -8,6 +8,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.target import Kind
 from gsparc.data.units import power_in_decibels
 from gsparc.models.method import Prediction
+from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.predictor import Predictor
 
 MAPPED: tuple[Kind, ...] = ("rssi", "csi")
@@ -57,7 +58,7 @@ def measured_levels(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, n
     finite = np.isfinite(power)
     mean = np.where(finite, power, 0).sum(axis=1) / np.maximum(finite.sum(axis=1), 1)
     with np.errstate(divide="ignore", invalid="ignore"):
-        level = np.where(mean > 0, 10 * np.log10(mean), np.nan)
+        level = np.where(mean > 0, to_decibels(mean), np.nan)
     return level, side
 
 

@@ -21,6 +21,7 @@ from gsparc.models.method import Method, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
 from gsparc.models.station_views import OneStationView
 from gsparc.models.updated import STORED, Changes, Level, Updated, map_level, stored_changes, with_changes
+from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.drift import ROWS, Alarm, Watch
 from gsparc.prediction.query import Queries, read_places
 from gsparc.processes.changes import Belief, LaterRows, learn, refit_scale
@@ -227,7 +228,7 @@ class UpdateMixin:
         result = {
             "number": joined.number, "batch": joined.batch, "station": torch.from_numpy(of),
             "place": joined.places + torch.from_numpy(self.site.origin) if len(joined) else joined.places,
-            "level": joined.level + joined.missed + 10 * np.log10(self.site.target_scale),
+            "level": joined.level + joined.missed + to_decibels(self.site.target_scale),
             "faded_db": joined.faded.sqrt(),
         }  # fmt: skip
         order = joined.number.argsort()
@@ -291,7 +292,7 @@ class UpdateMixin:
             )
         stored = self._answer_unit(unit).stored(torch.from_numpy(powers)).numpy()
         row, station = np.nonzero(np.isfinite(powers) & (stored > 0))
-        level = 10 * np.log10(stored[row, station])
+        level = to_decibels(stored[row, station])
         return LevelRows(at[row], level, np.zeros(len(row), np.int8), station)
 
     def _read_rows(self, rows: LevelRows, changes: Changes) -> dict[int, LaterRows]:

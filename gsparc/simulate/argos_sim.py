@@ -20,6 +20,7 @@ from gsparc.data.datasets.campaign import make_once, write_split
 from gsparc.data.files import whole_folder
 from gsparc.data.limits import Checked, setting, whole
 from gsparc.data.schema import LIGHT
+from gsparc.physics.decibels import from_decibels
 from gsparc.simulate.streets import StreetPaths, Streets, trace_streets
 
 TONES = np.array(argos.TONES)
@@ -116,8 +117,8 @@ def draw_world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World
     rays = trace_streets(streets, users, LIGHT / CARRIER_HZ)
     power = (np.abs(rays.gain) ** 2).sum(axis=1)
     # Half of the users are heard better than MEDIAN_SNR_DB.
-    noise = float(np.median(power)) / 10 ** (MEDIAN_SNR_DB / 10)
-    decoded = np.flatnonzero(power > noise * 10 ** (DECODED_DB / 10))[:count]
+    noise = float(np.median(power)) / from_decibels(MEDIAN_SNR_DB)
+    decoded = np.flatnonzero(power > noise * from_decibels(DECODED_DB))[:count]
     if len(decoded) < count:
         raise ValueError(f"argos-sim: only {len(decoded)} of {count} users are decoded")
     return World(users[decoded], rays.select_users(decoded), noise)

@@ -11,6 +11,7 @@ import numpy as np
 from gsparc.data.blocks import allocate, row_blocks
 from gsparc.data.own import write_own
 from gsparc.data.schema import Measurements
+from gsparc.physics.decibels import from_decibels
 from gsparc.simulate.auto import Choice
 from gsparc.simulate.convergence import Convergence
 from gsparc.simulate.paths import ARRAYS, TracedPaths, group_offsets
@@ -141,7 +142,7 @@ def _arrays(campaign: CampaignSettings, survey: Survey, rows: ShardRows) -> dict
     }
     if snr_db is not None:
         power = sum(float((np.abs(csi[part]) ** 2).sum()) for part in row_blocks(csi)) / csi.size
-        variance = power / 10 ** (snr_db / 10)
+        variance = power / from_decibels(snr_db)
         # Another stream than the split's, so that noise does not follow what is held out.
         rng = np.random.default_rng(scene.seed + 1)
         for component in (csi.real, csi.imag):  # all of the one, then all of the other

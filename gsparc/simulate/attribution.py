@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.spectrum import SpectrumSettings, render_spectra
@@ -128,11 +129,11 @@ class SurveyProbe:
     def errors(self, remaining: Effects | TracedPaths, deliverable: Deliverable) -> np.ndarray:
         """Return the deliverable's error at each receiver (R,), in the unit of its tolerance."""
         # Losing everything is infinite in decibels, and would spoil every quantile.
-        least = 10 ** (-SILENCE_DB / 10)
+        least = from_decibels(-SILENCE_DB)
         if deliverable.kind == "coverage":
-            return np.abs(10 * np.log10(np.maximum(1 - self.lost_power_shares(remaining), least)))
+            return np.abs(to_decibels(np.maximum(1 - self.lost_power_shares(remaining), least)))
         if deliverable.kind == "csi":
-            return 10 * np.log10(np.maximum(self.nmse(remaining), least))
+            return to_decibels(np.maximum(self.nmse(remaining), least))
         full, near = self._images
         # With nothing left out the image is there already.
         image = full if remaining == self.effects else self._render(self._rest(remaining))

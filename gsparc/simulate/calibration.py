@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize
 
+from gsparc.physics.decibels import to_decibels
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import RayTracer
 
@@ -216,7 +217,7 @@ def calibrate(
         steps: most evaluations; 0 learns gain and scale alone.
     """
     reached = traced > 0
-    gain, scale = fit_gain_and_scale(measured_db[reached] - 10 * np.log10(traced[reached]))
+    gain, scale = fit_gain_and_scale(measured_db[reached] - to_decibels(traced[reached]))
     if not steps:
         return RoomCalibration(dict(start), gain, scale, 0)
     centre = np.concatenate([one.logarithms() for one in start.values()])

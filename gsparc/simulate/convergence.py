@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from skimage.metrics import structural_similarity
 
+from gsparc.physics.decibels import to_decibels
 from gsparc.simulate.settings import CampaignSettings
 from gsparc.simulate.spectrum import render_spectra
 from gsparc.simulate.survey import Survey
@@ -64,11 +65,11 @@ def measure_convergence(
     similar = [structural_similarity(a, b, data_range=1.0) for a, b in zip(*images, strict=True)]
     twice = np.stack([power, again.received_power()])
     # Only receivers that both seeds reach have levels to compare.
-    difference_db = np.abs(np.diff(10 * np.log10(twice[:, (twice > 0).all(0)]), axis=0))
+    difference_db = np.abs(np.diff(to_decibels(twice[:, (twice > 0).all(0)]), axis=0))
     return Convergence(
         nmse=float((np.abs(csi - other) ** 2).sum() / energy),
         spectrum_nmse=float(squared.sum() / (images[0] ** 2).mean((1, 2)).sum()),
-        spectrum_psnr_db=float(np.mean(-10 * np.log10(np.maximum(squared, 1e-12)))),
+        spectrum_psnr_db=-float(np.mean(to_decibels(np.maximum(squared, 1e-12)))),
         spectrum_ssim=float(np.mean(similar)),
         power_db=float(np.quantile(difference_db, 0.95)) if difference_db.size else 0.0,
         receivers=len(squared),

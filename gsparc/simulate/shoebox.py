@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gsparc.data.schema import LIGHT
+from gsparc.physics.decibels import from_decibels
 from gsparc.simulate.effects import SPECULAR, Effects
 from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.survey import TracingEngine
@@ -226,7 +227,7 @@ def trace_room(
             csi[:, a, k] = (amplitude * wave).sum(axis=1)
     variance = 0.0
     if snr_db is not None:
-        variance = float(np.mean(np.abs(csi) ** 2) / 10 ** (snr_db / 10))
+        variance = float(np.mean(np.abs(csi) ** 2) / from_decibels(snr_db))
         rng = np.random.default_rng(seed)
         # Half of the variance in the real part, half in the imaginary one.
         csi += np.sqrt(variance / 2) * (rng.normal(size=csi.shape) + 1j * rng.normal(size=csi.shape))

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.limits import choice
+from gsparc.physics.decibels import from_decibels, to_decibels
 
 # 14 symbols of a slot less two of pilots.
 SYMBOLS = 12  # of a slot that carry data
@@ -133,12 +134,12 @@ class Adaptation:
         for some in sinr.split(CHUNK):
             tones = some[:, None, None, :, None, None].expand(-1, 28, 1, -1, 1, 1)
             parts.append(self._of_every_mcs(len(some), sinr=tones)[2][..., 0])
-        return 10 * torch.cat(parts).cpu().log10()
+        return to_decibels(torch.cat(parts).cpu())
 
     def _fails(self, effective_db: Tensor) -> Tensor:
         """Transport-block error rates (n, 28); infinite where there is no such MCS."""
         allocated = torch.full((len(effective_db), 28, 1), SYMBOLS * self.subcarriers, dtype=torch.int32)
-        effective = (10 ** (effective_db / 10))[..., None]
+        effective = from_decibels(effective_db)[..., None]
         rates = self._of_every_mcs(len(effective), sinr_eff=effective, num_allocated_re=allocated)
         return rates[3][..., 0].cpu().double()
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from gsparc.apps.link.adaptation import Adaptation, Band, Rates
 from gsparc.apps.link.pusch import Pusch
 from gsparc.data.executor import run_all
+from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.processes.uncertainty import binomial_interval
 
 STEEP = (0.005, 0.9)  # block error rates of perfect knowledge between which every block counts
@@ -48,7 +49,7 @@ def beam_loss_db(true: Tensor, predicted: Tensor) -> Tensor:
     """Return what is lost against beams from the true channel (n,) [dB], at most 100; NaN of silence."""
     best = beam_gain(true, true)
     # Largest of both: a beam into a null would be infinitely bad.
-    return 10 * torch.log10(best / torch.maximum(beam_gain(true, predicted), LEAST * best))
+    return to_decibels(best / torch.maximum(beam_gain(true, predicted), LEAST * best))
 
 
 def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[str, Any]:
@@ -73,8 +74,8 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
         best = beam_gain(there, there).mean()
         gain = torch.maximum(beam_gain(there, guess).mean(), LEAST * best)
         here = {
-            "gain_db": float(10 * best.log10()), "predicted_gain_db": float(10 * gain.log10()),
-            "loss_db": float(10 * (best / gain).log10()),
+            "gain_db": float(to_decibels(best)), "predicted_gain_db": float(to_decibels(gain)),
+            "loss_db": float(to_decibels(best / gain)),
             "loss_db_mean": float(loss.mean()), "loss_db_max": float(loss.max()),
             "share_losing_more_than_1_db": float((loss > 1).mean()),
             "loss_db_accepted": float(loss[accepted].mean()) if accepted.any() else None,
@@ -101,7 +102,7 @@ def adapt_rates(band: Band, aside: Band, settings: Mapping[str, Any], rule: str)
     median = band.median_power
     if median <= 0:
         raise ValueError("every test channel of this antenna is silent: there is no rate to adapt")
-    noises = [median / 10 ** (level / 10) for level in settings["snr_db"]]
+    noises = [median / from_decibels(level) for level in settings["snr_db"]]
     # One care for all noise levels: how predictions err does not depend on the noise they are lived in.
     cares = settings["care"] if rule == "carries_most" else []
     delivered = {c: sum(loop.rates(aside, n, c).chosen_bps.mean() for n in noises) for c in cares}

@@ -16,6 +16,7 @@ from gsparc.apps.maps.geojson import write_shapes
 from gsparc.data.errors import DataError
 from gsparc.data.files import whole_file, write_archive
 from gsparc.data.limits import finite_array
+from gsparc.physics.decibels import from_decibels, to_decibels
 
 REFUSED = -1  # of `best_server`
 NO_CLASS = 65535  # in a file of classes
@@ -234,16 +235,16 @@ def sinr(
         NaN where no power is known, or where there is neither noise nor interference.
     """
     # float64: 10^(-12) beside 10^(-4) keeps no digit of interference in float32.
-    linear = np.where(np.isfinite(power_db), 10 ** (power_db.astype(np.float64) / 10), 0.0)
+    linear = np.where(np.isfinite(power_db), from_decibels(power_db.astype(np.float64)), 0.0)
     known, first, cell = _strongest(power_db)
     signal = linear[first, cell]
     same = True if carrier is None else carrier[:, None] == carrier[first]
     every = load @ (linear * same) - load[first] * signal
-    noise = 0.0 if noise_db is None else 10 ** (noise_db / 10)
+    noise = 0.0 if noise_db is None else from_decibels(noise_db)
     # The sum less its own part may round below 0 where one station is alone.
     rest = np.maximum(every, 0.0) + noise
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = 10 * np.log10(signal / rest)
+        ratio = to_decibels(signal / rest)
     return np.where(known & (rest > 0), ratio, np.nan)
 
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.prediction.channels import Paths
 from gsparc.prediction.levels import predicted_levels
 from gsparc.prediction.predictor import Predictor
@@ -113,8 +114,8 @@ def merge_paths(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | No
         queue = queue[~alike]
     level = np.array(power)
     order = np.argsort(-level)
-    order = order[level[order] > level.max(initial=0.0) * 10 ** (-SILENT_DB / 10)]
+    order = order[level[order] > level.max(initial=0.0) * from_decibels(-SILENT_DB)]
     chosen = np.array(firsts, np.int64)[order]
     return PlacePaths(
-        10 * np.log10(level[order]), delay_ns[chosen], None if towards is None else towards[chosen]
+        to_decibels(level[order]), delay_ns[chosen], None if towards is None else towards[chosen]
     )

@@ -10,6 +10,7 @@ from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import Answer
 from gsparc.data.schema import Site
 from gsparc.evaluation.drawing import panels
+from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.processes.few_rows import evenly_spaced
 
 SPECTRUM = Legend("power by direction", 0.0, 1.0, "inferno")
@@ -24,7 +25,7 @@ def response_db(response: np.ndarray) -> np.ndarray:
     """
     power = np.abs(response).astype(np.float64) ** 2
     power = power[:, 0] if power.shape[1] == 1 else power[evenly_spaced(len(power), MOST_LINES)]
-    return 10 * np.log10(np.maximum(power, max(power.max(), 1e-300) * 10 ** (FLOOR_DB / 10)))
+    return to_decibels(np.maximum(power, max(power.max(), 1e-300) * from_decibels(FLOOR_DB)))
 
 
 def panel_image(answer: Answer, site: Site) -> np.ndarray | None:

@@ -13,6 +13,7 @@ from gsparc.apps.view.answer import SILENT_DB, Answer, azimuth_elevation
 from gsparc.apps.view.building import SURFACES
 from gsparc.apps.view.scene import Faces, Part
 from gsparc.data.schema import ENDS
+from gsparc.physics.decibels import from_decibels, to_decibels
 
 PHASES_DB = 2.0  # between a level and the sum of its paths' powers, that is spoken of
 
@@ -48,7 +49,7 @@ def _paths(answer: Answer) -> list[str]:
     ]
     if answer.level_db is not None and len(rays.gain_db) > 1:
         # Powers of paths added without phase, to tell fading from weakness.
-        gap = answer.level_db - 10 * np.log10((10 ** (rays.gain_db / 10)).sum())
+        gap = answer.level_db - to_decibels(from_decibels(rays.gain_db).sum())
         if abs(gap) >= PHASES_DB:
             how = "cancel each other" if gap < 0 else "add up"
             lines.append(f"they {how}: {abs(gap):.1f} dB {'less' if gap < 0 else 'more'} than their powers")

@@ -13,6 +13,7 @@ from gsparc.data.limits import SettingError, choice
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
 from gsparc.data.spacing import neighbour_distance
+from gsparc.physics.decibels import to_decibels
 from gsparc.physics.row_factors import FREEDOMS, Freedom, align_factors, describe_freedom, resolvable_delays
 from gsparc.processes.few_rows import evenly_spaced
 
@@ -90,7 +91,7 @@ def estimate_coherence(data: Measurements) -> Coherence | None:
         measured = np.sqrt(abs((first * second.conj()).mean()))
     turned = a * align_factors(a, b, rows.tones, "phase+delay")[:, None]
     phase, delay = float(np.abs(first).mean()), float(np.abs(_correlation(turned, b)[0]).mean())
-    levels = 10 * np.log10(size[:, 0] / size[:, 1])
+    levels = to_decibels(size[:, 0] / size[:, 1])
     scatter = float(1.4826 * np.median(np.abs(levels))) / np.sqrt(2)
     freedom: Freedom = "none"
     noise = np.sqrt(max(np.log(max(len(resolvable_delays(rows.tones)), 3)), 1.0) / values[0].size)

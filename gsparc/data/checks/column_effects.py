@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 
 from gsparc.data.blocks import rows_by
 from gsparc.data.schema import Measurements
+from gsparc.physics.decibels import to_decibels
 from gsparc.processes.level_field import LevelField, fit_level_field
 
 LEAST_ROWS, MOST_ROWS = 60, 480  # links that tell; that are looked at
@@ -78,7 +79,7 @@ class LevelsAtPlaces:
     def of(data: Measurements) -> tuple[LevelsAtPlaces, np.ndarray]:
         """Return those of powers that were measured, and (n,) their rows."""
         rows = np.flatnonzero((data.censored_side() == 0) & (data.target[:, 0] > 0))
-        level = 10 * np.log10(data.target[rows, 0].astype(np.float64))
+        level = to_decibels(data.target[rows, 0].astype(np.float64))
         return LevelsAtPlaces(data.moving[rows], data.stations_of(rows), level), rows
 
     def take(self, rows: np.ndarray) -> LevelsAtPlaces:

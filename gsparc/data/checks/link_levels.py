@@ -10,6 +10,7 @@ import numpy as np
 from gsparc.data.blocks import rows_by
 from gsparc.data.schema import Measurements
 from gsparc.data.selection import FROM_ROW
+from gsparc.physics.decibels import to_decibels
 
 UNNAMED = "the station"  # a single one, of a file without stations
 
@@ -60,7 +61,7 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     _, first, which = np.unique(place, return_index=True, return_inverse=True)
     count = len(stations)
     with np.errstate(divide="ignore"):
-        level = 10 * np.log10(data.powers()[:, 0])
+        level = to_decibels(data.powers()[:, 0])
     link, called = which.reshape(-1) * count + station, data.row_names
     side = data.censored_side()
     rows = np.flatnonzero(side <= 0)

@@ -14,6 +14,7 @@ from gsparc.data.errors import DataError
 from gsparc.data.own import interpret_and_log
 from gsparc.data.raw import Raw, read_raw, rename_arrays
 from gsparc.data.schema import Measurements
+from gsparc.physics.decibels import to_decibels
 
 TARGETS = ("spectrum", "csi", "rssi")
 STORED = {"spectrum": "spectrum", "csi": "csi", "rssi": "received_power"}  # array that a target is read from
@@ -107,7 +108,7 @@ def _in_decibels(power: np.ndarray) -> dict[str, np.ndarray]:
     any path is not weaker for it. Outliers are those of J. W. Tukey, "Exploratory Data Analysis" (1977).
     """
     with np.errstate(divide="ignore"):
-        decibels = 10 * np.log10(power)
+        decibels = to_decibels(power)
     arrived = decibels[np.isfinite(decibels)]
     if len(arrived) == len(decibels):
         return {"rssi_db": decibels}

@@ -18,6 +18,7 @@ from gsparc.data.datasets.campaign import Campaign
 from gsparc.data.errors import DataError, readable
 from gsparc.data.pickles import read_pickle
 from gsparc.data.raw import Raw, read_raw
+from gsparc.physics.decibels import to_decibels
 
 CARRIER_HZ = 920e6
 PICOWATT_DB = -90.0  # relative to a milliwatt
@@ -47,7 +48,7 @@ def _of_release(folder: Path) -> Raw:
     if len(where) != len(power):
         raise DataError(f"{folder}: {len(where)} positions, but {len(power)} values")
     with np.errstate(divide="ignore", invalid="ignore"):
-        level = 10 * np.log10(power) + PICOWATT_DB
+        level = to_decibels(power) + PICOWATT_DB
     heard = np.isfinite(where).all(axis=1) & np.isfinite(level)
     arrays = {
         "rx_position": where[heard].astype(np.float32),

@@ -21,6 +21,7 @@ from gsparc.data.errors import DataError, list_first, readable
 from gsparc.data.files import read_csv
 from gsparc.data.limits import choice, or_null
 from gsparc.data.raw import Raw
+from gsparc.physics.decibels import to_decibels
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -158,7 +159,7 @@ def _filled(tone: np.ndarray, csi: np.ndarray, path: Path) -> tuple[np.ndarray, 
     low, high = FILLED.get(int(-tone.min()), (0, int(tone.max())))
     in_band = (np.abs(tone) >= low) & (np.abs(tone) <= high)
     with np.errstate(divide="ignore", invalid="ignore"):
-        power = 10 * np.log10(np.mean(np.abs(csi) ** 2, axis=1))
+        power = to_decibels(np.mean(np.abs(csi) ** 2, axis=1))
         beside = np.median(power - np.median(power[:, in_band], axis=1, keepdims=True), axis=0)
     right = (beside > WEAK_DB) & (beside < STRONG_DB)
     if not (in_band & right).any():
@@ -179,7 +180,7 @@ def _levelled(csi: np.ndarray, rssi_dbm: np.ndarray, path: Path) -> tuple[np.nda
     if np.isnan(rssi_dbm).any():
         count = np.isnan(rssi_dbm).sum()
         raise DataError(f"{path}: {count} packets without RSSI; give all places an rssi_dbm")
-    power_db = 10 * np.log10(np.sum(np.abs(csi) ** 2, axis=1).mean(axis=1))
+    power_db = to_decibels(np.sum(np.abs(csi) ** 2, axis=1).mean(axis=1))
     offset_db = rssi_dbm - power_db
     if np.std(offset_db) <= KEPT_DB:
         return csi * 10 ** (np.median(offset_db) / 20), "dBm"

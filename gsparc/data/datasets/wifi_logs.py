@@ -15,6 +15,7 @@ import numpy as np
 
 from gsparc.data.datasets.wsr import RECORD, TONES, read_log
 from gsparc.data.errors import DataError, readable
+from gsparc.physics.decibels import to_decibels
 
 SUFFIXES = {".pcap": "nexmon", ".dat": "intel", ".csv": "esp32"}
 HT40 = 0x800  # of the rates of an Intel 5300: 40 MHz
@@ -132,7 +133,7 @@ def _intel(path: Path, csiread: Any, _: str) -> Packets:
         records = read_log(path)
         power = np.sum(np.abs(records.csi) ** 2, axis=2).mean(axis=1).clip(1e-300)  # of zeros: no level in dB
         sender = format_address(np.frombuffer(records.sender.tobytes(), np.uint8).reshape(-1, 6))
-        return Packets(records.time, sender, records.csi.swapaxes(1, 2), TONES, 10 * np.log10(power))
+        return Packets(records.time, sender, records.csi.swapaxes(1, 2), TONES, to_decibels(power))
     at, count = 0, 0
     while at + 2 < len(content):
         size = int.from_bytes(content[at : at + 2], "big")

@@ -22,6 +22,7 @@ from gsparc.data.datasets.campaign import Campaign, read_converted
 from gsparc.data.errors import DataError, readable
 from gsparc.data.files import read_csv
 from gsparc.data.raw import Raw
+from gsparc.physics.decibels import from_decibels
 
 CARRIER_HZ = 5.54e9  # Wi-Fi channel 108
 TONES = np.array([*range(-28, 0, 2), -1, *range(1, 28, 2), 28])  # of 64 that an Intel 5300 reports, at 20 MHz
@@ -128,7 +129,7 @@ def read_log(path: Path) -> Log:
     parts = np.packbits(bits[:, at].reshape(len(records), 30, 6, 8), axis=-1, bitorder="little")
     pairs = parts[..., 0].view(np.int8).astype(np.float64)
     csi = pairs[..., ::2] + 1j * pairs[..., 1::2]
-    heard_mw = np.sum(10 ** (records["rssi"] / 10), axis=1) * 10 ** (-(44.0 + records["gain"]) / 10)
+    heard_mw = np.sum(from_decibels(records["rssi"]), axis=1) * from_decibels(-(44.0 + records["gain"]))
     scale = np.sqrt(heard_mw * len(TONES) / np.maximum(np.sum(np.abs(csi) ** 2, axis=(1, 2)), 1))
     time = records["second"] + 1e-6 * records["microsecond"]
     numbers = records["number"].astype(np.int64)

@@ -16,6 +16,7 @@ from gsparc.data.limits import Limit, choice, number, or_null, or_word
 from gsparc.data.own_checks import Checker
 from gsparc.data.schema import OTHER, Links
 from gsparc.data.selection import take_rows
+from gsparc.physics.decibels import to_decibels
 
 POWERS = ("rssi", "rssi_db")
 BESIDE, LEAST_MARKS = 6, 12  # rows around a mark; marks that tell
@@ -102,7 +103,7 @@ def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) 
     if not keep.all() or censored.any():
         none = " or without any power" if measured == "spectrum" else ""
         below = np.ones(1) if floor is None or not censored.any() else floor[censored]
-        below = 10 * np.log10(below) if measured == "rssi" else below
+        below = to_decibels(below) if measured == "rssi" else below
         limits = f"{below.min():.4g}" + f" to {below.max():.4g}" * bool(np.ptp(below))
         what = "not listed" + " or not heard" * bool(censored.sum() > unlisted) if unlisted else "not heard"
         unheard = f"powers were {what}: below {limits} dB"

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.row_order import along_curve, hash_rows
+from gsparc.physics.decibels import to_decibels
 
 if TYPE_CHECKING:
     from gsparc.data.schema import Measurements
@@ -197,4 +198,4 @@ def strongest_lists(data: Measurements) -> StrongestLists | None:
 
 def levels_db(data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Return levels (n,) [dB] of rows of powers."""
-    return 10 * np.log10(data.powers(rows)[:, 0])
+    return to_decibels(data.powers(rows)[:, 0])

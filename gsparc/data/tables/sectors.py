@@ -13,6 +13,7 @@ from gsparc.data.files import read_shipped_table
 from gsparc.data.tables.heads import LISTS, SHEET, unit_of, words_of
 from gsparc.data.tables.sheet import Sheet
 from gsparc.data.units import UNITS, Unit
+from gsparc.physics.decibels import to_decibels
 
 HEADS = {text: name for name, texts in SHEET["sectors"].items() for text in texts}
 # 3GPP TS 36.101, table 5.7.3-1: lowest downlink frequency [MHz] of a band, and its first EARFCN.
@@ -143,7 +144,7 @@ def _convert(unit: Unit, values: np.ndarray) -> np.ndarray:
     """Values (n,) in a unit, in the schema's; powers in dBm."""
     with np.errstate(divide="ignore", invalid="ignore"):
         result = unit.convert(values)
-        return 10 * np.log10(result) + 30 if unit.kind == "power" else result
+        return to_decibels(result) + 30 if unit.kind == "power" else result
 
 
 def _fits(unit: Unit, values: np.ndarray, name: str) -> bool:

@@ -21,7 +21,7 @@ from gsparc.data.splits import Fold
 from gsparc.data.target import Kind
 from gsparc.models.method import Method, Prediction
 from gsparc.models.target_rows import heard_rows
-from gsparc.physics.decibels import finite_decibels
+from gsparc.physics.decibels import finite_decibels, from_decibels, to_decibels
 from gsparc.simulate.calibration import (
     GENERIC,
     Material,
@@ -153,8 +153,8 @@ class CalibratedRayTracer(Checked, Method):
         power = paths.received_power()
         # No path is -inf dB, which the silent level replaces.
         with np.errstate(divide="ignore"):
-            level = np.where(power > 0, 10 * np.log10(power) + learned.gain_db, self._silent_db)
-        return Prediction(torch.from_numpy(10 ** (level / 10))[:, None].float())
+            level = np.where(power > 0, to_decibels(power) + learned.gain_db, self._silent_db)
+        return Prediction(torch.from_numpy(from_decibels(level))[:, None].float())
 
     def _channels(self, paths: TracedPaths) -> np.ndarray:
         """(B, 1, K) without the factor."""

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from gsparc.data.schema import LIGHT
+from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.predictor import Predictor
 
 PATHS = 25  # that a DeepMIMO scenario has at most
@@ -51,7 +52,7 @@ def write_scenario(folder: Path, predictor: Predictor, place: np.ndarray) -> tup
     meets = np.where(direct[..., None] | (share <= 0), np.nan, place[:, None] + share * away)
     silent = strongest <= 0
     arrays = {
-        "power": 10 * np.log10(np.where(silent, np.nan, strongest)), "delay": delay,
+        "power": to_decibels(np.where(silent, np.nan, strongest)), "delay": delay,
         "phase": np.degrees(np.angle(top(paths.gain[:, 0]))), "inter": np.where(direct, 0.0, 1.0),
         "inter_pos": meets[:, :, None],
     }  # fmt: skip

@@ -11,6 +11,7 @@ import numpy as np
 
 from gsparc.data.raw import Raw, write_raw
 from gsparc.data.schema import LIGHT
+from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.predictor import Predictor
 
 PER_WAVE = 8  # instants per wavelength of the fastest motion: four times what its Doppler needs
@@ -108,7 +109,7 @@ def write_taps(predictor: Predictor, way: Trajectory, how: Mapping[str, Any], fi
     about = {"rate_hz": line.rate_hz, "carrier_hz": line.carrier_hz, "residual": line.residual}
     write_raw(file, Raw(arrays, about, units))
     # 1e-30 is -300 dB: no residual at all has no decibels.
-    error_db, worst = 10 * np.log10(np.maximum([line.residual, line.worst], 1e-30))
+    error_db, worst = to_decibels(np.maximum([line.residual, line.worst], 1e-30))
     return {
         "taps/count": line.gain.shape[2], "taps/rate_hz": line.rate_hz, "taps/residual_db": float(error_db),
         "taps/worst_db": float(worst), "taps/early_s": delay_s[0],

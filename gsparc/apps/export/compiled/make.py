@@ -26,6 +26,7 @@ from gsparc.models.powers.field import PowerField
 from gsparc.models.splat.image_process import ImageProcess
 from gsparc.models.splat.method import LearnedField
 from gsparc.ops import Pose
+from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.predictor import Predictor
 
 ANSWERED = {"csi": 1500, "rssi": 3000}  # places that distilled forms are made from
@@ -96,7 +97,7 @@ def _squares(form: Predictor, model: Predictor, places: np.ndarray) -> np.ndarra
     if model.site.target.is_level:
         # A power of 0 has no decibels; 1e-30 is far below any receiver's noise.
         whole = np.maximum(whole, 1e-30)
-        answers, whole = 10 * np.log10(np.maximum(answers / whole, SILENT)), np.zeros_like(whole)
+        answers, whole = to_decibels(np.maximum(answers / whole, SILENT)), np.zeros_like(whole)
     squared, power = (np.square(np.abs(one).astype(np.float64)).mean(1) for one in (answers - whole, whole))
     return np.stack([squared, power if model.site.target.is_complex else np.ones(len(places))])
 
