@@ -296,11 +296,8 @@ def _rows(
     values: np.ndarray, test: Callable[[np.ndarray], np.ndarray], mask: np.ndarray | None = None
 ) -> np.ndarray:
     """Rows (S,) of `values` (S, ...) with a measured entry that passes `test`, a block at a time."""
-    flags = []
-    for part in row_blocks(values):
-        passed = test(values[part]) if mask is None else test(values[part]) & mask[part]
-        flags.append(passed.reshape(len(passed), -1).any(1))
-    return np.concatenate(flags)
+    passed = (test(values[p]) & (True if mask is None else mask[p]) for p in row_blocks(values))
+    return np.concatenate([part.reshape(len(part), -1).any(1) for part in passed])
 
 
 def _infinite(values: np.ndarray) -> np.ndarray:

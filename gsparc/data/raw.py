@@ -5,11 +5,8 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import mmap
 import re
 import struct
-import subprocess
-import sys
 import tempfile
 import zipfile
 import zlib
@@ -33,6 +30,7 @@ from scipy.io import loadmat, netcdf_file
 from gsparc.data.blocks import BIG, is_big, iterate_bytes, machine_memory, map_from_disk
 from gsparc.data.errors import DataError, absent, explain_error, readable
 from gsparc.data.files import check_fetched, whole_file
+from gsparc.data.hdf5_text import hdf5_text_error
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 NETCDF_SUFFIXES = (".nc", ".nc3", ".nc4", ".cdf")
@@ -341,42 +339,6 @@ def rename_arrays(raw: Raw, names: Mapping[str, str]) -> Raw:
     """Return the same content with arrays and their units renamed from the keys to the values of `names`."""
     arrays = {names.get(k, k): v for k, v in raw.arrays.items()}
     return replace(raw, arrays=arrays, units={names.get(k, k): v for k, v in raw.units.items()})
-
-
-HEAP = b"GCOL"  # signature of a global heap (HDF5 file format specification 3.0, III.E)
-SECONDS = 20.0
-READ = """
-import sys, h5py
-with h5py.File(sys.argv[1], "r") as file:
-    for item in file.values():
-        if isinstance(item, h5py.Dataset):
-            if item.dtype.hasobject and item.nbytes < 2**28:
-                item[()]
-            dict(item.attrs)
-    dict(file.attrs)
-"""
-
-
-def hdf5_text_error(path: Path, seconds: float = SECONDS) -> str | None:
-    """Say why text in HDF5 cannot be read within `seconds`; None when it can, or when there is none."""
-    if not _has_heap(path):
-        return None
-    try:
-        read, nothing = [sys.executable, "-I", "-c", READ, str(path.absolute())], subprocess.DEVNULL
-        process = subprocess.run(read, stdin=nothing, capture_output=True, timeout=seconds)
-    except subprocess.TimeoutExpired:
-        return f"its text cannot be read in {seconds:g} s"
-    if process.returncode < 0:
-        return "its text crashes the HDF5 library"
-    last = process.stderr.decode(errors="replace").strip().splitlines()
-    return None if process.returncode == 0 else last[-1] if last else "its text cannot be read"
-
-
-def _has_heap(path: Path) -> bool:
-    if path.stat().st_size == 0:
-        return False
-    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
-        return content.find(HEAP) >= 0
 
 
 NEVER_WRITTEN = 9e36  # default fill value of NetCDF's floating point numbers is 9.97e36

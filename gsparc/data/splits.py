@@ -12,9 +12,10 @@ from typing import Any, Literal
 import numpy as np
 
 from gsparc.data.errors import DataError
+from gsparc.data.held_out import block_rows, corner_fold, grouped_folds, last_rows
 from gsparc.data.limits import POSITIVE, SHARE, Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.schema import TrainTest
-from gsparc.data.spacing import number_squares, path_order, rows_far_from, tenth_of_extent, thin_rows
+from gsparc.data.spacing import thin_rows
 from gsparc.processes.few_rows import draw_rows
 
 WHOLE = ("stations", "carriers", "runs")  # of which whole ones are held out
@@ -244,27 +245,21 @@ def _pairs(positions: np.ndarray, taken: np.ndarray, settings: SplitSettings) ->
     rows, rng = np.arange(len(positions)), np.random.default_rng(settings.seed)
     match settings.name:
         case "random":
-            return [_cut_off(rng.permutation(rows), settings.test_fraction)]
+            return [last_rows(rng.permutation(rows), settings.test_fraction)]
         case "sparse":
-            return [_cut_off(rng.permutation(rows), 1 - settings.train_fraction)]
+            return [last_rows(rng.permutation(rows), 1 - settings.train_fraction)]
         case "later":
-            return [_cut_off(taken, settings.test_fraction)]
+            return [last_rows(taken, settings.test_fraction)]
         case "none":
             return [(taken, taken[:0])]
         case "grouped":
-            return _grouped(positions, settings)
+            return grouped_folds(positions, settings)
         case "corner":
-            return [_corner(positions, settings)]
+            return [corner_fold(positions, settings)]
         case "blocks":
-            test = _blocks(positions, rows, settings, settings.share, [settings.seed])
+            test = block_rows(positions, rows, settings, settings.share, [settings.seed])
             return [(np.setdiff1d(rows, test), test)]
     raise ValueError(f"split={settings.name}: no such way to split by places")
-
-
-def _cut_off(order: np.ndarray, test_share: float) -> TrainTest:
-    """The last of ordered rows as test rows; rounding leaves one row on either side."""
-    train_count = len(order) - min(max(round(test_share * len(order)), 1), max(len(order) - 1, 0))
-    return np.sort(order[:train_count]), np.sort(order[train_count:])
 
 
 def rows_to_leave_out(leave_out: LeaveOut, outliers: np.ndarray | None, rows: int) -> np.ndarray:
@@ -298,46 +293,6 @@ def hash_indices(folds: tuple[Fold, ...], parts: Sequence[str] = ("train", "val"
     return digest.hexdigest()
 
 
-def _grouped(positions: np.ndarray, settings: SplitSettings) -> list[TrainTest]:
-    """Each fold tests on whole stretches of the path, training rows near them dropped."""
-    order = path_order(positions)
-    if len(order) < 2 * settings.folds * settings.stretches_per_fold:
-        raise DataError(
-            f"split=grouped: {len(order)} rows are too few for {settings.folds} folds of "
-            f"{settings.stretches_per_fold} stretches; lower split.folds or take split=random"
-        )
-    stretches = np.array_split(order, settings.folds * settings.stretches_per_fold)
-    pairs = []
-    for fold in range(settings.folds):
-        # Every folds-th stretch: one fold's stretches lie all over the site.
-        test = np.concatenate(stretches[fold :: settings.folds])
-        # Path order is kept here: the validation stretch is cut from it.
-        rest = order[~np.isin(order, test)]
-        pairs.append((rows_far_from(positions, rest, test, settings.buffer_m), np.sort(test)))
-    return pairs
-
-
-def _blocks(
-    positions: np.ndarray, rows: np.ndarray, settings: SplitSettings, share: float, seed: list[int]
-) -> np.ndarray:
-    """Those of `rows` in whole squares of floor, drawn until they are a `share` of `rows` at least."""
-    floor = positions[:, :2]
-    side = settings.side_m or tenth_of_extent(floor)
-    if not tenth_of_extent(floor) > 0:
-        raise DataError("split=blocks: all positions are one above the other, there are no squares of floor")
-    square = number_squares(floor[rows], side)
-    order = np.random.default_rng(seed).permutation(square.max() + 1)
-    # Whole squares are added until the share is reached: the test set is never smaller.
-    sizes = np.cumsum(np.bincount(square)[order])
-    count = int(np.searchsorted(sizes, share * len(rows))) + 1
-    if count >= len(order):
-        raise DataError(
-            f"split=blocks: {len(order)} squares of {side:.3g} m, too few to hold some out; lower "
-            "split.side_m or split.share"
-        )
-    return rows[np.isin(square, order[:count])]
-
-
 def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]:
     """Folds that each hold out a station, or one that holds out `leave_out` of them, or a share of the runs.
 
@@ -367,20 +322,6 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
     return tuple(folds)
 
 
-def _corner(positions: np.ndarray, settings: SplitSettings) -> TrainTest:
-    """A rectangle in one corner of the site, seen from above, holding `test_fraction` of the rows."""
-    lower, extent = positions[:, :2].min(axis=0), np.ptp(positions[:, :2], axis=0)
-    # A site without extent along an axis is divided by 1: that axis tells no row from another.
-    unit = (positions[:, :2] - lower) / np.where(extent > 0, extent, 1.0)
-    corner = np.array([sign == "+" for sign in settings.corner], dtype=np.float64)
-    # The larger of the two distances: its level lines are rectangles about the corner.
-    depth = np.abs(unit - corner).max(axis=1)
-    count = max(round(settings.test_fraction * len(positions)), 1)
-    test = np.sort(np.argsort(depth, kind="stable")[:count])
-    rest = np.setdiff1d(np.arange(len(positions)), test)
-    return rows_far_from(positions, rest, test, settings.buffer_m), test
-
-
 def _finish(fold: int, train: np.ndarray, test: np.ndarray, positions: np.ndarray, s: SplitSettings) -> Fold:
     """Thin the training rows, then set some of them aside for validation."""
     if s.spacing_m is not None:
@@ -405,7 +346,7 @@ def _finish(fold: int, train: np.ndarray, test: np.ndarray, positions: np.ndarra
         chosen = np.arange(start, start + count)
     elif s.name == "blocks" and count:
         # Validation as hard as the test: whole squares as well.
-        chosen = np.searchsorted(train, _blocks(positions, train, s, s.val_fraction, [s.seed, fold, 2]))
+        chosen = np.searchsorted(train, block_rows(positions, train, s, s.val_fraction, [s.seed, fold, 2]))
     else:
         chosen = rng.permutation(len(train))[:count]
     val = train[chosen]

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -18,9 +18,10 @@ from torch import Tensor
 from gsparc.data.moments import Snapshots
 from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements, Site
-from gsparc.data.site_objects import GaussianCloud, SiteObjects
+from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.data.target import Kind
+from gsparc.models.abilities import HasJoint
 from gsparc.physics.decibels import RELATIVE_DB, from_decibels
 from gsparc.physics.row_factors import align_factors
 from gsparc.processes.stored import from_plain, to_plain
@@ -28,7 +29,7 @@ from gsparc.training.context import FitContext, FitReport
 from gsparc.training.effort import Effort
 
 if TYPE_CHECKING:
-    from gsparc.processes.powers import PowerProcess
+    pass
 
 T = TypeVar("T")
 MEAN_DEVICE = -1  # number of the device that nobody named, see `Site.device_levels`
@@ -379,98 +380,3 @@ def predict_with_threads(method: Method, query: Query) -> Prediction:
     """Return what a method predicts, by as many threads as suit the query."""
     with suitable_threads(method, len(query)):
         return method.predict(query)
-
-
-@runtime_checkable
-class Reconditions(Protocol):
-    """Learns from other rows with its settings as they are: what is left out is forgotten but by these."""
-
-    def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
-        """Return a method of rows (n,) alone; None where more than settings would remember the others."""
-
-
-@runtime_checkable
-class HasProcess(Protocol):
-    """A Gaussian process on powers says what it does not know."""
-
-    def process(self) -> PowerProcess | None:
-        """Return the process; None where what was fitted has none."""
-
-
-class JointLevels(NamedTuple):
-    """Levels of k places or stations and their errors; tensors, or a `Predictor`'s arrays.
-
-    Attributes:
-        mean: (G, k) of measurements [dB].
-        covariance: (G, k, k) [dB^2].
-        noise: (k,) variance of a measurement's noise [dB^2].
-    """
-
-    mean: Any
-    covariance: Any
-    noise: Any
-
-
-@runtime_checkable
-class HasJoint(Protocol):
-    """Levels of several stations, or at several places, with their covariance."""
-
-    def predict_joint(self, moving: Tensor, stations: Tensor) -> JointLevels:
-        """See `gsparc.models.powers.together.field.JointPowerField.predict_joint`."""
-        ...
-
-    def add_station(self, place: np.ndarray, sectors: Tensor, like: int | None = None) -> HasJoint:
-        """See `gsparc.models.powers.together.field.JointPowerField.add_station`."""
-        ...
-
-
-@runtime_checkable
-class AddsCarriers(Protocol):
-    """It answers at carriers that nobody measured."""
-
-    def add_carrier(self, frequency_hz: float) -> Any:
-        """Return the same method whose site has one station more; see `Stations.add_carrier`.
-
-        Raises:
-            ValueError: what was fitted here knows its own carriers alone.
-        """
-
-
-class QueryPaths(NamedTuple):
-    """Paths to B places and A antennas of the moving end.
-
-    Attributes:
-        gain: (B, A, N) complex64 at the carrier, in stored units.
-        delay: (B, A, N) float64 [s].
-        unit: (B, N, 3) from the middle of the antennas to where a path comes from.
-        carrier_hz: of the gains [Hz].
-    """
-
-    gain: Tensor
-    delay: Tensor
-    unit: Tensor
-    carrier_hz: float
-
-
-@runtime_checkable
-class HasPaths(Protocol):
-    """Its channels are sums of propagation paths."""
-
-    def paths(self, query: Query) -> QueryPaths:
-        """Return gains (B, A, N), delays (B, A, N) [s], directions (B, N, 3) of arrival, the carrier [Hz].
-
-        Raises:
-            ValueError: what was fitted here has none.
-        """
-
-
-@runtime_checkable
-class HasGaussians(Protocol):
-    """What it renders are Gaussians in space."""
-
-    def gaussians(self, query: Query) -> GaussianCloud:
-        """Return all of them, with what they emit: the root mean square over these queries.
-
-        Raises:
-            ValueError: what was fitted here has none.
-        """

@@ -28,9 +28,10 @@ from gsparc.data.schema import OF_STATION, Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, fitting
+from gsparc.models.abilities import AddsCarriers, HasJoint, Reconditions
 from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
-from gsparc.models.method import AddsCarriers, HasJoint, Method, MethodFactory, Prediction, Reconditions
+from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.powers.own_terms import pool_station_weights
 from gsparc.models.station_views import AllStationsView, OneStationView
 from gsparc.models.target_rows import heard_rows

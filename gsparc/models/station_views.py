@@ -8,7 +8,8 @@ import torch
 
 from gsparc.data.ends import NOBODY
 from gsparc.data.query import Query
-from gsparc.models.method import HasJoint, Method, Prediction
+from gsparc.models.abilities import HasJoint
+from gsparc.models.method import Method, Prediction
 from gsparc.models.reduced import View
 
 

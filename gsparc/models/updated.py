@@ -12,7 +12,8 @@ from torch import Tensor
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Site
-from gsparc.models.method import HasProcess, Method, MethodFactory, Prediction
+from gsparc.models.abilities import HasProcess
+from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import View
 from gsparc.models.target_rows import linear_moments

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Site
-from gsparc.models.method import HasPaths, Method
+from gsparc.models.abilities import HasPaths
+from gsparc.models.method import Method
 from gsparc.models.uplink.interface import SeparatesPaths, UplinkMethod
 from gsparc.ops import Pose
 

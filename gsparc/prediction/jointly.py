@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from gsparc.data.schema import Site
-from gsparc.models.method import HasJoint, HasProcess, JointLevels, Method
+from gsparc.models.abilities import HasJoint, HasProcess, JointLevels
+from gsparc.models.method import Method
 from gsparc.models.station_views import OneStationView
 from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.query import Queries

@@ -16,15 +16,9 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Site
 from gsparc.data.target import Kind
 from gsparc.data.units import LINEAR, PowerUnit
+from gsparc.models.abilities import AddsCarriers, HasGaussians
 from gsparc.models.device_offsets import find_device
-from gsparc.models.method import (
-    MEAN_DEVICE,
-    AddsCarriers,
-    HasGaussians,
-    Method,
-    Prediction,
-    predict_with_threads,
-)
+from gsparc.models.method import MEAN_DEVICE, Method, Prediction, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
 from gsparc.physics.row_factors import describe_freedom
 from gsparc.prediction.confidence import ConfidenceMixin, Trusted

@@ -12,8 +12,9 @@ from gsparc.data.inner_folds import InnerFolds, cut_folds
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.models import fitting
+from gsparc.models.abilities import Reconditions
 from gsparc.models.device_offsets import without_devices
-from gsparc.models.method import Method, MethodFactory, Reconditions
+from gsparc.models.method import Method, MethodFactory
 from gsparc.models.per_station import PerStation, stations_of_fold, wrap_per_station
 from gsparc.training.context import FitContext
 

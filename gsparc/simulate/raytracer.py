@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -19,13 +19,12 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.data.limits import choice
 from gsparc.data.schema import LIGHT
 from gsparc.simulate import llvm
 from gsparc.simulate.effects import DIFFRACTION, EDGE, Effects
+from gsparc.simulate.loading import load_scene
 from gsparc.simulate.paths import TracedPaths, join_receivers
-from gsparc.simulate.scenes.shipped import list_shipped_scenes
-from gsparc.simulate.scenes.solid import LISTED_MATERIALS, Solid
+from gsparc.simulate.scenes.solid import Solid
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna
 from gsparc.simulate.survey import TracingEngine
 
@@ -36,11 +35,6 @@ CANDIDATES_PER_RECEIVER = 20_000
 HASHES = 64_000_000
 GROUND_LEVEL = 0.7  # least share of the ground's area that is level
 LARGEST_BUFFER = 8_000_000  # candidates of one call; about 300 bytes each
-# Thickness [m] and scattering coefficient, where a scene gives none.
-MATERIALS = {
-    row["material"]: (float(row["thickness_m"]), float(row["scattering"])) for row in LISTED_MATERIALS
-}
-OTHERS = (0.10, 0.20)
 
 
 @dataclass(frozen=True)
@@ -99,7 +93,7 @@ class RayTracer(TracingEngine):
         dr.set_thread_count(torch.get_num_threads())  # of one thread alone the bits come again
         self.sampling = sampling
         self.wavelength = LIGHT / carrier_hz
-        self.scene = _load(source, carrier_hz, scattering)
+        self.scene = load_scene(source, carrier_hz, scattering)
         self.transmitter, self.antenna = np.asarray(transmitter, dtype=np.float64), antenna
         self._arrays: list[tuple[int, str]] = []  # antennas of the scene, shared by `with_transmitter`
         self.retried = 0  # batches traced again because candidates were cut off
@@ -392,60 +386,3 @@ def _collect(solution: Any, receivers: int, ports: int) -> TracedPaths:
         row = int(sight.argmax())
         raise RuntimeError(f"receiver {row} of a batch has {sight[row]} lines of sight, one at most is true")
     return TracedPaths.from_unsorted(receivers, owner, gain, delay, direction, mechanisms, order)
-
-
-def _load(source: Sequence[Solid] | str | Path, carrier_hz: float, scattering: float | None) -> Any:
-    import sionna.rt as rt
-
-    def scatters(itu: str) -> float:
-        return MATERIALS.get(itu, OTHERS)[1] if scattering is None else scattering
-
-    if isinstance(source, (str, Path)):
-        scene = _load_file(source)
-        for material in scene.radio_materials.values():
-            # Built-in scenes come with 0: diffuse reflection would silently contribute nothing.
-            if float(material.scattering_coefficient[0]) == 0.0:
-                material.scattering_coefficient = scatters(getattr(material, "itu_type", None) or "")
-    else:
-        scene = rt.load_scene()
-        _add(scene, source, scatters)
-    scene.frequency = float(carrier_hz)
-    return scene
-
-
-def _load_file(source: str | Path) -> Any:
-    import sionna.rt as rt
-
-    path = Path(source)
-    if isinstance(source, Path) or path.suffix == ".xml":
-        if not path.is_file():
-            raise ValueError(f"scene.xml={source}: no such file")
-        try:
-            return rt.load_scene(str(path))
-        except Exception as error:  # Mitsuba raises RuntimeError, Sionna several others
-            first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-            raise ValueError(f"scene.xml={source}: Sionna cannot read it ({first.strip()})") from error
-    choice(*list_shipped_scenes()).check("scene.builtin", source)
-    return rt.load_scene(getattr(rt.scene, str(source)))
-
-
-def _add(scene: Any, solids: Sequence[Solid], scatters: Callable[[str], float]) -> None:
-    import mitsuba as mi
-    import sionna.rt as rt
-
-    materials = {
-        name: rt.ITURadioMaterial(
-            f"itu-{name}", name, MATERIALS.get(name, OTHERS)[0], scattering_coefficient=scatters(name)
-        )
-        for name in sorted({solid.material for solid in solids})
-    }
-    objects = []
-    for solid in solids:
-        mesh = mi.Mesh(solid.name, vertex_count=len(solid.vertices), face_count=len(solid.faces))
-        parameters = mi.traverse(mesh)
-        parameters["vertex_positions"] = np.ascontiguousarray(solid.vertices, dtype=np.float32).ravel()
-        parameters["faces"] = np.ascontiguousarray(solid.faces, dtype=np.uint32).ravel()
-        parameters.update()
-        material = materials[solid.material]
-        objects.append(rt.SceneObject(mi_mesh=mesh, name=solid.name, radio_material=material))
-    scene.add(objects)

@@ -24,7 +24,8 @@ from gsparc.commands.train import train
 from gsparc.data.load import datamodule
 from gsparc.data.splits import Fold
 from gsparc.evaluation.console import error_in_one_line
-from gsparc.evaluation.experiment.cells import load_every_problem, unlisted_contenders
+from gsparc.evaluation.experiment.cells import load_every_problem
+from gsparc.evaluation.experiment.contenders import unlisted_contenders
 from gsparc.models.registry import build, method_class
 from gsparc.training.context import FitContext
 

@@ -7,7 +7,7 @@ import logging
 import re
 from collections.abc import Mapping, Sequence
 from copy import deepcopy
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import product
 from pathlib import Path
@@ -16,24 +16,20 @@ from typing import Any, TypeVar
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.files import load_yaml
-from gsparc.data.instantiate import from_settings, import_target
+from gsparc.data.instantiate import from_settings
 from gsparc.data.limits import POSITIVE
 from gsparc.data.load import load, split_for
 from gsparc.data.public.fetch import fetched_path_or_none
 from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Split
-from gsparc.evaluation.console import config_folder, to_dict
+from gsparc.evaluation.console import to_dict
+from gsparc.evaluation.experiment.contenders import Contender, unlisted_contenders
 from gsparc.evaluation.experiment.options import REDRAW
 from gsparc.evaluation.experiment.runner import Job
 from gsparc.evaluation.ledger import measurements_hash
 from gsparc.models.powers.together.network import find_sectors
 from gsparc.models.registry import (
-    all_methods,
-    built_in_methods,
     fill_defaults,
-    method_class,
-    plain_methods,
 )
 from gsparc.simulate.scenes.build import has_known_scene
 
@@ -242,52 +238,6 @@ def _may_match(pattern: str, dataset: str, split: str) -> bool:
 
 
 @dataclass(frozen=True)
-class Contender:
-    """A method as the comparison's configuration names it.
-
-    Attributes:
-        name: in tables.
-        choose: overrides of train.yaml that select it; empty: `model=<name>`.
-        effort: whether it takes part once for every effort and seed, or once.
-        kinds: of data it serves; empty for all.
-        problems: patterns of dataset/split that it takes part in; empty for all.
-        given: what it reads beside places, by such patterns; the last one that matches counts.
-        train_s: seconds that its fit takes at effort 1, as far as they are known [s].
-        stations: takes part only where there are several stations, some rows of each being learned from.
-        scene: takes part only where the measurements name the scene that they were made in.
-        networks: takes part where stations are sectors of a network, which have one model whatever is chosen.
-    """
-
-    name: str
-    choose: tuple[str, ...] = ()
-    effort: bool = False
-    kinds: tuple[str, ...] = ()
-    problems: tuple[str, ...] = ()
-    given: Mapping[str, str] = field(default_factory=dict)
-    train_s: float | None = None
-    stations: bool = False
-    scene: bool = False
-    networks: bool = True
-
-    def serves(self, problem: Problem) -> bool:
-        """Return whether it can take part."""
-        suits = not self.kinds or problem.kind in self.kinds
-        suits &= not self.problems or any(fnmatchcase(problem.name, pattern) for pattern in self.problems)
-        # Booleans compare as 0 and 1: what a method needs, the problem must have.
-        needs = problem.stations >= self.stations and problem.scene >= self.scene
-        return suits and needs and self.networks >= problem.network
-
-    def reads(self, problem: Problem) -> str:
-        """Return what it is given beside places; "" for nothing."""
-        return ([what for where, what in self.given.items() if fnmatchcase(problem.name, where)] or [""])[-1]
-
-    def overrides(self, effort: float | None) -> list[str]:
-        """Return overrides of train.yaml, but for the seed."""
-        choice = self.choose or (f"model={self.name}",)
-        return [*choice, *([] if effort is None else [f"effort={effort:g}"])]
-
-
-@dataclass(frozen=True)
 class Cell:
     """One training and its result.
 
@@ -310,26 +260,6 @@ class Cell:
     def __str__(self) -> str:
         effort = ANY if self.effort is None else f"{self.effort:g}"
         return f"{self.dataset}/{self.split}/{self.method}/{effort}/{ANY if self.seed is None else self.seed}"
-
-
-class Unlisted(Contender):
-    """A method that the configuration does not name: its class tells which data it serves."""
-
-    def serves(self, problem: Problem) -> bool:
-        """See `Contender.serves`."""
-        kind, folds = method_class(self.name), problem.folds.folds
-        return super().serves(problem) and all(kind.stands_beside(problem.data, fold) for fold in folds)
-
-
-def unlisted_contenders() -> dict[str, Contender]:
-    """Return those of plugins and plain methods that conf/compare.yaml does not name."""
-    # The file, not the settings: `~methods.gp` on a command line leaves it out.
-    file = config_folder() / "compare.yaml"
-    listed = load_yaml(file.read_text(encoding="utf-8"), file)["methods"]
-    exclusions = {*listed, *({*built_in_methods()} - {*plain_methods()})}
-    classes = {name: import_target(path) for name, path in all_methods().items() if name not in exclusions}
-    # One that cannot be imported is warned of.
-    return {name: Unlisted(name, effort=method.takes_effort) for name, method in classes.items() if method}
 
 
 def plan_cells(

@@ -15,9 +15,10 @@ from torch.nn.functional import normalize
 from gsparc.data.ends import Ends
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
+from gsparc.models.abilities import QueryPaths
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, Moments
 from gsparc.models.image_sources.rows import Rows, channel_places, static_array
-from gsparc.models.method import Prediction, QueryPaths
+from gsparc.models.method import Prediction
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.places import moving_end
 

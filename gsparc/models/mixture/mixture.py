@@ -23,10 +23,11 @@ from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
+from gsparc.models.abilities import HasPaths, HasProcess, QueryPaths
 from gsparc.models.channels.initial import estimate_run_factors
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, method_from_state, method_state
 from gsparc.models.image_sources.frame import merge_equal_paths
-from gsparc.models.method import HasPaths, HasProcess, Method, Prediction, QueryPaths
+from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.each_or_together import LearnsTogether

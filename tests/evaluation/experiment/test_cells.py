@@ -7,7 +7,8 @@ from campaigns import compose
 from omegaconf import OmegaConf
 from refusals import refused
 
-from gsparc.evaluation.experiment.cells import Contender, SplitChoice, plan_cells, read_entries, wanted_cells
+from gsparc.evaluation.experiment.cells import SplitChoice, plan_cells, read_entries, wanted_cells
+from gsparc.evaluation.experiment.contenders import Contender
 
 METHODS = {
     "gp": Contender("gp", ("model=gp",)),

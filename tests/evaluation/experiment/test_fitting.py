@@ -6,7 +6,8 @@ import json
 import pytest
 from hydra import initialize_config_module
 
-from gsparc.evaluation.experiment.cells import Cell, Contender, Problem, _may_match, job_of_cell
+from gsparc.evaluation.experiment.cells import Cell, Problem, _may_match, job_of_cell
+from gsparc.evaluation.experiment.contenders import Contender
 from gsparc.evaluation.experiment.runner import run_jobs, time_by_dataset
 from gsparc.evaluation.ledger import run_once
 from gsparc.evaluation.results import Run, as_frame

@@ -20,8 +20,8 @@ from gsparc.evaluation.experiment.folds import build_callbacks
 from gsparc.field.gradient_stage import DEFAULTS
 from gsparc.field.optimizer import rate_factor
 from gsparc.models import checkpoint
+from gsparc.models.abilities import HasGaussians
 from gsparc.models.fitting import fit_or_resume
-from gsparc.models.method import HasGaussians
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext

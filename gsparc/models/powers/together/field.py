@@ -23,8 +23,9 @@ from gsparc.data.errors import DataError
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
+from gsparc.models.abilities import JointLevels
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.method import JointLevels, Prediction
+from gsparc.models.method import Prediction
 from gsparc.models.powers.prior_map import NetworkMaps, describe_use
 from gsparc.models.powers.together.learning import (
     LEAST_STATIONS,
