@@ -151,7 +151,10 @@ def run_once(
     changes = [] if record is None else state.changes(record)
     if record is None or record.get("ended") or changes:
         if changes and not resumes:
-            log.info("%s: begun anew, as these changed: %s", folder, list_first(changes))
+            settings = state.changes(record, reuse=True)
+            files = len(changes) - len(settings)  # of the program: hundreds of modules tell a reader nothing
+            words = [*settings, f"{files} files of the program"] if files else settings
+            log.info("%s: runs again, as these changed since it ran: %s", folder, list_first(words))
         set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
         record = {**asdict(state), "began": time.time()}
     else:
@@ -181,7 +184,7 @@ def set_earlier_aside(run_dir: Path, *begun_from: str | None) -> None:
     paths = [Path(path).resolve() for path in begun_from if path]
     goes_on = any(run_dir.resolve() in (path, *path.parents) for path in paths)
     if set_aside(run_dir, *LEFT[: 1 if goes_on else None]):
-        log.info("%s: files of an earlier run are kept as NAME.earlier", run_dir)
+        log.info("%s: files of an earlier run there were renamed to NAME.earlier", run_dir)
 
 
 def edited(record: Mapping[str, Any]) -> list[str]:

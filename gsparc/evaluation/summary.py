@@ -162,7 +162,7 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
     if above := facts.get(f"{prefix}/heard_above_db"):
         rest.append(
-            f"{GIVEN_HEARD}; maps and predict show levels listed or not, {above:.1f} dB lower in the mean: "
+            f"{GIVEN_HEARD}; maps and predict show all levels, {above:.1f} dB lower in the mean: "
             "compare maps with levels of all cells (a scanner), not with lists"
         )
     if unlisted := facts.get(f"{prefix}/unlisted"):
@@ -248,14 +248,14 @@ def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]
     far = {n: max(x, 1e-12) for n, x in chi2.items() if x is not None and (x < low or x > high)}
     factors = [(n, max(x, 1 / x) ** 0.5, "large" if x < 1 else "small") for n, x in far.items()]
     faults = ", ".join(
-        f"of {name} is {times:.2g} times too {side} ({CALIBRATION} {chi2[name]:.2g})"
+        f"of {name} is {times:.2g} times too {side} ({CALIBRATION} {chi2[name]:.2g}, 1 is right)"
         for name, times, side in factors
     )
     tested = "gsparc map ckpt=FILE has tested intervals"
     if not figure.startswith("rmse"):  # for spectra and channels there are thresholds alone
         tested = "gsparc calibrate ckpt=FILE tests which answers to accept"
-    meaning = f"stated uncertainty: std {faults}, where 1 is right"
-    return [f"{meaning}; it orders answers, but is no error bar here; {tested}"] if faults else []
+    meaning = f"stated uncertainty: std {faults}"
+    return [f"{meaning}; it orders predictions, but is no error bar here; {tested}"] if faults else []
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
@@ -277,7 +277,7 @@ def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]
 
 
 def judge_baseline(baseline: str, method: str, figure: str, lead: Lead, listed: bool = False) -> list[str]:
-    """Return whether a baseline, which has `lead` over a method, is better, worse or not told apart.
+    """Return whether a baseline, which has `lead` over a method, is significantly better, worse, or neither.
 
     Of `listed` rows alone it is no choice: lists hold what is strong, and which cells they hold is not known.
     """

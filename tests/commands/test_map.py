@@ -78,7 +78,7 @@ def test_a_plan_from_the_model(mapped, model, tmp_path):
     assert 0 < facts["plan/expected_error_db"] < facts["plan/expected_error_before_db"]
     lines = (tmp_path / "plan.csv").read_text().splitlines()
     assert len(lines) == 7 and lines[0].endswith(",way_m") and (tmp_path / "plan.png").exists()
-    assert "; rows logged on the way not counted" in said
+    assert "; rows logged on the way do not count" in said
     how = [f"ckpt={model}", "count=1", "promised=false"]
     done = run("plan", *how, "threshold_db=-80", folder=tmp_path)
     assert any("of the strongest station, where -80 is in doubt" in one for one in done.out), done
@@ -89,7 +89,7 @@ def test_a_plan_from_the_model(mapped, model, tmp_path):
 def test_a_plan_did_not_say_how_many_stations_a_place_lists(mapped, model, tmp_path, monkeypatch):
     monkeypatch.setattr("gsparc.apps.maps.promise.Promise.stations_of_place", lambda self: 1)
     done = run("plan", f"ckpt={model}", "count=1", "area=[-20,0,80,60]", folder=tmp_path)
-    assert any(", a place lists the 1 strongest of 2, a way of" in line for line in done.out), done
+    assert any(", if a place lists the 1 strongest of 2, a way of" in line for line in done.out), done
 
 
 def test_the_file_of_a_way_held_no_stops(model, tmp_path):
@@ -146,7 +146,7 @@ def test_a_best_place_was_not_said_to_be_like_others(tmp_path, monkeypatch):
     monkeypatch.setattr("gsparc.apps.maps.placing.place_station", with_intervals)
     done = run("place", f"ckpt={path}", "count=4", "promised=false", "left_out=0", folder=tmp_path / "to")
     assert any(line.endswith(", gaining 10.0 points") for line in done.out), done
-    told = "of the gain 4.0 to 20.0 points, not told apart from 2 of 3 others"
+    told = "of the gain 4.0 to 20.0 points, not significantly above 2 of 3 others"
     assert any(told in line for line in done.out)
 
 

@@ -268,7 +268,7 @@ def test_a_job_that_begins_anew_says_why(tmp_path, caplog):
     run_once(tmp_path, state(), ends(tmp_path, 1))
     assert not caplog.messages
     run_once(tmp_path, state(settings={"seed": 0, "effort": 2}), ends(tmp_path, 1))
-    assert caplog.messages == [f"{tmp_path}: begun anew, as these changed: settings.effort"]
+    assert caplog.messages == [f"{tmp_path}: runs again, as these changed since it ran: settings.effort"]
 
 
 def test_a_run_that_went_on_said_that_it_began_anew(tmp_path, caplog):
@@ -278,4 +278,4 @@ def test_a_run_that_went_on_said_that_it_began_anew(tmp_path, caplog):
     assert State.from_config(one) == State.from_config(other)
     run_once(tmp_path, state(settings={"effort": 1}), ends(tmp_path))
     run_once(tmp_path, state(settings={"effort": 3}), ends(tmp_path), again=True, resumes=True)
-    assert not any("begun anew" in message for message in caplog.messages)
+    assert not any("runs again" in message for message in caplog.messages)

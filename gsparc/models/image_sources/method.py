@@ -160,9 +160,9 @@ class ImageSourceGP(SourcesInFrame):
         scene = self.members[0].scene
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
         agree = ensemble.reached_noise_floor([member.left_out for member in members], self.noise_floor)
-        ended = "two agree up to noise, enough" if agree else "all that effort= asks for"
+        ended = "two agree up to noise, which is enough" if agree else "as many as effort= asks for"
         boxes, patches = len(scene.clutter.boxes), len(scene.clutter.patches)
-        notes = [f"{len(members)} of {self.settings.searches} searches ({ended}), {counts} sources"]
+        notes = [f"{len(members)} of {self.settings.searches} searches ({ended}) found {counts} sources"]
         if boxes or patches:
             notes.append(f"clutter: {boxes} occluding boxes, {patches} finite mirrors")
         if (self.factors != 1).any():

@@ -43,7 +43,7 @@ from gsparc.training.stopwatch import Stopwatch
 log = logging.getLogger(__name__)
 QUERY_CHUNK = 1024  # memory; stations at one place share most of their work, see `ChannelField`
 # Of fields, in words.
-PARTS = {"power": "a trend of levels", "residual": "a process of what is left"}
+PARTS = {"power": "a trend over distance", "residual": "a Gaussian process of the rest"}
 
 
 class Mixture(LearnsTogether, ClosedForm):
@@ -285,7 +285,7 @@ class Mixture(LearnsTogether, ClosedForm):
     def description(self) -> str:
         """See `Method`."""
         terms = ", ".join(PARTS.get(term, term) for term in self.terms) or PARTS["residual"]
-        return f"{self.started.replace('+', ' + ')} in closed form, made of {terms}"
+        return f"{self.started.replace('+', ' + ')} in closed form, with {terms}"
 
     def count_components(self) -> int:
         """Return the number of Gaussians of all members."""

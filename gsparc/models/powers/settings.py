@@ -113,7 +113,7 @@ class KernelCandidate:
         law = self.trend.law
         mean = "a constant" if law is None else f"a distance law of exponent {law.exponent:.3g}"
         has_map = any(isinstance(one, UserTerm) and isinstance(one.term, PriorMap) for one in self.trend.more)
-        return f"{self.kernel.description}, about {mean}{' and a share of the map' * has_map}"
+        return f"{self.kernel.description}, mean: {mean}{' and a share of the map' * has_map}"
 
 
 def candidate_priors(

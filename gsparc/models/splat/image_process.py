@@ -170,7 +170,7 @@ class ImageProcess(LearnedField):
         """See `Method`."""
         weight = 0.0 if self._average is None else self._average[1]
         return super().description + (
-            f"; weight of a plain Gaussian process {weight:.2g}" if self.plain else ""
+            f"; averaged with a plain Gaussian process of weight {weight:.2g}" if self.plain else ""
         )
 
     def without_process(self) -> Method | None:
