@@ -85,7 +85,7 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
     # Fewer than alpha were bad, and a confidence was blamed; rows of patches that err together were too few.
     evidence.error[:] = np.where(np.arange(900) % 8 == 0, 10.0, 0.01)
     said = unseen.calibrate_and_store(Guarantee(alpha=0.144), "auto", False, 2)[1]
-    assert "so few do not show that at most alpha=0.144 are" in said
+    assert "too few rows to show that at most alpha=0.144 are" in said
     evidence.error[:] = np.where(number_patches(evidence.position) % 8 == 0, 10.0, 0.01)
     said = unseen.calibrate_and_store(Guarantee(alpha=0.2), "distance", True, 0)[1]
     assert "as neighbours err alike" in said

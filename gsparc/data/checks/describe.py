@@ -32,7 +32,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("grid", "" if site.grid is None else _grid(site.grid)),
         ("array", "" if site.array is None else f"{len(site.array)} receive antennas"),
         ("scale", "" if powers or scale == 1 else f"measurements are divided by {scale:.4g}, then stored"),
-        ("censored", f"{weak} of {len(data)} powers lie below a level (not heard or listed), {strong} above one"
+        ("censored", f"{weak} of {len(data)} powers lie below a level (unheard, unlisted), {strong} above one"
          if data.censored is not None else ""),
         ("runs", "" if data.run is None else f"{data.run.max() + 1}" + ", of unknown factors" * (not powers)),
         ("phases", "" if phases is None else str(phases)),

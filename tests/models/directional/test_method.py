@@ -46,7 +46,7 @@ def test_few_receivers_are_enough_with_directions():
     apart = torch.cdist(torch.from_numpy(sources), found).amin(1)
     assert len(found) == len(sources) == 7 and float(apart.max()) < 0.02
     assert error(method, data, fold.test) < 0.02
-    assert "7 triangulated sources" in note
+    assert "7 sources where directions cross" in note
 
 
 def test_a_search_starts_from_sources_where_rays_meet():
