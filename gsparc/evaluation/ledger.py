@@ -53,8 +53,8 @@ ENVIRONMENT = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib
 
 
 @dataclass(frozen=True)
-class State:
-    """What a result depends on, but for the program.
+class FitInputs:
+    """What a fit depends on besides the program: a fit of the same inputs is done.
 
     Attributes:
         settings: resolved, by dotted name, without those that say where data lie.
@@ -72,7 +72,7 @@ class State:
     unread: dict[str, str] = field(default_factory=dict)
 
     @classmethod
-    def from_config(cls, config: DictConfig, data: str = "", split: str = "") -> State:
+    def from_config(cls, config: DictConfig, data: str = "", split: str = "") -> FitInputs:
         """Return the state of a resolved configuration, of hashes of measurements and of their split."""
         subset = OmegaConf.masked_copy(config, [str(name) for name in config if name not in WHERE])
         whole: Any = OmegaConf.to_container(subset, resolve=True)  # what is missing is `???`
@@ -111,7 +111,7 @@ def measurements_hash(data: Measurements) -> str:
     return sha256(repr(whole).encode()).hexdigest()
 
 
-def read_finished(folder: Path, state: State, reuse: bool = False) -> dict[str, Any] | None:
+def read_finished(folder: Path, state: FitInputs, reuse: bool = False) -> dict[str, Any] | None:
     """Return the summary of a fit that is done; None where it is not.
 
     Args:
@@ -126,7 +126,7 @@ def read_finished(folder: Path, state: State, reuse: bool = False) -> dict[str, 
 
 
 def run_once(
-    folder: Path, state: State, work: Callable[[str | None], object], *, reuse: bool = False,
+    folder: Path, state: FitInputs, work: Callable[[str | None], object], *, reuse: bool = False,
     again: bool = False, resumes: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the summary of a fit, which is done now where it is not done.

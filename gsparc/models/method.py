@@ -101,7 +101,7 @@ class MethodFactory(ABC):
     takes_effort = False  # whether `FitContext.effort` changes its fit
     takes_weights = False  # whether its training may start from another model's (`FitContext.init_from`)
     # In tables, among plain methods, which a reader could have without gsparc; of this class alone.
-    plain_place: ClassVar[int | None] = None
+    baseline_order: ClassVar[int | None] = None
     kinds: ClassVar[tuple[Kind, ...]] = ()  # of data beside whose other methods it stands; empty for all
 
     @abstractmethod
@@ -296,7 +296,7 @@ def predict_in_batches(
     """Yield which of rows (n,) were asked together, as numbers (b,) into these, their batch, and the answer.
 
     One station after the other: each may have a model of its own, whose matrices are read for every batch.
-    Where rows have factors of their own (`Site.freedom`), answers are turned to what was measured.
+    Where rows have factors of their own (`Site.unknown_factor`), answers are turned to what was measured.
     """
     order = np.argsort(data.stations_of(rows), kind="stable")
 
@@ -309,7 +309,7 @@ def predict_in_batches(
                 answer = answer.of_devices(method.fitted_site, torch.from_numpy(data.device[rows[chosen]]))
             yield chosen, batch, answer
 
-    if data.site.freedom == "none":
+    if data.site.unknown_factor == "none":
         yield from predict_batches()
         return
     answers, back = list(predict_batches()), np.argsort(order)
@@ -326,7 +326,9 @@ def factors_to_measured(means: Tensor, data: Measurements, rows: np.ndarray) -> 
     """Return factors (n, 1, K) complex64 that turn means (n, A, K) to rows (n,) by what is free of these."""
     moments = Snapshots.from_rows(data, rows)
     answers = moments.arrange(means.numpy())
-    turns = align_factors(answers * (moments.values != 0), moments.values, moments.tones, data.site.freedom)
+    turns = align_factors(
+        answers * (moments.values != 0), moments.values, moments.tones, data.site.unknown_factor
+    )
     return torch.from_numpy(moments.to_rows(turns).astype(np.complex64))
 
 

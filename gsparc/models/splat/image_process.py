@@ -17,17 +17,17 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.method import Method, Prediction
-from gsparc.models.reduced import Settings, average_with_process
-from gsparc.models.splat.auto_settings import resolve_auto
-from gsparc.models.splat.method import LearnedField
-from gsparc.models.stack import (
+from gsparc.models.member_weights import (
     LEAST_HELD,
     choose_weights,
     error_products,
     explained_variance,
     relative_to_row,
 )
+from gsparc.models.method import Method, Prediction
+from gsparc.models.reduced import Settings, average_with_process
+from gsparc.models.splat.auto_settings import resolve_auto
+from gsparc.models.splat.method import LearnedField
 from gsparc.models.terms import array_obstacle
 from gsparc.physics.decibels import RELATIVE_DB
 from gsparc.training.context import FitContext, FitReport
