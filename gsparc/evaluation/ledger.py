@@ -150,7 +150,7 @@ def run_once(
     record, resume_path = read_summary(folder / RECORD), None
     changes = [] if record is None else state.changes(record)
     if record is None or record.get("ended") or changes:
-        if changes and not resumes:
+        if record is not None and changes and not resumes:
             settings = state.changes(record, reuse=True)
             files = len(changes) - len(settings)  # of the program: hundreds of modules tell a reader nothing
             words = [*settings, f"{files} files of the program"] if files else settings

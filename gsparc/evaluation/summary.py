@@ -166,12 +166,12 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
             "compare maps with levels of all cells (a scanner), not with lists"
         )
     if unlisted := facts.get(f"{prefix}/unlisted"):
-        rest.append(f"off, or gone? expected in lists and in none: {unlisted}")
+        rest.append(f"cells that may be off: lists should hold them and none does: {unlisted}")
         without = {name: facts.get(f"{prefix}/{name}{WITHOUT_OFF}") for name in OF_LISTS}
         if said := [f"{name} {value:.2f}" for name, value in without.items() if value is not None]:
             rest.append(f"figures above count these cells; without them: {', '.join(said)}")
     if new := facts.get(f"{prefix}/new"):
-        rest.append(f"heard for the first time, with lists that should have held it: {new}")
+        rest.append(f"new cells, which earlier lists should have held: {new}")
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
     cost = [LINE.format(of_what=folds, cost=facts["time/cost"])] if facts.get("time/cost") else []
     lines = [*seen.get(prefix, []), *run_conditions(facts), *rest, *describe_model(facts), *cost]
@@ -232,7 +232,7 @@ def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str
     number = f"row {row}"  # as split.leave_out counts; the file may count otherwise
     called = number if name in (None, number) else f"{name} ({number} of split.leave_out)"
     return [
-        f"{called} alone makes {share:.1%} of the error or power that nmse and mse add up: they describe "
+        f"{called} alone makes {share:.1%} of the error or power that nmse and mse add up: both describe "
         f"little else. The median row's NMSE is {median:.3g}"
     ]
 
@@ -255,7 +255,7 @@ def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]
     if not figure.startswith("rmse"):  # for spectra and channels there are thresholds alone
         tested = "gsparc calibrate ckpt=FILE tests which answers to accept"
     meaning = f"stated uncertainty: std {faults}"
-    return [f"{meaning}; it orders predictions, but is no error bar here; {tested}"] if faults else []
+    return [f"{meaning}; std orders predictions, but is no error bar here; {tested}"] if faults else []
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:

@@ -93,7 +93,7 @@ def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
         "carrier" if all(one.phase_reference == "carrier" for one in found) else "neighbours"
     )
     log.info(
-        "aligned %d rows by %s: each told by the others to NMSE %.3g; phases over places are %s",
+        "aligned %d rows by %s: each is predicted by the others to NMSE %.3g; phases over places are %s",
         len(fit_rows), describe_factor(site.unknown_factor), float(np.mean([one.error for one in found])),
         "the carrier's" if reference == "carrier" else "relative to neighbours",
     )  # fmt: skip
