@@ -111,8 +111,8 @@ def test_remarks_name_stand_ins_busy_machines_and_better_baselines():
     ("ImageSources", "rays in closed form", None, ["gsparc: image sources, rays in closed form"]),
     ("ArrayProcess", "array process through 9", None, ["gsparc: array process through 9"]),
     ("Powers", "joint_powers in closed form", None, ["gsparc: powers of all stations in closed form"]),
-    ("Powers", "powers in closed form", "length 3 m\na law\nc\nd",
-     ["gsparc: powers in closed form", "  length 3 m", "  a law", "  c"]),
+    ("Powers", "powers in closed form", "length 3 m\na law\nc\nd\ne",
+     ["gsparc: powers in closed form", "  length 3 m", "  a law", "  c", "  d"]),
 ])  # fmt: skip
 def test_the_console_never_said_which_method_was_chosen(kind, made, learned, said):
     facts = {"dataset/kind": "csi", "model/label": "gsparc", "model/class": kind, "model/made": made}

@@ -96,7 +96,7 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
     check.raw.arrays["sensitivity_db"] = np.r_[levels[heard], below]
     used = "all" if len(below) == every else f"{len(below)} (mostly near where they are listed) of"
     used = f"{used} {every} unlisted levels are used beside {len(heard)} listed ones"
-    check.notes.append(f"{missing}: {how}; {used} (dataset.absent=unknown uses none)")
+    check.notes += [f"{missing}: {how}", f"{used} (dataset.absent=unknown uses none)"]
     return len(below) * strongest
 
 

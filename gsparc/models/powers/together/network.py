@@ -146,16 +146,18 @@ def learn_network(
     exponent, _, wider, higher, floor, tilt = trend.shared.tolist()
     law_note = (
         f"{len(names)} sectors of {int(network.site.max()) + 1} sites in one model: distance exponent "
-        f"{exponent:.3g}, gains +- {gain:.2g} dB, shadowing of a site {site:.2g} dB over"
-        f" {wide:.3g} m, of a sector {own:.2g} dB over {near:.3g} m and"
-        f" {bearing:.2g} dB from bearing to bearing, noise {noise:.2g} dB"
+        f"{exponent:.3g}, gains +- {gain:.2g} dB, noise {noise:.2g} dB"
+    )
+    shadow_note = (
+        f"shadowing of a site {site:.2g} dB over {wide:.3g} m, of a sector {own:.2g} dB over {near:.3g} m, "
+        f"{bearing:.2g} dB from bearing to bearing"
     )
     beams = (
         f"beams {math.exp(wider):.2f} times as wide and {math.exp(higher):.2f} times as high as listed or "
         f"usual, front-to-back ratio {floor:.3g} dB, tilts off by {tilt:+.2g} degrees"
     )
     aimed = [beams] if bool((trend.table[:, 0] != NO_AZIMUTH).any()) else []
-    return evidence, Prior(kernel, replace(trend, more=more)), [law_note, *aimed, *notes]
+    return evidence, Prior(kernel, replace(trend, more=more)), [law_note, shadow_note, *aimed, *notes]
 
 
 def _fit_azimuths(
