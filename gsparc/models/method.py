@@ -43,8 +43,8 @@ class Prediction:
         mean: (B, H, W) float32 in [0, 1], (B, antennas, subcarriers) complex64, or (B, 1) float32; all of it
             in double precision where positions are float64, see `Method.gradient_problem`.
         variance: (B,) float32, expected squared error per entry; None when the method has none.
-        unknown: (B,) float32 in [0, 1]; 1 where nothing is known, such as far away, and of a process its
-            variance relative to the prior's; None when the method does not say.
+        unknown: (B,) float32 in [0, 1], share of the prior variance that training left: near 0 at training
+            rows, 1 far from all of them; None when the method does not say. Confidence is 1 minus it.
         explained: like the mean, its share that Gaussians predict; None where that is not told apart.
     """
 
@@ -100,7 +100,7 @@ class MethodFactory(ABC):
     has_parts = False  # whether it resumes parts in folders of their own
     takes_effort = False  # whether `FitContext.effort` changes its fit
     takes_weights = False  # whether its training may start from another model's (`FitContext.init_from`)
-    # In tables, among plain methods, which a reader could have without gsparc; of this class alone.
+    # Place in tables of a baseline, which a reader could have without gsparc; of this class alone.
     baseline_order: ClassVar[int | None] = None
     kinds: ClassVar[tuple[Kind, ...]] = ()  # of data beside whose other methods it stands; empty for all
 
