@@ -238,7 +238,8 @@ class _Search:
         gain = (before.nll - after.nll) / sum(group.target.numel() for group in self.groups)
         notes.append(
             f"waves: {name} {'kept' if keep else 'dropped'}: error times {ratio[0]:.3f} at left-out rows, "
-            f"{ratio[1]:.3f} and {ratio[2]:.3f} in small and large squares; log likelihood {gain:+.3f} a channel"
+            f"{ratio[1]:.3f} and {ratio[2]:.3f} in small and large squares; "
+            f"log likelihood {gain:+.3f} a channel"
         )
         return after if keep else before
 
