@@ -50,7 +50,8 @@ def task(config: DictConfig) -> dict[str, Any]:
             # An infinite threshold accepts nobody, and JSON has no infinity.
             threshold = stored.threshold if np.isfinite(stored.threshold) else None
             facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold
-            stored_lines.append(f"{one.path}: {bound}")
+            # The confidence first, then what is promised of it: a line each.
+            stored_lines += [f"{one.path}: {part}" for part in bound.split("; ", 1)]
     return finish_run(run_dir, facts, *calibration_tables(facts), lines=stored_lines)
 
 
