@@ -51,7 +51,7 @@ def test_every_layer_and_a_table(mapped):
     assert facts["map/stations"] == 2 and "held-out blocks" in said
     assert f"expected error {facts['map/expected_error_db']:.2f} dB" in said
     ends = facts["map/covered_low"], facts["map/covered_high"]  # a covered share had no interval
-    assert 0 <= ends[0] < 1 - facts["map/outage"] < ends[1] <= 1 and "(90 % interval" in said
+    assert 0 <= ends[0] < 1 - facts["map/outage"] < ends[1] <= 1 and "; 90 % interval" in said
     with np.load(folder / "map.npz") as found:
         told = np.isfinite(found["power_db"])
         assert found["power_db"].shape == (2, 30, 40) and told.mean() > 0.8
