@@ -55,7 +55,7 @@ def contradicted(notes: Sequence[str]) -> list[str]:
     """Sectors whose azimuths levels contradict; all are named by one note."""
     said = [note for note in notes if "azimuths are contradicted by levels" in note]
     assert len(said) <= 1
-    return re.findall(r"(\S+) \(\d+ deg: levels fit \d+\)", " ".join(said))
+    return re.findall(r"(\S+) \(listed \d+, fitted \d+ degrees\)", " ".join(said))
 
 
 def levels(method: PerStation, one: Network) -> tuple[np.ndarray, np.ndarray]:
