@@ -266,7 +266,7 @@ def test_what_was_heard_beyond_the_trained_places_was_located_at_their_edge_unsa
     assert facts["locate/beyond"] == sum(beyond) > 0.6 * len(found)
     assert facts["locate/median_m"] < 0.3 * facts["baseline/nearest/median_m"], "sought beyond the edge"
     said = capsys.readouterr().out
-    assert f"{sum(beyond)} of {len(found)} snapshots: beyond the trained places, where areas promise" in said
+    assert f"{sum(beyond)} of {len(found)} snapshots are beyond the trained places: no promise" in said
     assert f"{len(found)} true places lie outside" in said
     facts, found = located(tmp_path / "own", f"ckpt={ckpt}", "calibrate=0")
     assert facts["locate/beyond"] <= 0.2 * len(found)
