@@ -126,7 +126,7 @@ def test_every_field_with_rows_left_out_takes_them(kind, tmp_path):
     data = KINDS[kind](tmp_path)
     fold = fold_of(data)
     _, report = fitting.fit_or_resume(wrap_per_station(Gsparc(position_std=0.05), data), data, fold, BRIEF)
-    assert any("errors of places explain" in note or "is not used" in note for note in report.notes)
+    assert any("with errors of places" in note or "is not used" in note for note in report.notes)
 
 
 def test_rendered_spectra_say_that_positions_count_as_exact(tmp_path, caplog):
