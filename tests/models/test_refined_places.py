@@ -102,7 +102,7 @@ def test_known_errors_of_places_cost_less_than_unknown_ones():
     told = replace(moved, position_std=np.full(len(moved), 0.015))
     (without, _), (known, report) = (_fitted(data, fold) for data in (moved, told))
     assert _missed(known, exact, fold) < 0.75 * _missed(without, exact, fold)
-    assert "positions refined by" in report.notes[0] and report.cost.stages["measured places"] > 0
+    assert "positions moved by" in report.notes[0] and report.cost.stages["measured places"] > 0
 
 
 @pytest.mark.slow
