@@ -22,7 +22,7 @@ FACTS = {
     "rx_rotation": -np.eye(3), "uplink_array": np.eye(3), "uplink_hz": ONE, "antennas": np.arange(2),
     "stations": Stations(np.zeros((2, 3)), ("one", "two")), "georeference": Georeference(52.0, 13.0),
     "moving_box": np.array([-ONE, 2 * ONE]), "level_unit": "dBm", "unit": "mW",
-    "freedom": "phase", "phase_reference": "carrier",
+    "unknown_factor": "phase", "phase_reference": "carrier",
     "device_names": ("one", "two"),
 }  # fmt: skip
 

@@ -28,7 +28,7 @@ class NearestK(Interpolator):
         return ()
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        """At places (B, 3) [m]; `variance=` and `unknown=` (B,) may be given besides."""
+        """At places (B, 3) [m]; `variance=` (squared error) and `unknown=` (0 to 1), (B,), are optional."""
         near = cKDTree(self.places.numpy()).query(queries, k=range(1, self.k + 1))[1]
         return Prediction(self._to_targets(self.rows[near].float().mean(1)))
 

@@ -50,7 +50,8 @@ def task(config: DictConfig) -> dict[str, Any]:
             # An infinite threshold accepts nobody, and JSON has no infinity.
             threshold = stored.threshold if np.isfinite(stored.threshold) else None
             facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold
-            stored_lines.append(f"{one.path}: {bound}")
+            # The confidence first, then what is promised of it: a line each.
+            stored_lines += [f"{one.path}: {part}" for part in bound.split("; ", 1)]
     return finish_run(run_dir, facts, *calibration_tables(facts), lines=stored_lines)
 
 
@@ -67,18 +68,18 @@ def calibration_tables(facts: dict[str, Any]) -> list[Table]:
         Column("rows divided", "", of="how"), Column("confidence", "", of="kind"),
         Column("answers accepted", ".0%", of="coverage"), Column("bad among them", ".1%", of="realised"),
         Column("trials accepting none", ".0%", of="silent"),
-        Column("too many bad, of all trials", ".1%", of="broken_of_all"),
-        Column("promised of all trials: at most", ".0%", of=lambda row: facts["promise/delta"]),
-        Column("too many bad, of accepting trials: no promise", ".1%", of=_broken),
+        Column("failed, of all trials", ".1%", of="broken_of_all"),
+        Column("promised: at most", ".0%", of=lambda row: facts["promise/delta"]),
+        Column("failed, of accepting trials: no promise", ".1%", of=_broken),
     ]  # fmt: skip
     # Spatial draws are left out where the patches are too few.
     trials_of = [{"how": how, **facts_under(facts, f"trial/{how}")} for how in ("random", "spatial")]
     of = f"{facts['dataset/name']}, {facts['positions']} test positions of {facts['model/name']}"
     heading = f"{of}: which confidence orders errors best (a smaller area is better)"
     bad = f"bad (an error above {facts['promise/limit_db']:g} dB)"
-    trials = "Trials of the promise, each of a threshold set on some rows and tried on others"
-    promise = f"{trials}: more than {facts['promise/alpha']:.0%} of accepted answers {bad} are too many"
-    note = f"Trials may accept fewer: {SHARES[1]:.0%} of the rows calibrate, for storing {1 - SHARES[0]:.0%}"
+    trials = "Trials, each with a threshold from some rows and a test on others"
+    promise = f"{trials}; one fails if more than {facts['promise/alpha']:.0%} of accepted answers are {bad}"
+    note = f"Trials calibrate on {SHARES[1]:.0%} of the rows, the stored threshold on {1 - SHARES[0]:.0%}"
     return [
         Table.from_rows(heading, curves, [row for row in kinds if "area" in row]),
         Table.from_rows(promise, draws, [row for row in trials_of if "coverage" in row], note=note),

@@ -14,7 +14,7 @@ from gsparc.data.public.fetch import MIRROR, PublicSet, fetch, public_sets
 
 def describe_set(one: PublicSet) -> str:
     """Say what a set is, its size and licence, how it is used and cited, and where it comes from."""
-    size = one.size_text if one.sources else "size said first" if one.hub else "by hand"
+    size = one.size_text if one.sources else "size shown before fetching" if one.hub else "by hand"
     licence = one.licence or "no licence stated: ask its makers before you pass it on"
     use = f"dataset={one.dataset}" if one.dataset else "no loader of its own"
     first = one.sources[0] if one.sources else None

@@ -60,7 +60,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         alike = ((low <= found.gain[0]) & (found.gain[0] <= high))[1:].sum()
         interval = "90 % intervals {low:.1%} to {high:.1%}, of the gain " + f"{100 * low[0]:.1f} to "
         interval += f"{100 * high[0]:.1f} points"
-        interval += f", not told apart from {alike} of {len(low) - 1} others" * (len(low) > 1)
+        interval += f", not significantly above {alike} of {len(low) - 1} others" * (len(low) > 1)
     lines = [
         placing.assumption(predictor.site, found.places[0, 2], where["antenna"]),
         f"now {found.before:.1%} of the area, {found.grid.step:.3g} m squares, with {level:g} {unit} or more"

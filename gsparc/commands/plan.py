@@ -64,7 +64,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         doubt = "" if config.threshold_db is None else f", where {config.threshold_db:g} is in doubt"
         before += f" of {every}{doubt}"
         if promise is not None and (each := promise.stations_of_place()) < len(predictor.site.stations):
-            before += f", a place lists the {each} strongest of {len(predictor.site.stations)}"
+            before += f", if a place lists the {each} strongest of {len(predictor.site.stations)}"
     kind = "straight from place to place" if config.walkable is None else "along the lines of walkable"
-    before += f", a way of {plan.length_m:.0f} m, {kind}; rows logged on the way not counted; plan "
-    return finish_run(run_dir, facts, lines=filter(None, (plan.stopped, plan.in_vain)), before=before)
+    way_line = f"a way of {plan.length_m:.0f} m, {kind}; rows logged on the way do not count"
+    lines = filter(None, (plan.stopped, plan.in_vain, way_line))
+    return finish_run(run_dir, facts, lines=lines, before=f"{before}; plan ")

@@ -19,7 +19,7 @@ from gsparc.commands.shared.settings import to_dict
 from gsparc.data.limits import whole
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.experiment import tradeoff
-from gsparc.evaluation.ledger import State, measurements_hash, run_once
+from gsparc.evaluation.ledger import FitInputs, measurements_hash, run_once
 from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.plots import draw_front
 from gsparc.evaluation.summary import write_samples
@@ -36,7 +36,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     """Sweep a checkpoint; return the facts of `summary.json`. A job of a multirun is done once."""
     run_dir = run_directory()
     run = open_files([config.ckpt], to_dict(config.dataset), to_dict(config.split))
-    state = State.from_config(config, measurements_hash(run.data), run.split.sha256)
+    state = FitInputs.from_config(config, measurements_hash(run.data), run.split.sha256)
     trained = run.stored[0].extra.get("run_id")  # the front is stored in the file itself, which changes it
     state = replace(state, files=state.files | ({"ckpt": trained} if trained else {}))
     with locked(run_dir / ".job"):

@@ -67,8 +67,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         "update/rows_kept": len(predictor.rows), "update/alarms": len(table) - alarms_before,
         "update/versions": len(predictor.versions), "time/update_s": seconds,
     }  # fmt: skip
-    silent = f", {skipped} others tell nothing" if skipped else ""
-    message = f"{row_count} rows added{silent}, {len(table) - alarms_before} alarm(s)"
+    silent = f", {skipped} skipped (silence where it was expected)" if skipped else ""
+    message = f"{row_count} rows added{silent}, alarms: {len(table) - alarms_before}"
     message = f"back by {config.undo}: {len(predictor.rows)} rows kept" if config.undo else message
     message += f", {seconds:.2g} s"
     before = f"update: {message}; model in {out}; summary "

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from gsparc.data.checks import outliers
-from gsparc.data.checks.coherence import set_freedom
+from gsparc.data.checks.coherence import set_unknown_factor
 from gsparc.data.limits import check_arguments, whole
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
@@ -144,7 +144,7 @@ class DataModule(pl.LightningDataModule, ABC):
     @cached_property
     def measurements(self) -> Measurements:
         """All measurements, read when first asked for; rows far beyond all others are warned of."""
-        data = set_freedom(self.load(), self.free)
+        data = set_unknown_factor(self.load(), self.free)
         for warning in outliers.outlier_warnings(data):
             log.warning("%s: %s", self.name, warning)
         return data

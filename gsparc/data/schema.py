@@ -17,7 +17,7 @@ from gsparc.data.query import Batch
 from gsparc.data.target import TARGETS, Kind, Target
 from gsparc.data.units import PowerUnit
 from gsparc.ops import Pose, SphereGrid
-from gsparc.physics.row_factors import Freedom, describe_freedom
+from gsparc.physics.row_factors import UnknownFactor, describe_factor
 
 if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
@@ -166,7 +166,7 @@ class Site:
             of both as in `Measurements.moving`.
         level_unit: what 10 log10 of a received power is in, `dB` where the file does not say.
         unit: that powers were given in, and are answered in; None: `level_unit`.
-        freedom: what of each row's factor nobody knows, see `gsparc.physics.row_factors`.
+        unknown_factor: what nobody knows of the complex factor of each row, see `gsparc.physics.row_factors`.
         phase_reference: of rows that were turned to each other: `carrier`, phases over places are those of
             waves; `neighbours`, near rows were made alike. None where rows are as measured.
         device_names: (D,) what measured powers is called; None where nothing tells.
@@ -198,7 +198,7 @@ class Site:
     georeference: Georeference | None = None
     level_unit: str = "dB"
     unit: str | None = None
-    freedom: Freedom = "none"
+    unknown_factor: UnknownFactor = "none"
     phase_reference: Literal["carrier", "neighbours"] | None = None
     device_names: tuple[str, ...] | None = None
     device_levels: np.ndarray | None = field(default=None, compare=False)
@@ -212,12 +212,14 @@ class Site:
     def scored(self) -> Scored:
         """The figures of merit that tell of it; rows with factors of their own are aligned first."""
         # Only channels have phases: powers and spectra are the same under any factor.
-        return "aligned csi" if self.target.is_complex and self.freedom != "none" else self.kind
+        return "aligned csi" if self.target.is_complex and self.unknown_factor != "none" else self.kind
 
     def need_phase(self, what: str) -> None:
         """Raise `ValueError` where rows have phases of their own, so that `what` cannot be told."""
-        if self.freedom != "none":
-            raise ValueError(f"{what}: channels are known up to {describe_freedom(self.freedom)} of each row")
+        if self.unknown_factor != "none":
+            raise ValueError(
+                f"{what}: channels are known up to {describe_factor(self.unknown_factor)} of each row"
+            )
 
     @property
     def moving_end(self) -> End:

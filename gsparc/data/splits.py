@@ -77,7 +77,7 @@ class Split:
     def title(self) -> str:
         """Return its name, and that no seed draws the test rows where the release names them."""
         every = " (all rows of the file are asked)" * (self.name == "whole")
-        return self.name + every + " (the test rows that its files name)" * self.of_release
+        return self.name + every + " (test rows named by its files)" * self.of_release
 
     def check(self) -> None:
         """Refuse folds that teach nothing, or test nothing (DataError)."""

@@ -33,8 +33,8 @@ def align_to_site(data: Measurements, site: Site, *, whole: bool = False) -> Mea
         if here != there:
             raise ValueError(f"the model was trained with {what} {there}, {ours.name} has {here}")
     data = _about(data, site)
-    if site.freedom != "none":  # few rows of another file may not tell
-        data = replace(data, site=replace(data.site, freedom=site.freedom))
+    if site.unknown_factor != "none":  # few rows of another file may not tell
+        data = replace(data, site=replace(data.site, unknown_factor=site.unknown_factor))
     ours = data.site
     shift = ours.origin - site.origin
     if ours.static_position is not None and site.static_position is not None:

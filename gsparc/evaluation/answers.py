@@ -244,7 +244,7 @@ def output_path(out: str | None, places: Path, overwrite: bool) -> Path:
     if path.exists() and path.samefile(places):
         raise DataError(f"out={path}: these are the places themselves; give another out=FILE")
     if path.exists() and not overwrite:
-        raise DataError(f"out={path}: is there already; say overwrite=true, or another out=FILE")
+        raise DataError(f"out={path}: the file exists; say overwrite=true, or another out=FILE")
     return path
 
 

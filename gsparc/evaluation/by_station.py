@@ -160,16 +160,20 @@ def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
     """
     # Among the baselines may be the method itself.
     names = [one for one in columns if one.endswith("/rmse_db") and one.split("/")[1] not in ("zero", method)]
-    heads = {"rmse_db": method, "bias_db": "its bias_db", **{name: name.split("/")[1] for name in names}}
+    heads = {
+        "rmse_db": method,
+        "bias_db": f"bias_db of {method}",
+        **{name: name.split("/")[1] for name in names},
+    }
     table_columns = [Column("station", "", of="station"), Column("rows", ".0f", of="rows")]
     table_columns += [Column(head, number_format("rmse_db"), of=name) for name, head in heads.items()]
     every = pd.DataFrame(columns, columns=None if columns else ["rows", "rmse_db"])
     rows = every[every["rows"] >= FEW].sort_values("rmse_db", ascending=False, kind="stable")
     if len(rows) < 2:
         return []
-    better = [f"than {heads[name]} at {(rows.rmse_db < rows[name]).sum()}" for name in names]
-    compared = f"{len(rows)} stations of {FEW} rows or more"
-    note = f"{method} is better {', '.join(better)} of {compared}" if names else ""
+    better = [f"{(rows.rmse_db < rows[name]).sum()} than {heads[name]}" for name in names]
+    compared = f"of {len(rows)} stations with {FEW} rows or more"
+    note = f"{method} has a smaller rmse_db at, {compared}: {', '.join(better)}" if names else ""
     title = "rmse_db of the worst stations; by_station.csv has all"
     named = rows.assign(station=show_names(rows["station"], rows.get("cell")))
     offset = named[rows.bias_db**2 > OFFSET * rows.rmse_db**2] if "bias_db" in rows else rows[:0]

@@ -84,7 +84,7 @@ def _draw_over_loss(runs: list[Row]) -> Figure:
     return figure
 
 
-def _draw_coverage(runs: list[Row]) -> Figure:
+def _draw_accepted(runs: list[Row]) -> Figure:
     """Which test rows the paper's threshold accepts, and the share accepted over all thresholds."""
     figure, ((places, curve),) = panels(2.4 * WIDE, TALL + 0.6, 1, 2)
     taus = np.linspace(0, 1, 201)
@@ -143,4 +143,4 @@ def _draw_brackets(runs: list[Row]) -> Figure:
     return figure
 
 
-PICTURES = {"confidence": _draw_over_loss, "coverage": _draw_coverage, "snr_brackets": _draw_brackets}
+PICTURES = {"confidence": _draw_over_loss, "accepted": _draw_accepted, "snr_brackets": _draw_brackets}

@@ -83,7 +83,7 @@ def repeated_warnings() -> list[str]:
     more = [list(texts) for one in screens for texts in one.warned.values() if len(texts) > 1]
     again = [f"{len(a)} like '{shorten(re.sub(PATH, '', a[0]), AGAIN, placeholder='')} ...'" for a in more]
     severe = dict.fromkeys(text for one in screens for text in one.severe)
-    return [*severe, *([f"warnings shown by their first: {', '.join(again)}"] if again else [])]
+    return [*severe, *([f"repeated warnings: {', '.join(again)}"] if again else [])]
 
 
 def to_dict(node: DictConfig) -> dict[str, Any]:

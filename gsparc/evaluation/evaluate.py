@@ -229,7 +229,7 @@ def time_methods(
 
 def dataset_facts(data: Measurements) -> dict[str, Any]:
     """Return `dataset/*`."""
-    names = ("name", "sha256", "stand_in", "convergence_error", "freedom")
+    names = ("name", "sha256", "stand_in", "convergence_error", "unknown_factor")
     seconds = data.provenance.get("simulate_s")
     return {
         **{f"dataset/{name}": getattr(data.site, name) for name in names},

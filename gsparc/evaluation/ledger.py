@@ -53,8 +53,8 @@ ENVIRONMENT = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib
 
 
 @dataclass(frozen=True)
-class State:
-    """What a result depends on, but for the program.
+class FitInputs:
+    """What a fit depends on besides the program: a fit of the same inputs is done.
 
     Attributes:
         settings: resolved, by dotted name, without those that say where data lie.
@@ -72,7 +72,7 @@ class State:
     unread: dict[str, str] = field(default_factory=dict)
 
     @classmethod
-    def from_config(cls, config: DictConfig, data: str = "", split: str = "") -> State:
+    def from_config(cls, config: DictConfig, data: str = "", split: str = "") -> FitInputs:
         """Return the state of a resolved configuration, of hashes of measurements and of their split."""
         subset = OmegaConf.masked_copy(config, [str(name) for name in config if name not in WHERE])
         whole: Any = OmegaConf.to_container(subset, resolve=True)  # what is missing is `???`
@@ -111,7 +111,7 @@ def measurements_hash(data: Measurements) -> str:
     return sha256(repr(whole).encode()).hexdigest()
 
 
-def read_finished(folder: Path, state: State, reuse: bool = False) -> dict[str, Any] | None:
+def read_finished(folder: Path, state: FitInputs, reuse: bool = False) -> dict[str, Any] | None:
     """Return the summary of a fit that is done; None where it is not.
 
     Args:
@@ -126,7 +126,7 @@ def read_finished(folder: Path, state: State, reuse: bool = False) -> dict[str, 
 
 
 def run_once(
-    folder: Path, state: State, work: Callable[[str | None], object], *, reuse: bool = False,
+    folder: Path, state: FitInputs, work: Callable[[str | None], object], *, reuse: bool = False,
     again: bool = False, resumes: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Return the summary of a fit, which is done now where it is not done.
@@ -150,8 +150,11 @@ def run_once(
     record, resume_path = read_summary(folder / RECORD), None
     changes = [] if record is None else state.changes(record)
     if record is None or record.get("ended") or changes:
-        if changes and not resumes:
-            log.info("%s: begun anew, as these changed: %s", folder, list_first(changes))
+        if record is not None and changes and not resumes:
+            settings = state.changes(record, reuse=True)
+            files = len(changes) - len(settings)  # of the program: hundreds of modules tell a reader nothing
+            words = [*settings, f"{files} files of the program"] if files else settings
+            log.info("%s: runs again, as these changed since it ran: %s", folder, list_first(words))
         set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
         record = {**asdict(state), "began": time.time()}
     else:
@@ -181,7 +184,7 @@ def set_earlier_aside(run_dir: Path, *begun_from: str | None) -> None:
     paths = [Path(path).resolve() for path in begun_from if path]
     goes_on = any(run_dir.resolve() in (path, *path.parents) for path in paths)
     if set_aside(run_dir, *LEFT[: 1 if goes_on else None]):
-        log.info("%s: files of an earlier run are kept as NAME.earlier", run_dir)
+        log.info("%s: files of an earlier run there were renamed to NAME.earlier", run_dir)
 
 
 def edited(record: Mapping[str, Any]) -> list[str]:

@@ -357,7 +357,7 @@ class Unseen:
         kind_changed = f"confidence={kind_used}{why}, before: {before}; "
         if kind == "auto" and not np.isfinite(threshold):
             # Without a promise a choice by chance would replace what falls away from the measurements.
-            stored, kind_changed = self.earlier, f"confidence stays {before}, the checkpoint as it was; "
+            stored, kind_changed = self.earlier, f"confidence stays {before}, the checkpoint is unchanged; "
         else:
             store_trusted(self.path, stored)
         if np.isfinite(threshold):
@@ -366,6 +366,6 @@ class Unseen:
             from_there = f"accepted from {threshold:.4g}, {share:.0%} of {len(evidence)} test positions"
             of += f", which fails in at most {guarantee.delta:.0%} of cases; threshold stored in {self.path}"
             return stored, f"{kind_changed}{from_there}: {of}"
-        return stored, f"{kind_changed}no threshold keeps the bound: " + risk.explain_none(
+        return stored, f"{kind_changed}no threshold keeps the promise: " + risk.explain_none(
             evidence, guarantee, *how
         )

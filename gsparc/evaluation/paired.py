@@ -88,12 +88,12 @@ class Lead:
         """Return the sentence for two methods, `one` having the lead, of which neither is surely better.
 
         >>> Lead(0.22, 0.14, 32, "test rows").no_difference("gp", "gsparc", "psnr_db")
-        'gp and gsparc are not told apart in psnr_db: gp is 0.22 ± 0.14 dB better over 32 test rows'
+        'gp and gsparc do not differ significantly in psnr_db: gp is 0.22 ± 0.14 dB better over 32 test rows'
         """
         if self.same:
             return f"{one} and {other} have the same {figure} over {self.pairs}"
         better, lead = (one, self) if self.ahead_db >= 0 else (other, -self)
-        return f"{one} and {other} are not told apart in {figure}: {better} is {lead}"
+        return f"{one} and {other} do not differ significantly in {figure}: {better} is {lead}"
 
 
 def gains_of_rows(one: Mapping[str, Any], other: Mapping[str, Any], figure: str) -> np.ndarray | None:

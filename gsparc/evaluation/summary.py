@@ -46,7 +46,7 @@ from gsparc.training.cost import LINE
 _Found = TypeVar("_Found")
 PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
 # A load above 1 means waiting; 1.2 leaves room for what the machine does on its own.
-MOST_LEARNED = 3  # notes of a fit below the table; the log has all
+MOST_LEARNED = 4  # notes of a fit below the table; the log has all
 RIGHT_CHI2 = 0.25, 4.0  # std wrong by a factor of two; 73 runs of public and simulated data had .6 to 2.2
 BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
 
@@ -162,16 +162,16 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
     if above := facts.get(f"{prefix}/heard_above_db"):
         rest.append(
-            f"{GIVEN_HEARD}; maps and predict show levels listed or not, {above:.1f} dB lower in the mean: "
+            f"{GIVEN_HEARD}; maps and predict show all levels, {above:.1f} dB lower in the mean: "
             "compare maps with levels of all cells (a scanner), not with lists"
         )
     if unlisted := facts.get(f"{prefix}/unlisted"):
-        rest.append(f"off, or gone? expected in lists and in none: {unlisted}")
+        rest.append(f"cells that may be off: lists should hold them and none does: {unlisted}")
         without = {name: facts.get(f"{prefix}/{name}{WITHOUT_OFF}") for name in OF_LISTS}
         if said := [f"{name} {value:.2f}" for name, value in without.items() if value is not None]:
             rest.append(f"figures above count these cells; without them: {', '.join(said)}")
     if new := facts.get(f"{prefix}/new"):
-        rest.append(f"heard for the first time, with lists that should have held it: {new}")
+        rest.append(f"new cells, which earlier lists should have held: {new}")
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
     cost = [LINE.format(of_what=folds, cost=facts["time/cost"])] if facts.get("time/cost") else []
     lines = [*seen.get(prefix, []), *run_conditions(facts), *rest, *describe_model(facts), *cost]
@@ -232,7 +232,7 @@ def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str
     number = f"row {row}"  # as split.leave_out counts; the file may count otherwise
     called = number if name in (None, number) else f"{name} ({number} of split.leave_out)"
     return [
-        f"{called} alone makes {share:.1%} of the error or power that nmse and mse add up: they describe "
+        f"{called} alone makes {share:.1%} of the error or power that nmse and mse add up: both describe "
         f"little else. The median row's NMSE is {median:.3g}"
     ]
 
@@ -248,14 +248,14 @@ def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]
     far = {n: max(x, 1e-12) for n, x in chi2.items() if x is not None and (x < low or x > high)}
     factors = [(n, max(x, 1 / x) ** 0.5, "large" if x < 1 else "small") for n, x in far.items()]
     faults = ", ".join(
-        f"of {name} is {times:.2g} times too {side} ({CALIBRATION} {chi2[name]:.2g})"
+        f"of {name} is {times:.2g} times too {side} ({CALIBRATION} {chi2[name]:.2g}, 1 is right)"
         for name, times, side in factors
     )
     tested = "gsparc map ckpt=FILE has tested intervals"
     if not figure.startswith("rmse"):  # for spectra and channels there are thresholds alone
         tested = "gsparc calibrate ckpt=FILE tests which answers to accept"
-    meaning = f"stated uncertainty: std {faults}, where 1 is right"
-    return [f"{meaning}; it orders answers, but is no error bar here; {tested}"] if faults else []
+    meaning = f"stated uncertainty: std {faults}"
+    return [f"{meaning}; std orders predictions, but is no error bar here; {tested}"] if faults else []
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
@@ -277,7 +277,7 @@ def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]
 
 
 def judge_baseline(baseline: str, method: str, figure: str, lead: Lead, listed: bool = False) -> list[str]:
-    """Return whether a baseline, which has `lead` over a method, is better, worse or not told apart.
+    """Return whether a baseline, which has `lead` over a method, is significantly better, worse, or neither.
 
     Of `listed` rows alone it is no choice: lists hold what is strong, and which cells they hold is not known.
     """

@@ -58,7 +58,7 @@ class KeepBest(L.Callback):
         self.looks += not trainer.sanity_checking
         if self.looks == self.patience and not self.step:
             trainer.should_stop = True
-            log.info("gradient steps: no significant gain in %d validations, training ends", self.looks)
+            log.info("gradient steps end: no significant gain in %d validations", self.looks)
 
     def on_fit_end(self, trainer: L.Trainer, module: GaussianModule) -> None:  # type: ignore[override]
         """Go back to the best; also after a checkpoint with every step done."""
@@ -68,8 +68,8 @@ class KeepBest(L.Callback):
         steps = trainer.global_step
         if module.solved and len(self.start) and self.step:
             log.info(
-                "%d gradient steps moved the squared error of %d held-out rows from %.4g to %.4g; "
-                "experiment=field starts at random: there another loss or callback makes a difference",
+                "%d gradient steps changed the squared error of %d validation rows from %.4g to %.4g; "
+                "a random start (experiment=field) depends more on the loss and on callbacks",
                 self.step, len(self.start), float(self.start.mean()), self.error,
             )  # fmt: skip
         if self.step == steps:
@@ -78,7 +78,7 @@ class KeepBest(L.Callback):
         edit.resize_gaussians(model, model.gaussians, len(self._kept["gaussians.ids"]))
         model.load_state_dict(self._kept)
         log.info(
-            "gradient steps: %d taken, %s kept: later ones not significantly better on %d rows held out",
+            "gradient steps: %d taken, %s kept: more are not significantly better on %d validation rows",
             steps, f"the first {self.step}" if self.step else "none", len(self.start),
         )  # fmt: skip
 

@@ -4,7 +4,7 @@ With one unknown factor a row, what rows share is their shape. Rows are turned a
 near places, then each to what a process of all other rows says of it, in turns with the process's settings.
 Many phases fit: those that vary slowly over places ("neighbours") are as good as the carrier's, unless
 several antennas at known places see the same factor: then only phases of waves ("carrier") fit all of them.
-What predicts rows left out better, after the same freedom, is taken.
+What predicts rows left out better, after the same unknown factor, is taken.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from gsparc.data.moments import Snapshots, number_moments
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.physics.decibels import TINY_POWER
-from gsparc.physics.row_factors import Freedom, align_factors, describe_freedom
+from gsparc.physics.row_factors import UnknownFactor, align_factors, describe_factor
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.few_rows import covering_rows
 from gsparc.processes.fit_kernel import fit_two_lengths, initial_kernel
@@ -53,7 +53,7 @@ class Alignment:
 
     Attributes:
         factors: (n, K) complex128.
-        error: of rows predicted from the others after the same freedom, relative to their power.
+        error: of rows predicted from the others after the same unknown factor, relative to their power.
         phase_reference: see `Site`.
     """
 
@@ -66,10 +66,10 @@ def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
     """Return measurements with training and validation rows turned to each other, and rows to learn from.
 
     Several packets of one place and station become one, the first of them, whose channel is their mean. Rows
-    keep what `site.freedom` leaves them; test rows are not looked at. Without freedom nothing is done.
+    keep what `site.unknown_factor` leaves them; test rows are not looked at. Without one nothing is done.
     """
     site = data.site
-    if site.freedom == "none" or site.phase_reference is not None:
+    if site.unknown_factor == "none" or site.phase_reference is not None:
         return data, fold
     fit_rows = np.sort(fold.learned())
     key = (fold.train.tobytes(), fold.val.tobytes(), site.sha256.encode())
@@ -78,10 +78,10 @@ def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
             return result
     target, noise, found = np.array(data.target), data.noise_variance, []
     for rows in _group_snapshots(data, fit_rows):
-        best, channels = align_rows(rows, site.freedom, site), target[rows.rows]
+        best, channels = align_rows(rows, site.unknown_factor, site), target[rows.rows]
         found.append(best)
         factors = rows.to_rows(best.factors)
-        if site.freedom == "phase+delay+gain":
+        if site.unknown_factor == "phase+delay+gain":
             # Where gains are free rows have no level of their own: all are learned at unit power.
             level = _rms_of_rows(rows.values)[rows.moment]
             factors = factors / level[:, None, None]
@@ -93,8 +93,8 @@ def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
         "carrier" if all(one.phase_reference == "carrier" for one in found) else "neighbours"
     )
     log.info(
-        "aligned %d rows by %s: each told by the others to NMSE %.3g; phases over places are %s",
-        len(fit_rows), describe_freedom(site.freedom), float(np.mean([one.error for one in found])),
+        "aligned %d rows by %s: each is predicted by the others to NMSE %.3g; phases over places are %s",
+        len(fit_rows), describe_factor(site.unknown_factor), float(np.mean([one.error for one in found])),
         "the carrier's" if reference == "carrier" else "relative to neighbours",
     )  # fmt: skip
     turned = replace(
@@ -144,17 +144,17 @@ def _rms_of_rows(values: np.ndarray) -> np.ndarray:
 _LAST: list[tuple[weakref.ref[Measurements], tuple[bytes, ...], tuple[Measurements, Fold]]] = []
 
 
-def align_rows(rows: Snapshots, freedom: Freedom, site: Site) -> Alignment:
+def align_rows(rows: Snapshots, unknown_factor: UnknownFactor, site: Site) -> Alignment:
     """Return the better of phases relative to neighbours and, where several antennas tell, the carrier's."""
     if len(rows.values) == 1:  # a row alone has no other to be turned to
         return Alignment(np.ones((1, len(rows.tones)), np.complex128), 1.0, "neighbours")
     power = np.sqrt((np.abs(rows.values) ** 2).mean((0, 2), keepdims=True))
     # Unit power at every antenna: the strongest would decide the factor of all.
     values = rows.values / np.maximum(power, np.finfo(float).tiny)
-    if freedom == "phase+delay+gain":
+    if unknown_factor == "phase+delay+gain":
         values = values / _rms_of_rows(values)[:, None, None]
     length = site.wavelength or SPACINGS * median_spacing(rows.places)
-    one = _Rows(rows.places, values, rows.tones, freedom, length)
+    one = _Rows(rows.places, values, rows.tones, unknown_factor, length)
     found = [one.refine_by_neighbours(one.align_along_tree(None))]
     direct = _direct_wave(rows, site)
     if direct is not None:
@@ -169,7 +169,7 @@ class _Rows:
     places: np.ndarray
     values: np.ndarray
     tones: np.ndarray
-    freedom: Freedom
+    unknown_factor: UnknownFactor
     length: float
 
     def align_along_tree(self, direct_wave: np.ndarray | None) -> np.ndarray:
@@ -187,15 +187,15 @@ class _Rows:
         if len(rest):
             next_to = cKDTree(self.places[trunk]).query(self.places[rest])[1]
             child, parent = np.r_[child, rest], np.r_[parent, trunk[next_to]]
-        steps = align_factors(values[child], values[parent], self.tones, self.freedom_of_phase)
+        steps = align_factors(values[child], values[parent], self.tones, self.factor_without_gain)
         for row, onto, step in zip(child, parent, steps, strict=True):
             factors[row] = step * factors[onto]
         return factors
 
     @property
-    def freedom_of_phase(self) -> Freedom:
+    def factor_without_gain(self) -> UnknownFactor:
         """Without the gain, which unit rows have lost."""
-        return "phase" if self.freedom == "phase" else "phase+delay"
+        return "phase" if self.unknown_factor == "phase" else "phase+delay"
 
     def refine_by_neighbours(self, factors: np.ndarray) -> Alignment:
         """Go on from these factors by a process of two lengths; return the round that tells rows best."""
@@ -235,12 +235,14 @@ class _Rows:
     def _sweep_factors(self, factors: np.ndarray, weights: csr_array, sweeps: int) -> np.ndarray:
         for _ in range(sweeps):
             predictions = self._predict_left_out(factors, weights)
-            factors = align_factors(self.values, predictions, self.tones, self.freedom_of_phase)
+            factors = align_factors(self.values, predictions, self.tones, self.factor_without_gain)
         return factors
 
     def _left_out_error(self, factors: np.ndarray, weights: csr_array) -> float:
         predictions = self._predict_left_out(factors, weights)
-        predictions = predictions * align_factors(predictions, self.values, self.tones, self.freedom)[:, None]
+        predictions = (
+            predictions * align_factors(predictions, self.values, self.tones, self.unknown_factor)[:, None]
+        )
         missed = np.abs(self.values - predictions) ** 2 * (self.values != 0)
         return float(missed.sum() / (np.abs(self.values) ** 2).sum())
 

@@ -26,6 +26,7 @@ VERSION = 2  # of what a checkpoint holds
 FORMAT = "gsparc-checkpoint"
 PARTS = {"format", "version", "config", "method", "target", "site", "state", "extra", "sha256"}
 DEEPEST = 50  # of containers in containers
+RENAMED = {"freedom": "unknown_factor"}  # facts of sites in older checkpoints
 MODEL = "model.ckpt"  # of a run's folder
 
 
@@ -230,7 +231,8 @@ def _stored_from_content(content: Mapping[str, Any], path: Path) -> StoredModel:
 
 def _site_from(facts: Mapping[str, Any]) -> Site:
     names = {f.name for f in fields(Site)}
-    values = {k: v for k, v in _tensors_to_numpy(facts).items() if k in names}
+    now = {RENAMED.get(k, k): v for k, v in _tensors_to_numpy(facts).items()}
+    values = {k: v for k, v in now.items() if k in names}
     if values.get("grid") is not None:
         values["grid"] = SphereGrid(**values["grid"])
     if values.get("stations") is not None:

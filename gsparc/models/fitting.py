@@ -43,7 +43,7 @@ CHANGEABLE = ("trainer", "callbacks", "effort", "model.refit")
 """Settings that may change on the way, and are then named."""
 UNHASHED = (
     "kind", "static_end", "grid", "normalisation", "origin", "target_scale",
-    "uplink_array", "uplink_hz", "antennas", "freedom",
+    "uplink_array", "uplink_hz", "antennas", "unknown_factor",
 )  # fmt: skip
 """Facts of a site that the content hash of its measurements leaves out."""
 
@@ -78,7 +78,7 @@ def fit_or_resume(
         module.measurements = ordered
         context = replace(context, datamodule=module)
     (ordered, rows), resume_path = align_phases(ordered, rows), context.resume
-    aligning = watch.seconds if ordered.site.freedom != "none" else 0.0
+    aligning = watch.seconds if ordered.site.unknown_factor != "none" else 0.0
     if resume_path is not None:  # what was read then is not known
         heeded.count_reads("*")
     if resume_path is not None and not resume_path.exists():  # the interrupted run had not begun this part

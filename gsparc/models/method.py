@@ -44,8 +44,8 @@ class Prediction:
         mean: (B, H, W) float32 in [0, 1], (B, antennas, subcarriers) complex64, or (B, 1) float32; all of it
             in double precision where positions are float64, see `Method.gradient_problem`.
         variance: (B,) float32, expected squared error per entry; None when the method has none.
-        unknown: (B,) float32 in [0, 1]; 1 where nothing is known, such as far away, and of a process its
-            variance relative to the prior's; None when the method does not say.
+        unknown: (B,) float32 in [0, 1], share of the prior variance that training left: near 0 at training
+            rows, 1 far from all of them; None when the method does not say. Confidence is 1 minus it.
         explained: like the mean, its share that Gaussians predict; None where that is not told apart.
     """
 
@@ -101,8 +101,8 @@ class MethodFactory(ABC):
     has_parts = False  # whether it resumes parts in folders of their own
     takes_effort = False  # whether `FitContext.effort` changes its fit
     takes_weights = False  # whether its training may start from another model's (`FitContext.init_from`)
-    # In tables, among plain methods, which a reader could have without gsparc; of this class alone.
-    plain_place: ClassVar[int | None] = None
+    # Place in tables of a baseline, which a reader could have without gsparc; of this class alone.
+    baseline_order: ClassVar[int | None] = None
     kinds: ClassVar[tuple[Kind, ...]] = ()  # of data beside whose other methods it stands; empty for all
 
     @abstractmethod
@@ -297,7 +297,7 @@ def predict_in_batches(
     """Yield which of rows (n,) were asked together, as numbers (b,) into these, their batch, and the answer.
 
     One station after the other: each may have a model of its own, whose matrices are read for every batch.
-    Where rows have factors of their own (`Site.freedom`), answers are turned to what was measured.
+    Where rows have factors of their own (`Site.unknown_factor`), answers are turned to what was measured.
     """
     order = np.argsort(data.stations_of(rows), kind="stable")
 
@@ -310,7 +310,7 @@ def predict_in_batches(
                 answer = answer.of_devices(method.fitted_site, torch.from_numpy(data.device[rows[chosen]]))
             yield chosen, batch, answer
 
-    if data.site.freedom == "none":
+    if data.site.unknown_factor == "none":
         yield from predict_batches()
         return
     answers, back = list(predict_batches()), np.argsort(order)
@@ -327,7 +327,9 @@ def factors_to_measured(means: Tensor, data: Measurements, rows: np.ndarray) -> 
     """Return factors (n, 1, K) complex64 that turn means (n, A, K) to rows (n,) by what is free of these."""
     moments = Snapshots.from_rows(data, rows)
     answers = moments.arrange(means.numpy())
-    turns = align_factors(answers * (moments.values != 0), moments.values, moments.tones, data.site.freedom)
+    turns = align_factors(
+        answers * (moments.values != 0), moments.values, moments.tones, data.site.unknown_factor
+    )
     return torch.from_numpy(moments.to_rows(turns).astype(np.complex64))
 
 

@@ -20,7 +20,7 @@ from gsparc.data import heeded
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.models.closed_form import ClosedForm
-from gsparc.models.stack import to_real_entries
+from gsparc.models.member_weights import to_real_entries
 
 log = logging.getLogger(__name__)
 
@@ -112,10 +112,10 @@ def refine_places(
     _, first, place = np.unique(data.moving[rows], axis=0, return_index=True, return_inverse=True)
     place = place.reshape(-1)
     moved, gain = estimate_place_errors(seen, torch.from_numpy(place), torch.from_numpy(std[rows][first]))
-    note = f"errors of places explain the rows left out {gain:+.0f} nats better: positions "
+    note = f"log likelihood of rows left out {gain:+.0f} with errors of places (position_std): positions "
     if gain <= 0:
         return rows, np.zeros_like(data.moving[rows]), f"{note}stay as measured"
-    return rows, moved.numpy()[place], f"{note}refined by {float(moved.square().mean().sqrt()):.2g} m (rms)"
+    return rows, moved.numpy()[place], f"{note}moved by {float(moved.square().mean().sqrt()):.2g} m (rms)"
 
 
 def _linearise(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Linearised]:

@@ -56,7 +56,7 @@ def plain_methods() -> tuple[str, ...]:
     """Return names of plain methods, which others are shown beside, in the order of tables."""
     classes = ((name, import_target(path)) for name, path in all_methods().items())
     # A class of its own: what derives from a plain method is none.
-    found = {name: vars(method).get("plain_place") for name, method in classes if method is not None}
+    found = {name: vars(method).get("baseline_order") for name, method in classes if method is not None}
     places = {name: place for name, place in found.items() if place is not None}
     return tuple(sorted(places, key=places.__getitem__))
 

@@ -11,20 +11,20 @@ from typing import Literal, get_args
 
 import numpy as np
 
-Freedom = Literal["none", "phase", "phase+delay", "phase+delay+gain"]
-FREEDOMS: tuple[Freedom, ...] = get_args(Freedom)
+UnknownFactor = Literal["none", "phase", "phase+delay", "phase+delay+gain"]
+UNKNOWN_FACTORS: tuple[UnknownFactor, ...] = get_args(UnknownFactor)
 FINE = 8  # delays tried within one over the bandwidth
 MOST_DELAYS = 1024
 AT_ONCE = 4_096  # rows whose delays are tried together: memory
 
 
-def describe_freedom(freedom: Freedom) -> str:
+def describe_factor(unknown_factor: UnknownFactor) -> str:
     """Say in words what is free, for messages: `a phase and a delay`.
 
-    >>> describe_freedom("phase+delay+gain")
+    >>> describe_factor("phase+delay+gain")
     'a phase, a delay and a gain'
     """
-    parts = [f"a {part}" for part in freedom.split("+")]
+    parts = [f"a {part}" for part in unknown_factor.split("+")]
     return " and ".join([", ".join(parts[:-1]), parts[-1]] if len(parts) > 1 else parts)
 
 
@@ -46,7 +46,7 @@ def resolvable_delays(tones: np.ndarray) -> np.ndarray:
 
 
 def align_factors(
-    values: np.ndarray, reference: np.ndarray, tones: np.ndarray, freedom: Freedom
+    values: np.ndarray, reference: np.ndarray, tones: np.ndarray, unknown_factor: UnknownFactor
 ) -> np.ndarray:
     """Return factors (n, K) that turn rows to their references best; 1 where nothing is free.
 
@@ -61,18 +61,18 @@ def align_factors(
         values: (n, A, K) complex, 0 where nothing was measured.
         reference: (n, A, K) complex.
         tones: (K,) [Hz].
-        freedom: what of a row is free.
+        unknown_factor: what of a row is free.
     """
-    if freedom == "none":
+    if unknown_factor == "none":
         return np.ones((len(values), len(tones)), np.complex128)
     if len(values) > AT_ONCE:
         parts = np.array_split(np.arange(len(values)), -(-len(values) // AT_ONCE))
         return np.concatenate(
-            [align_factors(values[part], reference[part], tones, freedom) for part in parts]
+            [align_factors(values[part], reference[part], tones, unknown_factor) for part in parts]
         )
     product = (values * reference.conj()).sum(1)
     slope = np.zeros(len(values))
-    delays = resolvable_delays(tones) if freedom != "phase" else np.zeros(1)
+    delays = resolvable_delays(tones) if unknown_factor != "phase" else np.zeros(1)
     if len(delays) > 2:
         steering = np.exp(2j * np.pi * delays[:, None] * (tones - tones.mean()))
         size = np.abs(product @ steering.T)
@@ -84,7 +84,7 @@ def align_factors(
     turned = np.exp(2j * np.pi * slope[:, None] * (tones - tones.mean()))
     overlap = (product * turned).sum(1)
     factor = turned * np.exp(-1j * np.angle(overlap))[:, None]
-    if freedom == "phase+delay+gain":
+    if unknown_factor == "phase+delay+gain":
         power = (np.abs(values) ** 2).sum((1, 2))
         # The gain of least squares; a row of zeros keeps 1.
         factor *= np.divide(np.abs(overlap), power, out=np.ones_like(power), where=power > 0)[:, None]

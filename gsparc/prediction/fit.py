@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.checks.coherence import set_freedom
+from gsparc.data.checks.coherence import set_unknown_factor
 from gsparc.data.datasets.campaign import find_implausible
 from gsparc.data.errors import Caution, DataError
 from gsparc.data.instantiate import accepted_arguments, suggest_or_list
@@ -78,7 +78,7 @@ def fit(
         text = "; ".join(refused.problems).replace("dataset.frequency_hz", "frequency_hz")  # an array here
         raise DataError(text) from None
     none = np.zeros(0, np.int64)
-    data, _ = order_rows(set_freedom(reading.data, align), Fold(none, none, none))
+    data, _ = order_rows(set_unknown_factor(reading.data, align), Fold(none, none, none))
     for note in [*reading.notes, *find_implausible(reading.data, reading.file_row)[0]]:
         log.warning("%s", note)
     kind, options = method_class(model), {**(settings or {}), **({} if terms == () else {"terms": terms})}

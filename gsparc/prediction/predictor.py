@@ -20,7 +20,7 @@ from gsparc.models.abilities import AddsCarriers, HasGaussians
 from gsparc.models.device_offsets import find_device
 from gsparc.models.method import MEAN_DEVICE, Method, Prediction, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
-from gsparc.physics.row_factors import describe_freedom
+from gsparc.physics.row_factors import describe_factor
 from gsparc.prediction.confidence import ConfidenceMixin, Trusted
 from gsparc.prediction.gradients import predict_with_gradients
 from gsparc.prediction.jointly import JointMixin
@@ -96,8 +96,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
     @property
     def known(self) -> str:
         """Say in words what answers are known up to: `all`, or `up to a phase of each row` of channels."""
-        free = self.site.freedom
-        return "all" if free == "none" else f"up to {describe_freedom(free)} of each row"
+        free = self.site.unknown_factor
+        return "all" if free == "none" else f"up to {describe_factor(free)} of each row"
 
     @property
     def stations(self) -> list[str]:

@@ -151,9 +151,9 @@ def explain_none(evidence: Evidence, guarantee: Guarantee, kind: str, spatial: b
         if calibrate_threshold(evidence, other, kind, spatial, seed, tested=False).threshold.accepted:
             hint = f"limit_db={limit} would be"
             break
-    reason = "the others are not told from them surely enough"
+    reason = "no confidence separates the others surely enough"
     if bad < guarantee.alpha:
-        reason = f"so few do not show that at most alpha={guarantee.alpha:g} are"
+        reason = f"too few rows to show that at most alpha={guarantee.alpha:g} are"
     return (
         f"{bad:.0%} of {len(evidence)} test positions are worse than {guarantee.limit_db:g} dB, and "
         f"{reason}; {hint} kept, more training rows may help"

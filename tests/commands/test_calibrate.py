@@ -72,7 +72,7 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
     )
     stored, said = unseen.calibrate_and_store(Guarantee(-40.0), *how)
     # A choice among confidences replaced the model's own though nothing was promised.
-    assert "confidence stays the model's own, the checkpoint as it was; " in said and not kept
+    assert "confidence stays the model's own, the checkpoint is unchanged; " in said and not kept
     assert stored.threshold == np.inf and "100% of 900 test positions are worse than -40 dB" in said
     better = float(re.search(r"limit_db=(\S+) would be kept", said)[1])
     assert -25 < better < 0
@@ -85,7 +85,7 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
     # Fewer than alpha were bad, and a confidence was blamed; rows of patches that err together were too few.
     evidence.error[:] = np.where(np.arange(900) % 8 == 0, 10.0, 0.01)
     said = unseen.calibrate_and_store(Guarantee(alpha=0.144), "auto", False, 2)[1]
-    assert "so few do not show that at most alpha=0.144 are" in said
+    assert "too few rows to show that at most alpha=0.144 are" in said
     evidence.error[:] = np.where(number_patches(evidence.position) % 8 == 0, 10.0, 0.01)
     said = unseen.calibrate_and_store(Guarantee(alpha=0.2), "distance", True, 0)[1]
     assert "as neighbours err alike" in said
@@ -165,10 +165,10 @@ def test_trials_beside_a_promise_of_other_trials_read_as_a_broken_one() -> None:
     facts = calibration_facts(_evidence(), [run_trials(_evidence(), promise, False, 5)], promise)
     trials = calibration_tables(facts | {"dataset/name": "d", "model/name": "m"})[1]
     heads = [column.name for column in trials.columns]
-    at = heads.index("too many bad, of all trials")
-    told = ["promised of all trials: at most", "too many bad, of accepting trials: no promise"]
+    at = heads.index("failed, of all trials")
+    told = ["promised: at most", "failed, of accepting trials: no promise"]
     assert heads[at + 1 :] == told
-    assert trials.note == "Trials may accept fewer: 40% of the rows calibrate, for storing 80%"
+    assert trials.note == "Trials calibrate on 40% of the rows, the stored threshold on 80%"
 
 
 def _trained(folder, *more: str, run: str = "run"):

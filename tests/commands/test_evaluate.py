@@ -78,7 +78,7 @@ def test_a_last_fit_from_all_rows_tests_nothing_and_serves_all_the_same(tmp_path
     said = "\n".join(done.out)
     assert "nothing was tested: all 80 rows were learned from (split=none)" in said
     # A count of three parts stood above it, and a table of dashes.
-    assert "all 80 rows are learned from (8 decide" in said and "rmse_db" not in said
+    assert "all 80 rows are learned from (8 of them" in said and "rmse_db" not in said
     own = {"name": "own", "file": str(file)}
     found, _, _ = evaluate_files([tmp_path / "run" / "model.ckpt"], own, eval_on="val")
     assert found.facts["val/rmse_db"] < 1  # an interpolator of rows that it has learned

@@ -201,7 +201,7 @@ def test_200_snapshots_left_out_were_each_sought_twice_from_the_coarse_grid_on(
     monkeypatch.setattr(locator.Locator, "search_cells", counted)
     with caplog.at_level("INFO"):
         facts, _ = located(tmp_path / "run", f"ckpt={ckpt}", "eval_on=train", "rows=1", "calibrate=2")
-    assert facts["locate/calibrated_on"] == 20 and "calibrated on 20 snapshots left out" in caplog.text
+    assert facts["locate/calibrated_on"] == 20 and "calibrated on 20 left-out snapshots" in caplog.text
     assert [bool(one and one[0]) for one in before[:48]] == [False] * 8 + [True] * 8 + [False] * 12 + [
         True
     ] * 20
@@ -213,7 +213,7 @@ def test_the_log_showed_trust_as_an_object(roofs, tmp_path, monkeypatch, caplog)
     given = f"ckpt={roofs[0]}", "store=false", "eval_on=train", "rows=1", "calibrate=2"
     with caplog.at_level("INFO"):
         located(tmp_path / "run", *given)
-    assert "3 snapshots left out: areas of 100.0 %" in caplog.text and "Trust(" not in caplog.text
+    assert "3 left-out snapshots: areas take 100.0 %" in caplog.text and "Trust(" not in caplog.text
 
 
 @pytest.mark.slow
@@ -231,7 +231,7 @@ def test_a_calibration_of_another_plan_or_prior_was_taken(roofs, tmp_path, monke
         caplog.clear()
         with caplog.at_level("INFO"):
             located(tmp_path / str(number), *given, "calibrate=2")
-        said += [[word in caplog.text for word in ("calibrated before", "calibrated with cells=")]]
+        said += [[word in caplog.text for word in ("calibrated before", "calibration was of cells=")]]
     assert said == [[False, False], [True, False], [False, True]]
     located(tmp_path / "stored", *given, "calibrate=0")
     with pytest.raises(ValueError, match=r"was calibrated with plan=.*, plan_points=.*, cells=\w{8}: "):
@@ -266,8 +266,8 @@ def test_what_was_heard_beyond_the_trained_places_was_located_at_their_edge_unsa
     assert facts["locate/beyond"] == sum(beyond) > 0.6 * len(found)
     assert facts["locate/median_m"] < 0.3 * facts["baseline/nearest/median_m"], "sought beyond the edge"
     said = capsys.readouterr().out
-    assert f"{sum(beyond)} of {len(found)} snapshots: beyond the trained places, where areas promise" in said
-    assert f"{len(found)} true places lie beyond these" in said
+    assert f"{sum(beyond)} of {len(found)} snapshots are beyond the trained places: no promise" in said
+    assert f"{len(found)} true places lie outside" in said
     facts, found = located(tmp_path / "own", f"ckpt={ckpt}", "calibrate=0")
     assert facts["locate/beyond"] <= 0.2 * len(found)
 

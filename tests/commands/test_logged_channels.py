@@ -26,7 +26,7 @@ def test_a_default_run_is_ahead_of_every_plain_method(logged, tmp_path):
         "dataset=own", f"dataset.file={logged / 'logged.npz'}", "model=gsparc", "logger=none"
     )
     facts, objects = train(config, tmp_path)
-    assert facts["dataset/kind"] == "aligned csi" and facts["dataset/freedom"] == "phase+delay"
+    assert facts["dataset/kind"] == "aligned csi" and facts["dataset/unknown_factor"] == "phase+delay"
     assert facts["test/nmse_aligned"] < 0.05 and facts["test/tone_rmse_db"] < 2.6  # at random, seed 0
     for name in ("mean", "nearest", "idw"):
         assert facts["test/nmse_aligned"] < facts[f"baseline/{name}/nmse_aligned"]

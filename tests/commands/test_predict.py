@@ -307,7 +307,7 @@ def test_where_the_answers_go(town, tmp_path):
     for out, how, message in (
         ("b.txt", {}, r"expected a name ending in \.csv or \.npz"),
         ("a.csv", {"overwrite": True}, "these are the places themselves"),
-        ("b.csv", {}, "is there already; say overwrite=true"),
+        ("b.csv", {}, "the file exists; say overwrite=true"),
     ):
         refused(message, predict_file, town, file, tmp_path / out, **how)
     assert (tmp_path / "b.csv").read_text() == "kept"

@@ -203,5 +203,5 @@ def test_the_title_of_a_table_did_not_say_the_draw_of_the_split(tmp_path):
 def test_the_title_named_a_seed_where_the_release_named_the_test_rows(tmp_path):
     """`split random (split.seed=2)`, and the seed had moved validation rows alone."""
     said = said_of_a_draw(tmp_path, split_train=np.arange(40), split_test=np.arange(40, 60))
-    assert "split random (the test rows that its files name), test, seed 0" in said
-    assert "random (the test rows that its files name): 36 training" in said and "(split.seed" not in said
+    assert "split random (test rows named by its files), test, seed 0" in said
+    assert "random (test rows named by its files): 36 training" in said and "(split.seed" not in said

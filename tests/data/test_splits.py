@@ -48,7 +48,7 @@ def test_random_uses_the_release_unless_redrawn():
     split = make_split(_walk(), SplitSettings(), release)
     np.testing.assert_array_equal(split.folds[0].test, release[1])
     np.testing.assert_array_equal(np.union1d(split.folds[0].train, split.folds[0].val), release[0])
-    assert split.title == "random (the test rows that its files name)"
+    assert split.title == "random (test rows named by its files)"
     drawn = make_split(_walk(), SplitSettings(redraw=True), release)
     assert drawn.title == "random"
     assert len(drawn.folds[0].test) == 80 and drawn.sha256 != split.sha256

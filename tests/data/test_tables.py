@@ -130,7 +130,7 @@ def test_midnight_passes_and_a_date_stands_beside_its_clock(write, refused):
 def test_columns_of_levels_in_db_did_not_say_how_dbm_are_asked_for(write):
     notes = parse_table(write("x,y,AP1,AP2\n1,2,-80,-70\n4,5,-81,-71\n")).notes
     assert any(
-        "taken as rssi_db [dB] of the stations" in n and n.endswith("(maps in dBm: unit=dBm)") for n in notes
+        "taken as rssi_db [dB] of the stations" in n and n.endswith("(dBm? set unit=dBm)") for n in notes
     )
 
 
@@ -208,7 +208,7 @@ def test_long_layout_with_a_second_file(write, caplog):
     np.testing.assert_array_equal(arrays["station_height"], [10, 20, 3])
     np.testing.assert_array_equal(arrays["sensitivity_db"], [-120, -110, -110])
     np.testing.assert_array_equal(arrays["carrier_hz"], [8e8, 1.8e9, 8e8])
-    assert "listed, but in no row, and kept: 5" in table.notes
+    assert "stations of the list, heard in no row, and kept: 5" in table.notes
 
 
 def test_names_that_a_join_wrote_as_floats_were_other_stations(write):

@@ -77,13 +77,13 @@ def test_errors_of_single_stations_were_nowhere(drive, tmp_path):
     assert stations["baseline/idw/rmse_db"].idxmax() == 1 and "baseline/mean/bias_db" in stations
     (worst,) = worst_stations(found.stations, "nearest")
     heads, rows = worst.texts()
-    assert heads == ["station", "rows", "nearest", "its bias_db", "mean", "idw"]
+    assert heads == ["station", "rows", "nearest", "bias_db of nearest", "mean", "idw"]
     assert rows[0][:2] == ["south", "12"] and len(rows) == 3
     ahead = [
         int((stations["rmse_db"] < stations[f"baseline/{one}/rmse_db"]).sum()) for one in ("mean", "idw")
     ]
-    better = f"nearest is better than mean at {ahead[0]}, than idw at {ahead[1]}"
-    assert worst.note == f"{better} of 3 stations of 10 rows or more"
+    better = f"{ahead[0]} than mean, {ahead[1]} than idw"
+    assert worst.note == f"nearest has a smaller rmse_db at, of 3 stations with 10 rows or more: {better}"
     heads, rows = results_table(found.facts, "nearest").texts()
     assert rows[-1][heads.index("best_server")] == f"{found.facts['test/best_server']:.1%}"
 
@@ -93,8 +93,8 @@ def test_a_method_was_better_than_itself_at_none_of_the_stations():
     rows = {"station": ["a", "b"], "rows": [12, 12], "rmse_db": [5.0, 4.0], "bias_db": [1.0, 1.0]}
     baselines = {f"baseline/{name}/rmse_db": [5.0, 6.0] for name in ("zero", "gp", "idw")}
     (worst,) = worst_stations({**rows, **baselines}, "gp")
-    assert worst.note == "gp is better than idw at 1 of 2 stations of 10 rows or more"
-    assert worst.texts()[0] == ["station", "rows", "gp", "its bias_db", "idw"]
+    assert worst.note == "gp has a smaller rmse_db at, of 2 stations with 10 rows or more: 1 than idw"
+    assert worst.texts()[0] == ["station", "rows", "gp", "bias_db of gp", "idw"]
 
 
 def test_a_cell_that_lost_ten_decibels_was_said_to_need_another_baseline():

@@ -55,7 +55,7 @@ def test_rows_where_nothing_was_heard_made_all_losses_low(tmp_path):
 
 def test_only_the_paper_s_curve_is_relative_to_the_rows_tested(tmp_path):
     sure = 0.4 + 0.1 * np.linspace(0, 1, 100)
-    places, curve = drawn("coverage", tmp_path, sure=sure)
+    places, curve = drawn("accepted", tmp_path, sure=sure)
     own, relative = (line.get_ydata() for line in curve.lines[:2])
     assert own[118] == 0 and relative[118] == pytest.approx(0.41)  # at .59
     assert "paper" in curve.lines[1].get_label() and "paper" not in curve.lines[0].get_label()

@@ -81,7 +81,7 @@ def test_twelve_stations_wrote_two_hundred_lines(monkeypatch, caplog):
         "warning: data/a.npz: 3 places were measured twice", "fitting",
     ]  # fmt: skip
     assert repeated_warnings() == [
-        "warnings shown by their first: 12 like '5 s are too few ...', 12 like 'no level of station s0 ...'"
+        "repeated warnings: 12 like '5 s are too few ...', 12 like 'no level of station s0 ...'"
     ]
 
 

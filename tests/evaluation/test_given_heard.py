@@ -47,7 +47,7 @@ def test_listed_rows_were_judged_by_levels_listed_or_not():
     # A share that is right is a mean of what happened.
     assert abs(columns["heard_share"].mean() - listed.mean()) < 0.05
     assert facts["test/outage/brier"] < 0.5 * facts["test/outage/brier_rate"]
-    assert any("given that they are heard" in line for line in remarks(facts))
+    assert any("levels of rows that are heard or listed" in line for line in remarks(facts))
 
 
 @pytest.mark.slow
@@ -66,7 +66,7 @@ def test_heard_rows_beside_silent_ones_were_judged_by_levels_heard_or_not():
     assert 0.2 < facts["test/outage/rate"] < 0.8 and facts["test/heard_above_db"] > 2
     assert facts["test/rmse_db"] < facts["baseline/kriging/rmse_db"]
     assert 0.8 < facts["test/reduced_chi2"] < 1.25 and 0.86 < facts["test/interval/coverage_90"] < 0.94
-    assert any("given that they are heard" in line for line in remarks(facts))
+    assert any("levels of rows that are heard or listed" in line for line in remarks(facts))
 
 
 MEANS_DB, SPREAD_DB = np.array([-70.0, -72, -74, -76, -78, -80]), 4.0

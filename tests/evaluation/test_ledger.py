@@ -20,7 +20,7 @@ from gsparc.data.splits import Fold, Split
 from gsparc.evaluation import ledger
 from gsparc.evaluation.ledger import (
     FAILURE,
-    State,
+    FitInputs,
     edited,
     measurements_hash,
     program,
@@ -32,8 +32,8 @@ from gsparc.evaluation.results import read_summary
 from gsparc.evaluation.summary import write_summary
 
 
-def state(**changes) -> State:
-    return State(**({"settings": {"seed": 0}, "files": {}, "data": "d", "split": "s"} | changes))
+def state(**changes) -> FitInputs:
+    return FitInputs(**({"settings": {"seed": 0}, "files": {}, "data": "d", "split": "s"} | changes))
 
 
 def ends(folder, value=1.0, seen=None):
@@ -104,11 +104,11 @@ def test_a_job_killed_after_its_record_took_the_summary_of_another_state(tmp_pat
     assert not (tmp_path / "summary.json").exists()
 
 
-def of(file, *words) -> State:
+def of(file, *words) -> FitInputs:
     """The state of a run on a table of spectra."""
     config = compose("dataset=own", f"dataset.file='{file}'", "model=mean", "logger=none", *words)
     begun = read_inputs(config)
-    return State.from_config(config, measurements_hash(begun.data), begun.split.sha256)
+    return FitInputs.from_config(config, measurements_hash(begun.data), begun.split.sha256)
 
 
 def test_a_finished_job_answered_for_a_split_file_of_before(tmp_path):
@@ -145,18 +145,18 @@ def test_a_job_found_done_read_its_data_first(tmp_path):
     """Seconds for each job of a sweep said again; files of the same bytes say the same."""
     file = spectra(tmp_path / "own.npz")
     configs = [compose("dataset=own", f"dataset.file='{file}'", "model=mean", f"seed={n}") for n in (0, 1)]
-    unread, other = map(State.from_config, configs)
+    unread, other = map(FitInputs.from_config, configs)
     run_once(tmp_path, replace(unread, data="d", split="s"), ends(tmp_path))
     assert read_finished(tmp_path, unread) == {"value": 1} and read_finished(tmp_path, other) is None
     with file.open("ab") as stream:
         stream.write(b" ")
-    assert read_finished(tmp_path, State.from_config(configs[0])) is None
-    assert read_finished(tmp_path, State.from_config(configs[0], "d", "s")) == {"value": 1}
+    assert read_finished(tmp_path, FitInputs.from_config(configs[0])) is None
+    assert read_finished(tmp_path, FitInputs.from_config(configs[0], "d", "s")) == {"value": 1}
     release = compose("dataset=rfid", f"dataset.root='{tmp_path}'", "model=mean")
-    before = State.from_config(release)
+    before = FitInputs.from_config(release)
     (tmp_path / "more.txt").touch()
-    assert before.tells_data and before != State.from_config(release)
-    assert not State.from_config(compose("dataset=rfid", "dataset.root=null", "model=mean")).tells_data
+    assert before.tells_data and before != FitInputs.from_config(release)
+    assert not FitInputs.from_config(compose("dataset=rfid", "dataset.root=null", "model=mean")).tells_data
 
 
 def test_commits_of_comments_alone_made_every_cell_stale():
@@ -248,7 +248,7 @@ def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):
     for text in ("[]", "[1]"):
         walls.write_text(text)
         states.append(
-            State.from_config(OmegaConf.create({"init": {"file": str(walls)}, "workers": len(text)}))
+            FitInputs.from_config(OmegaConf.create({"init": {"file": str(walls)}, "workers": len(text)}))
         )
     assert states[0].files != states[1].files and states[0].settings == states[1].settings
 
@@ -268,14 +268,14 @@ def test_a_job_that_begins_anew_says_why(tmp_path, caplog):
     run_once(tmp_path, state(), ends(tmp_path, 1))
     assert not caplog.messages
     run_once(tmp_path, state(settings={"seed": 0, "effort": 2}), ends(tmp_path, 1))
-    assert caplog.messages == [f"{tmp_path}: begun anew, as these changed: settings.effort"]
+    assert caplog.messages == [f"{tmp_path}: runs again, as these changed since it ran: settings.effort"]
 
 
 def test_a_run_that_went_on_said_that_it_began_anew(tmp_path, caplog):
     """`ckpt_path=` is no setting of the fit, and wins over whatever else changed."""
     caplog.set_level("INFO")
     one, other = (OmegaConf.create({"seed": 0, "ckpt_path": path}) for path in (None, "RUN"))
-    assert State.from_config(one) == State.from_config(other)
+    assert FitInputs.from_config(one) == FitInputs.from_config(other)
     run_once(tmp_path, state(settings={"effort": 1}), ends(tmp_path))
     run_once(tmp_path, state(settings={"effort": 3}), ends(tmp_path), again=True, resumes=True)
-    assert not any("begun anew" in message for message in caplog.messages)
+    assert not any("runs again" in message for message in caplog.messages)

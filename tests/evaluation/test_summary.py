@@ -111,8 +111,8 @@ def test_remarks_name_stand_ins_busy_machines_and_better_baselines():
     ("ImageSources", "rays in closed form", None, ["gsparc: image sources, rays in closed form"]),
     ("ArrayProcess", "array process through 9", None, ["gsparc: array process through 9"]),
     ("Powers", "joint_powers in closed form", None, ["gsparc: powers of all stations in closed form"]),
-    ("Powers", "powers in closed form", "length 3 m\na law\nc\nd",
-     ["gsparc: powers in closed form", "  length 3 m", "  a law", "  c"]),
+    ("Powers", "powers in closed form", "length 3 m\na law\nc\nd\ne",
+     ["gsparc: powers in closed form", "  length 3 m", "  a law", "  c", "  d"]),
 ])  # fmt: skip
 def test_the_console_never_said_which_method_was_chosen(kind, made, learned, said):
     facts = {"dataset/kind": "csi", "model/label": "gsparc", "model/class": kind, "model/made": made}
@@ -135,7 +135,7 @@ def test_a_baseline_was_better_by_chance_or_by_nothing():
     facts["baseline/gp/ahead_pairs"] = "24 test rows"
     assert remarks(facts) == ["the baseline gp and gsparc have the same rmse_db over 24 test rows"]
     assert remarks({**facts, "baseline/gp/ahead_db": -0.22, "baseline/gp/ahead_error_db": 0.14}) == [
-        "the baseline gp and gsparc are not told apart in rmse_db: "
+        "the baseline gp and gsparc do not differ significantly in rmse_db: "
         "gsparc is 0.22 ± 0.14 dB better over 24 test rows"
     ]
     ((said),) = remarks({**facts, "baseline/gp/ahead_db": 0.3, "baseline/gp/ahead_error_db": 0.1})
@@ -177,5 +177,5 @@ def test_a_baseline_whose_errors_are_forty_times_its_std_had_no_remark():
     facts = {"dataset/kind": "rssi", "model/label": "gsparc", "test/rmse_db": 1.0, "test/reduced_chi2": 1.1}
     (said,) = remarks(facts | {"baseline/gp/reduced_chi2": 1600.0})
     # It said `reduced_chi2 is 1 where ...` below tables without that column.
-    stated = "stated uncertainty: std of gp is 40 times too small (reduced_chi2 1.6e+03), where 1 is right"
+    stated = "stated uncertainty: std of gp is 40 times too small (reduced_chi2 1.6e+03, 1 is right)"
     assert said.startswith(stated)

@@ -57,7 +57,7 @@ def test_steps_that_hurt_are_taken_back(measured, tmp_path, caplog):
     start = fitted(measured, tmp_path / "start", "init=images", "model.steps=0", "model.refit=false")
     assert method.steps == 0 and held_out(method, measured) < 1.1 * held_out(start, measured)
     assert "40 taken, none kept" in caplog.text  # keeping the best ends no training
-    assert "moved the squared error" not in caplog.text  # `0 gradient steps moved ...` was said, too
+    assert "changed the squared error" not in caplog.text  # `0 gradient steps changed ...` was said, too
 
 
 def test_steps_that_nobody_asked_for_end_after_looks_without_a_gain(measured, tmp_path, caplog):

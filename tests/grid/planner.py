@@ -178,7 +178,9 @@ def azimuths(seed: int, buildings: bool, _: Path) -> Iterator[tuple]:
         data = replace(one, azimuth=azimuth % 360).data(LISTED)
         names, notes = np.array(data.site.stations.name), check_azimuths(data)
         kinds = ([note for note in notes if head in note] for head in ("contradicted by", "would not show"))
-        named, told = (dict(re.findall(r"([0-9]+-[0-9]+) \(?([0-9]+)", " ".join(kind))) for kind in kinds)
+        named, told = (
+            dict(re.findall(r"([0-9]+-[0-9]+) (?:\(listed )?([0-9]+)", " ".join(kind))) for kind in kinds
+        )
         named, untold = np.isin(names, [*named]), np.isin(names, [*told])
         false = np.delete(named, wrong).sum(), len(names) - len(wrong), untold.sum()
         for t in wrong or [-1]:

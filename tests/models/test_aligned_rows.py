@@ -1,4 +1,4 @@
-"""Rows with factors of their own: what is told of them after the same freedom, and the carrier's phase."""
+"""Rows with factors of their own: what is told of them up to these, and the carrier's phase."""
 
 from dataclasses import replace
 
@@ -6,7 +6,7 @@ import numpy as np
 import packets
 import pytest
 
-from gsparc.data.checks.coherence import set_freedom
+from gsparc.data.checks.coherence import set_unknown_factor
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Stations
 from gsparc.evaluation.align_site import align_to_site
@@ -23,14 +23,14 @@ def logged():
     given, channel = packets.robot()
     del given["run"]
     tones = given["frequency_hz"] - given["frequency_hz"].mean()
-    return set_freedom(packets.measurements(given, packets.logged(channel, tones, 0)), "auto")
+    return set_unknown_factor(packets.measurements(given, packets.logged(channel, tones, 0)), "auto")
 
 
 @pytest.mark.slow
 def test_neighbours_are_alike_after_alignment_and_test_rows_are_not_looked_at(logged):
     fold = packets.shares(logged, 0)
     turned, _ = align_phases(logged, fold)
-    assert turned.site.phase_reference == "neighbours" and turned.site.freedom == "phase+delay"
+    assert turned.site.phase_reference == "neighbours" and turned.site.unknown_factor == "phase+delay"
     assert (turned.target[fold.test] == logged.target[fold.test]).all()
     assert np.allclose(np.abs(turned.target), np.abs(logged.target), rtol=1e-4)
     other = np.array(logged.target)
@@ -42,7 +42,7 @@ def test_neighbours_are_alike_after_alignment_and_test_rows_are_not_looked_at(lo
 
 def test_rows_that_are_coherent_stay_as_they_are():
     data = packets.measurements(*packets.robot())
-    assert set_freedom(data, "auto") is data
+    assert set_unknown_factor(data, "auto") is data
     assert align_phases(data, packets.shares(data, 0))[0] is data
 
 
@@ -71,7 +71,7 @@ def _site():
 
 
 def test_a_free_gain_is_a_unit_row(logged):
-    free = replace(logged, site=replace(logged.site, freedom="phase+delay+gain"))
+    free = replace(logged, site=replace(logged.site, unknown_factor="phase+delay+gain"))
     fold = packets.shares(free, 0)
     target = align_phases(free, fold)[0].target[fold.train]
     assert np.ptp(np.abs(target).mean((1, 2))) < 0.5 * np.ptp(np.abs(free.target[fold.train]).mean((1, 2)))
@@ -108,9 +108,9 @@ def test_errors_of_positions_of_such_rows_ended_in_an_error(logged, caplog):
     assert "position_std is not used" in caplog.text and method.description.startswith("aligned")
 
 
-def test_another_file_is_scored_after_the_freedom_of_the_model(logged):
-    few = logged.subset(np.arange(8), replace(logged.site, freedom="none"))
-    assert align_to_site(few, logged.site).site.freedom == "phase+delay"
+def test_another_file_is_scored_after_the_unknown_factor_of_the_model(logged):
+    few = logged.subset(np.arange(8), replace(logged.site, unknown_factor="none"))
+    assert align_to_site(few, logged.site).site.unknown_factor == "phase+delay"
 
 
 @pytest.mark.slow

@@ -102,7 +102,7 @@ def test_known_errors_of_places_cost_less_than_unknown_ones():
     told = replace(moved, position_std=np.full(len(moved), 0.015))
     (without, _), (known, report) = (_fitted(data, fold) for data in (moved, told))
     assert _missed(known, exact, fold) < 0.75 * _missed(without, exact, fold)
-    assert "positions refined by" in report.notes[0] and report.cost.stages["measured places"] > 0
+    assert "positions moved by" in report.notes[0] and report.cost.stages["measured places"] > 0
 
 
 @pytest.mark.slow
@@ -126,7 +126,7 @@ def test_every_field_with_rows_left_out_takes_them(kind, tmp_path):
     data = KINDS[kind](tmp_path)
     fold = fold_of(data)
     _, report = fitting.fit_or_resume(wrap_per_station(Gsparc(position_std=0.05), data), data, fold, BRIEF)
-    assert any("errors of places explain" in note or "is not used" in note for note in report.notes)
+    assert any("with errors of places" in note or "is not used" in note for note in report.notes)
 
 
 def test_rendered_spectra_say_that_positions_count_as_exact(tmp_path, caplog):

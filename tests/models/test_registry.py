@@ -18,7 +18,7 @@ def test_a_typo_gets_the_nearest_name():
 class Twice(InverseDistance):
     """A plain method of somebody's own."""
 
-    plain_place = 45
+    baseline_order = 45
 
 
 class Thrice(Twice):

@@ -105,8 +105,8 @@ def _doubts(columns: dict[str, Any], facts: dict[str, Any]) -> list[str]:
     for key, why in locating.DOUBTS.items():
         facts[f"locate/{key}"] = count = int((doubt == why).sum())
         if count:
-            reason = f"{why}, where areas promise nothing (locate.csv, doubt)"
-            lines.append(f"{count} of {len(doubt)} snapshots: {reason}")
+            reason = f"{why}: no promise for their areas (column doubt of locate.csv)"
+            lines.append(f"{count} of {len(doubt)} snapshots are {reason}")
     if lines and "inside" in columns and (sure := doubt == "").any():
         share = np.mean(np.array(columns["inside"])[sure])
         lines.append(f"areas of the other {sure.sum()} hold {share:.0%} of places")
@@ -146,7 +146,9 @@ def locate_by_model(
     locator = Locator(SiteField(run.predictor), box, wider, unknown, start)
     if anew:
         if stored:
-            log.info("it was calibrated with %s: calibrated anew", ", ".join(other) or "the same settings")
+            log.info(
+                "the stored calibration was of %s: it is done again", ", ".join(other) or "the same settings"
+            )
         seed = int(config.seed)
         retraining = run.retraining(config.calibrate_effort, run_dir=run_dir / "left_out", seed=seed)
         trust, count = locating.learn_trust(retraining, locator, share, int(config.calibrate), cells)
@@ -155,7 +157,7 @@ def locate_by_model(
             entry = {"trust": asdict(trust), "how": how, "count": count}
             checkpoint.update_extra(config.ckpt, {locating.KEY: entry})
     elif config.calibrate:
-        log.info("calibrated before, on %d snapshots left out; renew=true does it again", count)
+        log.info("calibrated before, on %d left-out snapshots; renew=true repeats it", count)
 
     def columns(located: Sequence[Located]) -> dict[str, Any]:
         first = slice(len(located))
@@ -171,7 +173,7 @@ def locate_by_model(
     status = "are promised" if config.calibrate or stored else "are not calibrated"  # of which was warned
     claim = f"{share:.0%} {status}; {float(box.volume.sum()):.3g} {SIZES[size]} were searched"
     beyond = int(beyond_box(heard.place, box.box()).sum()) if placed else 0
-    claim += f", {beyond} true places lie beyond these" * bool(beyond)
+    claim += f", {beyond} true places lie outside" * bool(beyond)
     true = heard.place + origin if placed else None
     shown_at = [locating.to_world(one, origin) for one in located]
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")

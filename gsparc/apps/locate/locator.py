@@ -163,7 +163,7 @@ def learn_trust(
 
     def search(count: int) -> list[PlaceSearch]:
         pieces = [(*pair, one) for pair, one in zip_longest(pairs[:count], found)]
-        return run_all(lambda one: one[0].search_cells(one[1], trust, one[2]), pieces, "snapshots left out")
+        return run_all(lambda one: one[0].search_cells(one[1], trust, one[2]), pieces, "left-out snapshots")
 
     # Some first, as the rest is sought faster under a trust that is nearly right.
     for count in (TRUSTED, HELD_OUT):
@@ -171,7 +171,11 @@ def learn_trust(
         trust = calibrate_trust(found, places[: len(found)], trust)
     # Which cells are halved depends on the trust: the level is one of cells as they will be.
     trust = calibrate_level(trust, search(HELD_OUT), places, share)
-    log.info("calibrated on %d snapshots left out: areas of %.1f %%", len(places), 100 * trust.level)
+    log.info(
+        "calibrated on %d left-out snapshots: areas take %.1f %% of the probability",
+        len(places),
+        100 * trust.level,
+    )
     return trust, len(places)
 
 

@@ -77,9 +77,9 @@ class MeasurementPlan:
         if not len(self.places) or gain >= WORTH * self.before_db:
             return ""
         return (
-            f"hardly worth it: {len(self.places)} places (a walk of {self.length_m:.0f} m) take {gain:.2g} "
-            f"dB off {self.before_db:.2f} dB, {self.scatter_db:.2f} dB of which are the scatter of single "
-            "measurements; area=... where less was measured needs them more"
+            f"hardly worth measuring: {len(self.places)} places (a walk of {self.length_m:.0f} m) lower the "
+            f"expected error of {self.before_db:.2f} dB by {gain:.2g} dB; {self.scatter_db:.2f} dB of it are "
+            "scatter of single measurements; set area= to where less was measured"
         )
 
 

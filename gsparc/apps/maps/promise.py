@@ -191,23 +191,23 @@ def map_notes(
     notes = [*field.notes]
     figures = field.summarise()
     if (unsure := figures["map/server_unsure"]) and len(field.stations) > 1:
-        notes.append(f"best_server: in {unsure:.1%} of squares (hatched) it is more likely another, or none")
+        notes.append(f"best_server: unsure in {unsure:.1%} of squares (hatched): another or none is likelier")
     if (outage := figures["map/outage"]) is not None:
-        level = f"{field.threshold_db:g} {field.unit} or more of some station (the mean of 1 - outage)"
-        ends = "" if covered is None else " (90 % interval {:.1%} to {:.1%})".format(*covered)
+        level = f"{field.threshold_db:g} {field.unit} or more of some station (mean of 1 - outage)"
+        ends = "" if covered is None else "; 90 % interval {:.1%} to {:.1%}".format(*covered)
         refused_share = (field.grid.inside & field.refused).sum() / max(field.grid.inside.sum(), 1)
-        only = f" ({refused_share:.0%} of the area is refused, and not among them)" * bool(refused_share)
-        notes.append(f"{1 - float(outage):.1%}{ends} of the predicted squares{only} with {level}")
+        only = f"; {refused_share:.0%} of the area is refused and not counted" * bool(refused_share)
+        notes.append(f"{1 - float(outage):.1%} of the predicted squares have {level}{ends}{only}")
     if field.unit == "dB":
         notes.append("levels are in dB, as the data name no unit: if they are dBm, say unit=dBm")
     if coverage is None:
         caveat = "they are the model's own deviations, and no place is refused as too far from data"
         return [*notes, f"intervals are not tested: {caveat}"]
-    tested = f"tested on {coverage.rows} heard rows of {coverage.blocks} held-out blocks"
-    outcome = f"{coverage.share:.1%} of these rows held, {coverage.width_db:.1f} dB wide in the mean"
-    of_map = f"on the map those of the strongest station are {figures['map/width_db']:.1f} dB wide"
-    notes.append(f"{field.share:.0%} intervals, {tested}: {outcome}; {of_map}")
+    tested = f"{coverage.share:.1%} of {coverage.rows} heard rows in {coverage.blocks} held-out blocks"
+    of_map = f"on the map {figures['map/width_db']:.1f} dB for the strongest station"
+    width = f"mean width {coverage.width_db:.1f} dB, {of_map}"
+    notes.append(f"{field.share:.0%} intervals held {tested}; {width}")
     if figures["map/refused"]:
         squares = f"{figures['map/refused']} of {int(field.grid.inside.sum())} squares"
-        notes.append(f"{squares} are refused: too far from what was measured")
+        notes.append(f"{squares} are refused: too far from measurements to promise anything")
     return notes

@@ -44,7 +44,7 @@ def warn_of_held_out(predictor: Predictor) -> None:
     """Warn of rows that were held out for a test: to a map they are places where nobody measured."""
     if count := predictor.extra.get("tested"):
         log.warning(
-            "%d rows of its file were held out for the test, and count as not measured here: train the final "
+            "%d rows of its file were held out for the test and count as not measured here: train the final "
             "model with split=none", count,
         )  # fmt: skip
 

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from gsparc.commands.shared.inputs import RunInputs, read_inputs
 from gsparc.commands.shared.output import in_multirun, run_directory
 from gsparc.commands.shared.run_lock import locked
-from gsparc.evaluation.ledger import State, measurements_hash, read_finished, run_once
+from gsparc.evaluation.ledger import FitInputs, measurements_hash, read_finished, run_once
 from gsparc.evaluation.metric_formats import main_figure, score_of
 
 log = logging.getLogger(__name__)
@@ -33,14 +33,14 @@ def train_once(config: DictConfig, train: Callable[[DictConfig, Path, RunInputs]
         train(config, run_dir, inputs)
 
     with locked(run_dir / ".job"):  # the run's own is its training's
-        unread = State.from_config(config) if job else None  # of a job that is done no data are read
+        unread = FitInputs.from_config(config) if job else None  # of a job that is done no data are read
         facts = read_finished(run_dir, unread, config.reuse) if unread else None
         if facts is not None:
             log.info("%s: already done", run_dir)
             return facts
         inputs = read_inputs(config)
         data, split = measurements_hash(inputs.data), inputs.split.sha256
-        state = State.from_config(config, data, split)
+        state = FitInputs.from_config(config, data, split)
         state = replace(unread, data=data, split=split) if unread else state
         resumes = config.ckpt_path is not None
         return run_once(run_dir, state, work, reuse=config.reuse, again=not job, resumes=resumes)

@@ -14,7 +14,13 @@ from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
 from gsparc.data.spacing import neighbour_distance
 from gsparc.physics.decibels import to_decibels
-from gsparc.physics.row_factors import FREEDOMS, Freedom, align_factors, describe_freedom, resolvable_delays
+from gsparc.physics.row_factors import (
+    UNKNOWN_FACTORS,
+    UnknownFactor,
+    align_factors,
+    describe_factor,
+    resolvable_delays,
+)
 from gsparc.processes.few_rows import evenly_spaced
 
 log = logging.getLogger(__name__)
@@ -44,7 +50,7 @@ class Coherence:
             an eighth wavelength, of the advance of the phase between three rows in line.
         phase, delay: mean correlation after a free phase, and after a delay too, of each pair.
         level_db: scatter of levels between neighbours [dB].
-        freedom: what each row must be allowed.
+        unknown_factor: what each row must be allowed.
     """
 
     pairs: int
@@ -53,10 +59,14 @@ class Coherence:
     phase: float
     delay: float
     level_db: float
-    freedom: Freedom
+    unknown_factor: UnknownFactor
 
     def __str__(self) -> str:
-        tag = "" if self.freedom == "none" else f"every row has {describe_freedom(self.freedom)} of its own: "
+        tag = (
+            ""
+            if self.unknown_factor == "none"
+            else f"every row has {describe_factor(self.unknown_factor)} of its own: "
+        )
         return (
             f"{tag}rows {self.distance * 1e3:.3g} mm apart correlate by {self.as_measured:.2f} as measured, "
             f"by {self.phase:.2f} after a free phase, {self.delay:.2f} after a free delay too; their levels "
@@ -93,38 +103,40 @@ def estimate_coherence(data: Measurements) -> Coherence | None:
     phase, delay = float(np.abs(first).mean()), float(np.abs(_correlation(turned, b)[0]).mean())
     levels = to_decibels(size[:, 0] / size[:, 1])
     scatter = float(1.4826 * np.median(np.abs(levels))) / np.sqrt(2)
-    freedom: Freedom = "none"
+    unknown_factor: UnknownFactor = "none"
     noise = np.sqrt(max(np.log(max(len(resolvable_delays(rows.tones)), 3)), 1.0) / values[0].size)
     if measured < OWN[reach] * phase and max(phase, delay) > np.clip(CHANCE * noise, *ALIKE[reach]):
-        freedom = "phase+delay" if delay > phase + MORE else "phase"
+        unknown_factor = "phase+delay" if delay > phase + MORE else "phase"
         least = scatter * (1 - 2 * SPREAD / np.sqrt(len(near)))  # few pairs that fade scatter by chance
-        freedom = "phase+delay+gain" if least > SCATTER_DB[reach] else freedom
+        unknown_factor = "phase+delay+gain" if least > SCATTER_DB[reach] else unknown_factor
     distances = np.linalg.norm(rows.places[near[:, 0]] - rows.places[near[:, 1]], axis=1)
-    return Coherence(len(near), float(np.median(distances)), float(measured), phase, delay, scatter, freedom)
+    return Coherence(
+        len(near), float(np.median(distances)), float(measured), phase, delay, scatter, unknown_factor
+    )
 
 
-def set_freedom(data: Measurements, align: str) -> Measurements:
+def set_unknown_factor(data: Measurements, align: str) -> Measurements:
     """Return measurements with what is free of each row: as `align` says, `auto` by `estimate_coherence`.
 
     Raises:
-        SettingError: no such freedom, or one of what are no channels.
+        SettingError: no such factor, or one of what are no channels.
     """
-    choice("auto", *FREEDOMS).check("dataset.align", align)
+    choice("auto", *UNKNOWN_FACTORS).check("dataset.align", align)
     if not data.site.target.is_complex:
         if align not in ("auto", "none"):
             raise SettingError(f"dataset.align={align}: is for channels, these are {data.site.kind}")
         return data
-    freedom: Freedom = align  # type: ignore[assignment]
+    unknown_factor: UnknownFactor = align  # type: ignore[assignment]
     if align == "auto":
         found = estimate_coherence(data)
-        if found is None or found.freedom == "none":
+        if found is None or found.unknown_factor == "none":
             return data
-        freedom = found.freedom
+        unknown_factor = found.unknown_factor
         log.warning("%s; they are aligned (dataset.align=none keeps them as they are)", found)
         if (spacing := neighbour_distance(data.moving) / (data.site.wavelength or np.inf)) > IN_LINE:
             what = "neighbours tell levels, not the shape over subcarriers"
             log.warning("places are %.3g wavelengths apart: %s", spacing, what)
-    return replace(data, site=replace(data.site, freedom=freedom))
+    return replace(data, site=replace(data.site, unknown_factor=unknown_factor))
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -32,7 +32,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("grid", "" if site.grid is None else _grid(site.grid)),
         ("array", "" if site.array is None else f"{len(site.array)} receive antennas"),
         ("scale", "" if powers or scale == 1 else f"measurements are divided by {scale:.4g}, then stored"),
-        ("censored", f"of {len(data)} powers {weak} lie under a level (unheard, unlisted), {strong} above one"
+        ("censored", f"{weak} of {len(data)} powers lie below a level (unheard, unlisted), {strong} above one"
          if data.censored is not None else ""),
         ("runs", "" if data.run is None else f"{data.run.max() + 1}" + ", of unknown factors" * (not powers)),
         ("phases", "" if phases is None else str(phases)),
@@ -55,7 +55,9 @@ def summarise(data: Measurements, split: Split) -> list[tuple[str, str]]:
     folds = f"each of {count} folds has about " if count > 1 else ""
     rows = f"{folds}{train} training, {val} validation and {test} test rows"
     if split.name == "none":
-        rows = f"all {train + val} rows are learned from ({val} decide where a method has choices)"
+        rows = (
+            f"all {train + val} rows are learned from ({val} of them also decide between choices of a method)"
+        )
     lines = [
         ("data", f"{data.site.name}, {data.site.kind}: {_targets(data)}"),
         ("stays", _static(data.site)),
@@ -167,8 +169,8 @@ def held_out_block_rows(data: Measurements, side: float) -> np.ndarray:
 
 def propose_split(data: Measurements) -> str:
     """Propose a split, in one sentence for `gsparc check`."""
-    between = "split=random asks about places between these"
+    between = "split=random tests at places between these"
     side = propose_side(data)
     if side is None or not len(held_out_block_rows(data, side)):
         return f"{between}; too few places to hold out squares of floor"
-    return f"{between}; split=blocks split.side_m={side:g} about holes of {side:g} m"
+    return f"{between}; split=blocks split.side_m={side:g} in gaps of {side:g} m"

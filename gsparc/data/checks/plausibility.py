@@ -112,9 +112,9 @@ def floor_warnings(levels: LinkLevels) -> list[str]:
     ]
     shares = list_first([f"{share:.0%} of the levels{who} below {top:g} dB" for who, top, share in floors])
     return [
-        f"not heard? {shares}, a receiver's noise or lowest reading, are learned as signals; sensitivity_db="
-        f"{top:g} in the file (of a table dataset.columns.sensitivity_db={top:g}, or a column of stations, "
-        "of each its own) takes levels below as not heard"
+        f"not heard? {shares} look like a receiver's noise or lowest reading, but are learned as signals; "
+        f"sensitivity_db={top:g} in the file (of a table dataset.columns.sensitivity_db={top:g}, or a "
+        "column) takes lower levels as not heard"
         for top in sorted(top for _, top, _ in floors)[-1:]
     ]
 

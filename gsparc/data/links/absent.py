@@ -79,7 +79,7 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
         floor = np.nan_to_num(stated, nan=levels[heard].min())
         is_lossy = lists.short_are_lost(floor)
         may = np.isnan(lists.level) & (lists.full[:, None] | (not is_lossy))
-        how = "one that a full list leaves out is below its weakest"
+        how = "a station that a full list leaves out is learned as below its weakest level"
         how += f", in lists shorter than {lists.length}: "
         how += "unknown, strong ones are lost there" if is_lossy else f"below {floor.min():.4g} dB"
     if absent != "auto":
@@ -95,8 +95,8 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
     _repeat(check, np.r_[heard, heard[lists.first[of_list]]], station)
     check.raw.arrays["sensitivity_db"] = np.r_[levels[heard], below]
     used = "all" if len(below) == every else f"{len(below)} (mostly near where they are listed) of"
-    used = f"{used} {every} unlisted are used (dataset.absent=unknown takes none)"
-    check.notes.append(f"{missing}: {how}; beside {len(heard)} listed, {used}")
+    used = f"{used} {every} unlisted levels are used beside {len(heard)} listed ones"
+    check.notes += [f"{missing}: {how}", f"{used} (dataset.absent=unknown uses none)"]
     return len(below) * strongest
 
 

@@ -199,12 +199,12 @@ def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None)
     silent = np.isin(values, marks) | ((values == -np.inf) & (setting is None or len(marks) > 0))
     floor = "sensitivity_db"
     if level is None and silent.any() and np.isfinite(values[~silent]).any():
-        floor = f"{values[~silent & np.isfinite(values)].min():.4g} dB, the weakest"
+        floor = f"{values[~silent & np.isfinite(values)].min():.4g} dB, the weakest level heard"
     for mark in marks if setting is None else ():
         share = f"{int((values == mark).sum())} of {len(values)} levels are exactly {round(mark, 6) + 0:g}"
-        note = f"{share}, apart from all others: taken as not heard, below {floor}"
+        note = f"{share}, apart from all others: taken as not heard, that is below {floor}"
         does = "refuses" if abs(mark) > MOST_DB else "keeps"
-        say = f"dataset.not_heard=[] {does} them, sensitivity_db (dataset.columns.sensitivity_db) sets that"
+        say = f"dataset.not_heard=[] {does} them, sensitivity_db= sets another level"
         check.notes.append(Caution(f"{note}; {say}"))
     return silent
 

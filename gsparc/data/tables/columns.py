@@ -421,7 +421,7 @@ def _note(columns: tuple[Column, ...]) -> str:
         labels = [column.label for column in columns]
         of = "frequencies" if first.role in (*CHANNELS, *POLAR) else "stations"
         what += f" of the {of} {', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''}"
-        what += " (maps in dBm: unit=dBm)" if unit == " [dB]" else ""
+        what += " (dBm? set unit=dBm)" if unit == " [dB]" else ""
     turned = first.unit is not None and first.unit.changes
     return what + (f", {first.unit.name} turned into {first.schema_unit}" if turned and first.unit else "")
 

@@ -411,12 +411,12 @@ class Builder:
         assert self.listed is not None
         index = pd.Index(self.listed.names).get_indexer(words)
         self.arrays |= self.listed.extra
-        self._note_silent("in no row, and kept", np.delete(self.listed.names, index).tolist())
+        self._note_silent("heard in no row, and kept", np.delete(self.listed.names, index).tolist())
         return replace(self.listed, index=index)
 
     def _note_silent(self, where: str, names: list[str]) -> None:
         if names:
-            self.notes.append(f"listed, but {where}: {list_first(names, 8)}")
+            self.notes.append(f"stations of the list, {where}: {list_first(names, 8)}")
 
     def _unnamed(self, where: Places) -> StationList | None:
         """Stations told apart by their places alone."""

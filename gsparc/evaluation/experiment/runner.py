@@ -24,7 +24,7 @@ from gsparc.data.files import is_out_of_space
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.console import error_in_one_line
-from gsparc.evaluation.ledger import RECORD, State, edited, read_finished, run_once
+from gsparc.evaluation.ledger import RECORD, FitInputs, edited, read_finished, run_once
 from gsparc.evaluation.metric_formats import number_format
 from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.results import as_frame, frame_of_runs, own_rows, read_run, read_summary
@@ -78,9 +78,9 @@ class Job:
     reuse: bool = False
 
     @cached_property
-    def state(self) -> State:
+    def state(self) -> FitInputs:
         """What its result is to be of."""
-        state = State.from_config(self.config, self.content, self.split.sha256)
+        state = FitInputs.from_config(self.config, self.content, self.split.sha256)
         extra = {} if self.learned is None else {"learned": str(self.name)}
         return replace(state, settings=state.settings | extra)
 

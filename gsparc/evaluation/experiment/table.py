@@ -179,12 +179,12 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     rows, plain = list(block.itertuples()), plain_methods()
     first = rows[0]
     level = f"{score_heading(first.figure).partition(' (')[0]} {shown(first.figure, first.score_db):.2f}"
-    lines = [f"first: {first.method}, {level} after {first.train_cpu_s:.3g} processor seconds of training"]
+    lines = [f"best: {first.method}, {level} after {first.train_cpu_s:.3g} processor seconds of training"]
     leads = {row.method: lead_over_runs(first.results, row.results) for row in rows[1:]}
     if len(rows) > 1 and (lead := leads[rows[1].method]):
-        before = "the same as" if lead.same else f"{lead.ahead_db:.2f} ± {lead.error_db:.2f} dB before"
+        before = "the same as" if lead.same else f"{lead.ahead_db:.2f} ± {lead.error_db:.2f} dB better than"
         lines[0] += f"; {before} {rows[1].method} (standard error over the same {lead.pairs})"
-        lines[0] += "" if lead.same else f": they are {'' if lead.sure else 'not '}told apart"
+        lines[0] += "" if lead.same else f": {'' if lead.sure else 'not '}significant"
     cell = next((row for row in rows if row.method == ours), None)
     lead = None if cell is None else leads.get(cell.method)
     figure = heading_of(first.figure)
@@ -205,7 +205,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     close = block[(block.score_db >= first.score_db - CLOSE_DB) & block.query_ms.notna() & ~_published(block)]
     if len(close):
         quick = close.loc[close.query_ms.idxmin()]
-        near = f"fastest within {CLOSE_DB} dB of the first"
+        near = f"fastest within {CLOSE_DB} dB of the best"
         lines.append(f"{near}: {quick.method}, {quick.query_ms:.3g} ms a query")
     if inputs := "; ".join(f"{row.method}: {row.given}" for row in rows if row.given):
         lines.append(f"given more than places: {inputs}")
@@ -217,7 +217,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
 
 
 def table_of(block: pd.DataFrame, ours: str) -> Table:
-    """Return a block as a table without columns that no row fills; bold: the first, where told apart.
+    """Return a block as a table without columns that no row fills; bold: a significantly best.
 
     `ours` is marked.
     """

@@ -174,9 +174,9 @@ def table_of_leads(rows: pd.DataFrame) -> Table:
                 gain = Interval(-lead.ahead_db, error=lead.error_db)
                 lines.append([setting, against, gain, lead.pairs, verdict])
     ahead = Column("ahead of it, dB", ".2f")
-    columns = [SETTING, Column("against", ""), ahead, Column("pairs", ""), Column("told apart", "")]
+    columns = [SETTING, Column("against", ""), ahead, Column("pairs", ""), Column("significant", "")]
     figure = heading_of(fits.figure.iloc[0])
-    note = f"Of {figure}, on the same draws, seeds or rows; ± standard error; told apart: 95 % (Student's t)."
+    note = f"Of {figure}, on the same draws, seeds or rows; ± standard error; significant: 95 %, Student's t."
     if fits.seed.nunique(dropna=False) == 1 and any("test rows" in str(line[3]) for line in lines):
         note += " Of one seed: what seeds change is not in the error (seed=0,1,2)."
     return Table("Paired differences", columns, lines, note)

@@ -83,7 +83,7 @@ def write_recovery_report(result: RecoveredVectors, data: Measurements, rows: np
     )  # fmt: skip
     if len(bad):
         log.warning(
-            "%d %s cannot come from this array (array_position? a fault? see %s): %s",
-            len(bad), "spectrum" if len(bad) == 1 else "spectra", path.name,
-            list_first([names[i] for i in bad]),
+            "%d %s cannot come from this array: %s; check them and array_position, %s has the figures",
+            len(bad), "spectrum" if len(bad) == 1 else "spectra",
+            list_first([names[i] for i in bad]), path.name,
         )  # fmt: skip

@@ -200,7 +200,7 @@ class DistanceLaw(Differentiable):
     """Powers by the distance between the moving and the still end, or between two moving ends."""
 
     name = "distance_law"
-    plain_place = 70
+    baseline_order = 70
     kinds = ("rssi",)
     stored = ("law",)
     uses_censored = True

@@ -110,7 +110,7 @@ class GaussianProcess(Differentiable, ClosedForm):
     """
 
     name = "gp"
-    plain_place = 90
+    baseline_order = 90
     stored = ("mean", "axes", "pixels", "lost", "scores", "powers")
     stored_names: ClassVar[dict[str, str]] = {"components": "limit", "mean": "about"}
     uses_censored = True

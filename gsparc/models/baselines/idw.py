@@ -25,7 +25,7 @@ class InverseDistance(Interpolator):
     """
 
     name = "idw"
-    plain_place = 40
+    baseline_order = 40
     no_gradient: str | None = "its nearest samples change in jumps"
     stored: ClassVar[tuple[str, ...]] = ("positions", "targets")
     NEAR = 1e-6  # [m]; a query on a sample repeats it instead of dividing by zero

@@ -97,7 +97,7 @@ class Kriging(Interpolator):
     """Powers, spectra, and the power of channels."""
 
     name = "kriging"
-    plain_place = 80
+    baseline_order = 80
     kinds = ("rssi",)
     no_gradient = "its systems are solved outside of autograd"
     stored = ("positions", "values", "variogram", "channels")

@@ -14,7 +14,7 @@ class Mean(Interpolator):
     """Predicts the training mean everywhere (of decibels for RSSI)."""
 
     name = "mean"
-    plain_place = 20
+    baseline_order = 20
     no_gradient = "predictions are the same everywhere"
     stored = ("value",)
 

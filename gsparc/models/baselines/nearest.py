@@ -9,7 +9,7 @@ class Nearest(InverseDistance):
     """Repeats the sample measured nearest to the query; its confidence falls off with the distance."""
 
     name = "nearest"
-    plain_place = 30
+    baseline_order = 30
 
     def __init__(self) -> None:
         super().__init__(neighbours=1)

@@ -27,7 +27,7 @@ class Ridge(UplinkMethod):
     """
 
     name = "ridge"
-    plain_place = 110
+    baseline_order = 110
     stored = ("maps", "unit", "inputs")
 
     @classmethod

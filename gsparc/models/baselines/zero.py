@@ -13,7 +13,7 @@ class Zero(Interpolator):
     """Predicts zeros."""
 
     name = "zero"
-    plain_place = 10  # NMSE 1: what is worse is worse than saying nothing
+    baseline_order = 10  # NMSE 1: what is worse is worse than saying nothing
     no_gradient = "predictions are the same everywhere"
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:

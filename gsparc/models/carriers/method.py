@@ -23,8 +23,8 @@ from gsparc.models.carriers.alone import CarriersAlone
 from gsparc.models.carriers.array import OneArray
 from gsparc.models.carriers.geometry import SharedPaths, find_paths
 from gsparc.models.carriers.joint import Covariance, choose_joint, row_noise
+from gsparc.models.member_weights import choose_weights, error_products
 from gsparc.models.method import Prediction
-from gsparc.models.stack import choose_weights, error_products
 from gsparc.models.target_rows import training_targets
 from gsparc.physics.separable import Separable, separate_axes
 from gsparc.processes.factor import Factor

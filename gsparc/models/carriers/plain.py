@@ -21,7 +21,7 @@ class OtherCarriers(OneArray):
     """The mean of what all carriers saw at the place, or at the nearest one."""
 
     name = "other_carriers"
-    plain_place = 50
+    baseline_order = 50
     stored = (*OneArray.stored, "means")
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -45,7 +45,7 @@ class DirectBeam(OneArray):
     """The array's image of the direct path beside the mean image."""
 
     name = "direct_beam"
-    plain_place = 60
+    baseline_order = 60
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """See `Method.fit`; `ValueError` where carriers have not one array."""

@@ -61,7 +61,7 @@ class ComplexGP(ClosedForm):
     """
 
     name = "complex_gp"
-    plain_place = 100
+    baseline_order = 100
     stored = ("posterior", "runs", "shape")
     kinds = ("csi",)
     both_ends = True

@@ -237,8 +237,9 @@ class _Search:
         ratio = after.errors / before.errors
         gain = (before.nll - after.nll) / sum(group.target.numel() for group in self.groups)
         notes.append(
-            f"waves: {name} {'kept' if keep else 'dropped'}: {gain:+.3f} nats per channel, left-out error of "
-            f"rows, small and large cells times {ratio[0]:.3f}, {ratio[1]:.3f}, {ratio[2]:.3f}"
+            f"waves: {name} {'kept' if keep else 'dropped'}: error times {ratio[0]:.3f} at left-out rows, "
+            f"{ratio[1]:.3f} and {ratio[2]:.3f} in small and large squares; "
+            f"log likelihood {gain:+.3f} a channel"
         )
         return after if keep else before
 

@@ -20,7 +20,7 @@ from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Prediction
 from gsparc.physics.decibels import TINY_POWER
-from gsparc.physics.row_factors import Freedom, align_factors
+from gsparc.physics.row_factors import UnknownFactor, align_factors
 from gsparc.processes.few_rows import covering_rows
 
 COHERENT = 0.5  # share of the variance that a free phase finds again
@@ -56,7 +56,9 @@ class TurnedNeighbours(InverseDistance, ClosedForm):
         if len(positions) > 2:
             sample_rows = covering_rows(positions, TRIED, 0)
             mean, spread = self._turn_nearest(positions[sample_rows], skip=1)
-            turned = mean * align_factors(mean, targets[sample_rows], self._tones, self._freedom)[:, None]
+            turned = (
+                mean * align_factors(mean, targets[sample_rows], self._tones, self._unknown_factor)[:, None]
+            )
             missed = (np.abs(turned - targets[sample_rows]) ** 2).mean()
             self.scale = float(missed / max(spread.mean(), TINY_POWER))
         return notes
@@ -68,9 +70,9 @@ class TurnedNeighbours(InverseDistance, ClosedForm):
         return np.zeros(count) if tones is None or len(tones) != count else np.asarray(tones)
 
     @property
-    def _freedom(self) -> Freedom:
+    def _unknown_factor(self) -> UnknownFactor:
         """Without the gain: rows were brought to one level before."""
-        return "phase" if self.fitted_site.freedom == "phase" else "phase+delay"
+        return "phase" if self.fitted_site.unknown_factor == "phase" else "phase+delay"
 
     def _turn_nearest(self, queries: np.ndarray, skip: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Means (q, A, K) of the nearest rows but the first `skip`, and what these differ by (q,)."""
@@ -84,7 +86,7 @@ class TurnedNeighbours(InverseDistance, ClosedForm):
             mean = near[:, 0]
             for _ in range(ROUNDS):
                 onto = np.repeat(mean[:, None], count, 1).reshape(-1, *self.shape)
-                turns = align_factors(near.reshape(-1, *self.shape), onto, self._tones, self._freedom)
+                turns = align_factors(near.reshape(-1, *self.shape), onto, self._tones, self._unknown_factor)
                 near = near * turns.reshape(len(mean), count, 1, len(self._tones))
                 mean = (weight * near).sum(1)
             means[part] = mean

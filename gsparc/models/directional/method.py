@@ -96,12 +96,13 @@ class DirectionalGP(SourcesInFrame):
         self._refit_powers_and_kernel()
         changed = ""
         if self.visibility:
-            changed = f"{self._update_visibility()} visibility entries changed by channels; "
+            pairs = self._update_visibility()
+            changed = f"{pairs} pairs of receiver and source seen or hidden otherwise by channels; "
         self.posterior.precompute()
         note = (
-            f"directional_gp: {self.count_components()} triangulated sources, direction error "
+            f"directional_gp: {self.count_components()} sources where directions cross, direction error "
             f"{math.degrees(clusters.error):.2g} degrees; {changed}"
-            f"constant share of the gains' variance {self.posterior.kernel.constant:.1%}"
+            f"{self.posterior.kernel.constant:.1%} of the gains' variance alike at all places"
         )
         return FitReport(started.seconds, (note,))
 

@@ -39,11 +39,11 @@ from gsparc.models.image_sources.rows import (
 )
 from gsparc.models.image_sources.scene import JITTER, SourceScene
 from gsparc.models.image_sources.search import Found, SearchSettings
+from gsparc.models.member_weights import weights_of_fits
 from gsparc.models.method import Method
 from gsparc.models.reduced import MeanOnly, Settings
-from gsparc.models.stack import weights_of_fits
 from gsparc.physics.mirror_planes import hesse_form, image_rotations
-from gsparc.physics.row_factors import Freedom, align_factors
+from gsparc.physics.row_factors import UnknownFactor, align_factors
 from gsparc.physics.waves import point_wave, wave_over_band
 from gsparc.processes.averages import mixture_moments
 from gsparc.training.context import FitContext, FitReport
@@ -160,9 +160,9 @@ class ImageSourceGP(SourcesInFrame):
         scene = self.members[0].scene
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
         agree = ensemble.reached_noise_floor([member.left_out for member in members], self.noise_floor)
-        ended = "two agree up to noise, enough" if agree else "all that effort= asks for"
+        ended = "two agree up to noise, which is enough" if agree else "as many as effort= asks for"
         boxes, patches = len(scene.clutter.boxes), len(scene.clutter.patches)
-        notes = [f"{len(members)} of {self.settings.searches} searches ({ended}), {counts} sources"]
+        notes = [f"{len(members)} of {self.settings.searches} searches ({ended}) found {counts} sources"]
         if boxes or patches:
             notes.append(f"clutter: {boxes} occluding boxes, {patches} finite mirrors")
         if (self.factors != 1).any():
@@ -265,7 +265,7 @@ class ImageSourceGP(SourcesInFrame):
         summed = torch.einsum("mkf,kr->mrf", waves, gains.to(waves.dtype))
         predicted = summed.reshape(len(known), -1, len(frequency)).numpy()
         measured = data.target[known] if data.mask is None else np.where(data.mask, data.target, 0)[known]
-        free: Freedom = "phase" if self.settings.offsets == "phase" else "phase+delay"
+        free: UnknownFactor = "phase" if self.settings.offsets == "phase" else "phase+delay"
         target = data.target.copy()
         target[known] *= align_factors(measured, predicted, frequency, free)[:, None].astype(target.dtype)
         return replace(data, target=target)

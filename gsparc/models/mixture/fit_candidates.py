@@ -15,8 +15,8 @@ from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.image_sources.ensemble import CONVERGED_ERROR
+from gsparc.models.member_weights import leave_out_groups
 from gsparc.models.mixture.candidates import Candidate
-from gsparc.models.stack import leave_out_groups
 from gsparc.models.terms import EffectSettings
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.race import FellBehind, Race, mean_square

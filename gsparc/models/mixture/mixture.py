@@ -27,13 +27,13 @@ from gsparc.models.abilities import HasPaths, HasProcess, QueryPaths
 from gsparc.models.channels.initial import estimate_run_factors
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, method_from_state, method_state
 from gsparc.models.image_sources.frame import merge_equal_paths
+from gsparc.models.member_weights import explained_variance, weigh_members
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.each_or_together import LearnsTogether
 from gsparc.models.refined_places import move_rows, position_errors, refine_places
 from gsparc.models.run_factors import RunFactors
-from gsparc.models.stack import explained_variance, stack
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.averages import mixture_moments
 from gsparc.processes.powers import PowerProcess
@@ -44,7 +44,7 @@ from gsparc.training.stopwatch import Stopwatch
 log = logging.getLogger(__name__)
 QUERY_CHUNK = 1024  # memory; stations at one place share most of their work, see `ChannelField`
 # Of fields, in words.
-PARTS = {"power": "a trend of levels", "residual": "a process of what is left"}
+PARTS = {"power": "a trend over distance", "residual": "a Gaussian process of the rest"}
 
 
 class Mixture(LearnsTogether, ClosedForm):
@@ -160,7 +160,7 @@ class Mixture(LearnsTogether, ClosedForm):
         )
         # Searches have errors of their own, and of few squares nothing is sure: a mixture need not be.
         sure = 0.0 if set(found).intersection((*fit_candidates.SEARCHES, "neighbours")) else 1.0
-        chosen = stack(found, data, fold.val, cut, sure)
+        chosen = weigh_members(found, data, fold.val, cut, sure)
         heeded.count_reads(*(path for name in chosen for path in read[name]))
         self.members, self.weights = [found[name] for name in chosen], tuple(chosen.values())
         self.started = "+".join(chosen)
@@ -286,7 +286,7 @@ class Mixture(LearnsTogether, ClosedForm):
     def description(self) -> str:
         """See `Method`."""
         terms = ", ".join(PARTS.get(term, term) for term in self.terms) or PARTS["residual"]
-        return f"{self.started.replace('+', ' + ')} in closed form, made of {terms}"
+        return f"{self.started.replace('+', ' + ')} in closed form, with {terms}"
 
     def count_components(self) -> int:
         """Return the number of Gaussians of all members."""

@@ -107,7 +107,7 @@ class PowerField(ClosedForm):
             best = choose_candidate(seen, [MeanLaw(trend, 0.0, ())], self.seed, chosen_on)
             self.priors = ((1.0, best.prior),)
             about = "a distance law" if has_law else f"a constant, with fewer than {LAW_NEEDS} rows"
-            note = f"losses in {len(walls.sizes)} known walls and floors, about {about}"
+            note = f"losses in {len(walls.sizes)} known walls and floors, mean: {about}"
             return (note, *notes, *best.notes)
         found, remarks = candidate_priors(seen, site, self.seed, chosen_on, terms), list[str]()
         self.priors = ((1.0, found[0].prior),)

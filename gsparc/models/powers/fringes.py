@@ -17,9 +17,9 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsparc.models.member_weights import best_weights
 from gsparc.models.powers.groups import SPREAD, number_squares, split_groups
 from gsparc.models.powers.waves import FLOOR, PlaneWaveBasis, field_db, fit_wave_weights, make_basis
-from gsparc.models.stack import best_weights
 from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.processes.density import TINY
 from gsparc.processes.nearest import condition_on_nearest

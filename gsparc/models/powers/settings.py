@@ -19,10 +19,10 @@ from torch import Tensor
 from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import fit_site_law
 from gsparc.models.baselines.kriging import fit_variogram
+from gsparc.models.member_weights import best_weights
 from gsparc.models.powers.groups import SIDES, number_squares
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, set_term_unit, subtract_means
 from gsparc.models.powers.prior_map import PriorMap
-from gsparc.models.stack import best_weights
 from gsparc.processes.censored import ConditionalGaussian
 from gsparc.processes.fit_kernel import LOOKS, fit_kernel_by_evidence, fit_kernel_by_left_out
 from gsparc.processes.kernel import (
@@ -113,7 +113,7 @@ class KernelCandidate:
         law = self.trend.law
         mean = "a constant" if law is None else f"a distance law of exponent {law.exponent:.3g}"
         has_map = any(isinstance(one, UserTerm) and isinstance(one.term, PriorMap) for one in self.trend.more)
-        return f"{self.kernel.description}, about {mean}{' and a share of the map' * has_map}"
+        return f"{self.kernel.description}, mean: {mean}{' and a share of the map' * has_map}"
 
 
 def candidate_priors(

@@ -17,17 +17,17 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.method import Method, Prediction
-from gsparc.models.reduced import Settings, average_with_process
-from gsparc.models.splat.auto_settings import resolve_auto
-from gsparc.models.splat.method import LearnedField
-from gsparc.models.stack import (
+from gsparc.models.member_weights import (
     LEAST_HELD,
     choose_weights,
     error_products,
     explained_variance,
     relative_to_row,
 )
+from gsparc.models.method import Method, Prediction
+from gsparc.models.reduced import Settings, average_with_process
+from gsparc.models.splat.auto_settings import resolve_auto
+from gsparc.models.splat.method import LearnedField
 from gsparc.models.terms import array_obstacle
 from gsparc.physics.decibels import RELATIVE_DB
 from gsparc.training.context import FitContext, FitReport
@@ -170,7 +170,7 @@ class ImageProcess(LearnedField):
         """See `Method`."""
         weight = 0.0 if self._average is None else self._average[1]
         return super().description + (
-            f"; weight of a plain Gaussian process {weight:.2g}" if self.plain else ""
+            f"; averaged with a plain Gaussian process of weight {weight:.2g}" if self.plain else ""
         )
 
     def without_process(self) -> Method | None:

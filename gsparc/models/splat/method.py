@@ -37,13 +37,13 @@ from gsparc.field.response import ResponseSettings
 from gsparc.models import checkpoint
 from gsparc.models.checkpoint import StoredModel
 from gsparc.models.fitting import Origin
+from gsparc.models.member_weights import LEAST_HELD
 from gsparc.models.method import Method, Prediction, to_double
 from gsparc.models.splat import reduce
 from gsparc.models.splat.auto_settings import Choices, apply_choices, resolve_auto
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, read_interrupted
 from gsparc.models.splat.closed_form_start import start_in_closed_form
 from gsparc.models.splat.left_out_images import LeftOut
-from gsparc.models.stack import LEAST_HELD
 from gsparc.ops import Pose
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
@@ -519,7 +519,7 @@ class LearnedField(Method):
         text = f"{kind} through {text}" if self.choices.closed_form else text
         if self.choices.init == "vectors" and not self.steps and self.site is not None:
             enough = ENOUGH * len(self.site.array_geometry()[0])
-            text += f" ({enough} or more answer alike)" * (count >= enough)
+            text += f" ({enough} or more give the same answers)" * (count >= enough)
         part = "all" if self.steps == self.steps_taken else self.steps or "none"
         return text + (
             f", {self.steps_taken} gradient steps, {part} kept" if self.steps_taken else ", no gradient steps"

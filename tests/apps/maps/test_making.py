@@ -284,7 +284,7 @@ def test_a_map_named_cells_by_the_numbers_of_the_drive_where_the_list_has_names(
     # What was measured is in dB, of what nobody said: the map says how it is called dBm.
     assert any("unit=dBm" in note for note in map_notes(found, None))
     # No share was printed.
-    share = f"{1 - found.summarise()['map/outage']:.1%} of the predicted squares with"
+    share = f"{1 - found.summarise()['map/outage']:.1%} of the predicted squares have"
     assert any(note.startswith(share) for note in map_notes(found, None))
 
 

@@ -138,7 +138,7 @@ def test_a_station_that_is_not_listed_was_learned_nothing_of_by_its_sites_others
 
 def test_a_long_walk_for_nothing_was_not_called_so(predictor):
     found = plan_measurements(predictor, 1, route=True)
-    assert "hardly worth it: 1 places" in found.in_vain and 0 < found.scatter_db < found.before_db
+    assert "hardly worth measuring: 1 places" in found.in_vain and 0 < found.scatter_db < found.before_db
     assert not plan_measurements(None, 9, [0, 0, 30, 30]).in_vain
 
 

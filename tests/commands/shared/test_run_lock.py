@@ -149,7 +149,7 @@ def test_a_split_alone_was_called_results(tmp_path, caplog):
     caplog.set_level("INFO")
     (tmp_path / "split.json").write_text("{}")
     set_earlier_aside(tmp_path)
-    assert caplog.messages == [f"{tmp_path}: files of an earlier run are kept as NAME.earlier"]
+    assert caplog.messages == [f"{tmp_path}: files of an earlier run there were renamed to NAME.earlier"]
 
 
 def test_half_written_files_of_killed_runs_stayed_for_ever(tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import packets
 import pytest
 
-from gsparc.data.checks.coherence import estimate_coherence, set_freedom
+from gsparc.data.checks.coherence import estimate_coherence, set_unknown_factor
 from gsparc.data.limits import SettingError
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
@@ -20,16 +20,16 @@ def test_packets_of_a_robot_are_told_with_and_without_its_runs(layout, labelled)
         given, channel = packets.robot(transmitter, 10 * transmitter, layout)
         tones = given["frequency_hz"] - given["frequency_hz"].mean()
         coherent = estimate_coherence(packets.measurements(given, channel))
-        assert coherent is not None and coherent.freedom == "none"
+        assert coherent is not None and coherent.unknown_factor == "none"
         if not labelled:
             del given["run"]
         logged = packets.measurements(given, packets.logged(channel, tones, 0))
-        assert estimate_coherence(logged).freedom == "phase+delay"
+        assert estimate_coherence(logged).unknown_factor == "phase+delay"
         turned = packets.logged(channel, 0 * tones, 0)
-        assert estimate_coherence(packets.measurements(given, turned)).freedom.startswith("phase")
+        assert estimate_coherence(packets.measurements(given, turned)).unknown_factor.startswith("phase")
         if not labelled:  # millimetres apart
             louder = packets.measurements(given, packets.logged(channel, tones, 0, 6.0))
-            assert estimate_coherence(louder).freedom == "phase+delay+gain"
+            assert estimate_coherence(louder).unknown_factor == "phase+delay+gain"
 
 
 def waves(seed, noise=0.0, spacing=0.03):
@@ -52,29 +52,29 @@ def test_no_false_alarm_on_coherent_waves(spacing):
     for seed in range(5):
         for noise in (0.0, 0.5, 3.0):
             found = estimate_coherence(waves(seed, noise, spacing))
-            assert found is None or found.freedom == "none", (seed, noise, str(found))
+            assert found is None or found.unknown_factor == "none", (seed, noise, str(found))
 
 
 def test_the_setting_wins_over_the_verdict(caplog):
     data = waves(0)
-    assert set_freedom(data, "auto") is data
-    assert set_freedom(data, "phase").site.freedom == "phase"
+    assert set_unknown_factor(data, "auto") is data
+    assert set_unknown_factor(data, "phase").site.unknown_factor == "phase"
     draw = np.random.default_rng(0)
     turn = np.exp(2j * np.pi * draw.uniform(size=len(data)))
     own = replace(data, target=(data.target * turn[:, None, None]).astype(np.complex64))
     with caplog.at_level(logging.WARNING):
-        assert set_freedom(own, "auto").site.freedom == "phase"
+        assert set_unknown_factor(own, "auto").site.unknown_factor == "phase"
     assert "every row has a phase of its own" in caplog.text and "dataset.align=none" in caplog.text
-    assert set_freedom(own, "none").site.freedom == "none"
+    assert set_unknown_factor(own, "none").site.unknown_factor == "none"
     with pytest.raises(SettingError, match=r"dataset\.align='level'"):
-        set_freedom(data, "level")
+        set_unknown_factor(data, "level")
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_rows_without_power_divided_by_zero():
     data = waves(0)
     data.target[:30] = 0
-    assert estimate_coherence(data).freedom == "none"
+    assert estimate_coherence(data).unknown_factor == "none"
 
 
 def test_a_gain_for_each_packet_was_told_from_fifteen_pairs_that_fade():
@@ -91,5 +91,5 @@ def test_a_gain_for_each_packet_was_told_from_fifteen_pairs_that_fade():
         data = interpret(
             Raw({**given, "csi": np.repeat(shape, 2, axis=0) * level * turned}, {}), "pairs"
         ).data
-        found[pairs] = estimate_coherence(data).freedom
+        found[pairs] = estimate_coherence(data).unknown_factor
     assert found == {15: "phase", 300: "phase+delay+gain"} or found == {15: "phase", 300: "phase+gain"}

@@ -50,7 +50,9 @@ def test_a_lowest_reading_of_few_rows_is_found():
     arrays = {"rx_position": place, "station_position": posts, "station": np.arange(600) % 30}
     data = from_arrays(arrays | {"rssi_db": levels}, {"absent": "unknown"})
     (line,) = floor_warnings(link_levels(data))
-    assert line.startswith(f"not heard? 10% of the levels below {said(after)} dB, a receiver's noise or")
+    assert line.startswith(
+        f"not heard? 10% of the levels below {said(after)} dB look like a receiver's noise or"
+    )
 
 
 def said(level: float) -> str:

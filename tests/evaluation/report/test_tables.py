@@ -144,13 +144,13 @@ def test_draws_of_a_split_were_settings_beside_the_baselines_of_the_first(run_di
     assert "PSNR dB error" in pooled.csv() and "least" not in pooled.csv()
     ahead = cells(tables.table_of_leads(runs), 1)
     gains = np.array([0.1, -0.2, 0.6])
-    assert (ahead["against"], ahead["pairs"], ahead["told apart"]) == ("gp", "3 draws", "no")
+    assert (ahead["against"], ahead["pairs"], ahead["significant"]) == ("gp", "3 draws", "no")
     assert ahead["ahead of it, dB"].value == pytest.approx(gains.mean())
     assert ahead["ahead of it, dB"].error == pytest.approx(gains.std(ddof=1) / 3**0.5)
     results = tables.table_of_results(runs)
     assert [row[0] for row in results.rows].count("gp (baseline)") == 3
     assert warnings(runs) == [
-        "the baseline gp and gsparc are not told apart in psnr_db: "
+        "the baseline gp and gsparc do not differ significantly in psnr_db: "
         "gsparc is 0.17 ± 0.23 dB better over 3 draws"
     ]
 

@@ -127,7 +127,7 @@ def test_a_number_of_gaussians_that_changes_nothing_was_swept_without_a_word(kno
     )
     query = Query(*_ends(data, fold.test))
     torch.testing.assert_close(more.predict(query).mean, many.predict(query).mean, rtol=0, atol=2e-3)
-    assert "through 40 Gaussians (32 or more answer alike), no gradient steps" in more.description
+    assert "through 40 Gaussians (32 or more give the same answers), no gradient steps" in more.description
     assert "alike" not in few.description
 
 

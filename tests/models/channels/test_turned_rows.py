@@ -34,7 +34,7 @@ def line(count=60, seed=0):
     place = np.c_[along, np.zeros((count, 2))]
     arrays = {"rx_position": place, "tx_position": np.array([0.0, 3.0, 1.0]), "frequency_hz": TONES}
     data = from_arrays({**arrays, "csi": (channel * own)[:, None].astype(np.complex64)})
-    return replace(data, site=replace(data.site, freedom="phase+delay", phase_reference="neighbours"))
+    return replace(data, site=replace(data.site, unknown_factor="phase+delay", phase_reference="neighbours"))
 
 
 def fit(method, data, train, test, split=None):
@@ -97,7 +97,7 @@ def test_the_default_lost_to_its_nearest_rows_out_of_sight(transmitter):
     given, channel = packets.robot(transmitter, 0, "nlos")
     logged = packets.logged(channel, given["frequency_hz"], 0)
     data = packets.measurements(given, logged)
-    data = replace(data, site=replace(data.site, freedom="phase+delay"))
+    data = replace(data, site=replace(data.site, unknown_factor="phase+delay"))
     fold = packets.shares(data, 0, 0.5)
     turned, known = align_phases(data, fold)
     split = SplitSettings(name="blocks", side_m=0.5)

@@ -46,7 +46,7 @@ def test_few_receivers_are_enough_with_directions():
     apart = torch.cdist(torch.from_numpy(sources), found).amin(1)
     assert len(found) == len(sources) == 7 and float(apart.max()) < 0.02
     assert error(method, data, fold.test) < 0.02
-    assert "7 triangulated sources" in note
+    assert "7 sources where directions cross" in note
 
 
 def test_a_search_starts_from_sources_where_rays_meet():
@@ -144,7 +144,7 @@ def test_direction_errors_are_estimated_and_positions_refined_by_phase(degrees):
 def test_missing_and_spurious_rays_neither_add_nor_remove_sources():
     data, fold, _ = directed(60, pillar=True)
     method, note = fitted(add_direction_errors(data, 1.0, seed=1, missing=0.1, false=0.1), fold)
-    assert method.count_components() == 7 and " 0 visibility entries" not in note
+    assert method.count_components() == 7 and " 0 pairs of receiver" not in note
     assert error(method, data, fold.test) < 0.08  # rays alone: 0.17
 
 

@@ -145,7 +145,7 @@ def test_a_search_ends_that_could_add_too_little_to_another_solution(tmp_path, m
 def test_two_searches_at_the_noise_floor_are_enough(tmp_path):
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=0)
     method, report = fitted(data, fold, tmp_path, searches=8, search_rows=60, margin=1.0)
-    assert "of 8 searches (two agree up to noise, enough)" in report.notes[0]
+    assert "of 8 searches (two agree up to noise, which is enough)" in report.notes[0]
     # both threads may have started one more when the second ended
     assert 2 <= len(method.members) <= 2 + torch.get_num_threads()
 

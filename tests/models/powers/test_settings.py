@@ -73,10 +73,10 @@ def test_few_rows_do_not_choose_a_process_that_varies_far_more_than_they_do():
 def test_the_mean_is_chosen_by_likelihood_and_by_name():
     falling, flat = town(60, exponent=4.0, shadowing_db=0.0), town(60, exponent=0.0)
     for data, about, said in (
-        (falling, "auto", "about a distance law of exponent"),
-        (flat, "auto", "about a constant"),
-        (falling, "constant", "about a constant"),
-        (flat, "distance", "about a distance law"),
+        (falling, "auto", "mean: a distance law of exponent"),
+        (flat, "auto", "mean: a constant"),
+        (falling, "constant", "mean: a constant"),
+        (flat, "distance", "mean: a distance law"),
     ):
         assert said in fit(GaussianProcess(mean=about), data, 50)[1][0]
     with pytest.raises(ValueError, match="mean='flat': one of auto, constant, distance is needed"):

@@ -121,7 +121,7 @@ def _fit_site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
     levels, typical = np.array([[part.mean(), part.std()] for part in residuals]).T
     law = replace(law, level=law.level + float(np.median(levels)))  # that of one station may be far off
     trend = Trend.from_law(law, torch.from_numpy(few.places))
-    by = f"law of exponent {law.exponent:.3g}, levels +- {levels.std():.2g} dB"
+    by = f"distance exponent {law.exponent:.3g}, gains +- {levels.std():.2g} dB"
     spread = max(float(np.median(typical)), 0.1) / SLOPE_DB
     return replace(trend, spread=spread), [f"{len(levels)} stations in one model, {by}"]
 
@@ -177,7 +177,7 @@ def learn_shared_terms(rows: StationRows, priors: StationPriors, seed: int) -> t
     terms, _, ratio, _ = best if gain > ERRORS * unsure else plain
     before, after = (math.sqrt(float((one**2).mean())) for one in (others, errors))
     remark = (
-        f"stations left out, after one constant: rmse {before:.3g} dB without shared terms, "
+        f"stations left out, after one constant each: rmse {before:.3g} dB without shared terms, "
         f"{after:.3g} dB with them (gain {gain:.2g} +- {unsure:.2g} dB^2)"
     )
     return terms, min(max(ratio, 1 / WIDEST), WIDEST), remark

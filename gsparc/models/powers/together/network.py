@@ -145,17 +145,19 @@ def learn_network(
     (site, own, bearing, gain, noise), (wide, near) = map(math.sqrt, variances), shadowing.lengths
     exponent, _, wider, higher, floor, tilt = trend.shared.tolist()
     law_note = (
-        f"{len(names)} sectors of {int(network.site.max()) + 1} sites in one model: exponent "
-        f"{exponent:.3g}, levels +- {gain:.2g} dB, shadowing of a site {site:.2g} dB over"
-        f" {wide:.3g} m, of a sector {own:.2g} dB over {near:.3g} m and"
-        f" {bearing:.2g} dB by direction from it, noise {noise:.2g} dB"
+        f"{len(names)} sectors of {int(network.site.max()) + 1} sites in one model: distance exponent "
+        f"{exponent:.3g}, gains +- {gain:.2g} dB, noise {noise:.2g} dB"
+    )
+    shadow_note = (
+        f"shadowing of a site {site:.2g} dB over {wide:.3g} m, of a sector {own:.2g} dB over {near:.3g} m, "
+        f"{bearing:.2g} dB from bearing to bearing"
     )
     beams = (
         f"beams {math.exp(wider):.2f} times as wide and {math.exp(higher):.2f} times as high as listed or "
-        f"usual, floor {floor:.3g} dB, tilts {tilt:+.2g} deg"
+        f"usual, front-to-back ratio {floor:.3g} dB, tilts off by {tilt:+.2g} degrees"
     )
     aimed = [beams] if bool((trend.table[:, 0] != NO_AZIMUTH).any()) else []
-    return evidence, Prior(kernel, replace(trend, more=more)), [law_note, *aimed, *notes]
+    return evidence, Prior(kernel, replace(trend, more=more)), [law_note, shadow_note, *aimed, *notes]
 
 
 def _fit_azimuths(
@@ -269,17 +271,18 @@ def _note_untested(
     farthest = torch.where(alike & (trend.table[:, :1] != NO_AZIMUTH), TURNS.abs(), 0.0).amax(1)
     blind = [t for t in farthest.argsort(descending=True, stable=True) if farthest[t] >= CONTRADICTED_DEG]
     each = [f"{names[t]} {min(float(farthest[t] + TURNS.diff()[0]), 180):.0f} degrees" for t in blind]
-    told = f"the drive would not show errors of azimuths ({len(blind)} of {len(names)}) smaller than these"
+    cells = f"{len(blind)} of {len(names)} cells"
+    told = f"azimuths of {cells} are tested little: smaller errors than these would not show in the drive"
     return [f"{told}: {list_first(each, 30)}"] if blind else []
 
 
 def _note_turned(given: Tensor, found: Tensor, names: tuple[str, ...]) -> list[str]:
     """A note that names all azimuths (T,) [deg] that were turned, also by less in several steps."""
     said = [
-        f"{names[t]} ({given[t]:.0f} deg: levels fit {found[t]:.0f})"
+        f"{names[t]} (listed {given[t]:.0f}, fitted {found[t]:.0f} degrees)"
         for t in torch.nonzero(found != given)[:, 0].tolist()
     ]
-    every = f"azimuths are contradicted by levels, and those that fit are used: {', '.join(said)}"
+    every = f"azimuths are contradicted by levels; the fitted ones are used: {', '.join(said)}"
     return [Caution(every)] if said else []
 
 

@@ -55,7 +55,7 @@ def contradicted(notes: Sequence[str]) -> list[str]:
     """Sectors whose azimuths levels contradict; all are named by one note."""
     said = [note for note in notes if "azimuths are contradicted by levels" in note]
     assert len(said) <= 1
-    return re.findall(r"(\S+) \(\d+ deg: levels fit \d+\)", " ".join(said))
+    return re.findall(r"(\S+) \(listed \d+, fitted \d+ degrees\)", " ".join(said))
 
 
 def levels(method: PerStation, one: Network) -> tuple[np.ndarray, np.ndarray]:
@@ -261,7 +261,9 @@ def test_azimuths_that_no_row_tells_were_not_named():
     none = np.zeros(len(at), int)
     rows = StationRows(places=at.numpy(), decibels=level, side=none, station=none, index=every)
     (note,) = _note_untested(rows, trend, torch.zeros(3), 4.0, ("all around", "ahead", "never"))
-    assert note.endswith("(2 of 3) smaller than these: never 180 degrees, ahead 90 degrees")
+    assert note.startswith("azimuths of 2 of 3 cells") and note.endswith(
+        "never 180 degrees, ahead 90 degrees"
+    )
     turned = replace(trend, table=table + torch.tensor([[120.0, 0, 0, 0, 0], [0] * 5, [0] * 5]))
     assert _correct_azimuths(rows, turned, torch.zeros(3), 4.0).table[:, 0].tolist() == [90, 210, 330]
 

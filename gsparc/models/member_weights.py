@@ -138,7 +138,7 @@ def leave_out_groups(
     return LeftOutRows(np.concatenate(groups), mean, variance)
 
 
-def stack(
+def weigh_members(
     members: Mapping[str, ClosedForm],
     data: Measurements,
     val: np.ndarray,
@@ -173,7 +173,7 @@ def stack(
     if len(rows) < LEAST_HELD:
         log.info("%d rows are too few to weigh solutions by: init=%s alone", len(rows), first)
         return {first: 1.0}
-    if data.site.freedom != "none":  # errors are counted after it
+    if data.site.unknown_factor != "none":  # errors are counted after it
         predicted = [mean * factors_to_measured(mean, data, rows) for mean in predicted]
     predicted = [data.site.target.in_error_unit(mean) for mean in predicted]
     target = data.site.target.in_error_unit(data.batch(rows).target)

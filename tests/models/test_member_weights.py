@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.models.splat.image_process import FEW_ROWS, LEAST_GAIN, SURE
-from gsparc.models.stack import (
+from gsparc.models.member_weights import (
     best_weights,
     choose_weights,
     error_products,
@@ -15,6 +14,7 @@ from gsparc.models.stack import (
     mixture_errors,
     relative_to_row,
 )
+from gsparc.models.splat.image_process import FEW_ROWS, LEAST_GAIN, SURE
 
 EACH = np.arange(50)  # every row is a unit
 TARGET = torch.from_numpy(np.random.default_rng(0).standard_normal((50, 3)))
