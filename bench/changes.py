@@ -253,7 +253,7 @@ def readings(kind, seed, count):
 
 def detections():
     """Alarms of sequences without change, then delays, and what was named, for three kinds."""
-    site = SimpleNamespace(stations=None, moving_box=np.array([[-10.0, -10, 0], [10, 10, 0]]))
+    site = SimpleNamespace(every_station=[0], moving_box=np.array([[-10.0, -10, 0], [10, 10, 0]]))
 
     def alarms(kind, seed, count):
         return Watch.from_site(site).look({0: readings(kind, seed, count)}, 0, 28.0)[0].alarms

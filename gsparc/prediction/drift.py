@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.processes.changes import COMMON, KINDS, SHARE, LaterRows, evidence, innovations
+from gsparc.processes.changes import COMMON, KINDS, LOOKED, SHARE, LaterRows, evidence, innovations
 from gsparc.processes.places import horizontal, moving_end
 from gsparc.processes.stored import Stored
 
@@ -31,7 +31,6 @@ MIXED = 0.5  # share of rows that a change is sought in: of a local one not all 
 SIDES = 4  # cells along each side of the place
 AS_ALL = 20.0  # evidence that all stations miss alike, from which on an alarm of one is called theirs
 DEVICE = 2  # of KINDS: the offset that is expected after an alarm of all stations
-NAMED = 40  # rows of a station since a change that tell its kind
 LOUD = 2.0  # deviations of a row that lies in a local change
 SPREAD = 3  # cells that rows must be of to tell an offset from a local change
 SILENT = 0.5  # share of rows since a change in which a station is not heard any more: it is gone
@@ -187,16 +186,19 @@ class Watch(Stored):
             self.detector[streams], self.total[streams] = -np.inf, 0.0
             self.begun[name] = since
         noted = Alarm(who, RETURNED if stream > self.every else "", since, number, 0.0, (0.0, 0.0))
-        return replace(self, alarms=(*self.alarms, noted))._named(stations, extent)
+        # Rows from then on tell nothing of the changes before.
+        earlier = self._named({n: one[one.number < since] for n, one in stations.items()}, extent)
+        return replace(earlier, alarms=(*earlier.alarms, noted))._named(stations, extent)
 
     def _named(self, stations: Mapping[int, LaterRows], extent: float) -> Watch:
-        """The same with each station's last alarm named by the first rows since, more than then."""
+        """The same with each station's last alarm named by rows since, more than then."""
         alarms = list(self.alarms)
         for turn in sorted({alarm.station: turn for turn, alarm in enumerate(alarms)}.values()):
             alarm, who = alarms[turn], alarms[turn].station
             names = [*stations] if who < 0 else [who]
             since = [stations[n][stations[n].number >= alarm.since] for n in names if n in stations]
-            group = reduce(LaterRows.join, [rows[:NAMED] for rows in since], LaterRows.empty())
+            parts = [rows.spread(extent, LOOKED) for rows in since]
+            group = reduce(LaterRows.join, parts, LaterRows.empty())
             if not len(group):  # these rows were forgotten
                 continue
             kind = _find_kind(alarm, group, extent, len(np.unique(self.cells(group.places))))

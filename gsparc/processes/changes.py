@@ -25,7 +25,8 @@ from gsparc.processes.kernel import distances, matern32
 from gsparc.processes.stored import Stored
 
 ERRORS = 1 / 20  # length of a map's own errors between its rows, as a share of the site
-NEAR, LOOKED = 64, 40  # rows that tell of a place; latest ones of a station that tell its kind of change
+NEAR, LOOKED = 64, 60  # rows that tell of a place; ones of a station that tell its kind of change
+PART, RADIX = 1 / 5, 1000  # side of the parts of a place that these are of, as a share; more than parts
 BLOCK = 64  # queries at a time where each has neighbours of its own: memory
 NOISES = torch.tensor(
     (0.0, 1.0, 4.0, 12.0, 36.0)
@@ -157,6 +158,18 @@ class LaterRows(Stored):
         pairs = zip(vars(self).values(), vars(later).values(), strict=True)
         return LaterRows(*(torch.cat(pair) for pair in pairs))
 
+    def spread(self, extent: float, most: int) -> LaterRows:
+        """Return so many rows at most, the latest of each part of a site of this extent before others [m].
+
+        Rows of a walk that ends elsewhere are no reason to forget what was changed.
+        """
+        places = self.places.flip(0)
+        part = (places / (extent * PART)).floor() @ (RADIX ** torch.arange(places.shape[1])).double()
+        parts, order = part.sort(stable=True)
+        turn = torch.empty_like(order)
+        turn[order] = torch.arange(len(order)) - torch.searchsorted(parts, parts)
+        return self[(len(order) - 1 - turn.argsort(stable=True)[:most]).sort().values]
+
     @property
     def middle(self) -> Tensor:
         """What a map that tells nothing any more is taken for [dB]."""
@@ -203,14 +216,14 @@ def _values(rows: LaterRows, common: float) -> Tensor:
 def evidence(
     stations: Sequence[LaterRows], extent: float, common: float, scale: float = 1.0, looked: int = LOOKED
 ) -> Tensor:
-    """Return log densities (T, len(NOISES), K) of the `looked` latest rows of each station [nats].
+    """Return log densities (T, len(NOISES), K) of `looked` rows of each station, spread over places [nats].
 
     Args:
         stations: rows of each.
         extent, common, scale: see `Belief`.
         looked: rows of a station, at most.
     """
-    every = [rows[-looked:] for rows in stations]
+    every = [rows.spread(extent, looked) for rows in stations]
     most = max(len(rows) for rows in every)
     # Stations of fewer rows get rows of endless noise, which tell nothing of kinds.
     missed = torch.stack([_padded(_values(rows, common).T, most) for rows in every]).mT

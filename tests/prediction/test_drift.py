@@ -49,7 +49,7 @@ def test_a_local_change_is_placed():
 
 
 def test_a_change_is_noticed_once_and_its_end_is_named():
-    parts = later_rows(100, 4), later_rows(400, 5, change=-12.0), later_rows(150, 6)
+    parts = later_rows(100, 7), later_rows(400, 8, change=-12.0), later_rows(150, 9)
     every = parts[0].join(parts[1]).join(parts[2])
     rows = LaterRows(torch.arange(len(every)), *list(vars(every).values())[1:])
     first, last = alarms_of({0: rows})

@@ -116,3 +116,12 @@ def test_rows_that_are_contradicted_fade_and_others_keep_their_weight():
     near = np.linalg.norm(before.places[:, :2].numpy() - 5, axis=1)
     assert faded[near < 2].min() > 10 and faded[near > 8].median() < 0.1
     assert before.fade(later_rows(100, 7), EXTENT, 1.0).faded.median() == pytest.approx(1, abs=0.2)
+
+
+def test_a_walk_elsewhere_is_no_reason_to_forget_a_change():
+    rows, walk = later_rows(60, 2, change=-12.0), later_rows(80, 30)
+    far = replace(walk, places=walk.places / 2 + torch.tensor([10.0, 10.0, 0.75]))
+    there = np.array([[5.0, 5.0, 1.5], [4.0, 6.0, 1.5]])
+    before, after = (asked(learn({0: one}, EXTENT), one, there).mean for one in (rows, rows.join(far)))
+    assert (before < -65).all() and after == pytest.approx(before, abs=1)
+    assert len(rows.join(far).spread(EXTENT, 40)) == 40
