@@ -523,7 +523,7 @@ if __name__ == "__main__":
     logging.disable(logging.WARNING)
     for name in sys.argv[1:] or PARTS:
         with OUT.open(newline="") as file:
-            rows = {tuple(row[:4]): row for row in csv.reader(file)}
-        rows |= {tuple(map(str, row[:4])): row for row in map(list, PARTS[name]())}
+            rows = {tuple(row[:3]): row for row in csv.reader(file)}
+        rows |= {tuple(map(str, row[:3])): row for row in map(list, PARTS[name]())}
         with OUT.open("w", newline="") as file:  # of the same figure the last one
             csv.writer(file, lineterminator="\n").writerows(rows.values())

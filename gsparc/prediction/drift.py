@@ -157,8 +157,8 @@ class Watch(Stored):
         """A copy with the streams that one which saw nothing, or an older file's, lacks."""
         more = ((0, self.every + 1 + len(self.begun) - len(self.detector)), (0, 0))
         detector = np.pad(self.detector, more, constant_values=-np.inf)
-        sums = {"total": np.pad(self.total, more), "since": np.pad(self.since, more)}
-        return replace(deepcopy(self), detector=detector, **sums)
+        total, since = np.pad(self.total, more), np.pad(self.since, more)
+        return replace(deepcopy(self), detector=detector, total=total, since=since)
 
     def _advance(self, stream: int, number: int, ratio: np.ndarray | float, rows: float) -> bool:
         """Whether a stream's detector, in place one row further, raises an alarm."""
