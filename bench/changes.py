@@ -253,7 +253,7 @@ def readings(kind, seed, count):
 
 def detections():
     """Alarms of sequences without change, then delays, and what was named, for three kinds."""
-    site = SimpleNamespace(stations=None, moving_box=np.array([[-10.0, -10, 0], [10, 10, 0]]))
+    site = SimpleNamespace(every_station=[0], moving_box=np.array([[-10.0, -10, 0], [10, 10, 0]]))
 
     def alarms(kind, seed, count):
         return Watch.from_site(site).look({0: readings(kind, seed, count)}, 0, 28.0)[0].alarms
@@ -523,7 +523,7 @@ if __name__ == "__main__":
     logging.disable(logging.WARNING)
     for name in sys.argv[1:] or PARTS:
         with OUT.open(newline="") as file:
-            rows = {tuple(row[:4]): row for row in csv.reader(file)}
-        rows |= {tuple(map(str, row[:4])): row for row in map(list, PARTS[name]())}
+            rows = {tuple(row[:3]): row for row in csv.reader(file)}
+        rows |= {tuple(map(str, row[:3])): row for row in map(list, PARTS[name]())}
         with OUT.open("w", newline="") as file:  # of the same figure the last one
             csv.writer(file, lineterminator="\n").writerows(rows.values())

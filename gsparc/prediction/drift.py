@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.processes.changes import COMMON, KINDS, SHARE, LaterRows, evidence, innovations
+from gsparc.processes.changes import COMMON, KINDS, LOOKED, SHARE, LaterRows, evidence, innovations
 from gsparc.processes.places import horizontal, moving_end
 from gsparc.processes.stored import Stored
 
@@ -31,12 +31,12 @@ MIXED = 0.5  # share of rows that a change is sought in: of a local one not all 
 SIDES = 4  # cells along each side of the place
 AS_ALL = 20.0  # evidence that all stations miss alike, from which on an alarm of one is called theirs
 DEVICE = 2  # of KINDS: the offset that is expected after an alarm of all stations
-NAMED = 40  # rows of a station since a change that tell its kind
 LOUD = 2.0  # deviations of a row that lies in a local change
 SPREAD = 3  # cells that rows must be of to tell an offset from a local change
 SILENT = 0.5  # share of rows since a change in which a station is not heard any more: it is gone
 MIXING = 1e6  # [m] between updates, further than any place is away
-ROW = [("number", int), ("station", int), ("cell", int), ("surprise", float), ("place", float)]
+RETURNED = "returned"  # the kind of an alarm with which a station is as the map says again
+ROW = [(n, int) for n in ("number", "station", "cell")] + [(n, float) for n in ("surprise", "back", "place")]
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Alarm(Stored):
 
     Attributes:
         station: its number; -1: all alike, as of another device.
-        kind: `device`, `offset`, `local`, `moved` or `gone`.
+        kind: `device`, `offset`, `local`, `moved` or `gone`; `returned`: as the map says again.
         since, at: numbers of the rows it seems to have begun with, and that raised the alarm.
         change_db: mean that was missed since [dB].
         place: (2,) middle of the part of the place, local [m]; of other kinds the middle of the rows since.
@@ -65,7 +65,8 @@ class Watch(Stored):
 
     Attributes:
         low, side: corner (2,) and side (2,) of cells [m].
-        detector: (T + T cells + 1, sizes) logarithms of detectors: of stations, of their cells, of all.
+        detector: (T + T cells + 1 + T, sizes) logarithms of detectors: of stations, of their cells, of all,
+            of what changed at a station being as the map says again.
         total: the same, sums of log ratios since these were last below 0 (E. S. Page, Biometrika 41 (1954)).
         since: the same, number of the row with which that sum began: the change is dated to it.
         kind: (T,) of the change that is expected since the last alarm, see `gsparc.processes.changes.KINDS`.
@@ -85,11 +86,10 @@ class Watch(Stored):
     @classmethod
     def from_site(cls, site: Site) -> Watch:
         """Return one that has seen nothing."""
-        count, box = len(site.every_station), site.moving_box[:, :2]
-        shape = count * (1 + SIDES**2) + 1, len(SIZES)
-        kinds, begun = np.zeros((2, count), np.int64)
-        empty = np.full(shape, -np.inf), np.zeros(shape), np.zeros(shape, np.int64), kinds, begun
-        return cls(box[0], np.maximum(np.ptp(box, axis=0), 1e-3) / SIDES, *empty)
+        box, none = site.moving_box[:, :2], np.zeros((0, len(SIZES)))
+        kinds, begun = np.zeros((2, len(site.every_station)), np.int64)
+        side = np.maximum(np.ptp(box, axis=0), 1e-3) / SIDES
+        return cls(box[0], side, none, none, none.astype(np.int64), kinds, begun)
 
     def cells(self, places: Tensor) -> np.ndarray:
         """Return the number (n,) of the cell of places (n, 3) or (n, 6)."""
@@ -108,24 +108,23 @@ class Watch(Stored):
             extent: of the site [m].
             rows: to a false alarm, at least, in the mean.
         """
-        result, surprises, alarmed = deepcopy(self), [np.zeros(0)], True
+        result, surprises, alarmed = self._with_all_streams(), [np.zeros(0)], True
         while alarmed:
             # After an alarm others are expected, of which later rows miss something else.
             table, alarmed = result._surprises(stations, first, extent), False
             last, begin = np.diff(table["place"], append=np.inf) != 0, 0
             for turn, row in enumerate(table):
                 name, base = int(row["station"]), len(result.begun) + int(row["station"]) * SIDES**2
-                streams = [name, base + int(row["cell"])]
-                means = [row["surprise"]] * 2
+                ratio, number = _ratio(row["surprise"]), int(row["number"])
+                each = {name: ratio, base + int(row["cell"]): ratio}
                 if last[turn] and len(result.begun) >= COMMON:  # mean over stations heard at one place
-                    streams.append(-1)
-                    means.append(table["surprise"][begin : turn + 1].mean())
+                    each[result.every] = _ratio(table["surprise"][begin : turn + 1].mean())
                 begin = turn + 1 if last[turn] else begin
-                each, number = zip(streams, means, strict=True), int(row["number"])
-                raised = [stream for stream, mean in each if result._advance(stream, number, mean, rows)]
+                if result.kind[name]:
+                    each[result.every + 1 + name] = row["back"]
+                raised = [key for key, one in each.items() if result._advance(key, number, one, rows)]
                 if raised:
-                    every = result._evidence(-1) > math.log(AS_ALL)
-                    result = result._note(row, -1 if every else raised[-1], stations, extent)
+                    result = result._note(row, raised[-1], stations, extent)
                     first, alarmed, table = number + 1, True, table[: turn + 1]
                     break
             surprises.append(table["surprise"])
@@ -139,25 +138,36 @@ class Watch(Stored):
             start = int((later.number < first).sum())
             if start == len(later):
                 continue
-            off, variance = innovations(later, start, extent, int(self.kind[station]))
-            part = np.zeros(len(off), ROW)
+            surprise, back = innovations(later, start, extent, bool(self.kind[station]))
+            part = np.zeros(len(surprise), ROW)
             part["number"], part["station"] = later.number[start:], station
             part["cell"] = self.cells(later.places[start:])
-            part["surprise"] = off / variance.sqrt()
+            part["surprise"], part["back"] = surprise, back
             # The same number for rows of one place and update alone.
             part["place"] = later.places[start:].sum(1) + MIXING * later.batch[start:]
             parts.append(part)
         return np.sort(np.concatenate(parts), order="number")
 
-    def _advance(self, stream: int, number: int, surprise: float, rows: float) -> bool:
+    @property
+    def every(self) -> int:
+        """Number of the stream of all stations."""
+        return len(self.begun) * (1 + SIDES**2)
+
+    def _with_all_streams(self) -> Watch:
+        """A copy with the streams that one which saw nothing, or an older file's, lacks."""
+        more = ((0, self.every + 1 + len(self.begun) - len(self.detector)), (0, 0))
+        detector = np.pad(self.detector, more, constant_values=-np.inf)
+        total, since = np.pad(self.total, more), np.pad(self.since, more)
+        return replace(deepcopy(self), detector=detector, total=total, since=since)
+
+    def _advance(self, stream: int, number: int, ratio: np.ndarray | float, rows: float) -> bool:
         """Whether a stream's detector, in place one row further, raises an alarm."""
         detector, total, count = self.detector[stream], self.total[stream], len(self.begun)
-        ratio = np.log(1 - MIXED + MIXED * np.exp(SIZES * np.clip(surprise, -CLIP, CLIP) - SIZES**2 / 2))
         self.since[stream, total <= 0] = number
         total[:] = np.maximum(total, 0) + ratio
         detector[:] = np.logaddexp(detector, 0) + ratio
         # A third of all alarms for each family of streams, in equal shares.
-        family = 1 if stream == -1 else count if stream < count else count * SIDES**2
+        family = 1 if stream == self.every else count * SIDES**2 if count <= stream < self.every else count
         return self._evidence(stream) >= math.log(3 * family * rows)
 
     def _evidence(self, stream: int) -> float:
@@ -166,41 +176,54 @@ class Watch(Stored):
 
     def _note(self, row: np.ndarray, stream: int, stations: Mapping[int, LaterRows], extent: float) -> Watch:
         """The state after an alarm: a change since it was dated is from now on expected."""
+        alike = self._evidence(self.every) > math.log(AS_ALL)
+        stream = self.every if alike and stream < self.every else stream
         since = int(self.since[stream, self.total[stream].argmax()])
-        who, number = -1 if stream == -1 else int(row["station"]), int(row["number"])
+        who, number = -1 if alike else int(row["station"]), int(row["number"])
         for name in stations if who < 0 else (who,):
             begin = len(self.begun) + name * SIDES**2
-            streams = [name, *range(begin, begin + SIDES**2), -1]
+            streams = [name, *range(begin, begin + SIDES**2), self.every, self.every + 1 + name]
             self.detector[streams], self.total[streams] = -np.inf, 0.0
             self.begun[name] = since
-        noted = Alarm(who, "", since, number, 0.0, (0.0, 0.0))
-        return replace(self, alarms=(*self.alarms, noted))._named(stations, extent)
+        noted = Alarm(who, RETURNED if stream > self.every else "", since, number, 0.0, (0.0, 0.0))
+        # Rows from then on tell nothing of the changes before.
+        earlier = self._named({n: one[one.number < since] for n, one in stations.items()}, extent)
+        return replace(earlier, alarms=(*earlier.alarms, noted))._named(stations, extent)
 
     def _named(self, stations: Mapping[int, LaterRows], extent: float) -> Watch:
-        """The same with each station's last alarm named by the first rows since, more than then."""
-        last = {alarm.station: turn for turn, alarm in enumerate(self.alarms)}
+        """The same with each station's last alarm named by rows since, more than then."""
         alarms = list(self.alarms)
-        for who, turn in last.items():
-            alarm, names = alarms[turn], [*stations] if who < 0 else [who]
+        for turn in sorted({alarm.station: turn for turn, alarm in enumerate(alarms)}.values()):
+            alarm, who = alarms[turn], alarms[turn].station
+            names = [*stations] if who < 0 else [who]
             since = [stations[n][stations[n].number >= alarm.since] for n in names if n in stations]
-            group = reduce(LaterRows.join, [rows[:NAMED] for rows in since], LaterRows.empty())
+            parts = [rows.spread(extent, LOOKED) for rows in since]
+            group = reduce(LaterRows.join, parts, LaterRows.empty())
             if not len(group):  # these rows were forgotten
                 continue
-            kind = DEVICE if who < 0 else _find_kind(group, extent, len(np.unique(self.cells(group.places))))
+            kind = _find_kind(alarm, group, extent, len(np.unique(self.cells(group.places))))
             silent = group.silent.double().mean() > SILENT
             off = group.missed.abs() > LOUD * (group.doubt + group.noise).sqrt()
             # Of a part of the place only the rows that lie in it tell how much.
             group = group[off] if KINDS[kind].name == "local" and off.any() else group
             where = tuple(horizontal(moving_end(group.places.numpy())).mean(0).tolist())
             called = "device" if who < 0 else "gone" if silent else KINDS[kind].name
+            called = called if kind else RETURNED
             self.kind[names] = kind
             alarms[turn] = replace(alarm, kind=called, change_db=float(group.missed.mean()), place=where)
         return replace(self, alarms=tuple(alarms))
 
 
-def _find_kind(rows: LaterRows, extent: float, cells: int) -> int:
+def _find_kind(alarm: Alarm, rows: LaterRows, extent: float, cells: int) -> int:
     """Number of the kind of change that makes rows since it likeliest, which lie in so many cells."""
+    if alarm.kind == RETURNED or alarm.station < 0:
+        return 0 if alarm.kind == RETURNED else DEVICE
     likely = evidence([rows], extent, 0.0)[0, 0] + SHARE.log()
     # Of few cells an offset would look alike.
     there = [one.name == "local" or (one.name != "none" and cells >= SPREAD) for one in KINDS]
     return int(torch.where(torch.tensor(there), likely, -math.inf).argmax())
+
+
+def _ratio(surprise: float) -> np.ndarray:
+    """Log ratios of likelihoods (sizes,) of a surprise."""
+    return np.log(1 - MIXED + MIXED * np.exp(SIZES * np.clip(surprise, -CLIP, CLIP) - SIZES**2 / 2))

@@ -25,7 +25,8 @@ from gsparc.processes.kernel import distances, matern32
 from gsparc.processes.stored import Stored
 
 ERRORS = 1 / 20  # length of a map's own errors between its rows, as a share of the site
-NEAR, LOOKED = 64, 40  # rows that tell of a place; latest ones of a station that tell its kind of change
+NEAR, LOOKED = 64, 60  # rows that tell of a place; ones of a station that tell its kind of change
+PART, RADIX = 1 / 5, 1000  # side of the parts of a place that these are of, as a share; more than parts
 BLOCK = 64  # queries at a time where each has neighbours of its own: memory
 NOISES = torch.tensor(
     (0.0, 1.0, 4.0, 12.0, 36.0)
@@ -41,6 +42,8 @@ ALIKE, COUNTS = (
 WHOLE = 4  # power of the share of the place that rows lie in: whether a lone station was moved
 AWAY = 1 / 10  # length over which rows of a lone station that seems moved void the map: a local change's
 SURE = 3.0  # deviations by which rows that came before must be contradicted to fade
+CHANGED = 3  # of KINDS: the change that is expected of a station once one was noticed
+UNSEEN, RARE = 0.1, 1e-12  # rows that a share of none counts as; least probability of a row
 TOLD, UNTOLD = 16, 1e9  # earlier rows that tell of the next one; noise of one that is not there [dB^2]
 REFITTED = 200  # latest rows of a station that tell the lengths of changes
 STEPS, OCTAVES = (1.0, 0.5, 2**-0.5, 2**0.5, 2.0), 2.0  # of a scale that are tried; deviations of an octave
@@ -155,6 +158,18 @@ class LaterRows(Stored):
         pairs = zip(vars(self).values(), vars(later).values(), strict=True)
         return LaterRows(*(torch.cat(pair) for pair in pairs))
 
+    def spread(self, extent: float, most: int) -> LaterRows:
+        """Return so many rows at most, the latest of each part of a site of this extent before others [m].
+
+        Rows of a walk that ends elsewhere are no reason to forget what was changed.
+        """
+        places = self.places.flip(0)
+        part = (places / (extent * PART)).floor() @ (RADIX ** torch.arange(places.shape[1])).double()
+        parts, order = part.sort(stable=True)
+        turn = torch.empty_like(order)
+        turn[order] = torch.arange(len(order)) - torch.searchsorted(parts, parts)
+        return self[(len(order) - 1 - turn.argsort(stable=True)[:most]).sort().values]
+
     @property
     def middle(self) -> Tensor:
         """What a map that tells nothing any more is taken for [dB]."""
@@ -164,15 +179,16 @@ class LaterRows(Stored):
         """Return the rows with the variance that their age adds, and what later ones contradict of them.
 
         Of what the means of both miss nearby, first of an offset of all, then of what is left, the square
-        counts beyond `SURE` deviations.
+        counts beyond `SURE` deviations. Nearby is near: on either side of an edge rows are right.
         """
-        near = matern32(distances(later.places, self.places), extent / 10) + TINY
+        near = matern32(distances(later.places, self.places), extent * ERRORS) + TINY
         total, spread = near.sum(1), self.doubt + self.noise + self.faded
         off = later.missed - near @ self.missed / total
         error = later.doubt + later.noise + near.square() @ spread / total.square()
-        offset, unsure = off.mean(), SURE**2 * error.mean() / len(off)
-        added = (offset.square() - unsure).clamp_min(0.0)
-        residual, total = off - offset * (added > 0), near.sum(0)
+        # One row tells of no offset; those of a part of the place miss alike, too.
+        unsure = SURE**2 * (error.mean() + LOCAL[CHANGED].square()) / (len(off) - 1)
+        added = (off.mean().square() - unsure).clamp_min(0.0)
+        residual, total = off - off.mean() * (added > 0), near.sum(0)
         local = (residual @ near / total).square() - SURE**2 * (error @ near.square()) / total.square()
         aged = fade_db**2 * len(later) / HUNDRED
         return replace(self, faded=self.faded + aged + added + near.amax(0) * local.clamp_min(0.0))
@@ -200,14 +216,14 @@ def _values(rows: LaterRows, common: float) -> Tensor:
 def evidence(
     stations: Sequence[LaterRows], extent: float, common: float, scale: float = 1.0, looked: int = LOOKED
 ) -> Tensor:
-    """Return log densities (T, len(NOISES), K) of the `looked` latest rows of each station [nats].
+    """Return log densities (T, len(NOISES), K) of `looked` rows of each station, spread over places [nats].
 
     Args:
         stations: rows of each.
         extent, common, scale: see `Belief`.
         looked: rows of a station, at most.
     """
-    every = [rows[-looked:] for rows in stations]
+    every = [rows.spread(extent, looked) for rows in stations]
     most = max(len(rows) for rows in every)
     # Stations of fewer rows get rows of endless noise, which tell nothing of kinds.
     missed = torch.stack([_padded(_values(rows, common).T, most) for rows in every]).mT
@@ -349,26 +365,45 @@ def _solve(
 
 
 @torch.no_grad()
-def innovations(rows: LaterRows, first: int, extent: float, kind: int = 0) -> MeanVariance:
-    """Return what rows from `first` on miss of map and earlier rows, and variances, given a kind of change.
+def innovations(rows: LaterRows, first: int, extent: float, changed: bool = False) -> tuple[Tensor, Tensor]:
+    """Return surprises (n,) of rows from `first` on [deviations], and log ratios (n,) of a return to the map.
 
-    Each is told of by its nearest earlier rows; such errors are independent where the kind is the right one.
+    Each is told of by its nearest earlier rows; surprises are independent and normal. Where a part of the
+    place has changed, a row is in it or is not, as likely as rows near it are, so that edges surprise little.
+    Ratios are of a world where what lies in it is as the map says, to one where it stays as it is.
     """
-    count = len(rows)
+    kind, count = CHANGED if changed else 0, len(rows)
     new, order = torch.arange(first, count), torch.arange(count)
     distance = distances(rows.places[first:], rows.places)
     distance[order >= new[:, None]] = math.inf
     near = distance.topk(min(TOLD, count), largest=False)
-    unknown = near.values.isinf()  # of the first rows there are fewer
-    at, index = rows[new], near.indices
-    past = rows[index]
-    one = slice(kind, kind + 1)
-    gram = _covariance(past.places, past.places, past.doubt, past.doubt, extent, kinds=one)[:, 0]
-    gram.diagonal(dim1=-2, dim2=-1).add_(past.noise + past.faded + torch.where(unknown, UNTOLD, TINY))
-    cross = _covariance(at.places[:, None], past.places, at.doubt[:, None], past.doubt, extent, kinds=one)[
-        :, 0
-    ]
+    at, past = rows[new], rows[near.indices]
+    unknown = torch.where(near.values.isinf(), UNTOLD, 0.0)  # of the first rows there are fewer
+    size, told = OFFSET[kind].square() + LOCAL[kind].square(), past.doubt + past.noise + unknown
+    outside = (_log_normal(past.missed, told) - _log_normal(past.missed, told + size)).sigmoid()
+    # What is outside tells nothing of the change.
+    noise = past.noise + past.faded + unknown + TINY + size * outside / (1 - outside + TINY)
+    alike = (extent, 1.0, slice(kind, kind + 1))
+    gram = _covariance(past.places, past.places, past.doubt, past.doubt, *alike)[:, 0]
+    gram.diagonal(dim1=-2, dim2=-1).add_(noise)
+    cross = _covariance(at.places[:, None], past.places, at.doubt[:, None], past.doubt, *alike)[:, 0]
     weights = Factor.from_gram(gram, "raise").solve(cross.mT)[..., 0]
-    prior = KEEPS[kind] * at.doubt + OFFSET[kind].square() + LOCAL[kind].square()
-    variance = prior + at.noise - (weights * cross[:, 0]).sum(1)
-    return MeanVariance(at.missed - (weights * past.missed).sum(1), variance.clamp_min(TINY))
+    off = at.missed - (weights * past.missed).sum(1)
+    free = at.doubt + at.noise
+    variance = (free + size - (weights * cross[:, 0]).sum(1)).clamp_min(TINY)
+    surprise = off / variance.sqrt()
+    if not changed:
+        return surprise, torch.zeros_like(surprise)
+    close = matern32(near.values, extent * ERRORS).nan_to_num()
+    close = close * (told + size) / (told + size + past.faded)
+    share = ((close * outside).sum(1) + UNSEEN / 2) / (close.sum(1) + UNSEEN)
+    as_mapped, inside = _log_normal(at.missed, free), _log_normal(off, variance)
+    density = torch.logaddexp(share.log() + as_mapped, (1 - share).log() + inside)
+    below = share * torch.special.ndtr(at.missed / free.sqrt()) + (1 - share) * torch.special.ndtr(surprise)
+    ratio = (share + (1 - share) * (as_mapped - density).exp()).log()
+    return torch.special.ndtri(below.clamp(RARE, 1 - RARE)), ratio
+
+
+def _log_normal(values: Tensor, variance: Tensor) -> Tensor:
+    """Log densities of values whose mean is 0, but for a constant."""
+    return -0.5 * (values.square() / variance + variance.log())

@@ -48,6 +48,23 @@ def test_a_local_change_is_placed():
     assert np.linalg.norm(np.array(alarm.place) - CABINET) < 3 and alarm.change_db < -6
 
 
+def test_a_change_is_noticed_once_and_its_end_is_named():
+    parts = later_rows(100, 7), later_rows(400, 8, change=-12.0), later_rows(150, 9)
+    every = parts[0].join(parts[1]).join(parts[2])
+    rows = LaterRows(torch.arange(len(every)), *list(vars(every).values())[1:])
+    first, last = alarms_of({0: rows})
+    assert first.kind == "local" and 100 <= first.at < 180
+    assert last.kind == "returned" and 500 <= last.at < 560 and abs(last.change_db) < 1
+
+
+def test_files_of_before_returns_were_told_are_followed_on():
+    watch = Watch.from_site(site()).look({0: later_rows(5, 3)}, 0, EXTENT)[0]
+    older = {name: getattr(watch, name)[:-1] for name in ("detector", "total", "since")}
+    rows = later_rows(9, 3)
+    now, then = (one.look({0: rows}, 5, EXTENT)[0] for one in (watch, replace(watch, **older)))
+    assert (now.detector == then.detector).all()
+
+
 def test_a_station_that_is_heard_no_more_is_gone():
     rows = sequence(2, offset=-20.0)
     gone = LaterRows(*list(vars(rows).values())[:-1], rows.number >= BEGIN)

@@ -90,10 +90,24 @@ def test_no_system_is_larger_than_the_nearest_rows(monkeypatch):
 
 
 def test_innovations_of_a_map_that_holds_are_white():
-    off, variance = innovations(later_rows(600, 4), 0, EXTENT)
-    surprise = off / variance.sqrt()
+    surprise, _ = innovations(later_rows(600, 4), 0, EXTENT)
     assert surprise.square().mean() == pytest.approx(1, abs=0.15)
     assert abs(np.corrcoef(surprise[1:], surprise[:-1])[0, 1]) < 0.12
+
+
+def test_edges_of_a_change_surprise_little_and_what_returned_is_told_by_ratios():
+    surprise, ratio = innovations(later_rows(600, 4, change=-12.0), 0, EXTENT, changed=True)
+    assert surprise.square().mean() < 1.1 and (surprise.abs() > 3).double().mean() < 0.005
+    assert ratio.exp().mean() == pytest.approx(1, abs=0.05)
+    both = later_rows(300, 5, change=-12.0).join(later_rows(60, 6))
+    surprise, ratio = innovations(both, 300, EXTENT, changed=True)
+    assert ratio.sum() > 8 and ratio.min() > -1.5
+
+
+def test_one_row_that_is_off_fades_none_elsewhere():
+    before, row = later_rows(100, 5), later_rows(1, 6, offset=-15.0)
+    far = np.linalg.norm((before.places - row.places)[:, :2].numpy(), axis=1) > 8
+    assert before.fade(row, EXTENT, 0.0).faded[far].max() < 0.5
 
 
 def test_rows_that_are_contradicted_fade_and_others_keep_their_weight():
@@ -102,3 +116,12 @@ def test_rows_that_are_contradicted_fade_and_others_keep_their_weight():
     near = np.linalg.norm(before.places[:, :2].numpy() - 5, axis=1)
     assert faded[near < 2].min() > 10 and faded[near > 8].median() < 0.1
     assert before.fade(later_rows(100, 7), EXTENT, 1.0).faded.median() == pytest.approx(1, abs=0.2)
+
+
+def test_a_walk_elsewhere_is_no_reason_to_forget_a_change():
+    rows, walk = later_rows(60, 2, change=-12.0), later_rows(80, 30)
+    far = replace(walk, places=walk.places / 2 + torch.tensor([10.0, 10.0, 0.75]))
+    there = np.array([[5.0, 5.0, 1.5], [4.0, 6.0, 1.5]])
+    before, after = (asked(learn({0: one}, EXTENT), one, there).mean for one in (rows, rows.join(far)))
+    assert (before < -65).all() and after == pytest.approx(before, abs=1)
+    assert len(rows.join(far).spread(EXTENT, 40)) == 40
