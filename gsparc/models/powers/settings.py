@@ -35,7 +35,7 @@ from gsparc.processes.kernel import (
     median_distance,
 )
 from gsparc.processes.left_out import left_out_residuals, rows_of_groups
-from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
+from gsparc.processes.nearest import FEW, choose_kernel_by_nearest, condition_on_nearest
 from gsparc.processes.places import has_both_ends
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, PowerRows, condition_on_powers, trend_about_rows
@@ -171,7 +171,7 @@ def mix_candidates(
     posteriors = [condition_on_powers(part, one.prior, seed)[0].posterior for one in candidates]
     # Of all rows: drawn ones are farther apart than those that will answer.
     values = rows.measured_rows.means_at_places()
-    near = [condition_on_nearest(one.prior, values, seed).left_out().mean for one in candidates]
+    near = [condition_on_nearest(one.prior, values, seed, cover=FEW).left_out().mean for one in candidates]
     gram = AMONG_ROWS * _relative_gram([(values.values - mean)[:, 0].numpy() for mean in near])
     for sides in SPANS:
         gram += _relative_gram([_errors_without_squares(one, sides) for one in posteriors]) / len(SPANS)
