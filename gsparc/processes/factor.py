@@ -1,7 +1,7 @@
 """Cholesky factors of covariances, and all that is solved with them.
 
 LAPACK in place factors a single matrix without gradients, and solves for many columns, in .4 to .9 of torch's
-time from some hundred rows on. Few rows, single columns, inverses, batches, gradients and
+time from some hundred rows on. Few rows, inverses, batches, gradients and
 matrices worth several threads go to torch.
 """
 
@@ -65,8 +65,8 @@ class Factor:
 
         Args:
             covariance: real or complex.
-            failing: what follows where there is none: a ridge (of a single matrix), an error, or nothing:
-                of a batch of steps some may fail.
+            failing: what follows where there is none: a ridge, an error, or nothing: of a batch of steps some
+                may fail.
 
         Raises:
             NotDefiniteError: it has no factor, nor with the largest ridge.
@@ -75,8 +75,10 @@ class Factor:
         lower, failed = _cholesky(covariance)
         if not failed or failing == "ignore":
             return cls(lower)
-        if failing == "raise" or covariance.dim() > 2:
+        if failing == "raise":
             raise NotDefiniteError("a covariance is not positive definite")
+        if covariance.dim() > 2:
+            return cls(torch.stack([cls.from_gram(one).lower for one in covariance]))
         exact = covariance.to(torch.complex128 if covariance.is_complex() else torch.float64)
         exact = exact.clone() if exact is covariance else exact
         bound, added = ROUNDING * float(exact.diagonal().real.sum()), 0.0
@@ -114,7 +116,7 @@ class Factor:
         if values.is_complex() and not self.lower.is_complex():
             return solve_as_pairs(self.solve, values)
         values = values.to(self.lower.dtype)
-        if values.shape[-1] == 1 or not _suits_lapack(self.lower, values):
+        if not _suits_lapack(self.lower, values):
             return torch.cholesky_solve(values, self.lower)
         return self._solve_triangular(self.whiten(values), adjoint=True)
 
