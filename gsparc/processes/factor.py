@@ -55,7 +55,9 @@ class Factor:
     lower: Tensor
 
     @classmethod
-    def from_gram(cls, covariance: Tensor, failing: Literal["mend", "raise", "ignore"] = "mend") -> Factor:
+    def from_gram(
+        cls, covariance: Tensor, failing: Literal["mend", "raise", "ignore"] = "mend", overwrite: bool = False
+    ) -> Factor:
         """Factor a Hermitian covariance (..., n, n); in float64 and with a ridge where there is none without.
 
         Nearly noise-free rows at neighbouring places are alike to the last digit: a covariance of theirs is
@@ -67,12 +69,13 @@ class Factor:
             covariance: real or complex.
             failing: what follows where there is none: a ridge, an error, or nothing: of a batch of steps some
                 may fail.
+            overwrite: whether L may take the place of the covariance, which then is not to be mended.
 
         Raises:
             NotDefiniteError: it has no factor, nor with the largest ridge.
         """
         raise_if_cancelled()
-        lower, failed = _cholesky(covariance)
+        lower, failed = _cholesky(covariance, overwrite)
         if not failed or failing == "ignore":
             return cls(lower)
         if failing == "raise":
@@ -196,7 +199,7 @@ def _to_numpy(values: Tensor) -> np.ndarray:
     return values.detach().resolve_conj().resolve_neg().numpy()
 
 
-def _cholesky(covariance: Tensor) -> tuple[Tensor, bool]:
+def _cholesky(covariance: Tensor, overwrite: bool = False) -> tuple[Tensor, bool]:
     """L, and whether there is none."""
     if not _suits_lapack(covariance):
         lower, info = torch.linalg.cholesky_ex(covariance)
@@ -204,6 +207,7 @@ def _cholesky(covariance: Tensor) -> tuple[Tensor, bool]:
     transposed = _to_numpy(covariance).T  # in LAPACK's order of columns as it lies, its conjugate
     potrf = get_lapack_funcs("potrf", (transposed,))
     with BLAS.limit(limits=1):
-        # A copy, as LAPACK factors in place and the caller keeps the covariance.
-        upper, info = potrf(np.array(transposed, order="F"), lower=0, clean=1, overwrite_a=1)
+        # LAPACK factors in place: a copy, where the caller keeps the covariance.
+        given = transposed if overwrite else np.array(transposed, order="F")
+        upper, info = potrf(given, lower=0, clean=1, overwrite_a=1)
     return torch.from_numpy(upper.T), bool(info)

@@ -133,10 +133,13 @@ def candidate_priors(
     ]
     if not MIXED_FROM <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [choose_candidate(rows, trends, seed, max_rows)]
-    found = [choose_candidate(rows, [one], seed, max_rows, MIXED_ON) for one in trends]
-    found.sort(key=lambda one: -one.score)
     if rows.silent.any():
-        return found
+        found = [choose_candidate(rows, [one], seed, max_rows, MIXED_ON) for one in trends]
+        return sorted(found, key=lambda one: -one.score)
+    first = choose_candidate(rows, trends, seed, max_rows, MIXED_ON)
+    # Other laws have a kernel like it: a short walk from there, not one from anywhere.
+    others = (replace(first, **one._asdict()) for one in trends if one.trend is not first.trend)
+    found = [first, *(_refine_kernel(rows, one, seed, max_rows) for one in others)]
     # One row of a place: levels that repeat there to the digit would speak for no noise.
     once = np.sort(np.unique(rows.places, axis=0, return_index=True)[1])
     few = rows.subset(once).draw_subset(MIXED_ON, seed)
@@ -205,9 +208,12 @@ def choose_candidate(
     """
     many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
     best = _choose_on_part(rows, trends, seed, min(max_rows, compared_on) if many else max_rows, compared_on)
-    if not many:
-        return best
-    if not best.kernel.is_isotropic:  # none are nearest by which it could be chosen
+    return _refine_kernel(rows, best, seed, max_rows) if many else best
+
+
+def _refine_kernel(rows: PowerRows, best: KernelCandidate, seed: int, max_rows: int) -> KernelCandidate:
+    """The same mean with the kernel that rows, all heard, say near its own."""
+    if len(rows.places) <= CHOSEN_ON or not best.kernel.is_isotropic:  # none need, or can, be the nearest
         part = rows.draw_subset(min(max_rows, CHOSEN_ON), seed)
         return _search_kernel(part, best, [best.kernel], limit=REFINED)
     kernel, how = choose_kernel_by_nearest(best.prior, rows.means_at_places(), seed)  # given these, all tell
