@@ -1,8 +1,8 @@
 """Cholesky factors of covariances, and all that is solved with them.
 
 LAPACK in place factors a single matrix without gradients, and solves for many columns, in .4 to .9 of torch's
-time from some hundred rows on. Few rows, inverses, batches, gradients and
-matrices worth several threads go to torch.
+time from some hundred rows on. Few rows, inverses, batches, gradients and matrices worth several threads go
+to torch.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from torch import Tensor
 from gsparc.ops.transforms import is_differentiated
 from gsparc.processes.worker import raise_if_cancelled
 
+Failing = Literal["mend", "raise", "ignore"]
 # Rounding each entry to float32 moves an eigenvalue by at most `eps trace(K)`, since the Frobenius norm of a
 # covariance is at most its trace; entries that are sums are rounded several times.
 ROUNDING = torch.finfo(torch.float32).eps
@@ -55,9 +56,7 @@ class Factor:
     lower: Tensor
 
     @classmethod
-    def from_gram(
-        cls, covariance: Tensor, failing: Literal["mend", "raise", "ignore"] = "mend", overwrite: bool = False
-    ) -> Factor:
+    def from_gram(cls, covariance: Tensor, failing: Failing = "mend", overwrite: bool = False) -> Factor:
         """Factor a Hermitian covariance (..., n, n); in float64 and with a ridge where there is none without.
 
         Nearly noise-free rows at neighbouring places are alike to the last digit: a covariance of theirs is

@@ -7,7 +7,7 @@ with units where a group has ended.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -46,40 +46,35 @@ def left_out_residuals(
         precision = inverse if inverse.dim() == 1 else inverse.diagonal().real
         return LeftOutErrors(weights / precision.view(-1, *[1] * (weights.dim() - 1)), 1 / precision)
     residual, variance = torch.empty_like(weights), torch.empty_like(inverse.diagonal().real)
-    sets = list(groups)
-    for part, valid in _padded_batches(torch.tensor([len(one) for one in sets])):
-        index = pad_sequence([sets[number] for number in part.tolist()], batch_first=True)
-        block, rows = _padded_block(inverse, index, valid), index[valid]
-        residual[rows] = block.solve(weights[index])[valid]
-        variance[rows] = block.inverse.diagonal(dim1=1, dim2=2).real[valid]
+    for _, index, valid, block in _padded_blocks(inverse, list(groups)):
+        residual[index[valid]] = block.solve(weights[index])[valid]
+        variance[index[valid]] = block.inverse.diagonal(dim1=1, dim2=2).real[valid]
     return LeftOutErrors(residual, variance)
 
 
-def _padded_batches(size: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
-    """Yield numbers (c,) of sets of `size` (G,), the largest first, and which entries (c, m) each has."""
+def _padded_blocks(
+    inverse: Tensor, sets: Sequence[Tensor]
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Factor]]:
+    """Yield numbers (c,) of sets of rows, their rows (c, m), which of these are valid, and `K^-1` of them."""
+    size = torch.tensor([len(one) for one in sets])
     order = size.argsort()
     while len(order):
-        most = int(size[order[-1]])  # the largest that is left, and as many as memory takes with it
-        count = max(ENTRIES // max(most, 1) ** 2, 1)
+        # The largest that is left, and as many as memory takes with it.
+        count = max(ENTRIES // max(int(size[order[-1]]), 1) ** 2, 1)
         part, order = order[-count:], order[:-count]
-        yield part, torch.arange(most) < size[part, None]
-
-
-def _padded_block(inverse: Tensor, index: Tensor, valid: Tensor) -> Factor:
-    """Factor (c, m, m) of `K^-1` of rows (c, m), units where these are not `valid`."""
-    block = inverse[index[:, :, None], index[:, None]] * (valid[:, :, None] & valid[:, None])
-    block.diagonal(dim1=1, dim2=2).add_((~valid).to(block.dtype))
-    return Factor.from_gram(block)
+        index = pad_sequence([sets[number] for number in part.tolist()], batch_first=True)
+        valid = torch.arange(index.shape[1]) < size[part, None]
+        block = inverse[index[:, :, None], index[:, None]] * (valid[:, :, None] & valid[:, None])
+        block.diagonal(dim1=1, dim2=2).add_((~valid).to(block.dtype))
+        yield part, index, valid, Factor.from_gram(block)
 
 
 def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor) -> LeftOutErrors:
     """Return residuals (c, R) of rows (c,), each without what is `near` it (c, n) bool, and variances."""
     residual, variance = weights[rows].clone(), inverse.diagonal()[rows].real.clone()
-    for part, valid in _padded_batches(near.sum(1)):
-        # Members of a group come first, and in the order of rows as the sort is stable.
-        index = near[part].to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, : valid.shape[1]]
+    for part, index, valid, block in _padded_blocks(inverse, [one.nonzero()[:, 0] for one in near]):
         unit = ((index == rows[part, None]) & valid).to(inverse.dtype)
-        share = _padded_block(inverse, index, valid).solve(unit[..., None])[..., 0] * valid
+        share = block.solve(unit[..., None])[..., 0] * valid
         residual[part] = torch.einsum("cm,cmr->cr", share.to(weights.dtype), weights[index])
         variance[part] = (share * unit).sum(1).real
     return LeftOutErrors(residual, variance)
