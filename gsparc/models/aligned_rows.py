@@ -24,6 +24,7 @@ from scipy.spatial.distance import cdist
 
 from gsparc.data.moments import Snapshots, number_moments
 from gsparc.data.schema import Measurements, Site
+from gsparc.data.spacing import neighbour_distance
 from gsparc.data.splits import Fold
 from gsparc.physics.decibels import TINY_POWER
 from gsparc.physics.row_factors import UnknownFactor, align_factors, describe_factor
@@ -32,7 +33,7 @@ from gsparc.processes.few_rows import covering_rows
 from gsparc.processes.fit_kernel import fit_two_lengths, initial_kernel
 from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
 from gsparc.processes.nearest import neighbour_weights
-from gsparc.processes.neighbourhood import median_spacing, rows_with_nearest
+from gsparc.processes.neighbourhood import rows_with_nearest
 
 log = logging.getLogger(__name__)
 
@@ -153,7 +154,7 @@ def align_rows(rows: Snapshots, unknown_factor: UnknownFactor, site: Site) -> Al
     values = rows.values / np.maximum(power, np.finfo(float).tiny)
     if unknown_factor == "phase+delay+gain":
         values = values / _rms_of_rows(values)[:, None, None]
-    length = site.wavelength or SPACINGS * median_spacing(rows.places)
+    length = site.wavelength or SPACINGS * (neighbour_distance(rows.places) or 1.0)
     one = _Rows(rows.places, values, rows.tones, unknown_factor, length)
     found = [one.refine_by_neighbours(one.align_along_tree(None))]
     direct = _direct_wave(rows, site)
@@ -199,7 +200,7 @@ class _Rows:
 
     def refine_by_neighbours(self, factors: np.ndarray) -> Alignment:
         """Go on from these factors by a process of two lengths; return the round that tells rows best."""
-        kernel, found = initial_kernel(self.length, median_spacing(self.places)), []
+        kernel, found = initial_kernel(self.length, neighbour_distance(self.places)), []
         for _ in range(ROUNDS):
             factors = self._sweep_factors(factors, self._neighbour_weights(kernel), SWEEPS)
             error = self._left_out_error(factors, self._neighbour_weights(kernel))

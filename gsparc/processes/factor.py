@@ -1,8 +1,8 @@
 """Cholesky factors of covariances, and all that is solved with them.
 
 LAPACK in place factors a single matrix without gradients, and solves for many columns, in .4 to .9 of torch's
-time from some hundred rows on. Few rows, single columns, inverses, batches, gradients and
-matrices worth several threads go to torch.
+time from some hundred rows on. Few rows, inverses, batches, gradients and matrices worth several threads go
+to torch.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from torch import Tensor
 from gsparc.ops.transforms import is_differentiated
 from gsparc.processes.worker import raise_if_cancelled
 
+Failing = Literal["mend", "raise", "ignore"]
 # Rounding each entry to float32 moves an eigenvalue by at most `eps trace(K)`, since the Frobenius norm of a
 # covariance is at most its trace; entries that are sums are rounded several times.
 ROUNDING = torch.finfo(torch.float32).eps
@@ -55,7 +56,7 @@ class Factor:
     lower: Tensor
 
     @classmethod
-    def from_gram(cls, covariance: Tensor, failing: Literal["mend", "raise", "ignore"] = "mend") -> Factor:
+    def from_gram(cls, covariance: Tensor, failing: Failing = "mend", overwrite: bool = False) -> Factor:
         """Factor a Hermitian covariance (..., n, n); in float64 and with a ridge where there is none without.
 
         Nearly noise-free rows at neighbouring places are alike to the last digit: a covariance of theirs is
@@ -65,18 +66,21 @@ class Factor:
 
         Args:
             covariance: real or complex.
-            failing: what follows where there is none: a ridge (of a single matrix), an error, or nothing:
-                of a batch of steps some may fail.
+            failing: what follows where there is none: a ridge, an error, or nothing: of a batch of steps some
+                may fail.
+            overwrite: whether L may take the place of the covariance, which then is not to be mended.
 
         Raises:
             NotDefiniteError: it has no factor, nor with the largest ridge.
         """
         raise_if_cancelled()
-        lower, failed = _cholesky(covariance)
+        lower, failed = _cholesky(covariance, overwrite)
         if not failed or failing == "ignore":
             return cls(lower)
-        if failing == "raise" or covariance.dim() > 2:
+        if failing == "raise":
             raise NotDefiniteError("a covariance is not positive definite")
+        if covariance.dim() > 2:
+            return cls(torch.stack([cls.from_gram(one).lower for one in covariance]))
         exact = covariance.to(torch.complex128 if covariance.is_complex() else torch.float64)
         exact = exact.clone() if exact is covariance else exact
         bound, added = ROUNDING * float(exact.diagonal().real.sum()), 0.0
@@ -114,7 +118,7 @@ class Factor:
         if values.is_complex() and not self.lower.is_complex():
             return solve_as_pairs(self.solve, values)
         values = values.to(self.lower.dtype)
-        if values.shape[-1] == 1 or not _suits_lapack(self.lower, values):
+        if not _suits_lapack(self.lower, values):
             return torch.cholesky_solve(values, self.lower)
         return self._solve_triangular(self.whiten(values), adjoint=True)
 
@@ -194,7 +198,7 @@ def _to_numpy(values: Tensor) -> np.ndarray:
     return values.detach().resolve_conj().resolve_neg().numpy()
 
 
-def _cholesky(covariance: Tensor) -> tuple[Tensor, bool]:
+def _cholesky(covariance: Tensor, overwrite: bool = False) -> tuple[Tensor, bool]:
     """L, and whether there is none."""
     if not _suits_lapack(covariance):
         lower, info = torch.linalg.cholesky_ex(covariance)
@@ -202,6 +206,7 @@ def _cholesky(covariance: Tensor) -> tuple[Tensor, bool]:
     transposed = _to_numpy(covariance).T  # in LAPACK's order of columns as it lies, its conjugate
     potrf = get_lapack_funcs("potrf", (transposed,))
     with BLAS.limit(limits=1):
-        # A copy, as LAPACK factors in place and the caller keeps the covariance.
-        upper, info = potrf(np.array(transposed, order="F"), lower=0, clean=1, overwrite_a=1)
+        # LAPACK factors in place: a copy, where the caller keeps the covariance.
+        given = transposed if overwrite else np.array(transposed, order="F")
+        upper, info = potrf(given, lower=0, clean=1, overwrite_a=1)
     return torch.from_numpy(upper.T), bool(info)

@@ -1,17 +1,19 @@
 """Rows predicted from all others, or from all outside a group (Rasmussen and Williams 2006, eq. 5.12).
 
 Without a group S its residuals are `(K^-1_SS)^-1 (K^-1 Y)_S`, their covariance `(K^-1_SS)^-1`: a small system
-for each group instead of one of all other rows.
+for each group instead of one of all other rows. Systems of many sizes are solved in batches of the largest,
+with units where a group has ended.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
 from gsparc.processes.factor import Factor
 
@@ -44,37 +46,35 @@ def left_out_residuals(
         precision = inverse if inverse.dim() == 1 else inverse.diagonal().real
         return LeftOutErrors(weights / precision.view(-1, *[1] * (weights.dim() - 1)), 1 / precision)
     residual, variance = torch.empty_like(weights), torch.empty_like(inverse.diagonal().real)
-    for rows in groups:
-        residual[rows], covariance = left_out_group(inverse, weights, rows)
-        variance[rows] = covariance.diagonal().real
+    for _, index, valid, block in _padded_blocks(inverse, list(groups)):
+        residual[index[valid]] = block.solve(weights[index])[valid]
+        variance[index[valid]] = block.inverse.diagonal(dim1=1, dim2=2).real[valid]
     return LeftOutErrors(residual, variance)
 
 
-def left_out_group(inverse: Tensor, weights: Tensor, rows: Tensor) -> LeftOutErrors:
-    """Return residuals (s, R) of rows (s,) left out together, and their covariance (s, s)."""
-    block = Factor.from_gram(inverse[rows[:, None], rows])
-    return LeftOutErrors(block.solve(weights[rows]), block.inverse)
+def _padded_blocks(
+    inverse: Tensor, sets: Sequence[Tensor]
+) -> Iterator[tuple[Tensor, Tensor, Tensor, Factor]]:
+    """Yield numbers (c,) of sets of rows, their rows (c, m), which of these are valid, and `K^-1` of them."""
+    size = torch.tensor([len(one) for one in sets])
+    order = size.argsort()
+    while len(order):
+        # The largest that is left, and as many as memory takes with it.
+        count = max(ENTRIES // max(int(size[order[-1]]), 1) ** 2, 1)
+        part, order = order[-count:], order[:-count]
+        index = pad_sequence([sets[number] for number in part.tolist()], batch_first=True)
+        valid = torch.arange(index.shape[1]) < size[part, None]
+        block = inverse[index[:, :, None], index[:, None]] * (valid[:, :, None] & valid[:, None])
+        block.diagonal(dim1=1, dim2=2).add_((~valid).to(block.dtype))
+        yield part, index, valid, Factor.from_gram(block)
 
 
 def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor) -> LeftOutErrors:
-    """Return residuals (c, R) of rows (c,), each without what is `near` it (c, n) bool, and variances.
-
-    Small systems of many sizes, solved as batches of the largest with units where a group has ended.
-    """
-    size = near.sum(1)
+    """Return residuals (c, R) of rows (c,), each without what is `near` it (c, n) bool, and variances."""
     residual, variance = weights[rows].clone(), inverse.diagonal()[rows].real.clone()
-    order = size.argsort()
-    while len(order):
-        most = int(size[order[-1]])  # the largest that is left, and as many as memory takes with it
-        count = max(ENTRIES // most**2, 1)
-        part, order = order[-count:], order[:-count]
-        # Members of a group come first, and in the order of rows as the sort is stable.
-        index = near[part].to(torch.uint8).argsort(dim=1, descending=True, stable=True)[:, :most]
-        valid = torch.arange(most) < size[part, None]
-        block = inverse[index[:, :, None], index[:, None]] * (valid[:, :, None] & valid[:, None])
-        block.diagonal(dim1=1, dim2=2).add_((~valid).to(block.dtype))
-        unit = ((index == rows[part, None]) & valid).to(block.dtype)
-        share = Factor.from_gram(block, "raise").solve(unit[..., None])[..., 0] * valid
+    for part, index, valid, block in _padded_blocks(inverse, [one.nonzero()[:, 0] for one in near]):
+        unit = ((index == rows[part, None]) & valid).to(inverse.dtype)
+        share = block.solve(unit[..., None])[..., 0] * valid
         residual[part] = torch.einsum("cm,cmr->cr", share.to(weights.dtype), weights[index])
         variance[part] = (share * unit).sum(1).real
     return LeftOutErrors(residual, variance)
@@ -96,10 +96,10 @@ def left_out_signal(
         correction = (1 - (disturbance * inverse.mT).sum(1)) / inverse.diagonal()
         rest = disturbance + torch.diag(correction)
         return rest @ weights, (rest * (rest @ inverse).conj()).sum(1).real
-    residual, mixed = disturbance @ weights, disturbance @ inverse
-    for rows in groups:
-        correction, _ = left_out_group(inverse, weights, rows)
-        residual[rows] += correction - mixed[rows[:, None], rows] @ correction
+    residual, mixed, sets = disturbance @ weights, disturbance @ inverse, list(groups)
+    correction, _ = left_out_residuals(inverse, weights, sets)
+    for rows in sets:
+        residual[rows] += correction[rows] - mixed[rows[:, None], rows] @ correction[rows]
     return residual, None
 
 

@@ -32,7 +32,7 @@ from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, nearest_distance, rows_with_nearest
 from gsparc.processes.prior import Posterior, Prior
 
-COVER = 2_000  # rows that weigh the mean law
+COVER, FEW = 2_000, 500  # rows that weigh the mean law, where it is to stay, and for choices
 ENTRIES = 1_000_000  # of systems and values that are solved with at a time: memory
 LOOKED_AT = 1_200  # places whose density given their neighbours chooses the settings
 LOOKED_BY = 16  # their neighbours (M. L. Stein et al., J. R. Stat. Soc. B 66 (2004): few will do)
@@ -203,7 +203,7 @@ class Nearest(Posterior):
 
 def condition_on_nearest(
     prior: Prior, values: PlaceValues, seed: int, pseudo_values: PlaceValues | None = None,
-    pseudo_variance: Tensor | None = None, neighbours: int = NEIGHBOURS,
+    pseudo_variance: Tensor | None = None, neighbours: int = NEIGHBOURS, cover: int = COVER,
 ) -> Nearest:  # fmt: skip
     """Return the process given places, with settings as they are.
 
@@ -220,6 +220,7 @@ def condition_on_nearest(
         pseudo_values: of other places.
         pseudo_variance: (m,) their variances beyond the noise, of the amplitude.
         neighbours: of a place.
+        cover: see `trend_mean_and_covariance`.
     """
     # The mean of n measurements has an n-th of their noise.
     noise, every = prior.kernel.noise / values.count, values
@@ -236,13 +237,13 @@ def condition_on_nearest(
         return Nearest(prior, near, every.values, noise, none, none[:, :0], neighbours)
     places = torch.from_numpy(every.places)
     rest = every.values - prior.mean(places)
-    terms, spread = trend_mean_and_covariance(prior, every.places, rest, noise, seed)
+    terms, spread = trend_mean_and_covariance(prior, every.places, rest, noise, seed, cover)
     return Nearest(prior, near, rest, noise, terms, spread, neighbours)
 
 
 @torch.no_grad()
 def trend_mean_and_covariance(
-    prior: Prior, places: np.ndarray, rest: Tensor, noise: Tensor, seed: int
+    prior: Prior, places: np.ndarray, rest: Tensor, noise: Tensor, seed: int, cover: int
 ) -> tuple[Tensor, Tensor]:
     """Return mean (Q, P) and covariance (Q, Q) of the mean law's terms, unit normal before, given some rows.
 
@@ -250,8 +251,9 @@ def trend_mean_and_covariance(
         prior: see there.
         places, rest, noise: (m, D), (m, P), (m,) as in `Nearest`.
         seed: of the rows, which cover the site.
+        cover: most of them.
     """
-    few = covering_rows(places, COVER, seed)
+    few = covering_rows(places, cover, seed)
     at, chosen = torch.from_numpy(places[few]), torch.from_numpy(few)
     gram = prior.kernel.correlations(at, at)
     gram.diagonal().add_(noise[chosen])
@@ -318,7 +320,7 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
         return start, f"settings of {count} places, as they were"
     every = torch.from_numpy(values.places)
     rest = values.values - prior.mean(every)
-    about, _ = trend_mean_and_covariance(prior, values.places, rest, start.noise / values.count, seed)
+    about, _ = trend_mean_and_covariance(prior, values.places, rest, start.noise / values.count, seed, FEW)
     rest = rest - prior.columns(every) @ about
     level = Neighbourhood.from_places(values.places, seed).level
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]

@@ -111,14 +111,3 @@ def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:
     if not is_differentiated(queries):
         return torch.from_numpy(distance)
     return distances(queries[:, None], torch.from_numpy(tree.data[row])[:, None])[:, 0, 0]
-
-
-def median_spacing(places: np.ndarray) -> float:
-    """Return the median distance [m] from a place (n, D) to the next other one.
-
-    >>> median_spacing(np.array([[0.0], [0.0], [2.0], [4.0]]))
-    2.0
-    """
-    places = np.unique(places, axis=0)
-    near = cKDTree(places).query(places, k=min(2, len(places)))[0].reshape(len(places), -1)[:, -1]
-    return max(float(np.median(near)), 1e-9)

@@ -143,7 +143,7 @@ def _factor(prior: Prior, places: Tensor, extra: Tensor) -> Factor:
         # One triangle, all that a factor reads, in blocks that stay in the processor's caches.
         gram[part, : start + BLOCK] = prior.cross_covariance(places[part], places[: start + BLOCK])
     gram.diagonal().add_(prior.kernel.noise + extra)
-    return Factor.from_gram(gram, "raise")
+    return Factor.from_gram(gram, "raise", overwrite=True)
 
 
 def approximation_label(name: str, posterior: Posterior | None) -> str:

@@ -123,7 +123,7 @@ class PowerProcess(Stored):
     heard: float
     others: tuple[tuple[float, PowerProcess], ...] = ()
 
-    @property
+    @cached_property
     def members(self) -> tuple[tuple[float, PowerProcess], ...]:
         """Every process alone, with its share, this one first."""
         first_share = 1 - sum(share for share, _ in self.others)
@@ -144,23 +144,23 @@ class PowerProcess(Stored):
         """Places of the rows (n, 3) or (n, 6) [m]."""
         return self.posterior.places.numpy()
 
-    def answer(self, queries: Tensor) -> PowerAnswer:
-        """Predict powers at places (B, 3) or (B, 6) [m].
+    def answer(self, queries: Tensor, far: Tensor | None = None) -> PowerAnswer:
+        """Predict powers at places (B, 3) or (B, 6) [m], `far` (B,) from all rows where that is known [m].
 
         Unknown is the variance as a share of that of the known rows. What the mean law explains of them
         counts as known near them only: its slope says nothing of places far from all data.
         """
+        far = self.posterior.nearest_distance(queries) if far is None else far
         if self.others:
-            parts = [(share, *one.answer(queries)) for share, one in self.members]
+            parts = [(share, *one.answer(queries, far)) for share, one in self.members]
             mean, variance = mixture_moments([part[:3] for part in parts])
             return PowerAnswer(mean, variance, sum((p[0] * p[3] for p in parts), torch.zeros_like(mean)))
         result = self.posterior.answer(queries)
         prior_variance = 1 + self.kernel.noise
         whole = max(self.heard, prior_variance)
         by_law = 1 - prior_variance / whole  # share of that variance
-        far = self.posterior.nearest_distance(queries) / self._trend_reach
         # What the law explains counts as unknown where no row is near.
-        unknown = result.variance / whole + by_law * (1 - (-far.square()).exp())
+        unknown = result.variance / whole + by_law * (1 - (-(far / self._trend_reach).square()).exp())
         return PowerAnswer(result.mean[:, 0], self.kernel.amplitude * result.variance, unknown.clamp_max(1.0))
 
     @cached_property

@@ -55,6 +55,7 @@ def test_rounding_is_mended_with_a_ridge_and_what_is_more_is_refused():
         Factor.from_gram(alike, "raise")
     with pytest.raises(NotDefiniteError, match="gsparc check"):
         Factor.from_gram(-torch.eye(3))
+    assert torch.equal(Factor.from_gram(torch.stack([alike, torch.eye(200)])).lower[0], lower)
     with pytest.raises(NotDefiniteError):
         Factor.from_gram(torch.eye(3).expand(2, 3, 3) * torch.tensor([1.0, -1.0])[:, None, None])
 
@@ -91,8 +92,9 @@ def test_a_factor_of_nothing_says_nothing(capfd):
 @pytest.mark.parametrize("rows", [20, 200])
 @pytest.mark.parametrize("columns", [1, 3])
 def test_values_of_another_precision_are_taken_as_the_factors(rows, columns):
-    """Single columns and few rows go to torch, which refuses what LAPACK converted."""
+    """Few rows go to torch, which refuses what LAPACK converted; L may take the covariance's place."""
     gram = covariance(torch.float64, rows)
+    assert torch.equal(Factor.from_gram(gram.clone(), overwrite=True).lower, Factor.from_gram(gram).lower)
     values = torch.randn(rows, columns)
     found = Factor.from_gram(gram).solve(values)
     torch.testing.assert_close(gram @ found, values.double())

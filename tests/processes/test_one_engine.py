@@ -10,7 +10,7 @@ FACTORING = {
     "cholesky", "cholesky_ex", "cho_factor", "potrf", "dpotrf", "zpotrf", "cho_solve", "cholesky_solve",
     "cholesky_inverse", "solve_triangular", "trsm", "trtri", "dtrtri", "trtrs", "potri", "dpotri", "potrs",
 }  # fmt: skip
-DEFINED = ("left_out_group", "fit_by_ep")
+DEFINED = ("left_out_around", "fit_by_ep")
 
 
 def called(node: ast.Call) -> str:
@@ -28,5 +28,5 @@ def test_each_operation_is_in_its_place_alone():
             elif isinstance(node, ast.Call) and called(node) in FACTORING:
                 where["factor"].add(name)
     assert where["factor"] == {"gsparc/processes/factor.py"}
-    assert where["left_out_group"] == {"gsparc/processes/left_out.py"}
+    assert where["left_out_around"] == {"gsparc/processes/left_out.py"}
     assert where["fit_by_ep"] == {"gsparc/processes/censored.py"}

@@ -22,6 +22,7 @@ from torch import Tensor
 from gsparc.data.blocks import take
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
+from gsparc.data.spacing import neighbour_distance
 from gsparc.data.splits import Fold
 from gsparc.models.channels.columns import Group, Slot, fit_run_factors, negative_log_likelihood
 from gsparc.models.closed_form import ClosedForm
@@ -34,7 +35,7 @@ from gsparc.processes.few_rows import covering_rows
 from gsparc.processes.fit_kernel import fit_two_lengths, initial_kernel
 from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
 from gsparc.processes.nearest import NeighbourSample, PlaceValues, condition_on_nearest, nearest_density
-from gsparc.processes.neighbourhood import Neighbourhood, median_spacing
+from gsparc.processes.neighbourhood import Neighbourhood
 from gsparc.processes.places import ORIGIN
 from gsparc.processes.posterior import Exact, Posterior, approximation_label
 from gsparc.processes.powers import MOST_ROWS
@@ -113,7 +114,7 @@ class ComplexGP(ClosedForm):
         if self.fitted_site.phase_reference != "neighbours":
             return None
         at = places.numpy()
-        kernel, rows = initial_kernel(self._wavelength, median_spacing(at)), (at, values.numpy())
+        kernel, rows = initial_kernel(self._wavelength, neighbour_distance(at)), (at, values.numpy())
         for _ in range(REFINED):
             kernel = fit_two_lengths(*rows, self._wavelength, kernel)
         return replace(kernel, amplitude=1.0)

@@ -27,7 +27,7 @@ from gsparc.models.method import to_double
 from gsparc.physics.waves import point_wave, ranges
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.kernel import distances, matern32_of_squares
-from gsparc.processes.left_out import left_out_group, rows_of_groups
+from gsparc.processes.left_out import rows_of_groups
 
 CONSTANTS = (0.9, 0.97, 0.995)  # share of a gain's variance that is the same everywhere
 LENGTHS_M = (0.5, 2.0)  # over which the rest of it varies
@@ -206,10 +206,11 @@ class SightedSources:
         waves = self.unobstructed_waves * at.probability
         cross = self._cross_covariance(waves, at.retained, self.power) * at.correlation
         predicted, inverse = self.conditioned.mean(cross), self.conditioned.factor.inverse
-        for group in rows_of_groups(self.observer.numpy()):
-            residual, _ = left_out_group(inverse, self.conditioned.weights, group)
+        groups = rows_of_groups(self.observer.numpy())
+        residual, _ = self.conditioned.left_out(groups)
+        for group in groups:
             # Weights without rows S are `K^-1 y - (K^-1)_:S (K^-1_SS)^-1 (K^-1 y)_S`: no other factor.
-            predicted[group] -= cross[group] @ (inverse[:, group] @ residual)
+            predicted[group] -= cross[group] @ (inverse[:, group] @ residual[group])
         return predicted
 
     def _gain_correlation(self, kernel: GainKernel) -> Tensor:

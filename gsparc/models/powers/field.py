@@ -24,7 +24,7 @@ from gsparc.models.baselines.distance_law import fit_site_law
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.known.images import walls_in_frame
 from gsparc.models.method import Prediction
-from gsparc.models.powers.fringes import Fringes, fit_fringes, nearest_distances, resolves_wavelength
+from gsparc.models.powers.fringes import Fringes, fit_fringes, resolves_wavelength
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, describe_weights, subtract_means
 from gsparc.models.powers.settings import (
     LAW_NEEDS,
@@ -193,8 +193,9 @@ class PowerField(ClosedForm):
             posterior = process.posterior
             loud = (posterior.extra == 0).numpy() if isinstance(posterior, Exact) else self.at
             places = process.places[loud]
+            nearest = torch.from_numpy(cKDTree(places).query(places, k=2)[0][:, 1])
             decibels, factor = self.fringes.blend_blind_solutions(
-                decibels, torch.from_numpy(places), torch.from_numpy(nearest_distances(places)), self.known
+                decibels, torch.from_numpy(places), nearest, self.known
             )
             spread = spread * factor
         return LeftOutRows(self.known, *linear_moments(decibels.float(), spread.float()))

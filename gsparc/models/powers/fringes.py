@@ -14,9 +14,9 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsparc.data.spacing import neighbour_distance
 from gsparc.models.member_weights import best_weights
 from gsparc.models.powers.groups import SPREAD, number_squares, split_groups
 from gsparc.models.powers.waves import FLOOR, PlaneWaveBasis, field_db, fit_wave_weights, make_basis
@@ -126,13 +126,7 @@ def resolves_wavelength(places: np.ndarray, wavelength: float | None) -> bool:
     """Tell whether places (n, 3) are closer than half a wavelength to their neighbours, most of them."""
     if wavelength is None or has_both_ends(places):
         return False
-    unique = np.unique(places, axis=0)
-    return len(unique) > 1 and float(np.median(nearest_distances(unique))) < wavelength / 2
-
-
-def nearest_distances(places: np.ndarray) -> np.ndarray:
-    """Return distances (n,) of places (n, 3) from the nearest other [m]."""
-    return cKDTree(places).query(places, k=2)[0][:, 1]
+    return 0 < neighbour_distance(places) < wavelength / 2
 
 
 def fit_fringes(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsparc.data import spacing
 from gsparc.processes.places import horizontal, moving_end
 from gsparc.processes.trend import TINY_M
 
@@ -17,9 +18,8 @@ def number_squares(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
     Along the longer side of the places' box there are `sides` squares.
     """
     floor = horizontal(moving_end(places))
-    side = max(float(np.ptp(floor, axis=0).max()), TINY_M) / sides
-    cell = np.floor((floor - floor.min(0)) / side).clip(max=sides - 1).astype(np.int64)
-    return np.unique(cell, axis=0, return_inverse=True)[1].reshape(-1)
+    side = max(spacing.tenth_of_extent(floor), TINY_M) * SIDES / sides
+    return spacing.number_squares(floor - floor.min(0), side)
 
 
 def split_groups(group: np.ndarray, count: int, seed: int) -> list[np.ndarray]:

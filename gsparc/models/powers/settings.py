@@ -31,11 +31,10 @@ from gsparc.processes.kernel import (
     ExponentialShadowing,
     Kernel,
     Shadowing,
-    distances,
     median_distance,
 )
 from gsparc.processes.left_out import left_out_residuals, rows_of_groups
-from gsparc.processes.nearest import choose_kernel_by_nearest, condition_on_nearest
+from gsparc.processes.nearest import FEW, choose_kernel_by_nearest, condition_on_nearest
 from gsparc.processes.places import has_both_ends
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import MOST_ROWS, PowerProcess, PowerRows, condition_on_powers, trend_about_rows
@@ -133,10 +132,13 @@ def candidate_priors(
     ]
     if not MIXED_FROM <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [choose_candidate(rows, trends, seed, max_rows)]
-    found = [choose_candidate(rows, [one], seed, max_rows, MIXED_ON) for one in trends]
-    found.sort(key=lambda one: -one.score)
     if rows.silent.any():
-        return found
+        found = [choose_candidate(rows, [one], seed, max_rows, MIXED_ON) for one in trends]
+        return sorted(found, key=lambda one: -one.score)
+    found = [choose_candidate(rows, trends, seed, max_rows, MIXED_ON)]
+    # Other laws have a kernel like it: a short walk from there, not one from anywhere.
+    others = [replace(found[0], **one._asdict()) for one in trends if one.trend is not found[0].trend]
+    found += [_refine_kernel(rows, one, seed, max_rows) for one in others]
     # One row of a place: levels that repeat there to the digit would speak for no noise.
     once = np.sort(np.unique(rows.places, axis=0, return_index=True)[1])
     few = rows.subset(once).draw_subset(MIXED_ON, seed)
@@ -171,7 +173,7 @@ def mix_candidates(
     posteriors = [condition_on_powers(part, one.prior, seed)[0].posterior for one in candidates]
     # Of all rows: drawn ones are farther apart than those that will answer.
     values = rows.measured_rows.means_at_places()
-    near = [condition_on_nearest(one.prior, values, seed).left_out().mean for one in candidates]
+    near = [condition_on_nearest(one.prior, values, seed, cover=FEW).left_out().mean for one in candidates]
     gram = AMONG_ROWS * _relative_gram([(values.values - mean)[:, 0].numpy() for mean in near])
     for sides in SPANS:
         gram += _relative_gram([_errors_without_squares(one, sides) for one in posteriors]) / len(SPANS)
@@ -205,9 +207,12 @@ def choose_candidate(
     """
     many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
     best = _choose_on_part(rows, trends, seed, min(max_rows, compared_on) if many else max_rows, compared_on)
-    if not many:
-        return best
-    if not best.kernel.is_isotropic:  # none are nearest by which it could be chosen
+    return _refine_kernel(rows, best, seed, max_rows) if many else best
+
+
+def _refine_kernel(rows: PowerRows, best: KernelCandidate, seed: int, max_rows: int) -> KernelCandidate:
+    """The same mean with the kernel that rows, all heard, say near its own."""
+    if len(rows.places) <= CHOSEN_ON or not best.kernel.is_isotropic:  # none need, or can, be the nearest
         part = rows.draw_subset(min(max_rows, CHOSEN_ON), seed)
         return _search_kernel(part, best, [best.kernel], limit=REFINED)
     kernel, how = choose_kernel_by_nearest(best.prior, rows.means_at_places(), seed)  # given these, all tell
@@ -229,10 +234,11 @@ def _choose_on_part(
         scores = [_fit_by_evidence(weighed, one, REFINED).score for one in candidates]
     best = candidates[int(np.argmax(scores))]
     if len(few.places) >= TWO_LENGTHS_NEED:
-        two = _search_kernel(few, best, _two_length_starts(few, best.kernel), 2.0)
+        scale = median_distance(few.view(best.trend).apart)
+        two = _search_kernel(few, best, _two_length_starts(scale, best.kernel), 2.0)
         best = max(best, two, key=lambda one: one.score)
         if has_both_ends(few.places):
-            ends = _search_kernel(few, best, _end_starts(few, best.kernel), 4.0)
+            ends = _search_kernel(few, best, _end_starts(scale, best.kernel), 4.0)
             best = max(best, ends, key=lambda one: one.score)
     if len(loud.places) > len(few.places):
         # A look at all rows costs several at few: what was found on these is near already.
@@ -240,10 +246,8 @@ def _choose_on_part(
     if both:  # one walk: each look factors several covariances
         best = _fit_by_evidence(weighed, best, EVIDENCE_LOOKS)
     count = len((weighed if both else loud).places)
-    if count < len(rows.places):
-        note = f"settings chosen on {count} of {len(rows.places)} rows"
-        return replace(best, notes=(*best.notes, note))
-    return best
+    note = (f"settings chosen on {count} of {len(rows.places)} rows",) * (count < len(rows.places))
+    return replace(best, notes=best.notes + note)
 
 
 def _candidate_laws(rows: PowerRows, site: Site, mean: MeanName) -> list[MeanLaw]:
@@ -288,22 +292,17 @@ def _search_kernel(
     return replace(base, score=-value - base.cost - cost, kernel=kernel, cost=base.cost + cost)
 
 
-def _two_length_starts(rows: PowerRows, kernel: Kernel) -> list[Kernel]:
-    """Two lengths to start from, about the one that fits best and apart from it."""
-    scale = _median_distance(rows)
+def _two_length_starts(scale: float, kernel: Kernel) -> list[Kernel]:
+    """Two lengths to start from, near the best one and apart from it; `scale` is a median distance [m]."""
     fit, noise = kernel.length, kernel.noise
     near = [Kernel.from_lengths((fit * a, fit * b), (0.5, 0.5), noise) for a, b in SPLITS]
     return near + [Kernel.from_lengths((scale * a, scale * b), (0.3, 0.7), noise) for a, b in WIDE]
 
 
-def _median_distance(rows: PowerRows) -> float:
-    return median_distance(distances(*(torch.from_numpy(rows.places),) * 2))
-
-
-def _end_starts(rows: PowerRows, kernel: Kernel) -> list[Kernel]:
+def _end_starts(scale: float, kernel: Kernel) -> list[Kernel]:
     """Shadows of the path and of each end, or gains of each place, where one was found for both together."""
     starts = []
-    for length in (kernel.length, SHARES[0] * _median_distance(rows)):
+    for length in (kernel.length, SHARES[0] * scale):
         ends = (EndShadowing(length), EndShadowing(length, other=True))
         signals = [replace(one, share=1 / 3) for one in (Shadowing(kernel.lengths[-1]), *ends)]
         starts.append(replace(kernel, terms=(*signals, kernel.terms[-1])))

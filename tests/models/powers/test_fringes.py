@@ -7,8 +7,9 @@ from closed import fitted_to, read_back
 from interference import WAVELENGTH, plane
 
 from gsparc.data.query import Query
+from gsparc.data.spacing import neighbour_distance
 from gsparc.models.powers.field import PowerField
-from gsparc.models.powers.fringes import Blend, nearest_distances, resolves_wavelength
+from gsparc.models.powers.fringes import Blend, resolves_wavelength
 from gsparc.models.powers.waves import field_db, fit_wave_weights, make_basis
 from gsparc.ops import Pose
 
@@ -61,7 +62,7 @@ def test_fringes_were_judged_beside_a_process_of_some_rows(monkeypatch):
     data = plane(400)
     found = fitted_to(PowerField(), data, np.arange(400))[0].fringes
     assert found is not None and len(found.rows) == 150 + 40 and (found.fold < 0).sum() == 40
-    assert found.blend.distance[0] < 1.2 * np.median(nearest_distances(data.moving))
+    assert found.blend.distance[0] < 1.2 * neighbour_distance(data.moving)
 
 
 def test_far_from_all_rows_the_process_is_left_alone(interfering):
