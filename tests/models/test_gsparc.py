@@ -18,8 +18,7 @@ from scenes import fold_of
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models import checkpoint, fitting, loading
-from gsparc.models import stack as stacking
+from gsparc.models import checkpoint, fitting, loading, member_weights
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method
 from gsparc.models.mixture import fit_candidates
@@ -187,13 +186,13 @@ def test_the_log_begins_with_what_is_trained_and_ends_with_what_it_cost(name):
     assert ("callbacks" in first) == ("by rendering" in first)
     last = fitted.lines[-1]
     assert last.startswith("cost: ")
-    assert f" {fitted.report.seconds:.1f} s in all" in last or " s unused" in last
+    assert f" {fitted.report.seconds:.1f} s in all" in last or " s spent on what is not used" in last
 
 
 @pytest.mark.slow
 def test_channels_are_a_mean_of_fields_that_is_stored_whole(monkeypatch, tmp_path):
     equal = lambda gram, *unused: np.full(gram.shape[1], 1 / gram.shape[1])  # noqa: E731
-    monkeypatch.setattr(stacking, "choose_weights", equal)
+    monkeypatch.setattr(member_weights, "choose_weights", equal)
     monkeypatch.setattr(race, "LEAST_GAIN", -math.inf)
     monkeypatch.setattr(fit_candidates, "CONVERGED_ERROR", 0.0)
     few = ("init.searches=2", "init.search_rows=64", "init.max_sources=8")

@@ -100,7 +100,9 @@ def test_an_offset_that_is_said_is_added_to_what_rows_said(predictor):
 def test_no_factor_of_all_rows_is_made(predictor, monkeypatch):
     predictor.rssi(rx=SCREENED[:1])
     sizes, make = [], factor._cholesky
-    monkeypatch.setattr(factor, "_cholesky", lambda gram: sizes.append(gram.shape[-1]) or make(gram))
+    monkeypatch.setattr(
+        factor, "_cholesky", lambda gram, *rest: sizes.append(gram.shape[-1]) or make(gram, *rest)
+    )
     predictor.update(**changed(5))
     assert sizes and max(sizes) < 100 < len(PLACES)
 

@@ -1,6 +1,6 @@
 """Files whose bytes are damaged: cut short, overwritten, made to hang or crash the library that reads them.
 
-Remedy: gsparc/data/raw.py; text of variable length is first read by a program of its own, for a
+Remedy: gsparc/data/hdf5_text.py; text of variable length is first read by a program of its own, for a
 bounded time. Found: damage in a global heap of HDF5 that hangs or crashes libhdf5.
 """
 
@@ -11,7 +11,7 @@ import h5py
 import numpy as np
 import pytest
 
-from gsparc.data import raw as raw_files
+from gsparc.data import hdf5_text
 from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 
@@ -38,7 +38,7 @@ def test_variable_length_text_is_read(tmp_path):
 )
 def test_damaged_heaps_are_read_or_refused_in_bounded_time(tmp_path, count):
     good = users_file(tmp_path / "good.h5").read_bytes()
-    heap = good.index(raw_files.HEAP)
+    heap = good.index(hdf5_text.HEAP)
     for seed in range(count):
         draw, spoilt = random.Random(seed), bytearray(good)
         for _ in range(3):
@@ -53,9 +53,9 @@ def test_damaged_heaps_are_read_or_refused_in_bounded_time(tmp_path, count):
 
 def test_a_reader_that_hangs_or_crashes_is_told_apart(tmp_path, monkeypatch):
     path = users_file(tmp_path / "mine.h5")
-    monkeypatch.setattr(raw_files, "READ", "import time; time.sleep(60)")
-    assert "cannot be read in 0.5 s" in str(raw_files.hdf5_text_error(path, seconds=0.5))
-    monkeypatch.setattr(raw_files, "READ", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    monkeypatch.setattr(hdf5_text, "READ", "import time; time.sleep(60)")
+    assert "cannot be read in 0.5 s" in str(hdf5_text.hdf5_text_error(path, seconds=0.5))
+    monkeypatch.setattr(hdf5_text, "READ", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
     with pytest.raises(DataError, match=r"mine\.h5: damaged \(its text crashes the HDF5 library\)"):
         load_own(path)
 
@@ -63,9 +63,9 @@ def test_a_reader_that_hangs_or_crashes_is_told_apart(tmp_path, monkeypatch):
 def test_a_heap_that_makes_libhdf5_loop_is_refused(tmp_path, monkeypatch):
     """Found by fuzzing: an object that says it is 2 kB larger is walked past for ever."""
     spoilt = bytearray(users_file(tmp_path / "good.h5").read_bytes())
-    spoilt[spoilt.index(raw_files.HEAP) + 25] = 8  # second byte of the first object's size
+    spoilt[spoilt.index(hdf5_text.HEAP) + 25] = 8  # second byte of the first object's size
     path = tmp_path / "loops.h5"
     path.write_bytes(spoilt)
-    monkeypatch.setattr(raw_files.hdf5_text_error, "__defaults__", (1.0,))
+    monkeypatch.setattr(hdf5_text.hdf5_text_error, "__defaults__", (1.0,))
     with pytest.raises(DataError, match=r"loops\.h5: damaged \(its text cannot be read in 1 s\)"):
         load_own(path)
