@@ -21,7 +21,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.processes.changes import COMMON, KINDS, LOOKED, SHARE, LaterRows, evidence, innovations
-from gsparc.processes.places import horizontal, moving_end
+from gsparc.processes.places import first_end, horizontal
 from gsparc.processes.stored import Stored
 
 ROWS = 10_000  # readings to a false alarm, at least, in the mean
@@ -93,7 +93,7 @@ class Watch(Stored):
 
     def cells(self, places: Tensor) -> np.ndarray:
         """Return the number (n,) of the cell of places (n, 3) or (n, 6)."""
-        at = (horizontal(moving_end(places.numpy())) - self.low) // self.side
+        at = (horizontal(first_end(places.numpy())) - self.low) // self.side
         column, row = np.clip(at, 0, SIDES - 1).astype(np.int64).T
         return row * SIDES + column
 
@@ -206,7 +206,7 @@ class Watch(Stored):
             off = group.missed.abs() > LOUD * (group.doubt + group.noise).sqrt()
             # Of a part of the place only the rows that lie in it tell how much.
             group = group[off] if KINDS[kind].name == "local" and off.any() else group
-            where = tuple(horizontal(moving_end(group.places.numpy())).mean(0).tolist())
+            where = tuple(horizontal(first_end(group.places.numpy())).mean(0).tolist())
             called = "device" if who < 0 else "gone" if silent else KINDS[kind].name
             called = called if kind else RETURNED
             self.kind[names] = kind

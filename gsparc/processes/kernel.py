@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from gsparc.ops.transforms import needs_reference
-from gsparc.processes.places import moving_end, other_end
+from gsparc.processes.places import first_end, other_end
 from gsparc.processes.stored import Stored
 from gsparc.processes.term import Term
 
@@ -158,7 +158,7 @@ class EndShadowing(Shadowing):
 
     def covariance(self, a: Tensor, b: Tensor) -> Tensor:
         """See `Term`; of places (..., 6) of both ends [m]."""
-        end = other_end if self.other else moving_end
+        end = other_end if self.other else first_end
         return super().covariance(end(a), end(b))
 
 

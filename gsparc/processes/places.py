@@ -1,4 +1,4 @@
-"""Columns of places: the moving end [m], then the other end where both are told, then what else is."""
+"""Columns of places: one end [m], then the other end where both are told, then what else is."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ NO_PLACES = ORIGIN.new_zeros(0, len(ORIGIN))
 UNKNOWN = torch.full_like(ORIGIN, math.nan)  # a place that nobody gave
 
 
-def moving_end(places: Places) -> Places:
-    """Return the moving end (..., 3) of places (..., D), which may be of both ends [m].
+def first_end(places: Places) -> Places:
+    """Return the first end (..., 3) of places (..., D) [m]: the one that moves, or of two the transmitter.
 
-    >>> moving_end(np.array([[1.0, 2.0, 3.0, 0.0, 0.0, 9.0]]))
+    >>> first_end(np.array([[1.0, 2.0, 3.0, 0.0, 0.0, 9.0]]))
     array([[1., 2., 3.]])
     """
     return places[..., :3]
 
 
 def other_end(places: Places) -> Places:
-    """Return the other end (..., 3) of places (..., D) of both [m]; nothing (..., 0) of one.
+    """Return the second end (..., 3) of places (..., D) of both [m]; nothing (..., 0) of one.
 
     >>> other_end(np.array([[1.0, 2.0, 3.0, 0.0, 0.0, 9.0]]))
     array([[0., 0., 9.]])

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gsparc.processes.kernel import ExponentialShadowing, distances, to_number
-from gsparc.processes.places import Places, horizontal, moving_end, other_end
+from gsparc.processes.places import Places, first_end, horizontal, other_end
 from gsparc.processes.term import Term
 from gsparc.processes.trend import Trend
 
@@ -114,7 +114,7 @@ class Sectors(Trend):
         azimuth, tilt, width, height, _ = self.table[sector_of(places).long()].T
         shared = self.shared if shared is None else shared
         wider, higher, floor, tilted = shared.unsqueeze(-1).unbind(-2)[2:]
-        away = moving_end(places) - other_end(places)
+        away = first_end(places) - other_end(places)
         flat = horizontal(away).norm(dim=1).clamp_min(1e-3)
         # From north and clockwise, as azimuths of sectors are given.
         bearing = torch.rad2deg(torch.atan2(away[:, 0], away[:, 1]))
@@ -176,8 +176,8 @@ class SectorShadowing(Term[Tensor]):
 
     def covariance(self, a: Tensor, b: Tensor) -> Tensor:
         """Return that (..., n, m) of places (..., n, 7) and (..., m, 7), see `Term`."""
-        distance = distances(moving_end(a), moving_end(b))
-        ways = (horizontal(moving_end(at) - other_end(at)) for at in (a, b))
+        distance = distances(first_end(a), first_end(b))
+        ways = (horizontal(first_end(at) - other_end(at)) for at in (a, b))
         towards = [torch.nn.functional.normalize(way, dim=-1) for way in ways]
         # exp((cos angle - 1) / b^2): a Gaussian of small angles that closes around the circle.
         alike = (towards[0] / BEARING**2 @ towards[1].mT - 1 / BEARING**2).exp()

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.processes.places import moving_end, other_end
+from gsparc.processes.places import first_end, other_end
 from gsparc.processes.stored import Stored
 from gsparc.processes.term import Columns
 
@@ -44,7 +44,7 @@ class Law(Stored):
 
     def _squared_distance(self, places: Tensor) -> Tensor:
         still = other_end(places) if self.place is None else places.new_tensor(self.place)
-        return (moving_end(places) - still).square().sum(1).clamp_min(max(self.floor, TINY_M) ** 2)
+        return (first_end(places) - still).square().sum(1).clamp_min(max(self.floor, TINY_M) ** 2)
 
     def distance(self, places: Tensor) -> Tensor:
         """Return the distance [m], floored, (n,) at (n, 3), or of both ends (n, 6) [m]."""
@@ -88,7 +88,7 @@ class Walls(Columns):
         other = self.still.expand(len(places), -1) if len(self.still) else other_end(places)
         start, end = (
             (at @ self.axes.flatten(0, 1).T).view(len(places), -1, 3) - self.corners
-            for at in (moving_end(places), other)
+            for at in (first_end(places), other)
         )
         difference = (start - end)[..., :1]
         # Where a path meets the wall's plane; a path along the plane is divided by 1, and never counts.

@@ -20,7 +20,7 @@ from gsparc.models.closed_form import ClosedForm, LeftOutRows, Moments
 from gsparc.models.image_sources.rows import Rows, channel_places, static_array
 from gsparc.models.method import Prediction
 from gsparc.physics.waves import LIGHT
-from gsparc.processes.places import moving_end
+from gsparc.processes.places import first_end
 
 SAME_ROTATION = 1e-3  # largest difference of the entries of rotations that are taken as equal
 
@@ -151,7 +151,7 @@ class SourcesInFrame(ClosedForm):
         gain, away, sources = self._normalised_paths(places)
         gain = (gain * frame.scale).reshape(count, frame.antennas, -1) / self.factors[:, None]
         delay = (away / LIGHT).view(count, -1, away.shape[1]).expand(-1, frame.antennas, -1)
-        ends = moving_end(places)
+        ends = first_end(places)
         unit = normalize(sources - ends.reshape(count, -1, ends.shape[1]).mean(1)[:, None], dim=-1)
         return merge_equal_paths(QueryPaths(gain, delay, unit, frame.carrier_hz))
 

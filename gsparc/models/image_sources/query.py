@@ -19,7 +19,7 @@ from gsparc.physics.mirror_planes import image_rotations
 from gsparc.physics.waves import wave_over_band
 from gsparc.processes.few_rows import evenly_spaced
 from gsparc.processes.kernel import distances
-from gsparc.processes.places import moving_end
+from gsparc.processes.places import first_end
 
 CHUNK = 128  # places at a time: sources x places x rows floats in memory
 MATERN32 = 3  # factor of squared distances over lengths in Matern-3/2
@@ -58,7 +58,7 @@ class EnsembleMeans:
         # |u - v|^2 of unit vectors is 2 - 2 u.v.
         self.by_angle = (2 * MATERN32 / angle**2).float()
         self.by_length = (MATERN32 / length**2).float()
-        toward = unit_vectors(moving_end(self.places), self.sources)
+        toward = unit_vectors(first_end(self.places), self.sources)
         self.towards = (toward * -self.by_angle).mT.contiguous()
         # Not at the first query, which may be for inference alone.
         hides = any(len(scene.clutter) for scene in scenes)
@@ -76,7 +76,7 @@ class EnsembleMeans:
         """Return visible shares (K, m) of sources from queries (m, 3 or 6) [m]; None without clutter."""
         if not self.hiding:
             return None
-        places = moving_end(queries)
+        places = first_end(queries)
         return torch.cat([hidden.visible_share(legs.paths(places)) for legs, hidden in self.hiding])
 
     def ranges(self, queries: Tensor) -> Tensor:
@@ -91,7 +91,7 @@ class EnsembleMeans:
         dtype = self.towards.dtype
         squared = distances(queries, self.places).square().to(dtype)
         scaled = torch.addcmul(self.by_angle, squared, self.by_length)
-        scaled = torch.baddbmm(scaled, unit_vectors(moving_end(queries), self.sources, dtype), self.towards)
+        scaled = torch.baddbmm(scaled, unit_vectors(first_end(queries), self.sources, dtype), self.towards)
         root = scaled.clamp_min(1e-9).sqrt()  # Matern-3/2 of 3 times the squared distances
         decay = torch.exp(-root)
         return torch.addcmul(decay, root, decay)

@@ -15,7 +15,7 @@ from torch import Tensor
 from gsparc.data.schema import Measurements, Site
 from gsparc.physics.waves import ranges
 from gsparc.processes import few_rows
-from gsparc.processes.places import moving_end
+from gsparc.processes.places import first_end
 
 LEAST_ROWS = 8  # that a search may be limited to
 
@@ -137,7 +137,7 @@ def rows_of_measurements(data: Measurements, index: np.ndarray, limit: int, seed
                 continue
             comb = bins[np.floor((np.arange(count) + rng.random()) * len(bins) / count).astype(int)]
             # `element` names the static end's antenna.
-            at, target = np.repeat(moving_end(place[e, None]), count, 0), values[e, comb][:, None]
+            at, target = np.repeat(first_end(place[e, None]), count, 0), values[e, comb][:, None]
             target = target if per > 1 else values[:, comb].T
             parts.append((at, frequency[comb], target, np.full(count, row), np.full(count, e)))
     *columns, element = (torch.from_numpy(np.concatenate(column)) for column in zip(*parts, strict=True))
@@ -159,7 +159,7 @@ def ranges_at(places: Tensor, sources: Tensor, rotations: Tensor) -> Tensor:
         sources: (K, 3) float64 [m].
         rotations: (K, 3, 3), see `mirror_planes.orientations`.
     """
-    position = moving_end(places)
+    position = first_end(places)
     if places.shape[1] > position.shape[1]:
         # A mirror turns the array with its middle: offsets of antennas are mirrored about the image.
         sources = sources + torch.einsum("kij,mj->mki", rotations, places[:, position.shape[1] :])

@@ -18,7 +18,7 @@ from gsparc.models.image_sources.rows import Rows
 from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, images
 from gsparc.physics.waves import point_wave, ranges
 from gsparc.processes.kernel import matern32_of_squares
-from gsparc.processes.places import moving_end
+from gsparc.processes.places import first_end
 
 BETAS = 0.8, 0.95  # decay rates of Adam's moments: of tens of steps, not its usual thousand
 JITTER = 1e-5  # of unit signal power; what float32 needs to factor the covariance
@@ -46,7 +46,7 @@ class KernelVisibility:
 
         By reciprocity gains also vary over places of the static end, the last three of (n, 6) numbers.
         """
-        squared = _squared_distances(unit_vectors(moving_end(places), source, dtype)) / self.angle**2
+        squared = _squared_distances(unit_vectors(first_end(places), source, dtype)) / self.angle**2
         if not _needs_float64(places, float(torch.as_tensor(self.length).detach())):
             places = places.to(dtype)
         squared = squared + _squared_distances(places).to(dtype) / self.length**2

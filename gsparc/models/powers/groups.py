@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsparc.data import spacing
-from gsparc.processes.places import horizontal, moving_end
+from gsparc.processes.places import first_end, horizontal
 from gsparc.processes.trend import TINY_M
 
 SIDES = 10  # squares along the longer side of the places' box
@@ -17,7 +17,7 @@ def number_squares(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
 
     Along the longer side of the places' box there are `sides` squares.
     """
-    floor = horizontal(moving_end(places))
+    floor = horizontal(first_end(places))
     side = max(spacing.tenth_of_extent(floor), TINY_M) * SIDES / sides
     return spacing.number_squares(floor - floor.min(0), side)
 

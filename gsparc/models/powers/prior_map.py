@@ -20,7 +20,7 @@ from torch import Tensor
 
 from gsparc.data.prior_levels import read_prior_maps
 from gsparc.data.schema import Measurements
-from gsparc.processes.places import moving_end, other_end
+from gsparc.processes.places import first_end, other_end
 from gsparc.processes.sectors import ROUND, SHARED, Sectors, sector_of
 from gsparc.processes.term import Columns
 
@@ -123,6 +123,6 @@ class NetworkMaps(Columns):
             own = (sector_of(places) == number).nonzero()[:, 0]
             if len(own):
                 at = places[own]
-                level = one.columns(at)[:, 0] + usual_loss(moving_end(at) - other_end(at)) - self.level
+                level = one.columns(at)[:, 0] + usual_loss(first_end(at) - other_end(at)) - self.level
                 result = result.index_add(0, own, level.to(result))
         return result

@@ -11,7 +11,7 @@ from torch import Tensor
 from gsparc.models.channels.columns import Slot, SlotPlaces
 from gsparc.models.channels.kernels import spherical_wave
 from gsparc.models.channels.terms.spherical import Spherical
-from gsparc.processes.places import has_both_ends, moving_end, other_end
+from gsparc.processes.places import first_end, has_both_ends, other_end
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,9 @@ class Direct(Spherical):
         """Return the wave (1, n), see `Spherical`; of places (n, 6), from one end to the other."""
         if not has_both_ends(at.places):
             return super().waves(at)
-        middle, wavenumber = moving_end(self.frame.middle) - other_end(self.frame.middle), at.slot.wavenumber
+        middle, wavenumber = first_end(self.frame.middle) - other_end(self.frame.middle), at.slot.wavenumber
         away = torch.linalg.vector_norm(middle).clamp_min(2 * math.pi / wavenumber)
-        between = moving_end(at.places) - other_end(at.places)
+        between = first_end(at.places) - other_end(at.places)
         return spherical_wave(between, torch.zeros_like(middle), wavenumber, away)[None]
 
     @property

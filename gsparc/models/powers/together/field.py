@@ -39,7 +39,7 @@ from gsparc.models.powers.together.terms import SharedTerms, places_and_notes, r
 from gsparc.models.target_rows import linear_moments
 from gsparc.processes.factor import Factor
 from gsparc.processes.neighbourhood import nearest_distance
-from gsparc.processes.places import moving_end
+from gsparc.processes.places import first_end
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import MOST_ROWS, REACH
 from gsparc.processes.prior import Prior
@@ -166,7 +166,7 @@ class JointPowerField(ClosedForm):
             if chosen.any():
                 mean[chosen], variance = of.answer(places[chosen], number[chosen], exact)
                 spread[chosen], share[chosen] = inflation * variance, variance / self.whole
-        share = (share + self._law_share(moving_end(places))).clamp_max(1.0)
+        share = (share + self._law_share(first_end(places))).clamp_max(1.0)
         mean, spread, share = (part.to(query.tx.dtype) for part in (mean, spread, share))
         return Prediction(*linear_moments(mean, spread), share)
 
@@ -304,7 +304,7 @@ class JointPowerField(ClosedForm):
         """
         if self._reach is None:
             posterior, _ = self._require_posteriors()
-            places = torch.cat([moving_end(one.rows) for one in posterior.processes.values()]).numpy()
+            places = torch.cat([first_end(one.rows) for one in posterior.processes.values()]).numpy()
             self._reach = cKDTree(places), max(REACH * float(np.linalg.norm(np.ptp(places, axis=0))), TINY_M)
         tree, reach = self._reach
         far = nearest_distance(tree, moving)

@@ -18,7 +18,7 @@ from gsparc.models.powers.settings import EVIDENCE_LOOKS
 from gsparc.models.powers.together.terms import SharedTerms, StationRows
 from gsparc.processes.fit_kernel import fit_kernel_by_evidence, fit_kernel_by_left_out
 from gsparc.processes.kernel import Kernel, distances, median_distance
-from gsparc.processes.places import extra_columns, moving_end
+from gsparc.processes.places import extra_columns, first_end
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import LEAST_SILENT, MOST_ROWS, condition_on_powers
 from gsparc.processes.prior import Prior
@@ -130,7 +130,7 @@ def _fit_common_kernel(heard: StationRows, trend: Trend, seed: int) -> tuple[Ker
     """Lengths and noise that all stations have alike, and priors with the amplitude of each."""
     few = heard.thin_rows(heard.share_of(MOST_ROWS, LEARNED_EACH), seed)
     views = {number: few.select_station(number).view(trend) for number in few.stations}
-    at = torch.from_numpy(np.unique(moving_end(few.places), axis=0))
+    at = torch.from_numpy(np.unique(first_end(few.places), axis=0))
     far = distances(at, at)
     lengths = [length * median_distance(far) for length in START.lengths]
     start = Kernel.from_lengths(lengths, START.shares, START.noise)

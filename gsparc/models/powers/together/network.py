@@ -28,7 +28,7 @@ from gsparc.processes.factor import Factor
 from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.fit_kernel import SETTLED, minimise
 from gsparc.processes.kernel import Kernel, WhiteNoise, distances
-from gsparc.processes.places import horizontal, moving_end, other_end
+from gsparc.processes.places import first_end, horizontal, other_end
 from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import (
     NO_AZIMUTH,
@@ -108,7 +108,7 @@ def number_sites(stations: Stations, places: np.ndarray) -> np.ndarray:
 
 def relabel_by_site(rows: StationRows, network: Sectors) -> StationRows:
     """Return the same by sites; places (n, 7) say which station a row is of."""
-    ends = moving_end(rows.places), other_end(rows.places)
+    ends = first_end(rows.places), other_end(rows.places)
     places = np.concatenate([*ends, rows.station[:, None]], 1)
     return replace(rows, places=places, station=network.site.numpy()[rows.station])
 
@@ -298,7 +298,7 @@ def _fit_by_evidence(
     rough = replace(rough, doubt=torch.zeros(len(SHARED) + bands, 0, dtype=torch.float64))
     own = [gram @ gram.T for gram in map(rough.columns, places)]
     count, last = sum(map(len, places)), [list[PseudoValues]() for _ in parts]
-    middle = float(distances(*(moving_end(places[0]),) * 2).median()) or 1.0
+    middle = float(distances(*(first_end(places[0]),) * 2).median()) or 1.0
     start = _usual_kernel(rough, middle, max(scale**2, 1.0), max(float(gains.var()), 1.0))
     usual = start.parameters()
 

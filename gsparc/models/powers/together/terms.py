@@ -22,7 +22,7 @@ from gsparc.processes.factor import Factor
 from gsparc.processes.few_rows import draw_rows, first_rows, shuffle_groups
 from gsparc.processes.kernel import distances, matern32
 from gsparc.processes.nearest import JITTER
-from gsparc.processes.places import NO_PLACES, moving_end
+from gsparc.processes.places import NO_PLACES, first_end
 from gsparc.processes.powers import PowerRows
 from gsparc.processes.sectors import Sectors
 from gsparc.processes.term import Columns
@@ -70,7 +70,7 @@ class StationRows(PowerRows):
     def select_complete_places(self) -> Self:
         """Return those of places that have as many rows as any, if these are enough; else all."""
         ends = np.unique(self.places, axis=0)  # a sector's are of seven numbers
-        count = np.unique(moving_end(ends), axis=0, return_counts=True)[1]
+        count = np.unique(first_end(ends), axis=0, return_counts=True)[1]
         whole = count == count.max()
         enough = whole.sum() >= LEAST_WHOLE
         return self.subset(np.flatnonzero(whole[self._place_numbers])) if enough else self
@@ -89,7 +89,7 @@ class StationRows(PowerRows):
     @property
     def _place_numbers(self) -> np.ndarray:
         """Numbers (n,) of the places that the moving end was at."""
-        return np.unique(moving_end(self.places), axis=0, return_inverse=True)[1].reshape(-1)
+        return np.unique(first_end(self.places), axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def places_and_notes(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -143,7 +143,7 @@ class SharedTerms(Columns):
 
     def set_inducing(self, rows: StationRows, limit: int, seed: int) -> SharedTerms:
         """Return the same with g known at so many places of rows, drawn evenly."""
-        every = np.unique(moving_end(rows.places), axis=0)
+        every = np.unique(first_end(rows.places), axis=0)
         return replace(self, inducing=torch.from_numpy(every[draw_rows(len(every), limit, seed)]))
 
     def columns(self, places: Tensor) -> Tensor:
@@ -157,7 +157,7 @@ class SharedTerms(Columns):
         law = LAW_DB * torch.stack([decades, bend], 1)
         if not self.place_db:
             return law / self.unit
-        near = matern32(distances(self.inducing, moving_end(places)), self.length)
+        near = matern32(distances(self.inducing, first_end(places)), self.length)
         return torch.cat([law, self.place_db * self._inducing_factor.whiten(near).T], 1) / self.unit
 
     @cached_property
