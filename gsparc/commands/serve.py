@@ -58,7 +58,7 @@ def task(config: DictConfig) -> None:
     predictor = load(config.ckpt, unit=config.unit).select_station(config.station)
     site, powers = predictor.site, predictor.site.target.is_level
     # Powers of all stations are one answer; channels and spectra are of one station each.
-    if site.static_end is None or (site.stations and not powers):
+    if site.paired or (site.stations and not powers):
         raise DataError("serve: one end that stands still is needed; of several stations say station=NAME")
     keep = partial(keep_versions, config.ckpt, predictor) if config.updates else None
     if keep is not None and (config.station is not None or not powers):

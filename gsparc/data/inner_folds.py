@@ -106,7 +106,7 @@ def cut_folds(data: Measurements, fold: Fold, split: AnySplit | None, count: int
     end than theirs, as it was for the split.
     """
     positions = data.moving
-    if data.site.static_end is None and data.station is not None:
+    if data.site.paired and data.station is not None:
         positions = data.rx_position if _still(data.tx, data.station) else data.tx
     unit = data.run if split is not None and split.name == "runs" else data.station
     return inner_folds(positions, fold, split, count, seed, data.place, unit)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -21,6 +21,8 @@ from gsparc.physics.row_factors import UnknownFactor, describe_factor
 
 if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
+
+Places = TypeVar("Places")
 
 # Channels with unknown factors are compared after alignment, which is another figure.
 Scored = Literal["spectrum", "csi", "aligned csi", "rssi"]  # by which figures of merit
@@ -228,6 +230,11 @@ class Site:
         return OTHER[self.still_end]
 
     @property
+    def paired(self) -> bool:
+        """Whether both ends move: a place is a pair of positions."""
+        return self.static_end is None
+
+    @property
     def still_end(self) -> End:
         """The other end: the one that stands still; the transmitter where both move."""
         return self.static_end or "tx"
@@ -242,6 +249,14 @@ class Site:
         parts = np.split(np.asarray(places, np.float64), len(self.moving_ends), axis=-1)
         return {end: part + self.origin for end, part in zip(self.moving_ends, parts, strict=True)}
 
+    def name_moving(self, places: Places) -> dict[str, Places]:
+        """Return world places (..., 3) [m] of the moving end under its name, as a `Predictor` takes them.
+
+        >>> predictor.site.name_moving([1.0, 2.0, 1.5])
+        {'tx': [1.0, 2.0, 1.5]}
+        """
+        return {self.moving_end: places}
+
     def local_places(self, world: Mapping[End, np.ndarray]) -> np.ndarray:
         """Return local places (n, 3) or (n, 6) [m] of world ones by end: what `world_ends` takes."""
         return np.hstack([world[end] - self.origin for end in self.moving_ends])
@@ -250,7 +265,7 @@ class Site:
         """Return positions [m] of what moves: (B, 3) of one end (or one for all), or (B, 6) of both."""
         # A static receiver's pose has no leading axis, a batch of poses has one.
         place = rx.position.reshape(-1, 3)
-        if len(self.moving_ends) > 1:
+        if self.paired:
             return torch.cat([tx, place.expand(len(tx), 3)], dim=1)
         return tx if self.moving_end == "tx" else place
 
@@ -280,7 +295,7 @@ class Site:
     @property
     def maps_levels(self) -> bool:
         """Whether these are powers of one end that moves: levels over its places."""
-        return self.target.is_level and len(self.moving_ends) == 1
+        return self.target.is_level and not self.paired
 
     @property
     def has_waves(self) -> bool:

@@ -55,7 +55,7 @@ def wrap_per_station(factory: MethodFactory, data: Measurements) -> MethodFactor
     """
     if data.site.several:
         return PerStation(factory)
-    if data.site.static_end is None and not factory.both_ends:
+    if data.site.paired and not factory.both_ends:
         raise ValueError(f"{factory.name}: both ends move here; it needs one that stands still")
     return factory
 

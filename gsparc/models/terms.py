@@ -120,7 +120,7 @@ def _refuse_scene(
         why = "model.field.count=0 is the residual alone"
     elif site.target.is_level and site.several:
         why = "known walls are of one station's model; say stations=each"
-    elif site.target.is_level and site.static_end is not None and site.static_position is None:
+    elif site.target.is_level and not site.paired and site.static_position is None:
         why = "the dataset does not say where the static end is"
     elif site.target.is_level and switches.visibility is False:
         why = "of received powers walls only hide, which model.effects.visibility=false turns off"

@@ -230,7 +230,7 @@ def query_ends(
         DataError: both ends moved and nobody says where the other is, or it stood still and somebody does.
     """
     moving, other = site.moving_end, site.still_end
-    if len(site.moving_ends) == 1:
+    if not site.paired:
         if other_end is not None:
             raise DataError(f"other_end: the {other} stood still; leave it out")
         return {moving: places} | ({} if station is None else {other: station})

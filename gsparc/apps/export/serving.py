@@ -188,7 +188,7 @@ class Batcher:
         try:
             places = [np.zeros((0, 3)), *(_read(site.moving_end, one) for one in batch)]
             with self.lock:
-                values = getattr(self.predictor, self.what)(**{site.moving_end: np.concatenate(places)})
+                values = getattr(self.predictor, self.what)(**site.name_moving(np.concatenate(places)))
             values = np.stack([values.real, values.imag], -1) if np.iscomplexobj(values) else values
             parts = np.split(values.astype("<f4"), np.cumsum([len(one) for one in places])[:-1])
             return [part.copy() for part in parts[1:]]  # a view would keep the others' answers
@@ -216,7 +216,7 @@ def build_application(
         raise SettingError(
             "updates=true: whoever reaches it changes the model; set GSPARC_TOKEN, or say token=WORD"
         )
-    middle = getattr(predictor, site.kind)(**{site.moving_end: site.moving_box.mean(0) + site.origin})
+    middle = getattr(predictor, site.kind)(**site.name_moving(site.moving_box.mean(0) + site.origin))
     # Real and imaginary part count as two numbers.
     each = np.size(middle) * (2 if np.iscomplexobj(middle) else 1)
     if each > limits.numbers:
@@ -267,7 +267,7 @@ def build_application(
         rows = RowsBody.model_validate_json(body)
         with lock:
             levels = np.array(rows.levels, float).reshape(len(rows.places), -1)
-            where: dict[str, Any] = {site.moving_end: np.array(rows.places)}
+            where: dict[str, Any] = site.name_moving(np.array(rows.places))
             found = predictor.update(**where, rssi=levels)
             assert keep is not None
             try:

@@ -39,7 +39,7 @@ class SiteField:
 
     def __init__(self, predictor: Predictor) -> None:
         self.predictor, self.site = predictor, predictor.site
-        if self.site.static_end is None:
+        if self.site.paired:
             raise ValueError("locate: both ends move; one that stands still is needed")
         self.count = len(self.site.every_station)
 

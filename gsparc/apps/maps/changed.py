@@ -27,7 +27,7 @@ def add_changes(field: FieldMap, predictor: Predictor, dry: bool = False) -> Fie
         cells = np.flatnonzero(field.best_server.reshape(-1) == row)
         if len(cells):
             model = predictor.ask_station(int(number))
-            layers[:, cells] = model.change(**{model.site.moving_end: field.grid.places(cells)})
+            layers[:, cells] = model.change(**model.site.name_moving(field.grid.places(cells)))
     change, deviation = layers.reshape(2, *field.best_server.shape)
     return replace(field, extra={**field.extra, CHANGE: change, DEVIATION: deviation})
 

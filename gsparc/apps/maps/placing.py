@@ -233,7 +233,7 @@ def lay_candidates(
     """
     site = predictor.site
     check_arguments(locals(), count=whole(1))
-    if site.stations is None or site.static_end is None:
+    if site.stations is None or site.paired:
         raise DataError(f"place: {site.name} has no stations; several that were trained together are needed")
     grid = coarse_grid(predictor, area, height_m)
     heights = site.stations.position[:, 2] + site.origin[2]

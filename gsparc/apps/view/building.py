@@ -52,7 +52,7 @@ def build_scene(
     """Build everything that stands still, with the measurements and the Gaussians of one station."""
     stands = {name: at for name in viewed.stations if (at := viewed.static_place(name)) is not None}
     points = [viewed.box(), *(at[None] for at in stands.values())]
-    if viewed.site.static_end is None:
+    if viewed.site.paired:
         points.append(viewed.site.box + viewed.site.origin)
     frame = DrawingFrame.around(np.concatenate(points))
     extent = EXTENT / frame.scale
@@ -109,9 +109,9 @@ def model_gaussians(viewed: Viewed, station: str | None, measured: Measured | No
     if measured is not None:
         places = measured.places[np.linspace(0, len(measured.places) - 1, QUERIES).astype(int)]
     site = viewed.site
-    other = {} if site.static_end is not None else {"tx": site.box.mean(0) + site.origin}
+    other = {"tx": site.box.mean(0) + site.origin} if site.paired else {}
     with suppress(ValueError):  # of this kind are only some of those that it fits
-        return viewed.predictor_of(station).gaussians(**{site.moving_end: places}, **other)
+        return viewed.predictor_of(station).gaussians(**site.name_moving(places), **other)
     return None
 
 

@@ -84,7 +84,7 @@ class SiteView:
         measured = viewed.measured_at(name)
         scene = build_scene(viewed, self.plan, name, measured)
         power = scene.legends.get(VALUES) if viewed.site.kind in MAPPED else None
-        tree = cKDTree(measured.places) if measured is not None and viewed.site.static_end else None
+        tree = cKDTree(measured.places) if measured is not None and not viewed.site.paired else None
         return StationView(scene, measured, tree, power)
 
     def extent(self, name: str | None) -> float:
@@ -112,7 +112,7 @@ class SiteView:
         """Return the power over all of some cells, the transmitter where it first stands if both ends
         move.
         """
-        other = None if self.viewed.site.static_end is not None else self.initial_places(name)["tx"].tolist()
+        other = self.initial_places(name)["tx"].tolist() if self.viewed.site.paired else None
         *_, plane = refine_plane(self.viewed.predictor_of(name), grid, other)
         assert plane is not None
         return plane

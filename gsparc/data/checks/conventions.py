@@ -160,7 +160,7 @@ def _rivals_of_places(data: Measurements) -> list[str]:
     """
     links, rows = LevelsAtPlaces.of(data)
     candidates = np.flatnonzero(np.isfinite(np.hstack([data.tx, data.rx_position])[rows]).all(axis=1))
-    if data.site.static_end is None or len(candidates) < FEWEST["spectrum"]:
+    if data.site.paired or len(candidates) < FEWEST["spectrum"]:
         return []
     drawn = candidates[draw_rows(len(candidates), ROWS, 0)]
     data, links = data.subset(rows[drawn]), links.take(drawn)

@@ -100,9 +100,9 @@ def spacing_words(positions: np.ndarray, wavelength: float | None) -> str:
 
 def _static(site: Site) -> str:
     """Which end stands still, and where in the world."""
-    if site.static_end is None:
+    if site.paired:
         return "neither end"
-    end, stations = ENDS[site.static_end], site.every_station
+    end, stations = ENDS[site.still_end], site.every_station
     if site.stations is not None and (site.several or site.static_position is None):
         places = stations.position[np.isfinite(stations.position).all(axis=1)]
         unknown_count = len(stations) - len(places)

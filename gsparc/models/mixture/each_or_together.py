@@ -28,7 +28,7 @@ class LearnsTogether(MethodFactory):
 
     def learns_jointly(self, site: Site) -> bool:
         """Tell whether stations share a field: of powers, or channels of a known carrier with phases."""
-        waves = site.has_waves and len(site.moving_ends) == 1
+        waves = site.has_waves and not site.paired
         return (waves and site.phase_reference != "neighbours") or site.target.is_level
 
     def why_each(self, data: Measurements) -> str | None:

@@ -112,7 +112,7 @@ class Mixture(LearnsTogether, ClosedForm):
             read_walls(self.init.file)  # its errors come before anything is computed
         # Places are refined by slopes of predictions: of one end that moves, with phases that rows share.
         site, phases = data.site, data.site.phase_reference != "neighbours"
-        heeds = not site.target.is_image and site.static_end is not None and phases
+        heeds = not (site.target.is_image or site.paired) and phases
         fit_rows = fold.learned()
         if (std := position_errors(data, fit_rows, self.position_std, heeds)) is not None:
             return self._fit_twice(parts, init, data, fold, context, std)

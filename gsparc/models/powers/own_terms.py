@@ -64,7 +64,7 @@ class OwnTerms:
         """Return all as columns for measurements of a station or a network; count what is used as heeded."""
         # A tuple is not noted when it is read, nor what the class that makes a method was given.
         heeded.count_reads(*["model.terms"] * bool(self.terms))
-        if self.prior is None or data.site.static_end is None:  # a map is about one end that moves
+        if self.prior is None or data.site.paired:  # a map is about one end that moves
             return self.terms
         heeded.count_reads("model.prior")
         if data.site.several:

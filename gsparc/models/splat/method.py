@@ -200,7 +200,7 @@ class LearnedField(Method):
 
     def _refuse_site(self, site: Site) -> None:
         """Raise `ValueError`, one line, where it has no such field."""
-        one_end = not site.target.is_level and site.static_end is not None
+        one_end = not (site.target.is_level or site.paired)
         if self.settings.response.channel != "mean" or one_end:
             return
         why = "the target is powers" if site.target.is_level else "both ends move"

@@ -29,7 +29,7 @@ def write_scenario(folder: Path, predictor: Predictor, place: np.ndarray) -> tup
     site = predictor.site
     if site.static_position is None:
         raise ValueError("to=deepmimo: where the static end stands must be known")
-    paths = predictor.paths(**{site.moving_end: place})
+    paths = predictor.paths(**site.name_moving(place))
     if paths.direction is None:
         raise ValueError("to=deepmimo: paths with directions are needed")
     still = np.asarray(site.static_position, np.float64) + site.origin

@@ -133,7 +133,7 @@ def fit_taps(
         ValueError: another model, no rate, a band wider than the rate, or silence.
     """
     site = predictor.site
-    if not site.target.is_complex or site.static_end is None:
+    if not site.target.is_complex or site.paired:
         raise ValueError("to=taps: channels with one end that stands still are needed")
     tones = site.tones()
     if rate_hz is None and len(tones) == 1:
@@ -144,7 +144,7 @@ def fit_taps(
     places = way.places_at(time_s)
 
     def ask(place: np.ndarray) -> np.ndarray:
-        where: dict[str, Any] = {site.moving_end: place}
+        where: dict[str, Any] = site.name_moving(place)
         return predictor.csi(**where)[:, :antennas]
 
     if np.ptp(tones) > rate_hz:

@@ -66,7 +66,7 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
     method, site = predictor.method, predictor.site
     if isinstance(method, PerStation):
         raise ValueError(f"station= is needed, one of {', '.join(site.every_station.name)}")
-    if site.static_end is None and not site.target.is_level:
+    if site.paired and not site.target.is_level:
         advice = "take a model of powers, or one end that stands still"
         raise ValueError(f"to=c: channels and spectra of two moving ends have no compiled form; {advice}")
     # An exact form is not measured: its error is that of rounding to float32.
@@ -216,7 +216,7 @@ def near_places(site: Site, count: int, seed: int) -> np.ndarray:
     evenly in the logarithm of how much.
     """
     places, (low, high) = random_places(site, count, seed), site.moving_box
-    other = places[:, :3] if site.static_end is None else site.static_position
+    other = places[:, :3] if site.paired else site.static_position
     if other is None:  # nobody knows where
         return places
     # Logarithmic: powers, and with them errors, grow by decades towards the end that stands.

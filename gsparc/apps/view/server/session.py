@@ -122,8 +122,8 @@ class Session:
 
     def _notes(self) -> list[str]:
         note = "both ends moved: measured points are where the receiver was, wherever its transmitter"
-        if self.site.static_end is not None:
-            still = ENDS[self.site.static_end]
+        if not self.site.paired:
+            still = ENDS[self.site.still_end]
             note = f"the {still} stood still when measured: the model knows it there alone"
         return [*self.scene.notes, f"grid: {self.cell:g} m", note]
 
@@ -152,7 +152,7 @@ class Session:
 
     def _moved(self, end: str) -> None:
         self.want_answer()
-        if end == "tx" and self.site.static_end is None:
+        if end == "tx" and self.site.paired:
             self.want_plane()  # which shows the power of this transmitter
 
     def _go(self, where: str) -> None:
@@ -253,7 +253,7 @@ class Session:
 
     def _predicted_plane(self, grid: Grid) -> Iterator[None]:
         predictor = self.view.viewed.predictor_of(self.station)
-        other = self.places["tx"].tolist() if self.site.static_end is None else None
+        other = self.places["tx"].tolist() if self.site.paired else None
         legend, begin = self.one.power, time.perf_counter()
         self.visited.clear()
         for plane in refine_plane(predictor, grid, other):

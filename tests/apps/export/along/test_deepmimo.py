@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsparc.apps.export.along import deepmimo
-from gsparc.data.schema import LIGHT
+from gsparc.data.schema import LIGHT, Site
 from gsparc.prediction.channels import Paths
 
 CARRIER = 3.5e9
@@ -14,12 +14,11 @@ STILL = np.array([100.0, 50, 8])
 WALL = 120.0  # a mirror in x
 
 
-class Site:
-    kind, moving_end, origin, static_position = "csi", "rx", np.array([100.0, 50, 0]), np.array([0.0, 0, 8])
-
-
 class Mirror:
-    site = Site()
+    site = Site(
+        "mirror", "csi", "tx", None, None, CARRIER, None, np.array([100.0, 50, 0]),
+        static_position=np.array([0.0, 0, 8]),
+    )  # fmt: skip
 
     def paths(self, rx):
         sources = np.array([STILL, [2 * WALL - STILL[0], STILL[1], STILL[2]], [0, 0, 0]])
