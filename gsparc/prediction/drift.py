@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Site
-from gsparc.processes.changes import COMMON, KINDS, LOOKED, SHARE, LaterRows, evidence, innovations
+from gsparc.processes.changes import COMMON, KINDS, LOOKED, SHARE, LaterRows, evidence
+from gsparc.processes.innovations import innovations
 from gsparc.processes.places import first_end, horizontal
 from gsparc.processes.stored import Stored
 

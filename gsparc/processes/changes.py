@@ -9,7 +9,6 @@ Only systems of a station's nearest rows are solved, never one of all rows that 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -43,8 +42,7 @@ WHOLE = 4  # power of the share of the place that rows lie in: whether a lone st
 AWAY = 1 / 10  # length over which rows of a lone station that seems moved void the map: a local change's
 SURE = 3.0  # deviations by which rows that came before must be contradicted to fade
 CHANGED = 3  # of KINDS: the change that is expected of a station once one was noticed
-UNSEEN, RARE = 0.1, 1e-12  # rows that a share of none counts as; least probability of a row
-TOLD, UNTOLD = 16, 1e9  # earlier rows that tell of the next one; noise of one that is not there [dB^2]
+UNTOLD = 1e9  # noise of a row that is not there [dB^2]
 REFITTED = 200  # latest rows of a station that tell the lengths of changes
 STEPS, OCTAVES = (1.0, 0.5, 2**-0.5, 2**0.5, 2.0), 2.0  # of a scale that are tried; deviations of an octave
 HUNDRED = 100.0  # later rows that a fading is stated for
@@ -194,11 +192,11 @@ class LaterRows(Stored):
         return replace(self, faded=self.faded + aged + added + near.amax(0) * local.clamp_min(0.0))
 
 
-def _covariance(
+def covariance_by_kind(
     a: Tensor, b: Tensor, doubt_a: Tensor, doubt_b: Tensor, extent: float, scale: float = 1.0,
     kinds: Tensor | slice = slice(None),
 ) -> Tensor:  # fmt: skip
-    """Covariances (..., K, n, m) of what is missed at places (..., n, D) and (..., m, D), by kind."""
+    """Return covariances (..., K, n, m) of what is missed at places (..., n, D) and (..., m, D), by kind."""
     distance = distances(a, b)[..., None, :, :]
     doubt = (doubt_a[..., :, None] * doubt_b[..., None, :]).sqrt()[..., None, :, :]
     map_errors = doubt * matern32(distance, extent * ERRORS)
@@ -232,7 +230,9 @@ def evidence(
     noise = torch.stack([_padded(rows.noise, most, UNTOLD) for rows in every])[:, None]
     faded = torch.stack([_padded(rows.faded, most) for rows in every])[:, None]
     noise = NOISES[:, None] + noise + faded + TINY
-    gram = _covariance(places, places, doubt, doubt, extent, scale)[:, None].repeat(1, len(NOISES), 1, 1, 1)
+    gram = covariance_by_kind(places, places, doubt, doubt, extent, scale)[:, None].repeat(
+        1, len(NOISES), 1, 1, 1
+    )
     gram.diagonal(dim1=-2, dim2=-1).add_(noise[:, :, None])
     factor = Factor.from_gram(gram, "raise")
     white = factor.whiten(missed[:, None, ..., None].expand(-1, len(NOISES), -1, -1, -1))
@@ -353,57 +353,12 @@ def _solve(
     Of groups of places (G, B, D) by rows (G or none, n).
     """
     lengths = belief.extent, belief.scale, kept
-    gram = _covariance(rows.places, rows.places, rows.doubt, rows.doubt, *lengths)
+    gram = covariance_by_kind(rows.places, rows.places, rows.doubt, rows.doubt, *lengths)
     gram.diagonal(dim1=-2, dim2=-1).add_(noise.unsqueeze(-2))
-    cross = _covariance(places, rows.places, doubt, rows.doubt, *lengths)
+    cross = covariance_by_kind(places, rows.places, doubt, rows.doubt, *lengths)
     factor = Factor.from_gram(gram, "raise")
     mean = (cross @ factor.solve(values[..., None]))[..., 0]
     prior = KEEPS[kept, None] * doubt[:, None] + (OFFSET.square() + LOCAL.square())[kept, None]
     reduction = factor.whiten(cross.mT.contiguous()).square().sum(-2)
     near = matern32(distances(places, rows.places), belief.extent * AWAY).amax(-1)
     return mean, (prior - reduction).clamp_min(0.0), near[:, None].expand_as(mean)
-
-
-@torch.no_grad()
-def innovations(rows: LaterRows, first: int, extent: float, changed: bool = False) -> tuple[Tensor, Tensor]:
-    """Return surprises (n,) of rows from `first` on [deviations], and log ratios (n,) of a return to the map.
-
-    Each is told of by its nearest earlier rows; surprises are independent and normal. Where a part of the
-    place has changed, a row is in it or is not, as likely as rows near it are, so that edges surprise little.
-    Ratios are of a world where what lies in it is as the map says, to one where it stays as it is.
-    """
-    kind, count = CHANGED if changed else 0, len(rows)
-    new, order = torch.arange(first, count), torch.arange(count)
-    distance = distances(rows.places[first:], rows.places)
-    distance[order >= new[:, None]] = math.inf
-    near = distance.topk(min(TOLD, count), largest=False)
-    at, past = rows[new], rows[near.indices]
-    unknown = torch.where(near.values.isinf(), UNTOLD, 0.0)  # of the first rows there are fewer
-    size, told = OFFSET[kind].square() + LOCAL[kind].square(), past.doubt + past.noise + unknown
-    outside = (_log_normal(past.missed, told) - _log_normal(past.missed, told + size)).sigmoid()
-    # What is outside tells nothing of the change.
-    noise = past.noise + past.faded + unknown + TINY + size * outside / (1 - outside + TINY)
-    alike = (extent, 1.0, slice(kind, kind + 1))
-    gram = _covariance(past.places, past.places, past.doubt, past.doubt, *alike)[:, 0]
-    gram.diagonal(dim1=-2, dim2=-1).add_(noise)
-    cross = _covariance(at.places[:, None], past.places, at.doubt[:, None], past.doubt, *alike)[:, 0]
-    weights = Factor.from_gram(gram, "raise").solve(cross.mT)[..., 0]
-    off = at.missed - (weights * past.missed).sum(1)
-    free = at.doubt + at.noise
-    variance = (free + size - (weights * cross[:, 0]).sum(1)).clamp_min(TINY)
-    surprise = off / variance.sqrt()
-    if not changed:
-        return surprise, torch.zeros_like(surprise)
-    close = matern32(near.values, extent * ERRORS).nan_to_num()
-    close = close * (told + size) / (told + size + past.faded)
-    share = ((close * outside).sum(1) + UNSEEN / 2) / (close.sum(1) + UNSEEN)
-    as_mapped, inside = _log_normal(at.missed, free), _log_normal(off, variance)
-    density = torch.logaddexp(share.log() + as_mapped, (1 - share).log() + inside)
-    below = share * torch.special.ndtr(at.missed / free.sqrt()) + (1 - share) * torch.special.ndtr(surprise)
-    ratio = (share + (1 - share) * (as_mapped - density).exp()).log()
-    return torch.special.ndtri(below.clamp(RARE, 1 - RARE)), ratio
-
-
-def _log_normal(values: Tensor, variance: Tensor) -> Tensor:
-    """Log densities of values whose mean is 0, but for a constant."""
-    return -0.5 * (values.square() / variance + variance.log())

@@ -8,8 +8,9 @@ import torch
 from rooms_later import draw, later_rows
 
 from gsparc.processes import changes
-from gsparc.processes.changes import KINDS, Belief, LaterRows, correct, innovations, learn
+from gsparc.processes.changes import KINDS, Belief, LaterRows, correct, learn
 from gsparc.processes.factor import Factor
+from gsparc.processes.innovations import innovations
 
 EXTENT = 28.0
 
