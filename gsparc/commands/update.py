@@ -20,7 +20,7 @@ from gsparc.evaluation.table import Column, Table
 from gsparc.models import checkpoint
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.updating import level_rows, versions_extra
+from gsparc.prediction.updating import check_updatable, level_rows, versions_extra
 from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
@@ -39,6 +39,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     if (config.data is None) == (config.undo == 0):
         raise DataError("gsparc update: say data=FILE to add rows, or undo=COUNT to take updates back")
     stored = checkpoint.read(config.ckpt)
+    check_updatable(stored.site)  # before the data are read
     predictor = load(config.ckpt)
     alarms_before, watch, row_count, skipped = len(predictor.alarms), Stopwatch(), 0, 0
     if config.undo:

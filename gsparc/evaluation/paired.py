@@ -77,7 +77,7 @@ class Lead:
         return half_width(LEVEL, max(self.count - 1, 1)) * self.error_db
 
     def __str__(self) -> str:
-        error = "" if np.isnan(self.error_db) else f" ± {self.error_db:.2f}"
+        error = "" if np.isnan(self.error_db) else f" ± {self.error_db:.2f} (standard error)"
         return f"{self.ahead_db:.2f}{error} dB better over {self.pairs}"
 
     def __neg__(self) -> Lead:
@@ -87,8 +87,8 @@ class Lead:
     def no_difference(self, one: str, other: str, figure: str) -> str:
         """Return the sentence for two methods, `one` having the lead, of which neither is surely better.
 
-        >>> Lead(0.22, 0.14, 32, "test rows").no_difference("gp", "gsparc", "psnr_db")
-        'gp and gsparc do not differ significantly in psnr_db: gp is 0.22 ± 0.14 dB better over 32 test rows'
+        >>> Lead(0.22, 0.14, 9, "rows").no_difference("a", "b", "ssim")
+        'a and b do not differ significantly in ssim: a is 0.22 ± 0.14 (standard error) dB better over 9 rows'
         """
         if self.same:
             return f"{one} and {other} have the same {figure} over {self.pairs}"

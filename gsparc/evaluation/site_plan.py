@@ -140,7 +140,7 @@ def draw_site(
 def _title(data: Measurements, places: Spots) -> str:
     stations, called = data.site.stations, data.site.target.called
     at = "" if stations is None else f", {len(stations)} station{'s' * (len(stations) > 1)}"
-    spacing = spacing_words(distinct_places(data), data.site.wavelength).partition(";")[0]
+    spacing = spacing_words(distinct_places(data), data.site.carriers).partition(";")[0]
     return f"{data.site.name}: {len(data)} {called} at {len(places.place)} places{at}\n{spacing}"
 
 

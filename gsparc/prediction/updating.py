@@ -100,7 +100,7 @@ class UpdateMixin:
     def update(
         self, rows: Measurements | LevelRows | None = None, *, tx: Any = None, rx: Any = None,
         rssi: Any = None, unit: str | None = None, window: int = WINDOW, fade_db: float = FADE_DB,
-        false_alarm: float = ROWS, refit: bool = False,
+        false_alarm: float = ROWS, refit: bool = False, **others: Any,
     ) -> Found:  # fmt: skip
         """Condition on rows that came later, and tell what changed.
 
@@ -123,12 +123,15 @@ class UpdateMixin:
             fade_db: deviation that a hundred later rows of a station add to one that came before [dB].
             false_alarm: readings to a false alarm without any change, at least, in the mean.
             refit: fit the length over which changes vary to the rows kept, too; tenths of a second.
+            **others: such as `spectrum`, refused.
 
         Raises:
             ValueError: no powers, both ends move, or arrays that do not go together.
+            TypeError: no such argument.
         """
-        if not self.site.maps_levels:
-            raise ValueError("update: takes powers where one end stands still; train on all rows instead")
+        check_updatable(self.site)
+        if others:
+            raise TypeError(f"update: takes rssi=, not {next(iter(others))}=")
         if rows is None:
             rows = self._rows_of_arrays(tx, rx, rssi, unit)
         rows = level_rows(rows, self.site) if isinstance(rows, Measurements) else rows
@@ -324,6 +327,13 @@ class UpdateMixin:
                 torch.zeros_like(missed), torch.from_numpy(rows.side[index] != 0),
             )  # fmt: skip
         return {name: one for name, one in result.items() if len(one)}
+
+
+def check_updatable(site: Site) -> None:
+    """Raise `ValueError` where a site's models learn no later rows: not powers, or both ends move."""
+    if not site.maps_levels:
+        what = f"{site.target.called}{' of two moving ends' * site.target.is_level}"
+        raise ValueError(f"update: models of {what} cannot be updated: train again on all rows")
 
 
 def level_rows(data: Measurements, site: Site) -> LevelRows:

@@ -145,6 +145,14 @@ def test_training_starts_from_given_weights_on_rows_of_another_campaign(halfway,
     assert not torch.equal(after["on"]["gaussians.means"], before["gaussians.means"])
 
 
+def test_settings_of_a_run_that_is_not_there_were_gone_on_with(tmp_path):
+    answer = knock(
+        main, "train.py", ["dataset=rfid_sim", "model=mean", f"ckpt_path={tmp_path / 'last.ckpt'}"]
+    )
+    assert answer.status == 1 and "no such file" in answer.err[-1]
+    assert "going on" not in " ".join(answer.out + answer.err)
+
+
 @pytest.fixture(scope="module")
 def others(halfway, spectra_file, tmp_path_factory) -> dict[str, Path]:
     """Files that are none of `halfway`'s."""

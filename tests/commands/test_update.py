@@ -64,6 +64,24 @@ def test_neither_rows_nor_steps_back_and_no_version(before, tmp_path):
         assert answer.status != 0 and said in " ".join(answer.err + answer.out)
 
 
+def test_a_model_of_channels_was_refused_for_the_name_of_its_new_rows(tmp_path):
+    """A folder was `no file; expected a table`; `update(csi=...)` had an unexpected keyword."""
+    csi = np.exp(1j * np.arange(20))
+    waves = gsparc.fit(
+        rx=PLACES[:20], tx=[9.0, 9.0, 2.6], csi=csi, frequency_hz=1e9, model="mean", save=tmp_path / "a.ckpt"
+    )
+    answer, _ = update(tmp_path, f"ckpt={tmp_path / 'a.ckpt'}", f"data={tmp_path}")
+    said = "models of channels cannot be updated: train again on all rows"
+    assert answer.status != 0 and said in " ".join(answer.err + answer.out)
+    with pytest.raises(ValueError, match=said):
+        waves.update(rx=PLACES[:20], csi=csi)
+
+
+def test_a_model_of_powers_takes_no_spectra(before):
+    with pytest.raises(TypeError, match="takes rssi=, not spectrum="):
+        gsparc.load(before).update(rx=PLACES[:1], spectrum=[1.0])
+
+
 @pytest.mark.slow
 def test_a_kill_leaves_a_whole_file(before, tmp_path):
     out, new = tmp_path / "live.ckpt", room_file(tmp_path / "new.npz", 60, change=-12.0)

@@ -192,9 +192,10 @@ def test_a_lead_with_silent_rows_hid_a_loss_on_heard_ones():
         "baseline/kriging/ahead_listed_error_db": 0.1, "baseline/kriging/ahead_listed_pairs": "300 test rows",
     }  # fmt: skip
     assert remarks(facts) == [
-        "gsparc is 1.00 ± 0.10 dB better over 900 test rows in rmse_db_with_silent than kriging, the best "
-        "baseline",
-        "the baseline kriging is 0.64 ± 0.10 dB better over 300 test rows in rmse_db of heard rows",
+        "gsparc is 1.00 ± 0.10 (standard error) dB better over 900 test rows in rmse_db_with_silent "
+        "than kriging, the best baseline",
+        "the baseline kriging is 0.64 ± 0.10 (standard error) dB better over 300 test rows "
+        "in rmse_db of heard rows",
     ]
 
 

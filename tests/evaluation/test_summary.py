@@ -136,12 +136,15 @@ def test_a_baseline_was_better_by_chance_or_by_nothing():
     assert remarks(facts) == ["the baseline gp and gsparc have the same rmse_db over 24 test rows"]
     assert remarks({**facts, "baseline/gp/ahead_db": -0.22, "baseline/gp/ahead_error_db": 0.14}) == [
         "the baseline gp and gsparc do not differ significantly in rmse_db: "
-        "gsparc is 0.22 ± 0.14 dB better over 24 test rows"
+        "gsparc is 0.22 ± 0.14 (standard error) dB better over 24 test rows"
     ]
     ((said),) = remarks({**facts, "baseline/gp/ahead_db": 0.3, "baseline/gp/ahead_error_db": 0.1})
-    assert "gp is 0.30 ± 0.10 dB better over 24 test rows in rmse_db: the better choice" in said
+    assert (
+        "gp is 0.30 ± 0.10 (standard error) dB better over 24 test rows in rmse_db: the better choice" in said
+    )
     assert remarks({**facts, "baseline/gp/ahead_db": -0.3, "baseline/gp/ahead_error_db": 0.1}) == [
-        "gsparc is 0.30 ± 0.10 dB better over 24 test rows in rmse_db than gp, the best baseline"
+        "gsparc is 0.30 ± 0.10 (standard error) dB better over 24 test rows "
+        "in rmse_db than gp, the best baseline"
     ]
 
 

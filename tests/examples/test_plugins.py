@@ -130,6 +130,18 @@ def test_a_broken_plugin_is_warned_of_and_named_where_it_is_chosen(installed, tm
     assert error_in_one_line(error.value) == said
 
 
+def test_a_baseline_by_an_older_name_was_silently_none(installed, tmp_path, caplog):
+    project = tmp_path / "older"
+    project.mkdir()
+    (project / "older.py").write_text(
+        "from gsparc.models.baselines.mean import Mean\n\n\nclass Older(Mean):\n    plain_place = 45\n"
+    )
+    entry = '[project.entry-points."gsparc.models"]\nolder = "older:Older"\n'
+    (project / "pyproject.toml").write_text(f'[project]\nname = "older"\nversion = "1"\n{entry}')
+    installed(project)
+    assert caplog.messages == ["plugin older: no baseline; plain_place is called baseline_order now"]
+
+
 def test_a_third_party_library_as_a_plugin(installed, tmp_path):
     pytest.importorskip("gpytorch", reason="GPyTorch is not installed: pip install gpytorch")
     installed(EXAMPLES / "gpytorch-method")

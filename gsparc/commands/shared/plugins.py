@@ -9,7 +9,7 @@ from typing import Any
 from hydra.core.config_store import ConfigStore
 
 from gsparc.data.errors import DataError
-from gsparc.data.instantiate import GROUPS, plugin_node, plugins
+from gsparc.data.instantiate import GROUPS, import_target, plugin_node, plugins
 from gsparc.simulate.scenes.shipped import list_shipped_scenes, shipped_scene_settings
 
 log = logging.getLogger(__name__)
@@ -27,6 +27,8 @@ def offer_plugins() -> None:
             except DataError as error:
                 log.warning("plugin %s (%s) is left out: %s", name, path, error)
                 continue
+            if hasattr(import_target(path), "plain_place"):
+                log.warning("plugin %s: no baseline; plain_place is called baseline_order now", name)
             shared: dict[str, Any] = {"name": name, "batch_size": 16} if group == "dataset" else {}
             if group == "model" and "seed" in defaults:
                 # What a plugin draws follows the seed of the run.

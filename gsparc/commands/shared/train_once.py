@@ -24,9 +24,6 @@ log = logging.getLogger(__name__)
 def train_once(config: DictConfig, train: Callable[[DictConfig, Path, RunInputs], object]) -> dict[str, Any]:
     """Return the facts of a training; `train` does it, from what an interrupted try has left."""
     run_dir, job = run_directory(), in_multirun()
-    if config.ckpt_path is not None:
-        words = " ".join(HydraConfig.get().overrides.task)
-        log.info("going on with the settings of the interrupted run: %s", words)
 
     def work(left: str | None) -> None:
         config.ckpt_path = config.ckpt_path or left
@@ -43,6 +40,9 @@ def train_once(config: DictConfig, train: Callable[[DictConfig, Path, RunInputs]
         state = FitInputs.from_config(config, data, split)
         state = replace(unread, data=data, split=split) if unread else state
         resumes = config.ckpt_path is not None
+        if resumes:
+            words = " ".join(HydraConfig.get().overrides.task)
+            log.info("going on with the settings of the interrupted run: %s", words)
         return run_once(run_dir, state, work, reuse=config.reuse, again=not job, resumes=resumes)
 
 

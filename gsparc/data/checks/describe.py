@@ -26,7 +26,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
         ("kind", f"{site.kind}: {_targets(data)}"),
         ("stays", _static(site)),
         ("moves", _moving(data)),
-        ("neighbours", spacing_words(distinct_places(data), None if powers else site.wavelength)),
+        ("neighbours", spacing_words(distinct_places(data), None if powers else site.carriers)),
         ("carrier", _carrier(site)),
         ("band", f"{len(tones)} subcarriers over {np.ptp(tones) / 1e6:.6g} MHz" if len(tones) > 1 else ""),
         ("grid", "" if site.grid is None else _grid(site.grid)),
@@ -87,14 +87,17 @@ def _targets(data: Measurements) -> str:
     return data.site.target.describe(len(data), data.target.shape[1:])
 
 
-def spacing_words(positions: np.ndarray, wavelength: float | None) -> str:
-    """Say how far places (n, 3) [m] are from the nearest other, in metres and wavelengths."""
+def spacing_words(positions: np.ndarray, carriers: np.ndarray | None) -> str:
+    """Say how far places (n, 3) [m] are from the nearest other, and in wavelengths of the lowest carrier."""
     different, counts = np.unique(positions, axis=0, return_counts=True)
     if len(different) < 2:
         return "one place alone"
     distance, same = neighbour_distance(different), int(counts[counts > 1].sum())
     text = f"the nearest other place is {distance:.3g} m away (median)"
-    text += "" if wavelength is None else f", {distance / wavelength:.2g} wavelengths"
+    if carriers is not None and np.isfinite(carriers).all():
+        lowest = float(carriers.min())
+        text += f", {distance * lowest / LIGHT:.2g} wavelengths"
+        text += f" of the lowest carrier, {lowest / 1e9:.6g} GHz" if np.ptp(carriers) else ""
     return text + (f"; {same} rows share their place with another" if same else "")
 
 

@@ -42,6 +42,7 @@ BESIDE = {  # figures beside the score, by their columns
 }  # fmt: skip
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
+BESIDE_NOTE = "*: a row of beside=, with the seconds of the machine that measured it"
 GROUP = [*PROBLEM, "effort", "method"]
 CELL = [*GROUP[:2], "method", "effort", "seed", "figure", "value", "train_s", "train_cpu_s", "load"]
 ROW = [
@@ -155,11 +156,14 @@ def columns_of_csv(rows: pd.DataFrame) -> dict[str, list[Any]]:
 
 
 def split_by_problem(rows: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return a table per dataset, split and effort, best first; methods that count nothing stand in each."""
+    """Return a table per dataset, split and effort, best first; methods that count nothing stand in each.
+
+    Efforts are those of runs here; where all of these count nothing, published rows have the usual one.
+    """
     blocks = []
     for _, here in rows.groupby(PROBLEM, sort=False):
         without = here.effort.isna()
-        for effort in sorted(here.effort.dropna().unique()) or [None]:
+        for effort in sorted(here.effort[~_published(here)].dropna().unique()) or [1.0]:
             members = here[without | (here.effort == effort)]
             blocks.append(members.sort_values("score_db", ascending=False, kind="stable"))
     return blocks
@@ -201,8 +205,7 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         ahead = lead_over_runs(row.results, cell.results)
         if ahead is None or ahead.sure:
             lines.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - cell.score_db:.2f} dB")
-    # Of a published row the milliseconds are another machine's.
-    close = block[(block.score_db >= first.score_db - CLOSE_DB) & block.query_ms.notna() & ~_published(block)]
+    close = block[(block.score_db >= first.score_db - CLOSE_DB) & block.query_ms.notna()]
     if len(close):
         quick = close.loc[close.query_ms.idxmin()]
         near = f"fastest within {CLOSE_DB} dB of the best"
@@ -232,12 +235,14 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
         (not draws and (block.seeds > 1).any(), Column("seeds, same split", "d", of="seeds")),
         *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),
     ]
-    mark = np.where(_published(block), " (from beside=)", np.where(block.method == ours, " (ours)", ""))
+    published = _published(block)
+    mark = np.where(published, "*", np.where(block.method == ours, " (ours)", ""))
     rows = block.assign(named=block.method + block.label + mark).to_dict("records")
     columns_here = [column for there, column in columns if there]
     lead = lead_over_runs(*block.results[:2]) if len(block) > 1 else None
     bold = rows[0]["named"] if lead and lead.sure else None
-    return Table.from_rows(title_of(block), columns_here, rows, bold=bold)  # type: ignore[arg-type]
+    note = BESIDE_NOTE * bool(published.any())
+    return Table.from_rows(title_of(block), columns_here, rows, bold=bold, note=note)  # type: ignore[arg-type]
 
 
 def _published(block: pd.DataFrame) -> pd.Series:

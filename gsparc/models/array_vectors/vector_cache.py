@@ -82,8 +82,9 @@ def write_recovery_report(result: RecoveredVectors, data: Measurements, rows: np
         len(rows), np.median(result.residual), np.median(result.expected),
     )  # fmt: skip
     if len(bad):
+        called, them = ("spectrum", "it") if len(bad) == 1 else ("spectra", "them")
         log.warning(
-            "%d %s cannot come from this array: %s; check them and array_position, %s has the figures",
-            len(bad), "spectrum" if len(bad) == 1 else "spectra",
-            list_first([names[i] for i in bad]), path.name,
+            "%d %s cannot come from this array: %s; used all the same, check %s and array_position, "
+            "%s has the figures",
+            len(bad), called, list_first([names[i] for i in bad]), them, path.name,
         )  # fmt: skip

@@ -194,8 +194,8 @@ def test_a_simple_baseline_won_by_chance():
     cells = drawn("gsparc", 30.0, 30.0, 30.0) + drawn("gp", 32.0, 28.5, 30.4)
     said = said_of(cells + drawn("nearest", 31.0, 29.25, 30.2))
     assert (
-        "gp and gsparc do not differ significantly in PSNR dB: gp is 0.30 ± 1.01 dB better over 3 draws"
-        in said
+        "gp and gsparc do not differ significantly in PSNR dB: "
+        "gp is 0.30 ± 1.01 (standard error) dB better over 3 draws" in said
     )
     assert (
         "0.15 ± 0.51 dB better than nearest (standard error over the same 3 draws): not significant" in said

@@ -119,6 +119,7 @@ def test_a_report_of_draws_said_nothing_of_heard_rows(tmp_path):
         facts |= figures | {"baseline/gp/rmse_db_with_silent": 3.0 + off}
         runs.append(Run(tmp_path, facts, overrides=(f"split.seed={draw}",)))
     assert warnings(frame_of_runs(runs)) == [
-        "gsparc is 1.03 ± 0.09 dB better over 3 draws in rmse_db_with_silent than gp, the best baseline",
-        "the baseline gp is 1.03 ± 0.09 dB better over 3 draws in rmse_db of heard rows",
+        "gsparc is 1.03 ± 0.09 (standard error) dB better over 3 draws in rmse_db_with_silent "
+        "than gp, the best baseline",
+        "the baseline gp is 1.03 ± 0.09 (standard error) dB better over 3 draws in rmse_db of heard rows",
     ]

@@ -151,7 +151,7 @@ def test_draws_of_a_split_were_settings_beside_the_baselines_of_the_first(run_di
     assert [row[0] for row in results.rows].count("gp (baseline)") == 3
     assert warnings(runs) == [
         "the baseline gp and gsparc do not differ significantly in psnr_db: "
-        "gsparc is 0.17 ± 0.23 dB better over 3 draws"
+        "gsparc is 0.17 ± 0.23 (standard error) dB better over 3 draws"
     ]
 
 

@@ -124,6 +124,7 @@ def test_report_names_suspect_images(known_campaign, tmp_path, caplog):
     lines = (tmp_path / "array_recovery.csv").read_text().splitlines()
     assert [line[-1] for line in lines[1:]] == ["0", "0", "1", "0"] and "row 2" in caplog.text
     assert "1 spectrum cannot come from this array" in caplog.text
+    assert "used all the same, check it and array_position" in caplog.text
 
 
 def test_real_spectra_are_sixteen_complex_numbers():

@@ -81,25 +81,31 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
     parts = [_squares(form.predictor, predictor, places[i : i + 64]) for i in range(0, len(places), 64)]
     squared, power = np.concatenate(parts, axis=1)
     # The worst may be near the station, the mean is over random places alone.
-    found = np.array([squared[:count].mean(), squared.max()]) / max(power[:count].mean(), 1e-300)
-    error, worst = np.maximum(np.sqrt(found) if site.target.is_level else found, 1e-12).tolist()
+    found = np.array([squared[:count].mean(), squared.max()])
+    shares = found / max(power[:count].mean(), 1e-300)
+    found = shares if site.target.is_complex else np.sqrt(found) if site.target.is_level else found
+    error, worst = np.maximum(found, 1e-12).tolist()
     figure = f"{FIGURES[site.kind]} {error:.2g} at {count} random places, {worst:.2g} at the worst"
     if site.target.is_level:
         away, _ = _squares(form.predictor, predictor, far_places(site, 256, seed + 4))
         rms, most = np.sqrt([away.mean(), away.max()])
         figure += f", outside their box {rms:.2g}, {most:.2g} at the worst"
-    return CompiledForm(form, error, worst, f"{_NAMES[form.kind]}, distilled from {method.name}: {figure}")
+    how = f"distilled from {method.name}"
+    if site.target.is_image:
+        how = f"of {method.name} without the process averaged in"
+        figure += f", {shares[0]:.2g} and {shares[1]:.2g} of its answers' mean square"
+    return CompiledForm(form, error, worst, f"{_NAMES[form.kind]}, {how}: {figure}")
 
 
 def _squares(form: Predictor, model: Predictor, places: np.ndarray) -> np.ndarray:
-    """Squared error, and what it is divided by, of each local place (2, n) in terms of `FIGURES`."""
+    """Mean square of errors, and of the model's answers, of each local place (2, n), see `FIGURES`."""
     answers, whole = (ask_model(one, places).reshape(len(places), -1) for one in (form, model))
     if model.site.target.is_level:
         # A power of 0 has no decibels; 1e-30 is far below any receiver's noise.
         whole = np.maximum(whole, 1e-30)
         answers, whole = to_decibels(np.maximum(answers / whole, SILENT)), np.zeros_like(whole)
     squared, power = (np.square(np.abs(one).astype(np.float64)).mean(1) for one in (answers - whole, whole))
-    return np.stack([squared, power if model.site.target.is_complex else np.ones(len(places))])
+    return np.stack([squared, power])
 
 
 _NAMES = dict(enumerate((
