@@ -55,9 +55,9 @@ def read_prior_maps(
     every = {name for names in own for name in names if name}
     maps, faults = dict[str, Levels](), list[DataError]()
     several = not isinstance(path, str | Path) or Path(path).is_dir()
-    files = [path] if isinstance(path, str | Path) else path
-    files = sorted(Path(path).glob("*.tif")) if isinstance(path, str | Path) and several else files
-    for file in map(Path, files):
+    files = [Path(one) for one in ([path] if isinstance(path, str | Path) else path)]
+    files = sorted(files[0].glob("*.tif")) if len(files) == 1 and files[0].is_dir() else files
+    for file in files:
         for name, points, level in _read_file(file, data, every):
             try:
                 named = name or file.stem * several
