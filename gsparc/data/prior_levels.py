@@ -18,17 +18,18 @@ from gsparc.data.tables import is_table
 
 log = logging.getLogger(__name__)
 
+Files = str | Path | Sequence[str]
 Levels = tuple[np.ndarray, np.ndarray]  # places (M, 2) [m], world, and levels (M,) [dB] there
 BAND = "power_db"  # of the strongest station, as `gsparc map` writes; with a name behind it of one of several
 MOST = 4_000_000  # levels: they are kept with a model
 ABOUT_M = 100.0  # least distance from the box of rows and stations that levels are kept within [m]
 
 
-def read_prior_levels(path: str | Path, data: Measurements, station: str = "") -> Levels:
+def read_prior_levels(path: Files, data: Measurements, station: str = "") -> Levels:
     """Return places (M, 2) [m] in the world coordinates of the measurements, and levels (M,) [dB] there.
 
     Args:
-        path: *.tif, or what `dataset=own` reads.
+        path: *.tif, or what `dataset=own` reads; several, or a folder of *.tif: each named by its station.
         data: measurements, which the levels must overlap.
         station: whose levels are wanted, as it is shown; empty: the measurements are of one station.
 
@@ -39,7 +40,7 @@ def read_prior_levels(path: str | Path, data: Measurements, station: str = "") -
 
 
 def read_prior_maps(
-    path: str | Path, data: Measurements, stations: Sequence[str]
+    path: Files, data: Measurements, stations: Sequence[str]
 ) -> list[tuple[int, bool, Levels]]:
     """Return number, whether it is of the station and not of its site, and levels, of stations with a map.
 
@@ -50,22 +51,19 @@ def read_prior_maps(
     Raises:
         DataError: as `read_prior_levels`, of none of them.
     """
-    path = Path(path)
-    if path.suffix == ".ckpt":
-        raise DataError(f"model.prior={path}: draw it first, gsparc map ckpt={path}, and give its map.tif")
-    if not path.is_file():
-        raise DataError(
-            f"model.prior={path}: no such file; a GeoTIFF is needed, or a table of places and powers"
-        )
     own = [names_of_station(shown) for shown in stations]
     every = {name for names in own for name in names if name}
-    read = _read_raster(path, data) if path.suffix in (".tif", ".tiff") else _read_rows(path, data, every)
     maps, faults = dict[str, Levels](), list[DataError]()
-    for name, points, level in read:
-        try:
-            maps[name] = _near_rows(path, data, points, level)
-        except DataError as error:
-            faults.append(error)
+    several = not isinstance(path, str | Path) or Path(path).is_dir()
+    files = [Path(one) for one in ([path] if isinstance(path, str | Path) else path)]
+    files = sorted(files[0].glob("*.tif")) if len(files) == 1 and files[0].is_dir() else files
+    for file in files:
+        for name, points, level in _read_file(file, data, every):
+            try:
+                named = name or file.stem * several
+                maps[named] = _near_rows(file, data, points, level)
+            except DataError as error:
+                faults.append(error)
     if not maps:
         raise faults[0] if faults else DataError(f"model.prior={path}: no level is known in it")
     if stations == ("",) and len(maps) == 1:
@@ -100,6 +98,20 @@ def names_of_station(shown: str) -> tuple[str, ...]:
     return (shown, *both.groups()) if both else (shown,)
 
 
+def _read_file(
+    path: Path, data: Measurements, stations: Collection[str]
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield name, places and levels of each map in one file."""
+    if path.suffix == ".ckpt":
+        raise DataError(f"model.prior={path}: draw it first, gsparc map ckpt={path}, and give its map.tif")
+    if not path.is_file():
+        raise DataError(
+            f"model.prior={path}: no such file; a GeoTIFF is needed, or a table of places and powers"
+        )
+    read = _read_raster if path.suffix in (".tif", ".tiff") else _read_rows
+    yield from read(path, data, stations)
+
+
 def _near_rows(path: Path, data: Measurements, points: np.ndarray, level: np.ndarray) -> Levels:
     """What is known about rows and stations; `DataError` where that is nothing, or too much."""
     finite = np.isfinite(level) & np.isfinite(points).all(1)
@@ -128,7 +140,9 @@ def _extent(points: np.ndarray) -> np.ndarray:
     return np.stack([points.min(0), points.max(0)], 1)
 
 
-def _read_raster(path: Path, data: Measurements) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+def _read_raster(
+    path: Path, data: Measurements, stations: Collection[str]
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield name, centres of squares and their levels, of named bands, else of `BAND` or of the first."""
     try:
         import rasterio
@@ -138,7 +152,9 @@ def _read_raster(path: Path, data: Measurements) -> Iterator[tuple[str, np.ndarr
     with rasterio.open(path) as file:
         titles = [str(title or "") for title in file.descriptions]
         one = {"": titles.index(BAND) if BAND in titles else 0}
-        bands = {t.removeprefix(f"{BAND} "): k for k, t in enumerate(titles) if t.startswith(f"{BAND} ")}
+        known = {*stations, *map(site_name, stations)}
+        named = [t.removeprefix(f"{BAND} ") for t in titles]
+        bands = {t: k for k, t in enumerate(named) if t != titles[k] or t in known}
         row, column = np.mgrid[: file.height, : file.width]
         x, y = file.transform @ (column.ravel() + 0.5, row.ravel() + 0.5)
         points, crs, origin = np.c_[x, y], file.crs, data.site.georeference

@@ -153,9 +153,10 @@ def station_columns(methods: Mapping[str, Scores], data: Measurements) -> dict[s
     return {name: np.asarray(values) for name, values in columns.items()}
 
 
-def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
+def worst_stations(columns: Mapping[str, Any], method: str, later: bool = False) -> list[Table]:
     """Return a table of the stations with the largest rmse, of those with rows enough, if these are several.
 
+    Of a `later` log, no row of which was learned from, it names the command that learns offsets.
     Baselines beside it tell whether a station is hard, its note at how many the method is better.
     """
     # Among the baselines may be the method itself.
@@ -173,12 +174,12 @@ def worst_stations(columns: Mapping[str, Any], method: str) -> list[Table]:
         return []
     better = [f"{(rows.rmse_db < rows[name]).sum()} than {heads[name]}" for name in names]
     compared = f"of {len(rows)} stations with {FEW} rows or more"
-    note = f"{method} has a smaller rmse_db at, {compared}: {', '.join(better)}" if names else ""
+    note = f"{compared}, {method} has a smaller rmse_db at {', at '.join(better)}" if names else ""
     title = "rmse_db of the worst stations; by_station.csv has all"
     named = rows.assign(station=show_names(rows["station"], rows.get("cell")))
     offset = named[rows.bias_db**2 > OFFSET * rows.rmse_db**2] if "bias_db" in rows else rows[:0]
     if len(offset):
         those = ", ".join(f"{one.station} ({-one.bias_db:+.1f} dB)" for one in offset[:WORST].itertuples())
         note += f"{'; ' * bool(note)}measured levels differ from predicted by one offset: {those}"
-        note += ": of a later log, gsparc update learns that"
+        note += ": gsparc update learns that" * later
     return [Table.from_rows(title, table_columns, named[:WORST].to_dict("records"), note=note)]

@@ -147,16 +147,25 @@ def evaluate(
         figures = {**pool_figures(one, data, split), "skill": _skill(one, nearest)}
         facts |= {f"{room}/{figure}": value for figure, value in figures.items()}
     judged = judged_by({**facts, "dataset/kind": data.site.scored}, eval_on)
-    for (room, other), (ahead, figure) in product(others.items(), judged.items()):
-        lead = lead_over_rows(other.scores.samples, scores.samples, figure)
-        if lead is not None and other is not same:
-            facts |= {f"{room}/{ahead}{key}": value for key, value in lead.facts().items()}
-    facts |= {f"{room}/train_s": float(np.mean(other.train_s)) for room, other in others.items()}
-    facts[f"{eval_on}/unlisted"] = describe_never_listed(scores, data)
+    cells = {"": every}
     if off := [int(number) for number in unlisted_stations(scores, data).index]:
         # Rows of lists that they do not fill are judged by other levels: it is no choice of rows alone.
-        rest = pool_figures(score_methods(methods, data, split, eval_on, learned, off=off), data, split)
-        facts |= {f"{eval_on}/{name}{WITHOUT_OFF}": rest.get(name) for name in OF_LISTS}
+        fitted_of = {eval_on: methods, **{room: other.methods for room, other in others.items()}}
+        cells[WITHOUT_OFF] = {
+            room: score_methods(fitted, data, split, eval_on, learned, off=off)
+            for room, fitted in fitted_of.items()
+        }
+        for room, one in cells[WITHOUT_OFF].items():
+            rest = pool_figures(one, data, split)
+            facts |= {f"{room}/{name}{WITHOUT_OFF}": rest.get(name) for name in OF_LISTS}
+    for (end, scored), (room, other), (ahead, figure) in product(
+        cells.items(), others.items(), judged.items()
+    ):
+        lead = lead_over_rows(scored[room].samples, scored[eval_on].samples, figure)
+        if lead is not None and other is not same:
+            facts |= {f"{room}/{ahead}{end}{key}": value for key, value in lead.facts().items()}
+    facts |= {f"{room}/train_s": float(np.mean(other.train_s)) for room, other in others.items()}
+    facts[f"{eval_on}/unlisted"] = describe_never_listed(scores, data)
     facts[f"{eval_on}/new"] = None if learned is None else describe_new(learned[0], data)
     decided = scores.dominant_row()
     if decided and data.row_names:

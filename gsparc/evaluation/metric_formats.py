@@ -74,7 +74,7 @@ GIVEN_HEARD = "rmse_db judges levels of rows that are heard or listed"
 LISTED = "ahead_listed"
 BEST_SERVER = "best_server"  # beside errors of several stations, never compared by
 CALIBRATION = "reduced_chi2"  # 1 where predicted variances are right: shown beside errors, never compared
-OF_LISTS = WITH_SILENT, "rmse_db", CALIBRATION  # that cells which are off change
+OF_LISTS = WITH_SILENT, "rmse_db", BEST_SERVER, CALIBRATION  # that cells which are off change
 WITHOUT_OFF = "_without_off"  # behind these figures: of all other cells
 
 

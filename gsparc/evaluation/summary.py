@@ -163,12 +163,15 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     if above := facts.get(f"{prefix}/heard_above_db"):
         rest.append(
             f"{GIVEN_HEARD}; maps and predict show all levels, {above:.1f} dB lower in the mean: "
-            "compare maps with levels of all cells (a scanner), not with lists"
+            "compare maps with levels of all cells (a scanner), and with lists of a second drive by "
+            "gsparc evaluate, which allows for it"
         )
     if unlisted := facts.get(f"{prefix}/unlisted"):
         rest.append(f"cells that may be off: lists should hold them and none does: {unlisted}")
         without = {name: facts.get(f"{prefix}/{name}{WITHOUT_OFF}") for name in OF_LISTS}
-        if said := [f"{name} {value:.2f}" for name, value in without.items() if value is not None]:
+        if said := [
+            f"{name} {value:{number_format(name)}}" for name, value in without.items() if value is not None
+        ]:
             rest.append(f"figures above count these cells; without them: {', '.join(said)}")
     if new := facts.get(f"{prefix}/new"):
         rest.append(f"new cells, which earlier lists should have held: {new}")
@@ -259,18 +262,24 @@ def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
-    """Return whether the best baseline beats the method, or neither; with silent rows, and of heard ones."""
+    """Return whether the best baseline beats the method, or neither; with silent rows, and of heard ones.
+
+    Where cells may be off, of all others.
+    """
     method, notes = str(facts.get("model/label") or facts.get("model/name")), list[str]()
     for ahead, figure in judged_by(facts, prefix).items():
-        value = facts.get(f"{prefix}/{figure}")
-        keys = [k for k in facts if k.startswith("baseline/") and k.endswith(f"/{figure}")]
+        every = [key for key in facts if key.startswith("baseline/")]
+        end = WITHOUT_OFF * any(key.endswith(f"/{figure}{WITHOUT_OFF}") for key in every)
+        value = facts.get(f"{prefix}/{figure}{end}")
+        keys = [key for key in every if key.endswith(f"/{figure}{end}")]
         scores = {k.split("/")[1]: score_of(figure, facts[k]) for k in keys if facts[k] is not None}
         best = max(scores, key=lambda name: scores[name], default=None)
         if best is None or value is None:
             continue
-        lead = Lead.from_facts(facts, f"baseline/{best}/{ahead}")
+        lead = Lead.from_facts(facts, f"baseline/{best}/{ahead}{end}")
         if lead is not None:
-            notes += judge_baseline(best, method, figure, lead, ahead == LISTED)
+            said = judge_baseline(best, method, figure, lead, ahead == LISTED)
+            notes += [f"{'without cells that may be off: ' * bool(end)}{note}" for note in said]
         elif scores[best] > score_of(figure, value):
             notes.append(f"the baseline {best} has the better {figure} here; how surely is not known")
     return notes

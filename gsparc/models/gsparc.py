@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from gsparc.data import heeded
 from gsparc.data.limits import check_arguments, number, or_null
+from gsparc.data.prior_levels import Files
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.carriers.array import carriers_obstacle
 from gsparc.models.carriers.method import CarrierField
@@ -112,7 +112,7 @@ class Gsparc(LearnsTogether):
 
     def __init__(
         self, effects: EffectSettings = EffectSettings(), position_std: float | None = None,
-        terms: Sequence[Any] = (), prior: str | Path | None = None, name: str = "gsparc", **field: Any,
+        terms: Sequence[Any] = (), prior: Files | None = None, name: str = "gsparc", **field: Any,
     ) -> None:  # fmt: skip
         check_arguments(locals(), position_std=or_null(number(0)))
         self.rendered = ImageProcess(effects.residual is not False, **field)  # checks what it takes

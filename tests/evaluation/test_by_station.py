@@ -21,7 +21,7 @@ from gsparc.evaluation.by_station import (
     worst_stations,
 )
 from gsparc.evaluation.evaluate import evaluate
-from gsparc.evaluation.metric_formats import OF_LISTS, WITHOUT_OFF
+from gsparc.evaluation.metric_formats import BEST_SERVER, OF_LISTS, WITHOUT_OFF
 from gsparc.evaluation.scores import Scores, score_methods
 from gsparc.evaluation.summary import remarks, results_table
 from gsparc.models.method import Method, Prediction
@@ -82,8 +82,8 @@ def test_errors_of_single_stations_were_nowhere(drive, tmp_path):
     ahead = [
         int((stations["rmse_db"] < stations[f"baseline/{one}/rmse_db"]).sum()) for one in ("mean", "idw")
     ]
-    better = f"{ahead[0]} than mean, {ahead[1]} than idw"
-    assert worst.note == f"nearest has a smaller rmse_db at, of 3 stations with 10 rows or more: {better}"
+    better = f"at {ahead[0]} than mean, at {ahead[1]} than idw"
+    assert worst.note == f"of 3 stations with 10 rows or more, nearest has a smaller rmse_db {better}"
     heads, rows = results_table(found.facts, "nearest").texts()
     assert rows[-1][heads.index("best_server")] == f"{found.facts['test/best_server']:.1%}"
 
@@ -93,14 +93,16 @@ def test_a_method_was_better_than_itself_at_none_of_the_stations():
     rows = {"station": ["a", "b"], "rows": [12, 12], "rmse_db": [5.0, 4.0], "bias_db": [1.0, 1.0]}
     baselines = {f"baseline/{name}/rmse_db": [5.0, 6.0] for name in ("zero", "gp", "idw")}
     (worst,) = worst_stations({**rows, **baselines}, "gp")
-    assert worst.note == "gp has a smaller rmse_db at, of 2 stations with 10 rows or more: 1 than idw"
+    assert worst.note == "of 2 stations with 10 rows or more, gp has a smaller rmse_db at 1 than idw"
     assert worst.texts()[0] == ["station", "rows", "gp", "bias_db of gp", "idw"]
 
 
 def test_a_cell_that_lost_ten_decibels_was_said_to_need_another_baseline():
     columns = {"station": ["A", "B"], "rows": [40, 40], "rmse_db": [3.0, 11.7], "bias_db": [0.2, 11.3]}
     (worst,) = worst_stations(columns, "gsparc")
-    assert worst.note.startswith("measured levels differ from predicted by one offset: B (-11.3 dB)")
+    assert worst.note == "measured levels differ from predicted by one offset: B (-11.3 dB)"
+    (worst,) = worst_stations(columns, "gsparc", later=True)
+    assert worst.note.endswith("B (-11.3 dB): gsparc update learns that")
 
 
 def test_the_worst_stations_had_other_names_than_warnings_and_a_bias_of_no_meaning():
@@ -293,10 +295,15 @@ def test_figures_of_a_drive_counted_cells_that_were_off():
         Split("", (Fold(*parts),)) for parts in ((none, none, rows), (np.arange(len(learned)), none, none))
     )
     facts = evaluate(
-        TrueLaw(learned.site), None, align_to_site(judged, learned.site), whole, baselines=[],
+        TrueLaw(learned.site), None, align_to_site(judged, learned.site), whole, baselines=["idw"],
         learned=(learned, taught), timed=False,
     ).facts  # fmt: skip
     for figure in OF_LISTS[:2]:
         assert facts[f"test/{figure}{WITHOUT_OFF}"] < facts[f"test/{figure}"] - 0.1
+    assert facts[f"test/{BEST_SERVER}{WITHOUT_OFF}"] >= facts[f"test/{BEST_SERVER}"]
+    lead = facts["baseline/idw/ahead_db"] - facts[f"baseline/idw/ahead{WITHOUT_OFF}_db"]
+    assert abs(lead) > 0.1  # dead cells decided which method is better
     text = "\n".join(remarks(facts))
     assert f"figures above count these cells; without them: {OF_LISTS[0]} " in text
+    assert f", {BEST_SERVER} {facts[f'test/{BEST_SERVER}{WITHOUT_OFF}']:.1%}" in text
+    assert "without cells that may be off: " in text

@@ -191,7 +191,11 @@ def map_notes(
     notes = [*field.notes]
     figures = field.summarise()
     if (unsure := figures["map/server_unsure"]) and len(field.stations) > 1:
-        notes.append(f"best_server: unsure in {unsure:.1%} of squares (hatched): another or none is likelier")
+        chance = np.nanmean(field.server_chance[field.grid.inside])
+        doubt = f"unsure in {unsure:.1%} of squares (hatched): another or none is likelier"
+        notes.append(
+            f"best_server: the named cell is strongest with chance {chance:.2f} in the mean; {doubt}"
+        )
     if (outage := figures["map/outage"]) is not None:
         level = f"{field.threshold_db:g} {field.unit} or more of some station (mean of 1 - outage)"
         ends = "" if covered is None else "; 90 % interval {:.1%} to {:.1%}".format(*covered)

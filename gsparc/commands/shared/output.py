@@ -86,8 +86,8 @@ def tables_of(
     facts: Mapping[str, Any], title: str, eval_on: str, stations: Mapping[str, Any]
 ) -> list[Table]:  # fmt: skip
     """Return the table of a method beside others, and that of the worst of its `stations`, if any."""
-    label = facts["model/label"]
-    return [results_table(facts, label, title, eval_on), *worst_stations(stations, label)]
+    label, later = facts["model/label"], not facts.get("split/train")
+    return [results_table(facts, label, title, eval_on), *worst_stations(stations, label, later)]
 
 
 def finish_run(

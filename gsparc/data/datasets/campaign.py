@@ -14,6 +14,7 @@ import numpy as np
 from gsparc.data.assemble import check_positions
 from gsparc.data.checks.column_effects import run_warnings
 from gsparc.data.checks.conventions import convention_warnings
+from gsparc.data.checks.gone import gone_warnings
 from gsparc.data.checks.level_steps import LevelStep
 from gsparc.data.checks.link_levels import LinkLevels, link_levels
 from gsparc.data.checks.plausibility import find_level_steps, sanity_warnings
@@ -95,7 +96,7 @@ def find_implausible(
     hints += map(Severe, convention_warnings(data))
     if (levels := link_levels(data, file_row)) is None:
         return hints, None, []
-    steps, hints = find_level_steps(levels), [*hints, *run_warnings(data)]
+    steps, hints = find_level_steps(levels), [*hints, *run_warnings(data), *gone_warnings(data)]
     return [*hints, *sanity_warnings(levels, steps)], levels, steps
 
 

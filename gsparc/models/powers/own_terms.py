@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data import heeded
-from gsparc.data.prior_levels import read_prior_levels
+from gsparc.data.prior_levels import Files, read_prior_levels
 from gsparc.data.schema import OF_STATION, Measurements, Site
 from gsparc.models.powers.prior_map import NetworkMaps, PriorMap
 from gsparc.processes.places import has_both_ends
@@ -48,11 +47,11 @@ class OwnTerms:
 
     Attributes:
         terms: further columns of the mean.
-        prior: a file of levels, see `read_prior_levels`; None: nothing was predicted.
+        prior: files of levels, see `read_prior_levels`; None: nothing was predicted.
     """
 
     terms: tuple[Columns, ...] = ()
-    prior: str | Path | None = None
+    prior: Files | None = None
 
     @property
     def said(self) -> list[str]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Self
 
 import numpy as np
@@ -18,7 +17,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.data.prior_levels import read_prior_maps
+from gsparc.data.prior_levels import Files, read_prior_maps
 from gsparc.data.schema import Measurements
 from gsparc.processes.places import first_end, other_end
 from gsparc.processes.sectors import ROUND, SHARED, Sectors, sector_of
@@ -92,7 +91,7 @@ class NetworkMaps(Columns):
     level: float = 0.0
 
     @classmethod
-    def from_file(cls, path: str | Path, data: Measurements) -> Self:
+    def from_file(cls, path: Files, data: Measurements) -> Self:
         """Read the map of each station, or of its site; `DataError` where there is none, see there."""
         found = list[tuple[int, bool, PriorMap]]()
         for number, own, (world, levels) in read_prior_maps(path, data, data.site.every_station.shown):

@@ -233,6 +233,22 @@ def test_one_map_without_a_name_was_taken_for_that_of_every_cell(tmp_path, raste
     refused("of X1, X2, not of 0-0 .300., .* call bands", NetworkMaps.from_file, foreign, data)
 
 
+def test_several_files_were_no_path_and_bands_of_stations_names_no_maps(tmp_path, by_pci):
+    """`TypeError: expected str`, and a folder of maps did not exist."""
+    data, level = by_pci
+    files = [str(network_rasters(tmp_path / f"0-{t}.tif", level[:, [t]], [""])) for t in range(3)]
+    network_rasters(tmp_path / "best.tif", level, [""])
+    for prior in (files, tmp_path):
+        found = NetworkMaps.from_file(prior, data)
+        assert [one[:2] for one in found.maps] == [(t, True) for t in range(3)]
+        np.testing.assert_allclose(np.ptp(found.maps[2][2].level), np.ptp(level[:, 2]))
+    with rasterio.open(files[0], "r+") as file:
+        file.descriptions = ["0-1"]
+    (found,) = NetworkMaps.from_file(files[0], data).maps
+    assert found[:2] == (1, True)
+    refused("none.tif: no such file", NetworkMaps.from_file, [*files, "none.tif"], data)
+
+
 @pytest.mark.slow
 def test_maps_of_a_networks_cells_help_and_those_of_another_do_not(tmp_path, caplog):
     caplog.set_level("INFO")
