@@ -13,6 +13,7 @@ from gsparc.apps.locate.likelihood import Misfit, Trust
 from gsparc.apps.locate.posterior import PlacePosterior
 from gsparc.apps.locate.site_field import HeardMoments
 from gsparc.apps.locate.snapshots import Scans
+from gsparc.data.target import TARGETS
 
 
 @dataclass(frozen=True)
@@ -51,8 +52,9 @@ class PlaceSearch:
 
 def compute_misfit(heard: Scans, there: HeardMoments, unknown: Nuisances) -> Misfit:
     """Return the misfit of snapshots at places; see `gsparc.apps.locate.likelihood`."""
-    if heard.kind == "spectrum":
+    facts = TARGETS[heard.kind]
+    if facts.is_image:
         return likelihood.spectrum_misfit(heard.values, there.mean, there.variance)
-    if heard.kind == "csi":
+    if facts.is_complex:
         return likelihood.channel_misfit(heard.values, there.mean, there.variance, unknown.phase_known)
     return likelihood.level_misfit(heard.values, there.mean, there.variance, unknown.offset_db, heard.floor)
