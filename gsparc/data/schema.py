@@ -253,7 +253,7 @@ class Site:
         """Return world places (..., 3) [m] of the moving end under its name, as a `Predictor` takes them.
 
         >>> predictor.site.name_moving([1.0, 2.0, 1.5])
-        {'tx': [1.0, 2.0, 1.5]}
+        {'rx': [1.0, 2.0, 1.5]}
         """
         return {self.moving_end: places}
 

@@ -1,6 +1,7 @@
 """A scenario of DeepMIMO, read back as its loader reads it: channels, and geometry of a known mirror."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -65,7 +66,7 @@ def towards(start, end):
 
 def test_places_in_utm_metres_were_rounded_to_half_a_metre(tmp_path, monkeypatch):
     utm = np.array([447_000.25, 4_500_000.25, 0])
-    monkeypatch.setattr(Site, "origin", Site.origin + utm)
+    monkeypatch.setattr(Mirror, "site", replace(Mirror.site, origin=Mirror.site.origin + utm))
     monkeypatch.setattr(Mirror, "paths", lambda self, rx, paths=Mirror.paths: paths(self, rx - utm))
     deepmimo.write_scenario(tmp_path, Mirror(), PLACES + utm)
     at, still, meets = (
