@@ -172,9 +172,9 @@ def worst_stations(columns: Mapping[str, Any], method: str, later: bool = False)
     rows = every[every["rows"] >= FEW].sort_values("rmse_db", ascending=False, kind="stable")
     if len(rows) < 2:
         return []
-    better = [f"{(rows.rmse_db < rows[name]).sum()} than {heads[name]}" for name in names]
-    compared = f"of {len(rows)} stations with {FEW} rows or more"
-    note = f"{compared}, {method} has a smaller rmse_db at {', at '.join(better)}" if names else ""
+    better = ", ".join(f"than {heads[name]} at {(rows.rmse_db < rows[name]).sum()}" for name in names)
+    compared = f"of {len(rows)} stations ({FEW} rows or more)"
+    note = f"{method} has the smaller rmse_db {better} {compared}" if names else ""
     title = "rmse_db of the worst stations; by_station.csv has all"
     named = rows.assign(station=show_names(rows["station"], rows.get("cell")))
     offset = named[rows.bias_db**2 > OFFSET * rows.rmse_db**2] if "bias_db" in rows else rows[:0]

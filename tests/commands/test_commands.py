@@ -164,8 +164,8 @@ def test_ctrl_c_in_a_multirun_was_told_to_go_on_with_one_of_its_jobs(monkeypatch
     monkeypatch.setattr("gsparc.commands.train.task", with_advice)
     words = "-m", "dataset=rfid", "model=gsparc", "seed=0,1", f"hydra.sweep.dir={tmp_path}"
     answer = gsparc("train", *words)
-    kept = "error: interrupted; finished jobs are kept: the same command goes on with the others"
-    kept += ", begun ones from their last.ckpt, where they have one"
+    kept = "error: interrupted; finished jobs are kept: the same command goes on; "
+    kept += "unfinished ones resume from last.ckpt, or start again"
     assert (answer.status, answer.err[-1]) == (130, kept)
 
 

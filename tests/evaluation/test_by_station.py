@@ -82,8 +82,8 @@ def test_errors_of_single_stations_were_nowhere(drive, tmp_path):
     ahead = [
         int((stations["rmse_db"] < stations[f"baseline/{one}/rmse_db"]).sum()) for one in ("mean", "idw")
     ]
-    better = f"at {ahead[0]} than mean, at {ahead[1]} than idw"
-    assert worst.note == f"of 3 stations with 10 rows or more, nearest has a smaller rmse_db {better}"
+    better = f"than mean at {ahead[0]}, than idw at {ahead[1]}"
+    assert worst.note == f"nearest has the smaller rmse_db {better} of 3 stations (10 rows or more)"
     heads, rows = results_table(found.facts, "nearest").texts()
     assert rows[-1][heads.index("best_server")] == f"{found.facts['test/best_server']:.1%}"
 
@@ -93,7 +93,7 @@ def test_a_method_was_better_than_itself_at_none_of_the_stations():
     rows = {"station": ["a", "b"], "rows": [12, 12], "rmse_db": [5.0, 4.0], "bias_db": [1.0, 1.0]}
     baselines = {f"baseline/{name}/rmse_db": [5.0, 6.0] for name in ("zero", "gp", "idw")}
     (worst,) = worst_stations({**rows, **baselines}, "gp")
-    assert worst.note == "of 2 stations with 10 rows or more, gp has a smaller rmse_db at 1 than idw"
+    assert worst.note == "gp has the smaller rmse_db than idw at 1 of 2 stations (10 rows or more)"
     assert worst.texts()[0] == ["station", "rows", "gp", "bias_db of gp", "idw"]
 
 

@@ -174,8 +174,8 @@ def _multirun_advice() -> str:
     hydra_config = HydraConfig.get()
     told = any(word.startswith("hydra.sweep.dir=") for word in hydra_config.overrides.hydra)
     again = "the same command" if told else f"the same command with hydra.sweep.dir={hydra_config.sweep.dir}"
-    begun = "begun ones from their last.ckpt, where they have one"
-    return f"interrupted; finished jobs are kept: {again} goes on with the others, {begun}"
+    begun = "unfinished ones resume from last.ckpt, or start again"
+    return f"interrupted; finished jobs are kept: {again} goes on; {begun}"
 
 
 def _message_of(error: BaseException) -> str:

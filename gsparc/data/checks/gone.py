@@ -36,8 +36,8 @@ def gone_warnings(data: Measurements) -> list[str]:
     who = [stations.shown[t] for t in gone if FROM_ROW not in stations.name[t]]
     row = data.row_names[heard[lists.first[order[max(gone.values(), default=0)]]]].partition(", station")[0]
     finding = f"{list_first(who, 12)}: in no list from {row} on, though earlier ones nearby held them"
-    advice = "leave these rows out, or all cells of the site (dataset.stations=[...] names those to keep)"
-    return [Severe(f"{finding}: off, or gone? they are learned as weak there: {advice}")] * bool(who)
+    advice = "if so, remove later rows near it, or all cells of its site (dataset.stations=[names to keep])"
+    return [Severe(f"{finding}: off, or gone? They are learned as weak there: {advice}")] * bool(who)
 
 
 def find_gone(level: np.ndarray, place: np.ndarray, reach: float) -> dict[int, int]:
