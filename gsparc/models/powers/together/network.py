@@ -272,8 +272,8 @@ def _note_untested(
     blind = [t for t in farthest.argsort(descending=True, stable=True) if farthest[t] >= CONTRADICTED_DEG]
     each = [f"{names[t]} {min(float(farthest[t] + TURNS.diff()[0]), 180):.0f} degrees" for t in blind]
     cells = f"{len(blind)} of {len(names)} cells"
-    told = f"azimuths of {cells} are tested little: smaller errors than these would not show in the drive"
-    return [f"{told}: {list_first(each, 30)}"] if blind else []
+    told = f"azimuths of {cells} are tested little: the drive would not show an error of less than"
+    return [f"{told}: {list_first(each, 30)}; drive to both sides of their beams"] if blind else []
 
 
 def _note_turned(given: Tensor, found: Tensor, names: tuple[str, ...]) -> list[str]:

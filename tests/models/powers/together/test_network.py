@@ -261,9 +261,8 @@ def test_azimuths_that_no_row_tells_were_not_named():
     none = np.zeros(len(at), int)
     rows = StationRows(places=at.numpy(), decibels=level, side=none, station=none, index=every)
     (note,) = _note_untested(rows, trend, torch.zeros(3), 4.0, ("all around", "ahead", "never"))
-    assert note.startswith("azimuths of 2 of 3 cells") and note.endswith(
-        "never 180 degrees, ahead 90 degrees"
-    )
+    assert note.startswith("azimuths of 2 of 3 cells")
+    assert "never 180 degrees, ahead 90 degrees; drive to" in note
     turned = replace(trend, table=table + torch.tensor([[120.0, 0, 0, 0, 0], [0] * 5, [0] * 5]))
     assert _correct_azimuths(rows, turned, torch.zeros(3), 4.0).table[:, 0].tolist() == [90, 210, 330]
 
