@@ -181,5 +181,5 @@ def worst_stations(columns: Mapping[str, Any], method: str, later: bool = False)
     if len(offset):
         those = ", ".join(f"{one.station} ({-one.bias_db:+.1f} dB)" for one in offset[:WORST].itertuples())
         note += f"{'; ' * bool(note)}measured levels differ from predicted by one offset: {those}"
-        note += ": gsparc update learns that" * later
+        note += ": gsparc update learns that, but not from lists of the strongest" * later
     return [Table.from_rows(title, table_columns, named[:WORST].to_dict("records"), note=note)]

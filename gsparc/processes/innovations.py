@@ -54,6 +54,7 @@ def innovations(rows: LaterRows, first: int, extent: float, changed: bool = Fals
     surprise = off / variance.sqrt()
     if not changed:
         return surprise, torch.zeros_like(surprise)
+    # Of the first rows some neighbours are infinitely far: 0 times infinity is no share.
     close = matern32(near.values, extent * ERRORS).nan_to_num()
     close = close * (told + size) / (told + size + past.faded)
     share = ((close * outside).sum(1) + UNSEEN / 2) / (close.sum(1) + UNSEEN)

@@ -102,7 +102,7 @@ def test_a_cell_that_lost_ten_decibels_was_said_to_need_another_baseline():
     (worst,) = worst_stations(columns, "gsparc")
     assert worst.note == "measured levels differ from predicted by one offset: B (-11.3 dB)"
     (worst,) = worst_stations(columns, "gsparc", later=True)
-    assert worst.note.endswith("B (-11.3 dB): gsparc update learns that")
+    assert worst.note.endswith("B (-11.3 dB): gsparc update learns that, but not from lists of the strongest")
 
 
 def test_the_worst_stations_had_other_names_than_warnings_and_a_bias_of_no_meaning():

@@ -29,11 +29,11 @@ def gone_warnings(data: Measurements) -> list[str]:
     # As many changes of place as in `number_lists`: rows are in the order of measuring.
     if step == 0 or (np.diff(data.place[heard]) != 0).sum() > 2 * len(lists.level):
         return []
-    order = np.argsort(lists.first)
+    order, stations = np.argsort(lists.first), data.site.every_station
     gone = find_gone(lists.level[order], lists.place[order, :2], REACH * step)
-    stations = data.site.every_station
     # A station that a step of its level made another ends there.
-    who = [stations.shown[t] for t in gone if FROM_ROW not in stations.name[t]]
+    gone = {t: first for t, first in gone.items() if FROM_ROW not in stations.name[t]}
+    who = [stations.shown[t] for t in gone]
     row = data.row_names[heard[lists.first[order[max(gone.values(), default=0)]]]].partition(", station")[0]
     finding = f"{list_first(who, 12)}: in no list from {row} on, though earlier ones nearby held them"
     advice = "if so, remove later rows near it, or all cells of its site (dataset.stations=[names to keep])"
