@@ -212,3 +212,10 @@ def test_copies_by_station_of_other_processes_name_their_settings():
         assert fitted("stations", *given)[0] == {"trainer.max_steps"}
     finally:
         executor.use_engine(Engine())
+
+
+def test_phases_of_snapshots_mean_nothing_to_powers():
+    """`model.loss.snapshot=phase` of powers ended in an IndexError."""
+    given = "model=splat", "model.field.count=20", "trainer.max_steps=1"
+    plain, turned = (fitted("power", *given, *more)[1] for more in ((), ("model.loss.snapshot=phase",)))
+    assert torch.equal(plain, turned)
