@@ -149,8 +149,6 @@ def warned(caplog, about: str = "without effect") -> list[str]:
     ("tone", "model=gsparc model.field.count=0", set(), ""),
     ("power", "model=gsparc model.effects.phase=false", set(), ""),
     ("image", "model=gsparc model.effects.residual=false trainer.max_steps=1", set(), ""),
-    ("power", "model=gsparc model.attenuation.inverse_distance=true",
-     {"model.attenuation.inverse_distance"}, "(gsparc does not use it here)"),
 ])  # fmt: skip
 def test_what_decides_nothing_here_is_named_with_why(world, given, unused, reason, caplog):
     assert fitted(world, *given.split())[0] == unused
@@ -219,3 +217,20 @@ def test_phases_of_snapshots_mean_nothing_to_powers():
     given = "model=splat", "model.field.count=20", "trainer.max_steps=1"
     plain, turned = (fitted("power", *given, *more)[1] for more in ((), ("model.loss.snapshot=phase",)))
     assert torch.equal(plain, turned)
+
+
+@pytest.mark.slow
+def test_a_distance_law_of_gaussians_means_nothing_to_powers(caplog):
+    """`model.attenuation.inverse_distance=true` on powers was ignored without a word."""
+    falls = "model.attenuation.inverse_distance=true"
+    unused, answers = fitted("power", "model=gsparc", falls)
+    assert unused == {"model.attenuation.inverse_distance"}
+    assert warned(caplog) == [f"options without effect here: {falls} (gsparc does not use it here)"]
+    assert torch.equal(answers, fitted("power", "model=gsparc")[1])
+
+
+def test_hidden_units_that_cost_the_start_in_closed_form_were_said_to_have_no_effect(caplog):
+    """So were steps and the number of Gaussians, without which the process may not have all the weight."""
+    given = "model=gsparc", "model.steps=0", "model.field.count=20", "model.emission.hidden=16"
+    assert not fitted("array", *given)[0] and not warned(caplog)
+    assert "Gaussians (init=sphere, encoding=fourier, activation=sigmoid, steps=0) none" in caplog.text
