@@ -268,3 +268,14 @@ def test_maps_of_a_networks_cells_help_and_those_of_another_do_not(tmp_path, cap
     assert all(describe_use(used, 30) in caplog.text for used in (True, False))  # it was not said
     right.unlink()
     np.testing.assert_allclose(gsparc.load(path).rssi(rx=asked), found[1].rssi(rx=asked), atol=1e-3)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_map_of_a_station_at_an_unknown_place_was_written_and_never_read(rasters, count):
+    """Its place, NaN, stood in the state."""
+    rows, asked, path = draw(30, 3), draw(20, 4), rasters / "model.ckpt"
+    names = {"station": np.arange(30) % 2, "station_name": np.array(["a", "b"])} if count == 2 else {}
+    unknown = {"tx": None, "station_position": np.full((2, 3), np.nan) if names else None}
+    file = "two" if names else "right"
+    found = fit(rows, rasters / f"{file}.tif", model="powers", save=path, **names, **unknown)
+    assert np.array_equal(gsparc.load(path).rssi(rx=asked), found.rssi(rx=asked))
