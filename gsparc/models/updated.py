@@ -16,6 +16,7 @@ from gsparc.models.abilities import HasProcess
 from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import View
+from gsparc.models.station_views import OneStationView
 from gsparc.models.target_rows import linear_moments
 from gsparc.processes.averages import MeanVariance
 from gsparc.processes.changes import TINY, Belief, LaterRows, correct
@@ -151,13 +152,21 @@ def stored_changes(extra: Mapping[str, Any]) -> Changes | None:
     return changes if changes is not None and (changes.rows or changes.shifts) else None
 
 
-def with_changes(method: Method, changes: Changes | None) -> Method:
-    """Return a method with later rows in place of what it had of them; None: as it was learned."""
+def with_changes(method: Method, changes: Changes | None, own: int | None = None) -> Method:
+    """Return a method with later rows in place of what it had of them; None: as it was learned.
+
+    `own` is the number of the station that the method alone answers for; None: it knows all.
+    """
+    if isinstance(method, OneStationView):
+        view = copy(method)
+        view.inner = with_changes(method.inner, changes)
+        return view
     if isinstance(method, PerStation):
         result = copy(method)
         result._copies = {number: _with_own(one, changes, number) for number, one in method}
         return result
-    return _with_own(method, changes, 0 if method.site is None or method.site.stations is None else None)
+    alone = method.site is None or method.site.stations is None
+    return _with_own(method, changes, own or 0 if alone else None)
 
 
 def _with_own(method: Method, changes: Changes | None, own: int | None) -> Method:

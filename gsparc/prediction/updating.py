@@ -90,6 +90,8 @@ class UpdateMixin:
     versions: tuple[Version, ...]
     _whole: Method
     _prepared: list[Method]
+    _model_site: Site
+    _own_station: int | None
     _answer_unit: Callable[[str | None], PowerUnit]
 
     @property
@@ -177,16 +179,18 @@ class UpdateMixin:
         Raises:
             ValueError: no such station, or no finite number.
         """
-        number = None if station is None else find_station(station, self.site.every_station)
+        known = self._model_site.every_station
+        number = self._own_station if station is None else find_station(station, known)
         if station is not None and number is None:
             raise ValueError(f"shift: no station {station!r}; there are {', '.join(self.stations) or 'none'}")
         if not np.isfinite(change_db):
             raise ValueError(f"shift: change_db={change_db} is no finite number")
-        names = range(len(self.site.every_station)) if number is None else [number]
+        names = range(len(known)) if number is None else [number]
         changes = self._current.changes
         shifts = {n: dict(changes.shifts).get(n, 0.0) + float(change_db) for n in names}
         shifts = dict(changes.shifts) | shifts
-        entry = f"shift: {change_db:+g} dB of {'all stations' if station is None else station}"
+        whose = "all stations" if number is None else station or known.shown[number]
+        entry = f"shift: {change_db:+g} dB of {whose}"
         self._add_version(changes.stations, entry, replace(changes, shifts=tuple(sorted(shifts.items()))))
 
     def undo(self, count: int = 1) -> None:
@@ -257,8 +261,8 @@ class UpdateMixin:
     def _current(self) -> Version:
         if self.versions:
             return self.versions[-1]
-        extent = float(np.linalg.norm(np.ptp(self.site.moving_box[:, :3], axis=0)))
-        return Version(Changes(Belief(max(extent, 1e-3))), Watch.from_site(self.site))
+        extent = float(np.linalg.norm(np.ptp(self._model_site.moving_box[:, :3], axis=0)))
+        return Version(Changes(Belief(max(extent, 1e-3))), Watch.from_site(self._model_site))
 
     def _add_version(
         self, stations: dict[int, LaterRows], said: str, changes: Changes | None = None,
@@ -274,10 +278,10 @@ class UpdateMixin:
 
     def _become(self, versions: tuple[Version, ...]) -> None:
         changes = stored_changes(versions_extra(versions[-1:]))
-        whole_is_same = self._whole is self.method
-        self.versions, self.method = versions, with_changes(self.method, changes)
-        self._whole = self.method if whole_is_same else with_changes(self._whole, changes)
-        self._prepared.clear()
+        whole_is_same, own = self._whole is self.method, self._own_station
+        self.versions, self.method = versions, with_changes(self.method, changes, own)
+        self._whole = self.method if whole_is_same else with_changes(self._whole, changes, own)
+        self._prepared = []
 
     # -- rows ------------------------------------------------------------------------------------------
 
@@ -301,6 +305,10 @@ class UpdateMixin:
     def _read_rows(self, rows: LevelRows, changes: Changes) -> dict[int, LaterRows]:
         """New rows of each station that has a map, as they miss it."""
         method, site = with_changes(self.method, None), self.site
+        if self._own_station is not None:
+            if rows.station.any():
+                raise ValueError("update: rows of several stations; tell them to the model of all of them")
+            rows = replace(rows, station=np.full(len(rows), self._own_station))
         number, result, shifts = np.full(len(rows), -1), {}, dict(changes.shifts)
         levels: dict[int, tuple[np.ndarray, Level]] = {}
         for name in np.unique(rows.station).tolist():
