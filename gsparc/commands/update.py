@@ -38,25 +38,16 @@ def task(config: DictConfig) -> dict[str, Any]:
     check_arguments(config, **LIMITS)
     if (config.data is None) == (config.undo == 0):
         raise DataError("gsparc update: say data=FILE to add rows, or undo=COUNT to take updates back")
-    stored = checkpoint.read(config.ckpt)
-    check_updatable(stored.site)  # before the data are read
-    predictor = load(config.ckpt)
-    alarms_before, watch, row_count, skipped = len(predictor.alarms), Stopwatch(), 0, 0
-    if config.undo:
-        predictor.undo(config.undo)
-    else:
-        data, placed = read_like_stored(stored, config.data)
-        if not placed:
-            raise DataError(f"{config.data}: has no places; later rows need them")
-        how = {name: settings[name] for name in ("window", "fade_db", "false_alarm")}
-        rows = level_rows(data, predictor.site)
-        size = config.batch or len(rows)
-        for start in range(0, len(rows), size):
-            refit = config.refit and start + size >= len(rows)
-            found = predictor.update(rows.subset(slice(start, start + size)), refit=refit, **how)
-            row_count, skipped = row_count + len(found.rows), skipped + found.skipped
-    seconds, out = watch.seconds, config.out or config.ckpt
-    checkpoint.update_extra(config.ckpt, versions_extra(predictor.versions), out)
+    with checkpoint.rewriting(config.ckpt, config.out) as file:
+        check_updatable(file.stored.site)  # before the data are read
+        predictor = load(file.stored)
+        alarms_before, watch, row_count, skipped = len(predictor.alarms), Stopwatch(), 0, 0
+        if config.undo:
+            predictor.undo(config.undo)
+        else:
+            row_count, skipped = _add_rows(predictor, file.stored, config, settings)
+        seconds, out = watch.seconds, config.out or config.ckpt
+        file.store(versions_extra(predictor.versions))
     table = alarm_rows(predictor)
     text = io.StringIO()
     writer = csv.DictWriter(text, dict.fromkeys([*COLUMNS, *(table or [{}])[0]]), lineterminator="\n")
@@ -74,6 +65,23 @@ def task(config: DictConfig) -> dict[str, Any]:
     message += f", {seconds:.2g} s"
     before = f"update: {message}; model in {out}; summary "
     return finish_run(run_dir, facts, *[changes_table(table)] * bool(table), before=before)
+
+
+def _add_rows(
+    predictor: Predictor, stored: checkpoint.StoredModel, config: DictConfig, settings: dict[str, Any]
+) -> tuple[int, int]:
+    """Tell the rows of a file; return how many are kept, and how many were skipped."""
+    data, placed = read_like_stored(stored, config.data)
+    if not placed:
+        raise DataError(f"{config.data}: has no places; later rows need them")
+    how = {name: settings[name] for name in ("window", "fade_db", "false_alarm")}
+    rows, row_count, skipped = level_rows(data, predictor.site), 0, 0
+    size = config.batch or len(rows)
+    for start in range(0, len(rows), size):
+        refit = config.refit and start + size >= len(rows)
+        found = predictor.update(rows.subset(slice(start, start + size)), refit=refit, **how)
+        row_count, skipped = row_count + len(found.rows), skipped + found.skipped
+    return row_count, skipped
 
 
 def alarm_rows(predictor: Predictor) -> list[dict[str, Any]]:

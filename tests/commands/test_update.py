@@ -6,17 +6,23 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
 from doors import knock
 from rooms_later import PLACES, SCREENED, levels, room_file
+from told import CLIENTS, Soak
 
 import gsparc
 from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
+from gsparc.prediction.updating import versions_extra
+
+SOAK_S = int(os.environ.get("GSPARC_SOAK_S", "15"))
 
 
 @pytest.fixture(scope="module")
@@ -80,6 +86,40 @@ def test_a_model_of_channels_was_refused_for_the_name_of_its_new_rows(tmp_path):
 def test_a_model_of_powers_takes_no_spectra(before):
     with pytest.raises(TypeError, match="takes rssi=, not spectrum="):
         gsparc.load(before).update(rx=PLACES[:1], spectrum=[1.0])
+
+
+def test_rows_that_came_while_a_file_was_read_were_overwritten(before, tmp_path):
+    """Of four updates of 30 rows at once 60 rows were left."""
+    live, new, held = tmp_path / "live.ckpt", room_file(tmp_path / "new.npz", 40), threading.Event()
+    live.write_bytes(before.read_bytes())
+
+    def tell():
+        with checkpoint.rewriting(live) as file:
+            held.set()
+            predictor = gsparc.load(file.stored)
+            predictor.update(rx=PLACES[:3], rssi=[-60.0] * 3)
+            time.sleep(0.5)
+            file.store(versions_extra(predictor.versions))
+
+    with ThreadPoolExecutor(1) as pool:
+        beside = pool.submit(tell)
+        held.wait()
+        assert update(tmp_path / "run", f"ckpt={live}", f"data={new}")[0].status == 0
+        beside.result()
+    assert len(gsparc.load(live).rows) == 43
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(200 + SOAK_S)
+def test_rows_that_were_acknowledged_were_lost(tmp_path, capsys):
+    """83 of 218 that a server and `gsparc update` took in a minute; `GSPARC_SOAK_S=60`: for a minute."""
+    pytest.importorskip("uvicorn", reason="the extra `serve` is not installed")
+    counts = Soak(tmp_path, SOAK_S, alive_s=5).counts()
+    with capsys.disabled():
+        sys.stderr.write(f"{counts}\n")
+    assert counts["told"] > counts["by command"] > 0 and counts["kills"] > 0
+    assert counts["lost"] == counts["twice"] == counts["of nobody"] == 0
+    assert counts["of these on disk"] <= CLIENTS * counts["kills"]  # what was in flight
 
 
 @pytest.mark.slow

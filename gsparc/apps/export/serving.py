@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import hmac
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import asdict, dataclass
@@ -24,7 +24,10 @@ from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from gsparc.apps.export.told_file import ToldFile
+from gsparc.data.files import is_out_of_space, list_causes
 from gsparc.data.limits import POSITIVE, Checked, SettingError, number, setting, whole
+from gsparc.models.checkpoint import CheckpointError
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import read_places
 
@@ -198,7 +201,7 @@ class Batcher:
 
 
 def build_application(
-    predictor: Predictor, limits: Limits, token: str | None, keep: Callable[[], object] | None = None
+    predictor: Predictor, limits: Limits, token: str | None, told: ToldFile | None = None
 ) -> ASGIApp:
     """Return the routes: POST /predict, and /std for its deviations, GET /healthz; POST /update where wanted.
 
@@ -206,13 +209,13 @@ def build_application(
         predictor: of one end that moves and one station.
         limits: more places or numbers in one request are refused (413).
         token: that a request must bear (401) but for /healthz; None: none.
-        keep: stores the model after an update; None: there are none.
+        told: the model's file, for updates; None: there are none.
 
     Raises:
         SettingError: updates without a token, or more numbers in the answer at one place than `limits` allow.
     """
-    site, lock = predictor.site, Lock()
-    if keep is not None and token is None:
+    site, lock, telling = predictor.site, Lock(), asyncio.Lock()
+    if told is not None and token is None:
         raise SettingError(
             "updates=true: whoever reaches it changes the model; set GSPARC_TOKEN, or say token=WORD"
         )
@@ -265,28 +268,29 @@ def build_application(
 
     def add_rows(body: bytes) -> dict[str, Any]:
         rows = RowsBody.model_validate_json(body)
-        with lock:
-            levels = np.array(rows.levels, float).reshape(len(rows.places), -1)
-            where: dict[str, Any] = site.name_moving(np.array(rows.places))
-            found = predictor.update(**where, rssi=levels)
-            assert keep is not None
-            try:
-                keep()
-            except OSError:  # answers are those of the file
-                predictor.undo()
-                raise
+        levels = np.array(rows.levels, float).reshape(len(rows.places), -1)
+        where: dict[str, Any] = site.name_moving(np.array(rows.places))
+        assert told is not None
+        found = told.tell(predictor, lock, limits.request_s / 2, **where, rssi=levels)
         return {"rows": found.rows.tolist(), "skipped": found.skipped, "alarms": [*map(asdict, found.alarms)]}
 
     async def update(request: Request) -> dict[str, Any]:
         body, _ = await read_body(request, False, lists=2)
         try:
-            return await asyncio.to_thread(add_rows, body)
+            async with telling:  # waiting for the file holds one thread, the others answer
+                if await request.is_disconnected():  # it would send its rows again
+                    raise HTTPException(400, "the client left")
+                return await asyncio.to_thread(add_rows, body)
+        except CheckpointError as error:
+            busy = any(isinstance(cause, TimeoutError) for cause in list_causes(error))
+            status = 503 if busy else 507 if is_out_of_space(error) else 500
+            raise HTTPException(status, str(error)) from error
         except ValueError as error:  # of a body, too
             wanted = '{"places": [[x, y, z], ...], "levels": [[level or null of each station], ...]}'
             message = f"expected {wanted}" if isinstance(error, ValidationError) else str(error)
             raise HTTPException(422, message) from error
 
-    if keep is not None:
+    if told is not None:
         app.post("/update")(update)
 
     @app.post("/std")
