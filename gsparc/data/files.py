@@ -8,6 +8,7 @@ import io
 import math
 import os
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -52,6 +53,15 @@ def read_shipped_table(package: str, name: str) -> list[dict[str, str]]:
     """Read rows of a table in CSV that a package brings, by its heads."""
     text = files(package).joinpath(name).read_text(encoding="utf-8")
     return list(csv.DictReader(text.splitlines()))
+
+
+def refuse_repeated(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a record of JSON, as `object_pairs_hook` does; `ValueError` where a name is twice in it."""
+    record = dict(pairs)
+    if len(record) < len(pairs):
+        twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
+        raise ValueError(f"{twice!r} is twice in one record")
+    return record
 
 
 def check_line_length(path: str | Path, number: int, line: str) -> str:

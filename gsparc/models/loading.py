@@ -60,7 +60,7 @@ def load(path: str | Path) -> tuple[Method, checkpoint.StoredModel]:
         CheckpointError: as these two.
     """
     stored = checkpoint.read(path)
-    return with_changes(method_from_checkpoint(stored), stored_changes(stored.extra)), stored
+    return with_changes(method_from_checkpoint(stored), stored_changes(stored.extra, stored.path)), stored
 
 
 def load_module(path: str | Path) -> GaussianModule:

@@ -484,12 +484,31 @@ def test_levels_that_were_measured_change_the_answers_and_are_stored():
         assert post(json.dumps({**rows, "levels": rows["levels"][:5]}))[0] == 422
         status, body, _ = post(b'{"places": [[1, 2, 3]]}')
         assert status == 422 and b"levels" in body
+        for wrong, says in (
+            ('{"places": [], "levels": []}', b"holds nothing"),
+            ('{"places": [[1, 2, 1]], "levels": [[-90]], "levels": [[-60]]}', b"'levels' is twice"),
+            ('{"places": [[1, 2, 1], [2, 2, 1]], "levels": [[-90], [400]]}', b"row 1: a level"),
+            ('{"places": [[1, 2, 1], [2000000, 2, 1]], "levels": [[-90], [-90]]}', b"row 1: 2000 km"),
+            ('{"places": [[1, 2, 1], [2, 2, 1]], "levels": [[-90, -90]]}', b"found (1, 2)"),
+        ):
+            status, body, _ = post(wrong)
+            assert status == 422 and says in body, body
         assert post(json.dumps({name: part * 3 for name, part in rows.items()}))[0] == 413
     assert kept == [2]
     with pytest.raises(SettingError, match="updates=true: whoever reaches it"):
         build_application(predictor, Limits(), None, kept.clear)
     with Served(predictor) as running:
         assert running.post(json.dumps(rows), path="/update")[0] == 404
+
+
+def test_rows_of_a_key_that_are_posted_twice_are_taken_once():
+    """A client that tried again after a lost answer told its rows twice."""
+    rows = {"places": [[1.0, 2.0, 1.0]], "levels": [[-90.0]]}
+    with Served(predictor := fitted(), "word", lambda: None) as running:
+        for key, status in (("a", 200), ("a", 409), ("b", 200), (None, 200), (None, 200)):
+            body = json.dumps(rows | ({"key": key} if key else {}))
+            assert running.post(body, path="/update", authorization="Bearer word")[0] == status
+    assert len(predictor.rows) == 4
 
 
 def test_an_update_that_a_full_disk_refused_is_taken_back():
