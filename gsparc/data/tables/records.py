@@ -11,10 +11,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 
-from gsparc.data.files import check_content, refuse_repeated
+from gsparc.data.files import check_content, check_depth, refuse_repeated
+from gsparc.data.limits import MOST_VALUES
 
 POINTS = {"trkpt", "wpt", "Placemark"}  # of GPX and KML
-MOST_VALUES = 10_000  # of a cell
 DEGREES, METRES = ["longitude", "latitude", "height"], ["x", "y", "z"]  # as GeoJSON and KML order coordinates
 # Of cells with a place: whether latitudes come first; over how many degrees places that are none reach.
 PLACES = {"coordinates": (False, 360), "point": (False, 3), "pair": (True, 3)}
@@ -30,6 +30,7 @@ def read_records(path: Path) -> pd.DataFrame:
     """
     text = path.read_text(encoding="utf-8-sig")
     check_content(path, text, "[{<\n")
+    check_depth(path, text)
     frame = pd.json_normalize(_of_xml(text) if text.lstrip().startswith("<") else _of_json(text))
     while (name := next((name for name in frame if frame[name].map(_holds_records).any()), None)) is not None:
         frame = frame.explode(name, ignore_index=True)
