@@ -10,7 +10,7 @@ import re
 import sys
 import sysconfig
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from hashlib import file_digest, sha256
@@ -35,7 +35,11 @@ log = logging.getLogger(__name__)
 RECORD = "job.json"  # in a fit's folder: its state and program, when it began, and whether it has ended
 FAILURE = "failure.txt"  # why it has failed
 WHERE = ("engine", "workers", "ray", "logger", "reuse", "ckpt_path")  # of where, or whether, a fit is done
-OF_DATA = ("dataset.root", "dataset.file", "split.path")  # paths that stand for what was read from them
+OF_DATA = (  # paths that stand for what was read from them, or is written there where nothing is
+    *("dataset.root", "dataset.file", "split.path"),
+    "dataset.stand_in.root",
+)
+WORDS = (".name", "._target_")  # settings that are never paths: a folder may be called as a method is
 WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its settings name
 LEFT = (  # by a training: of another one, all of it would be read beside this one's
     *("summary.json", "split.json", "per_sample.csv", "by_station.csv", "render_ms.csv"),
@@ -78,9 +82,8 @@ class FitInputs:
         whole: Any = OmegaConf.to_container(subset, resolve=True)  # what is missing is `???`
         named = dict(dotted_settings(whole))
         where = {name: named.pop(name) for name in OF_DATA if name in named}
-        files = {name: value for name, value in named.items() if isinstance(value, str)}
         settings = json.loads(json.dumps(named, default=str))
-        return cls(settings, _hashes(files), data, split, {} if data else _hashes(where))
+        return cls(settings, _hashes(named), data, split, {} if data else _hashes(where))
 
     @property
     def tells_data(self) -> bool:
@@ -254,12 +257,33 @@ def _joined(files: Iterable[Path], root: Path) -> str:
     return sha256(repr(hashes).encode()).hexdigest()
 
 
-def _hashes(paths: Mapping[str, Any]) -> dict[str, str]:
-    """Of those settings that name a file, or the folder of a dataset."""
-    found = {name: _hash_of(Path(path)) for name, path in paths.items() if path and os.path.isfile(path)}
-    if (root := paths.get("dataset.root")) and os.path.isdir(root):
-        found["dataset.root"] = _joined(Path(root).rglob("*"), Path(root))
-    return found
+def _hashes(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Of those settings that name a file or folder, alone or in a list."""
+    hashes = {name: _named(value) for name, value in settings.items() if not name.endswith(WORDS)}
+    return {name: content for name, content in hashes.items() if content}
+
+
+def _named(value: Any) -> str:
+    """The hash of the files that a setting's value names; empty: none."""
+    if isinstance(value, Mapping | list | tuple):
+        parts = [_named(part) for part in (value.values() if isinstance(value, Mapping) else value)]
+        return sha256(repr(parts).encode()).hexdigest() if any(parts) else ""
+    if not isinstance(value, str) or not value:
+        return ""
+    if os.path.isdir(value):
+        return _joined(_files_under(value), Path(value))
+    return _hash_of(Path(value)) if os.path.isfile(value) else ""
+
+
+def _files_under(root: str) -> Iterator[Path]:
+    """All files of a folder and of those that links in it lead to, each folder once; not those of fits."""
+    seen = set[str]()
+    for folder, inner, names in os.walk(root, followlinks=True):
+        if os.path.realpath(folder) in seen or (RECORD in names and folder != root):
+            inner.clear()
+            continue
+        seen.add(os.path.realpath(folder))
+        yield from (Path(folder, name) for name in names)
 
 
 def _hash_of(file: Path) -> str:

@@ -60,7 +60,7 @@ def load(path: str | Path | checkpoint.StoredModel) -> tuple[Method, checkpoint.
         CheckpointError: as these two.
     """
     stored = path if isinstance(path, checkpoint.StoredModel) else checkpoint.read(path)
-    return with_changes(method_from_checkpoint(stored), stored_changes(stored.extra)), stored
+    return with_changes(method_from_checkpoint(stored), stored_changes(stored.extra, stored.path)), stored
 
 
 def load_module(path: str | Path) -> GaussianModule:

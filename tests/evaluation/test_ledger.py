@@ -253,6 +253,40 @@ def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):
     assert states[0].files != states[1].files and states[0].settings == states[1].settings
 
 
+@pytest.mark.parametrize("how", ["folder", "list", "link", "inner link", "nested"])
+def test_files_that_a_setting_names_in_a_list_a_folder_or_behind_a_link_count_by_content(tmp_path, how):
+    """A sweep answered of the maps of before: `model.prior=FOLDER`, `[a.tif,b.tif]`, a linked `spectrum/`."""
+    (folder := tmp_path / "maps").mkdir()
+    for name in ("a.tif", "b.tif"):
+        (folder / name).write_text(name)
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "spectrum").symlink_to(folder)
+    (folder / "loop").symlink_to(tmp_path / "in")
+    (tmp_path / "link").symlink_to(folder)
+    value = {
+        "folder": str(folder), "list": [str(folder / "a.tif"), str(folder / "b.tif")],
+        "link": str(tmp_path / "link"), "inner link": str(tmp_path / "in"),
+        "nested": [{"of": [str(folder / "b.tif")]}],
+    }[how]  # fmt: skip
+    of = lambda: FitInputs.from_config(OmegaConf.create({"model": {"prior": value, "name": str(folder)}}))  # noqa: E731
+    before = of()
+    assert before == of() and [*before.files] == ["model.prior"]
+    run_once(tmp_path / "in" / "fit", before, ends(tmp_path / "in" / "fit"))
+    assert of() == before  # what fits write there is none of what they read
+    (folder / "b.tif").write_text("changed")
+    assert of().files != before.files and of().settings == before.settings
+
+
+def test_a_release_behind_a_link_counts_by_its_content(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "release").mkdir()
+    (tmp_path / "release" / "spectrum").symlink_to(tmp_path / "elsewhere")
+    config = compose("dataset=rfid", f"dataset.root='{tmp_path}/release'", "model=mean")
+    before = FitInputs.from_config(config)
+    (tmp_path / "elsewhere" / "1.png").write_text("1")
+    assert before.unread != FitInputs.from_config(config).unread
+
+
 def test_records_of_an_older_program_are_reused_where_that_is_asked(tmp_path):
     """They have one hash of all files, and settings that say where data lay."""
     run_once(tmp_path, state(), ends(tmp_path, 1))

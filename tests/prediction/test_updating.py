@@ -182,7 +182,7 @@ def test_rows_of_several_stations_are_not_told_to_one(stations):
 
 def test_misuse_is_said(predictor):
     refused("rx= and rssi= are needed", predictor.update, rx=SCREENED)
-    refused("4 places and 1 stations", predictor.update, rx=SCREENED[:4], rssi=np.zeros((4, 2)))
+    refused(r"found \(4, 2\)", predictor.update, rx=SCREENED[:4], rssi=np.zeros((4, 2)))
 
 
 @pytest.mark.slow
