@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.processes.density import LeftOutDensity
+from gsparc.processes.density import left_out_density
 from gsparc.processes.factor import NotDefiniteError
 from gsparc.processes.fit_kernel import KernelRows, minimise
 from gsparc.processes.kernel import Kernel
@@ -28,7 +28,7 @@ def test_slopes_of_the_left_out_density(kernel, bounded, outputs):
 
     def density(at: torch.Tensor) -> torch.Tensor:
         gram = KernelRows(distance, columns, values).gram(kernel.with_values(at))
-        return LeftOutDensity.apply(gram, values, outputs + 1, bounded)[0]
+        return left_out_density([(gram, values)], outputs + 1, bounded)[0]
 
     at = kernel.parameters().requires_grad_()
     (slope,) = torch.autograd.grad(density(at), at)
@@ -40,7 +40,7 @@ def test_slopes_of_the_left_out_density(kernel, bounded, outputs):
 def test_it_is_that_of_refitting_without_each_row_at_the_best_amplitude():
     distance, columns, values = rows(12, 3)
     gram = KernelRows(distance, columns, values).gram(KERNELS[1])
-    density, amplitude = (float(part) for part in LeftOutDensity.apply(gram, values, 3, False))
+    density, amplitude = (float(part) for part in left_out_density([(gram, values)], 3, False))
     total, g, y = 0.0, gram.numpy(), values.numpy()
     for i in range(12):
         rest = np.delete(np.arange(12), i)
