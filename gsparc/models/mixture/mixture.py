@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar, cast
@@ -194,6 +194,17 @@ class Mixture(LearnsTogether, ClosedForm):
         """Condition every member on the same rows."""
         for member in self.members:
             member.condition(data, rows)
+
+    def members_data(self, data: Measurements) -> Measurements:
+        """See `HasMembers`; in the phase and level of the largest run."""
+        return self.runs.remove_factors(data)
+
+    def keep_members(self, kept: Sequence[ClosedForm]) -> None:
+        """See `HasMembers`; their weights keep their ratios."""
+        chosen = [number for number, one in enumerate(self.members) if one in kept]
+        names, weights = self.started.split("+"), np.array(self.weights)[chosen]
+        self.members, self.started = [self.members[i] for i in chosen], "+".join(names[i] for i in chosen)
+        self.weights = tuple((weights / weights.sum()).tolist())
 
     def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""

@@ -215,7 +215,9 @@ class JointPowerField(ClosedForm):
         """See `Method.state`."""
         heard = {str(number): prior.state() for number, prior in self.own.heard.items()}
         state: dict[str, Any] = {
-            "places": torch.from_numpy(self.places), "never": self.own.never.state(), "own": heard,
+            "places": torch.from_numpy(np.nan_to_num(self.places)),
+            "nowhere": np.flatnonzero(np.isnan(self.places).any(1)).tolist(),
+            "never": self.own.never.state(), "own": heard,
             "heard": self.heard.state(), "unheard": self.unheard.state(), "inflation": self.inflation,
             "seed": self.seed, "whole": self.whole,
             "rows": {str(number): rows for number, rows in self.rows.items()},
@@ -228,7 +230,9 @@ class JointPowerField(ClosedForm):
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, self.places, self.seed = site, state["places"].numpy(), int(state["seed"])
+        self.site, self.places, self.seed = site, state["places"].numpy().copy(), int(state["seed"])
+        # No place is no number, which no file holds; older files lack it.
+        self.places[state.get("nowhere", [])] = np.nan
         never = Prior.read(state["never"])
         heard = {int(number): Prior.read(part) for number, part in state["own"].items()}
         self.own = StationPriors(never, heard)

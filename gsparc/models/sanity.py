@@ -1,0 +1,163 @@
+"""Whether what was fitted may answer: each member against the next simpler one, the plain mean the last.
+
+A fit goes wrong in ways that nobody thought of. Rows predicted without their own values tell, whatever they
+are: a member that misses them by more than what is simpler does answers nothing. Asked once for each fit,
+before anything is printed or saved.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from gsparc.data import heeded
+from gsparc.data.errors import Severe
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.models.abilities import HasMembers
+from gsparc.models.baselines.mean import Mean
+from gsparc.models.checkpoint import find_non_finite
+from gsparc.models.closed_form import ClosedForm, LeftOutRows
+from gsparc.models.member_weights import to_real_entries
+from gsparc.models.method import (
+    Method,
+    MethodFactory,
+    Prediction,
+    factors_to_measured,
+    import_path,
+    predict_in_batches,
+)
+from gsparc.models.target_rows import heard_rows
+from gsparc.processes.uncertainty import mean_and_error
+from gsparc.training.context import FitContext, FitReport
+from gsparc.training.cost import Cost
+from gsparc.training.stopwatch import Stopwatch
+
+JUDGED = 500  # rows, of small stations all: a mean of squared errors is then known to a tenth
+LEAST = 4  # rows: fewer tell nothing
+MEAN = "the plain mean"
+
+
+def judge_fit(
+    method: Method, report: FitReport, data: Measurements, fold: Fold
+) -> tuple[Method, FitReport]:
+    """Return what may answer after a fit, and the report with a sentence of what may not.
+
+    Members in closed form are judged by their training rows, each predicted from the others; what trains by
+    gradient by validation rows, as it is in the end. Plain methods are what others are held against, and of
+    copies by station each was judged.
+
+    Args:
+        method: fitted; members of it may be taken out.
+        report: of the fit.
+        data, fold: what it was fitted to.
+    """
+    if method.has_parts or "baseline_order" in vars(type(method)):
+        return method, report
+    watch = Stopwatch()
+    with heeded.set_apart(), torch.no_grad():
+        members = [one for _, one in method.weighted_members()] if isinstance(method, ClosedForm) else [method]
+        members.sort(key=lambda one: one.count_components())  # without Gaussians it is the plain process
+        learned = method.members_data(data) if isinstance(method, HasMembers) else data
+        kept, texts = _refuse_members(members, learned, fold)
+        if texts and kept and isinstance(method, HasMembers):
+            method.keep_members(kept)
+        elif texts:
+            name, method = method.name, Mean()
+            method.fit(data, fold, FitContext())
+            method.name = name
+    cost = report.cost + Cost({"rows left out": watch.seconds}) if report.cost.stages else report.cost
+    notes = (*map(Severe, texts), *report.notes)
+    return method, replace(report, seconds=report.seconds + watch.seconds, notes=notes, cost=cost)
+
+
+def make_stored(factory: MethodFactory, target: str) -> Method:
+    """Return an unfitted method of the class that a checkpoint names: of `factory`, or what answers for it.
+
+    Raises:
+        ValueError: see `MethodFactory.create_as`.
+    """
+    return Mean() if target == import_path(Mean) else factory.create_as(target)
+
+
+def _refuse_members(
+    members: Sequence[Method], data: Measurements, fold: Fold
+) -> tuple[list[Method], list[str]]:
+    """Members that may answer, the simplest first, and why others do not."""
+    answers = [_rows_left_out(one, data, fold) for one in members]
+    rows = answers[0].rows
+    for other in answers[1:]:
+        rows = np.intersect1d(rows, other.rows)
+    rows = _draw_over_stations(rows, data.stations_of(rows))
+    kept, texts, simpler, least = list[Method](), list[str](), MEAN, np.zeros(0)
+    if len(rows) >= LEAST:
+        least = _errors_of_mean(data, fold, rows)
+    for member, answer in zip(members, answers, strict=True):
+        why = find_non_finite(member.state(), "state")
+        why = why and f"{why} is NaN or infinite"
+        if why is None and len(rows) >= LEAST:
+            order = np.argsort(answer.rows)
+            some = answer.mean[order[np.searchsorted(answer.rows, rows, sorter=order)]]
+            error = _squared_errors(some, data, rows)
+            gain, unsure = mean_and_error(error - least, rows)
+            if not np.isfinite(error).all():
+                why = f"{np.count_nonzero(~np.isfinite(error))} of {len(rows)} answers are NaN or infinite"
+            elif gain > unsure:
+                ratio = np.sqrt(error.mean() / max(least.mean(), np.finfo(float).tiny))
+                why = f"at {len(rows)} rows left out its rms error is {ratio:.3g} times that of {simpler}"
+            else:
+                simpler, least = member.name, error
+        if why is None:
+            kept.append(member)
+        else:
+            texts.append(f"{member.name} answers nothing: {why}; {simpler} answers")
+    return kept, texts
+
+
+def _rows_left_out(method: Method, data: Measurements, fold: Fold) -> LeftOutRows:
+    """Rows as a method predicts them without their own values; validation rows where it does not say."""
+    if isinstance(method, ClosedForm):
+        if type(method).left_out is not ClosedForm.left_out:
+            return method.left_out()
+        if method.held is not None:
+            return method.held
+    rows = _draw_over_stations(fold.val, data.stations_of(fold.val))
+    if not len(rows):
+        return LeftOutRows(rows, torch.zeros(0), torch.zeros(0))
+    order, _, parts = zip(*predict_in_batches(method, data, rows), strict=True)
+    mean = Prediction.joined(parts).mean
+    return LeftOutRows(rows[np.concatenate(order)], mean, mean.new_zeros(len(mean)))
+
+
+def _draw_over_stations(rows: np.ndarray, station: np.ndarray) -> np.ndarray:
+    """At most `JUDGED` of rows (n,), sorted: as many of each station, of small ones all."""
+    order = np.random.default_rng(0).permutation(len(rows))
+    order = order[np.argsort(station[order], kind="stable")]
+    first = np.searchsorted(station[order], station[order])
+    turn = np.arange(len(rows)) - first  # within its station
+    return np.sort(rows[order[np.argsort(turn, kind="stable")[:JUDGED]]])
+
+
+def _errors_of_mean(data: Measurements, fold: Fold, rows: np.ndarray) -> np.ndarray:
+    """Squared errors (n,) of what others of its station say of each of rows (n,), of few of them all rows."""
+    known, mean = heard_rows(data, fold.learned()), Mean()
+    mean.fit(data, Fold.of_all(known), FitContext())
+    count = np.bincount(data.stations_of(known), minlength=len(data.site.every_station))
+    count = np.where(count > 1, count, max(len(known), 2))[data.stations_of(rows)]
+    among = np.isin(rows, known)
+    factor = np.where(among, count / (count - 1), 1.0)
+    return _squared_errors(mean.predict(data.batch(rows)).mean, data, rows) * factor**2
+
+
+def _squared_errors(mean: torch.Tensor, data: Measurements, rows: np.ndarray) -> np.ndarray:
+    """Mean squares (n,) of the entries that were measured, in the unit of errors."""
+    if data.site.unknown_factor != "none":  # errors are counted after it
+        mean = mean * factors_to_measured(mean, data, rows)
+    batch, unit = data.batch(rows), data.site.target.in_error_unit
+    missed = unit(mean) - unit(batch.target)
+    if batch.mask is not None:
+        missed = torch.where(batch.mask, missed, torch.zeros_like(missed))
+    return to_real_entries(missed).square().mean(1).numpy()
