@@ -79,8 +79,11 @@ class ClosedForm(Method):
         """Set the weights from rows (n,); settings are chosen anew where that costs little."""
         self.fit(data, Fold.of_all(rows), FitContext())
 
-    def left_out(self) -> LeftOutRows:
+    def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """Return the rows it was conditioned on, each predicted from the others.
+
+        Args:
+            rows: (m,) that are asked for, of which it knows some; others may come with them. None: all.
 
         Raises:
             ValueError: not conditioned yet, or they are not kept.

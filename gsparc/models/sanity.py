@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from gsparc.data import heeded
 from gsparc.data.errors import Severe
@@ -31,36 +33,36 @@ from gsparc.models.method import (
     predict_in_batches,
 )
 from gsparc.models.target_rows import heard_rows
+from gsparc.processes.powers import MOST_ROWS
 from gsparc.processes.uncertainty import mean_and_error
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.stopwatch import Stopwatch
 
 JUDGED = 500  # rows, of small stations all: a mean of squared errors is then known to a tenth
+WORK, FEWEST = 4e8, 60  # multiplications that solve for them, and rows where these do not suffice
 LEAST = 4  # rows: fewer tell nothing
 MEAN = "the plain mean"
 
 
-def judge_fit(
-    method: Method, report: FitReport, data: Measurements, fold: Fold
-) -> tuple[Method, FitReport]:
+def judge_fit(method: Method, report: FitReport, data: Measurements, fold: Fold) -> tuple[Method, FitReport]:
     """Return what may answer after a fit, and the report with a sentence of what may not.
 
     Members in closed form are judged by their training rows, each predicted from the others; what trains by
-    gradient by validation rows, as it is in the end. Plain methods are what others are held against, and of
-    copies by station each was judged.
+    gradient by validation rows, as it is in the end. Plain and published methods are what others are held
+    against: their figures are their own. Of copies by station each was judged.
 
     Args:
         method: fitted; members of it may be taken out.
         report: of the fit.
         data, fold: what it was fitted to.
     """
-    if method.has_parts or "baseline_order" in vars(type(method)):
+    if method.has_parts or method.is_yardstick:
         return method, report
     watch = Stopwatch()
     with heeded.set_apart(), torch.no_grad():
-        members = [one for _, one in method.weighted_members()] if isinstance(method, ClosedForm) else [method]
-        members.sort(key=lambda one: one.count_components())  # without Gaussians it is the plain process
+        closed = isinstance(method, ClosedForm)
+        members = list(method.weighted_members()) if closed else [(1.0, method)]
         learned = method.members_data(data) if isinstance(method, HasMembers) else data
         kept, texts = _refuse_members(members, learned, fold)
         if texts and kept and isinstance(method, HasMembers):
@@ -69,6 +71,8 @@ def judge_fit(
             name, method = method.name, Mean()
             method.fit(data, fold, FitContext())
             method.name = name
+    who = " and ".join(one.name for one in kept) or MEAN
+    texts = [f"{text}; {who} answers" for text in texts]
     cost = report.cost + Cost({"rows left out": watch.seconds}) if report.cost.stages else report.cost
     notes = (*map(Severe, texts), *report.notes)
     return method, replace(report, seconds=report.seconds + watch.seconds, notes=notes, cost=cost)
@@ -84,44 +88,67 @@ def make_stored(factory: MethodFactory, target: str) -> Method:
 
 
 def _refuse_members(
-    members: Sequence[Method], data: Measurements, fold: Fold
+    members: Sequence[tuple[float, Method]], data: Measurements, fold: Fold
 ) -> tuple[list[Method], list[str]]:
-    """Members that may answer, the simplest first, and why others do not."""
-    answers = [_rows_left_out(one, data, fold) for one in members]
-    rows = answers[0].rows
-    for other in answers[1:]:
-        rows = np.intersect1d(rows, other.rows)
+    """Members that may answer, of such with their weights, and why others do not.
+
+    Plain processes are held against the mean, and what they answer together with those that have Gaussians
+    against that. Together, as a mean of two gains where they err apart; the worst goes until it does.
+    """
+    asked = _draw_over_stations(rows := heard_rows(data, fold.learned()), data.stations_of(rows))
+    answers = {id(one): _rows_left_out(one, data, fold, asked) for _, one in members}
+    rows = reduce(np.intersect1d, [answer.rows for answer in answers.values()])
     rows = _draw_over_stations(rows, data.stations_of(rows))
-    kept, texts, simpler, least = list[Method](), list[str](), MEAN, np.zeros(0)
-    if len(rows) >= LEAST:
-        least = _errors_of_mean(data, fold, rows)
-    for member, answer in zip(members, answers, strict=True):
-        why = find_non_finite(member.state(), "state")
-        why = why and f"{why} is NaN or infinite"
-        if why is None and len(rows) >= LEAST:
-            order = np.argsort(answer.rows)
-            some = answer.mean[order[np.searchsorted(answer.rows, rows, sorter=order)]]
-            error = _squared_errors(some, data, rows)
-            gain, unsure = mean_and_error(error - least, rows)
-            if not np.isfinite(error).all():
-                why = f"{np.count_nonzero(~np.isfinite(error))} of {len(rows)} answers are NaN or infinite"
-            elif gain > unsure:
-                ratio = np.sqrt(error.mean() / max(least.mean(), np.finfo(float).tiny))
-                why = f"at {len(rows)} rows left out its rms error is {ratio:.3g} times that of {simpler}"
-            else:
-                simpler, least = member.name, error
-        if why is None:
-            kept.append(member)
+    means = {name: _select_rows(answer, rows) for name, answer in answers.items()}
+    kept, texts, groups = list[tuple[float, Method]](), list[str](), {False: [], True: []}
+    for weight, one in members:
+        wrong = find_non_finite(one.state(), "state") or find_non_finite(means[id(one)], "row left out ")
+        if wrong:
+            texts.append(f"{one.name} answers nothing: {wrong} is NaN or infinite")
         else:
-            texts.append(f"{member.name} answers nothing: {why}; {simpler} answers")
-    return kept, texts
+            groups[_has_gaussians(one)].append((weight, one))
+    if len(rows) < LEAST:
+        return [one for group in groups.values() for _, one in group], texts
+
+    def missed(those: Sequence[tuple[float, Method]]) -> np.ndarray:
+        total = sum(weight for weight, _ in those)
+        return _squared_errors(sum(weight / total * means[id(one)] for weight, one in those), data, rows)
+
+    simpler, least = MEAN, _errors_of_mean(data, fold, rows)
+    for group in groups.values():
+        while group:
+            error = missed([*kept, *group])
+            gain, unsure = mean_and_error(error - least, np.arange(len(rows)))
+            if gain <= unsure:
+                kept, least = [*kept, *group], error
+                simpler = " and ".join(one.name for _, one in kept)
+                break
+            worst = max(group, key=lambda pair: missed([pair]).mean())
+            group.remove(worst)
+            ratio = np.sqrt(missed([worst]).mean() / max(least.mean(), np.finfo(float).tiny))
+            why = f"at {len(rows)} rows left out its rms error is {ratio:.3g} times that of {simpler}"
+            texts.append(f"{worst[1].name} answers nothing: {why}")
+    return [one for _, one in kept], texts
 
 
-def _rows_left_out(method: Method, data: Measurements, fold: Fold) -> LeftOutRows:
-    """Rows as a method predicts them without their own values; validation rows where it does not say."""
+def _has_gaussians(method: Method) -> bool:
+    """Whether it is more than a plain process."""
+    return bool(method.count_gaussians if isinstance(method, ClosedForm) else method.count_components())
+
+
+def _select_rows(answer: LeftOutRows, rows: np.ndarray) -> Tensor:
+    order = np.argsort(answer.rows)
+    return answer.mean[order[np.searchsorted(answer.rows, rows, sorter=order)]]
+
+
+def _rows_left_out(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> LeftOutRows:
+    """Rows (n,), maybe others too, as a method predicts them without their own values.
+
+    Validation rows where it does not say.
+    """
     if isinstance(method, ClosedForm):
         if type(method).left_out is not ClosedForm.left_out:
-            return method.left_out()
+            return method.left_out(rows)
         if method.held is not None:
             return method.held
     rows = _draw_over_stations(fold.val, data.stations_of(fold.val))
@@ -133,12 +160,17 @@ def _rows_left_out(method: Method, data: Measurements, fold: Fold) -> LeftOutRow
 
 
 def _draw_over_stations(rows: np.ndarray, station: np.ndarray) -> np.ndarray:
-    """At most `JUDGED` of rows (n,), sorted: as many of each station, of small ones all."""
+    """At most `JUDGED` of rows (n,), sorted: as many of each station, of small ones all.
+
+    Fewer where a covariance of many has to be solved for each, so that it takes no time beside the fit.
+    """
+    many = np.bincount(station).max(initial=1)
+    most = JUDGED if many > MOST_ROWS else int(np.clip(WORK / many**2, FEWEST, JUDGED))
     order = np.random.default_rng(0).permutation(len(rows))
     order = order[np.argsort(station[order], kind="stable")]
     first = np.searchsorted(station[order], station[order])
     turn = np.arange(len(rows)) - first  # within its station
-    return np.sort(rows[order[np.argsort(turn, kind="stable")[:JUDGED]]])
+    return np.sort(rows[order[np.argsort(turn, kind="stable")[:most]]])
 
 
 def _errors_of_mean(data: Measurements, fold: Fold, rows: np.ndarray) -> np.ndarray:
@@ -152,7 +184,7 @@ def _errors_of_mean(data: Measurements, fold: Fold, rows: np.ndarray) -> np.ndar
     return _squared_errors(mean.predict(data.batch(rows)).mean, data, rows) * factor**2
 
 
-def _squared_errors(mean: torch.Tensor, data: Measurements, rows: np.ndarray) -> np.ndarray:
+def _squared_errors(mean: Tensor, data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Mean squares (n,) of the entries that were measured, in the unit of errors."""
     if data.site.unknown_factor != "none":  # errors are counted after it
         mean = mean * factors_to_measured(mean, data, rows)

@@ -69,22 +69,20 @@ def left_out_density(
         parts: of V independent processes covariances (n, n) with noise, relative to the amplitude, and values
             (n, P) less the mean, coordinates in an orthonormal basis.
         entries: real numbers of a value, P or more.
-        bounded: adds half the square of an amplitude's excess in nats over the values' variance; without it
-            few rows may choose a long process with next to no noise, good at its neighbours alone.
+        bounded: adds half the square of the amplitudes' excess in nats over the values' variance, for each
+            process; without it few rows may choose a long one with next to no noise, good at neighbours.
         alike: rows that the common amplitude counts as, for one process.
     """
     sums = (LeftOutSums.apply(gram, values) for gram, values in parts)  # type: ignore[no-untyped-call]
-    squares, logs = map(torch.stack, zip(*sums, strict=True))
+    squares, logs = (torch.stack(part) / entries for part in zip(*sums, strict=True))
     count = squares.new_tensor([len(values) for _, values in parts])
-    power = torch.stack([values.square().sum() for _, values in parts])
-    prior = alike * _common_amplitude(squares.detach() / entries, count, alike) if alike else 0.0
-    shares = ((part / entries + prior) / (count + alike) for part in (squares, power))
-    amplitude, least = (share.clamp_min(FLAT) for share in shares)
-    density = 0.5 * (count + alike) * amplitude.log() + 0.5 * count * LOG_NORMAL - 0.5 * logs
-    if alike:
-        density = density - 0.5 * alike * math.log(prior / alike)
-    excess = (amplitude.log() - least.log()).clamp(0.0, EXCESS) if bounded else count.new_zeros(())
-    return (density + 0.5 * excess.square()).sum(), amplitude.detach()
+    common = _common_amplitude(squares.detach(), count, alike) if alike else FLAT
+    amplitude = ((squares + alike * common) / (count + alike)).clamp_min(FLAT)
+    density = 0.5 * ((count + alike) * amplitude.log() - alike * math.log(common) + count * LOG_NORMAL)
+    power = sum(float(values.square().sum()) for _, values in parts) / entries
+    excess = (squares.sum().clamp_min(FLAT).log() - math.log(max(power, FLAT))).clamp(0.0, EXCESS)
+    penalty = 0.5 * len(parts) * excess.square() if bounded else 0.0
+    return (density - 0.5 * entries * logs).sum() + penalty, amplitude.detach()
 
 
 def _common_amplitude(squares: Tensor, count: Tensor, alike: float) -> float:

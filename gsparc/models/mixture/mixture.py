@@ -237,9 +237,9 @@ class Mixture(LearnsTogether, ClosedForm):
         variance, unknown = (each.to(mean.real.dtype) for each in (variance, unknown))
         return Prediction(mean, variance, unknown, torch.stack(parts).sum(0) if parts else None)
 
-    def left_out(self) -> LeftOutRows:
+    def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """Return the mean of all; what they disagree about is part of its variance."""
-        result = [member.left_out() for member in self.members]
+        result = [member.left_out(rows) for member in self.members]
         if len({one.mean.shape for one in result}) > 1:
             raise ValueError(f"{self.name}: of several tones or antennas one is kept of rows left out")
         parts = [(weight, one.mean, one.variance) for weight, one in zip(self.weights, result, strict=True)]

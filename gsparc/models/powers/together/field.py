@@ -195,21 +195,23 @@ class JointPowerField(ClosedForm):
             noise[at] = inflation * kernel.amplitude * kernel.noise
         return JointLevels(mean, covariance, noise)
 
-    def left_out(self) -> LeftOutRows:
+    def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """See `ClosedForm`; of rows where something was heard.
 
         Raises:
             ValueError: before `condition`.
         """
         posterior, _ = self._require_posteriors()
-        means, spreads = [], []
+        means, spreads, known = [], [], []
         for number, process in posterior.processes.items():
-            error, variance = posterior.left_out(number)
-            loud = process.extra == 0
-            means.append((process.given_values()[:, 0] - error)[loud])
-            spreads.append(variance[loud])
+            asked = slice(None) if rows is None else np.isin(self.rows[number], rows)
+            some = (process.extra == 0).nonzero()[:, 0][asked]
+            error, variance = posterior.left_out(number, some)
+            means.append(process.given_values()[some, 0] - error)
+            spreads.append(variance)
+            known.append(self.rows[number][asked])
         moments = linear_moments(torch.cat(means).float(), torch.cat(spreads).float())
-        return LeftOutRows(torch.cat([*self.rows.values()]).numpy(), *moments)
+        return LeftOutRows(torch.cat(known).numpy(), *moments)
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
