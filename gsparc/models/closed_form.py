@@ -31,11 +31,13 @@ class LeftOutRows:
         rows: (n,) of the measurements.
         mean: (n, ...) predictions, stored units.
         variance: (n,) expected squared error per entry.
+        group: (n,) rows of one were left out together; None: each alone.
     """
 
     rows: np.ndarray
     mean: Tensor
     variance: Tensor
+    group: np.ndarray | None = None
 
 
 class Moments(NamedTuple):

@@ -33,13 +33,15 @@ from gsparc.models.method import (
     predict_in_batches,
 )
 from gsparc.models.target_rows import heard_rows
+from gsparc.processes.density import TINY
 from gsparc.processes.powers import MOST_ROWS
 from gsparc.processes.uncertainty import mean_and_error
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.stopwatch import Stopwatch
 
-JUDGED = 500  # rows, of small stations all: a mean of squared errors is then known to a tenth
+JUDGED = 1_000  # rows, of small stations all: one mad answer in 300 is then seen
+WILD = 2  # times what the mean misses any row by: all that was measured spans no more
 WORK, FEWEST = 4e8, 60  # multiplications that solve for them, and rows where these do not suffice
 LEAST = 4  # rows: fewer tell nothing
 MEAN = "the plain mean"
@@ -114,20 +116,25 @@ def _refuse_members(
         total = sum(weight for weight, _ in those)
         return _squared_errors(sum(weight / total * means[id(one)] for weight, one in those), data, rows)
 
-    simpler, least = MEAN, _errors_of_mean(data, fold, rows)
+    held = max(answers.values(), key=lambda answer: answer.group is not None)
+    simpler, least = MEAN, _errors_of_mean(data, fold, rows, held)
+    most = WILD**2 * least.max()  # of a row: a few that are mad have a large standard error
     for group in groups.values():
         while group:
             error = missed([*kept, *group])
             gain, unsure = mean_and_error(error - least, np.arange(len(rows)))
-            if gain <= unsure:
+            if gain <= unsure and error.max() <= most:
                 kept, least = [*kept, *group], error
                 simpler = " and ".join(one.name for _, one in kept)
                 break
             worst = max(group, key=lambda pair: missed([pair]).mean())
             group.remove(worst)
-            ratio = np.sqrt(missed([worst]).mean() / max(least.mean(), np.finfo(float).tiny))
-            why = f"at {len(rows)} rows left out its rms error is {ratio:.3g} times that of {simpler}"
-            texts.append(f"{worst[1].name} answers nothing: {why}")
+            error, at = missed([worst]), f"at {len(rows)} rows left out"
+            ratio = np.sqrt(error.mean() / max(least.mean(), TINY))
+            why = f"its rms error is {ratio:.3g} times that of {simpler}"
+            if wild := np.count_nonzero(error > most):
+                why += f", and {wild} are missed by more than {WILD} times what {MEAN} misses any by"
+            texts.append(f"{worst[1].name} answers nothing: {at} {why}")
     return [one for _, one in kept], texts
 
 
@@ -173,15 +180,27 @@ def _draw_over_stations(rows: np.ndarray, station: np.ndarray) -> np.ndarray:
     return np.sort(rows[order[np.argsort(turn, kind="stable")[:most]]])
 
 
-def _errors_of_mean(data: Measurements, fold: Fold, rows: np.ndarray) -> np.ndarray:
-    """Squared errors (n,) of what others of its station say of each of rows (n,), of few of them all rows."""
-    known, mean = heard_rows(data, fold.learned()), Mean()
-    mean.fit(data, Fold.of_all(known), FitContext())
+def _errors_of_mean(data: Measurements, fold: Fold, rows: np.ndarray, held: LeftOutRows) -> np.ndarray:
+    """Squared errors (n,) of what others of its station say of each of rows (n,), of few of them all rows.
+
+    Others are those that a member had, which `held` tells.
+    """
+    if held.group is not None:
+        error = np.zeros(len(rows))
+        for number in np.unique(held.group):
+            here, others = np.isin(rows, held.rows[held.group == number]), held.rows[held.group != number]
+            error[here] = _squared_errors(_mean_at(data, others, rows[here]), data, rows[here])
+        return error
+    known = heard_rows(data, fold.learned())
     count = np.bincount(data.stations_of(known), minlength=len(data.site.every_station))
     count = np.where(count > 1, count, max(len(known), 2))[data.stations_of(rows)]
-    among = np.isin(rows, known)
-    factor = np.where(among, count / (count - 1), 1.0)
-    return _squared_errors(mean.predict(data.batch(rows)).mean, data, rows) * factor**2
+    return _squared_errors(_mean_at(data, known, rows), data, rows) * (count / (count - 1)) ** 2
+
+
+def _mean_at(data: Measurements, known: np.ndarray, rows: np.ndarray) -> Tensor:
+    mean = Mean()
+    mean.fit(data, Fold.of_all(known), FitContext())
+    return mean.predict(data.batch(rows)).mean
 
 
 def _squared_errors(mean: Tensor, data: Measurements, rows: np.ndarray) -> np.ndarray:

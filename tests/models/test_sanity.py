@@ -16,6 +16,7 @@ from gsparc.data.splits import Fold
 from gsparc.models import checkpoint, fitting, loading, sanity
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean
+from gsparc.models.closed_form import LeftOutRows
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.per_station import PerStation
 from gsparc.models.powers.together import learning
@@ -117,7 +118,8 @@ def test_the_mean_is_that_of_the_other_rows_of_a_station():
     data = lying_still()
     rows = np.arange(0, len(data), 7)
     every, level = np.arange(len(data)), data.site.target.to_real(data.target)[:, 0].astype(float)
-    errors = sanity._errors_of_mean(data, Fold.of_all(every), rows)
+    alone = LeftOutRows(rows, torch.zeros(0), torch.zeros(0))
+    errors = sanity._errors_of_mean(data, Fold.of_all(every), rows, alone)
     for row, error in zip(rows, errors, strict=True):
         others = (data.station == data.station[row]) & (every != row)
         assert error == pytest.approx((level[row] - level[others].mean()) ** 2, rel=1e-3)
