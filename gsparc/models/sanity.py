@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data import heeded
 from gsparc.data.errors import Severe
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -42,7 +41,7 @@ from gsparc.training.stopwatch import Stopwatch
 
 JUDGED = 1_000  # rows, of small stations all: one mad answer in 300 is then seen
 WILD = 2  # times what the mean misses any row by: all that was measured spans no more
-WORK, FEWEST = 4e8, 60  # multiplications that solve for them, and rows where these do not suffice
+WORK, FEWEST = 1e8, 60  # multiplications that solve for them, and rows where these do not suffice
 LEAST = 4  # rows: fewer tell nothing
 MEAN = "the plain mean"
 
@@ -62,7 +61,7 @@ def judge_fit(method: Method, report: FitReport, data: Measurements, fold: Fold)
     if method.has_parts or method.is_yardstick:
         return method, report
     watch = Stopwatch()
-    with heeded.set_apart(), torch.no_grad():
+    with torch.no_grad():
         closed = isinstance(method, ClosedForm)
         members = list(method.weighted_members()) if closed else [(1.0, method)]
         learned = method.members_data(data) if isinstance(method, HasMembers) else data
