@@ -186,6 +186,11 @@ class Method(MethodFactory):
         return deepcopy(self)
 
     @property
+    def is_yardstick(self) -> bool:
+        """Whether others are held against it, so that it answers however bad it is: plain methods here."""
+        return vars(type(self)).get("baseline_order") is not None
+
+    @property
     def label(self) -> str:
         """The name as people read it, with how the fit approximates."""
         return self.name

@@ -32,6 +32,7 @@ from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
 from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.powers.own_terms import pool_station_weights
+from gsparc.models.sanity import make_stored
 from gsparc.models.station_views import AllStationsView, OneStationView
 from gsparc.models.target_rows import heard_rows
 from gsparc.training.context import FitContext, FitReport
@@ -322,7 +323,7 @@ class PerStation(Method):
         """See `Method.restore`."""
         self.site, self._shared = site, bool(state["shared"])
         for number, part in state["per_station"].items():
-            self._copies[int(number)] = copy = self.factory.create_as(part["target"])
+            self._copies[int(number)] = copy = make_stored(self.factory, part["target"])
             copy.name = self.name
             copy.restore(self._site_of_copy(site, int(number)), part["state"])
 

@@ -13,7 +13,7 @@ import numpy as np
 from hydra.utils import instantiate
 from lightning import Callback
 
-from gsparc.data.errors import Caution
+from gsparc.data.errors import Caution, Severe
 from gsparc.data.executor import run_each, uses_other_processes
 from gsparc.data.load import split_settings
 from gsparc.data.schema import Measurements
@@ -66,6 +66,7 @@ class FoldFits:
         """Return what a summary says of the fits."""
         notes = [note for note in self.notes if not isinstance(note, Caution)]  # those were warnings
         facts = {"time/train_cpu_s": fmean(self.train_cpu_s), "model/learned": "\n".join(notes) or None}
+        facts["model/refused"] = "\n".join(note for note in self.notes if isinstance(note, Severe)) or None
         if self.cost.stages:
             facts |= {"time/cost": self.cost.describe(), "time/unused_s": self.cost.unused_s}
         return facts

@@ -205,7 +205,7 @@ class PowerField(ClosedForm):
         explained_power = from_decibels(explained[:, None]) if self.count_components() else None
         return Prediction(*linear_moments(mean, spread), share, explained_power)
 
-    def left_out(self) -> LeftOutRows:
+    def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """See `ClosedForm`; of rows where something was heard.
 
         Of very many rows each is predicted without all that was measured at its place.
@@ -214,17 +214,20 @@ class PowerField(ClosedForm):
             ValueError: before `condition`.
         """
         process = self.require_fitted(self.powers)
-        decibels, spread = process.left_out(self.at)
+        some = None if rows is None else np.flatnonzero(np.isin(self.known, rows))
+        decibels, spread = process.left_out(self.at, some)
+        known = self.known if some is None else self.known[some]
         if self.fringes is not None:
             posterior = process.posterior
             loud = (posterior.extra == 0).numpy() if isinstance(posterior, Exact) else self.at
             places = process.places[loud]
-            nearest = torch.from_numpy(cKDTree(places).query(places, k=2)[0][:, 1])
+            asked = places if some is None else places[some]
+            nearest = torch.from_numpy(cKDTree(places).query(asked, k=2)[0][:, 1])
             decibels, factor = self.fringes.blend_blind_solutions(
-                decibels, torch.from_numpy(places), nearest, self.known
+                decibels, torch.from_numpy(asked), nearest, known
             )
             spread = spread * factor
-        return LeftOutRows(self.known, *linear_moments(decibels.float(), spread.float()))
+        return LeftOutRows(known, *linear_moments(decibels.float(), spread.float()))
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
