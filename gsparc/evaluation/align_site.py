@@ -13,6 +13,7 @@ from gsparc.data.errors import list_first
 from gsparc.data.links.stations import all_names
 from gsparc.data.schema import Measurements, Site, Stations
 from gsparc.data.units import WATTS
+from gsparc.models.method import MEAN_DEVICE
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +36,7 @@ def align_to_site(data: Measurements, site: Site, *, whole: bool = False) -> Mea
     data = _about(data, site)
     if site.unknown_factor != "none":  # few rows of another file may not tell
         data = replace(data, site=replace(data.site, unknown_factor=site.unknown_factor))
+    data = _with_devices(data, site)
     ours = data.site
     shift = ours.origin - site.origin
     if ours.static_position is not None and site.static_position is not None:
@@ -59,6 +61,16 @@ def align_to_site(data: Measurements, site: Site, *, whole: bool = False) -> Mea
         # Variances are of the square of the unit.
         noise_variance=_times(data.noise_variance, rescale**2),
     )  # fmt: skip
+
+
+def _with_devices(data: Measurements, site: Site) -> Measurements:
+    """`data` with the numbers that a model has for devices, by their names; unknown ones are the mean one."""
+    if data.device is None or data.site.device_names == site.device_names:
+        return data
+    known = {name: number for number, name in enumerate(site.device_names or ())}
+    number = np.array([known.get(name, MEAN_DEVICE) for name in data.site.device_names or ()])
+    device = number[data.device] if known else None
+    return replace(data, device=device, site=replace(data.site, device_names=site.device_names))
 
 
 def _about(data: Measurements, site: Site) -> Measurements:

@@ -9,15 +9,17 @@ were lost, in outages or at random, are missing beside strong ones, too.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.row_order import along_curve, hash_rows
 from gsparc.physics.decibels import to_decibels
+from gsparc.processes.stored import Stored, from_plain, to_plain
 
 if TYPE_CHECKING:
     from gsparc.data.schema import Measurements
@@ -62,7 +64,7 @@ Silent = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
-class StrongestLists:
+class StrongestLists(Stored):
     """Lists of the strongest of T stations.
 
     Attributes:
@@ -89,6 +91,21 @@ class StrongestLists:
         # By what they hold: the file's order is chance, and draws are by number.
         order = np.lexsort((hash_rows(np.nan_to_num(table)), along_curve(np.nan_to_num(at[first]))))
         return cls(int(np.isfinite(table).sum(1).max()), first[order], table[order], at[first[order]])
+
+    def state(self) -> dict[str, Any]:
+        """Return what `read` needs: of levels those that are, as most stations are in no list."""
+        moment, station = np.nonzero(np.isfinite(self.level))
+        levels = np.c_[moment, station], self.level[moment, station], self.level.shape[1]
+        return {**super().state(), "level": to_plain(levels)}
+
+    @classmethod
+    def read(cls, state: Mapping[str, Any]) -> Self:
+        """Return the lists whose `state()` this was."""
+        (links, values, count), rest = from_plain(state["level"]), {**state, "level": None}
+        lists = super().read(rest)
+        level = np.full((len(lists.first), count), np.nan)
+        level[tuple(links.T)] = values
+        return replace(lists, level=level)
 
     @property
     def full(self) -> np.ndarray:
@@ -190,6 +207,8 @@ def strongest_lists(data: Measurements) -> StrongestLists | None:
     if data.place is None or data.station is None or not data.site.several:
         return None
     heard = np.flatnonzero(data.censored_side() <= 0)
+    if not len(heard):
+        return None
     level, at = levels_db(data, heard), data.moving[heard]
     count = len(data.site.every_station)
     lists = StrongestLists.from_rows(data.place[heard], data.station[heard], level, at, count)
