@@ -17,7 +17,7 @@ from gsparc.data.executor import run_each
 from gsparc.data.files import write_archive
 from gsparc.data.query_places import QueryPlaces, read_query_places
 from gsparc.data.schema import End, Site
-from gsparc.data.target import Kind, Target
+from gsparc.data.target import Target
 from gsparc.data.units import PowerUnit, power_in_decibels
 from gsparc.evaluation.summary import write_samples
 from gsparc.models.device_offsets import find_device
@@ -121,7 +121,7 @@ def predict_file(
         if refused := predictions.count_refused():
             what = f"{refused} of {len(predictions)} predictions are refused (column refused)"
             log.warning("%s: %s: too far from what was measured", places, what)
-    write_answers(path, queries, predictions, site.kind, power)
+    write_answers(path, queries, predictions, site, power)
     facts: dict[str, Any] = {
         "predict/places": len(queries), "predict/predictions": len(predictions),
         "predict/far_outside": int(far.sum()),
@@ -296,10 +296,10 @@ def unit_suffix(unit: PowerUnit) -> str:
 
 
 def write_answers(
-    path: Path, queries: QueryPlaces, predictions: Answers, kind: Kind, power: PowerUnit | None
+    path: Path, queries: QueryPlaces, predictions: Answers, site: Site, power: PowerUnit | None
 ) -> None:
     """Write all predictions, whole or not at all; NaN for the level of no power."""
-    archive = path.suffix.lower() == ".npz"
+    archive, kind = path.suffix.lower() == ".npz", site.kind
     columns, name = _places(queries, predictions), kind if power is None else f"{kind}_{unit_suffix(power)}"
     outputs, mean = predictions.said, predictions.said.mean.numpy()
     if power is not None:
@@ -309,6 +309,7 @@ def write_answers(
         # Stored as a variance because those of independent parts add; a reader wants it in the level's unit.
         columns[f"{name}_std"] = outputs.variance.sqrt().float().numpy()
     if power is None:
+        mean = site.in_shape_of_file(mean) if site.target.is_complex else mean
         columns |= {kind: mean} if archive else _entries(mean)
     columns |= {name: values.round(DIGITS) for name, values in predictions.heard.items()}
     columns |= {} if outputs.confidence is None else {"confidence": outputs.confidence.numpy()}

@@ -336,6 +336,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         """Return the channel (B, antennas, subcarriers) complex64, in the physical units of the measurements.
 
         All three axes are there for one antenna or tone, too: of measured channels (B, K) take `[:, 0]`.
+        What was constant in all rows, as null tones are, is NaN.
 
         >>> heard, tones = np.exp(1j * places[:, :1] * [1, 2]), [2.4e9, 2.41e9]  # (60, 2)
         >>> near = gsparc.fit(rx=places, tx=[9.0, 9.0, 2.6], csi=heard, frequency_hz=tones, model="nearest")
@@ -351,7 +352,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
             grad: as in `predict`; at the measured tones alone.
         """
         if uplink is None and frequency_hz is None and symbols is None:
-            return self._predict_mean("csi", tx, rx, grad)
+            return self.site.in_shape_of_file(self._predict_mean("csi", tx, rx, grad))
         if grad:
             raise ValueError("grad=True: channels have gradients at positions and the measured tones alone")
         from gsparc.prediction import channels
