@@ -16,7 +16,6 @@ from gsparc.commands.shared.inputs import RunInputs, describe_inputs, read_input
 from gsparc.commands.shared.output import show_training
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.train_once import objective, train_once
-from gsparc.data import heeded
 from gsparc.data.files import SUMMARY
 from gsparc.data.split_files import write_split
 from gsparc.evaluation import summary
@@ -72,12 +71,10 @@ def train(
                 config_yaml=OmegaConf.to_yaml(config, resolve=True),
             )
             contexts = folds.fold_contexts(whole, split, resumes)
-            with heeded.record_reads(inputs.reads):
-                # `Method.fit` of every fold; models/{splat/method,peers/trained}.py call `Trainer.fit`.
-                keep = partial(folds.keep_fold, split, contexts, run_id)
-                fits = folds.fit_folds(method, data, split, contexts, learned=inputs.learned, keep=keep)
-                options.ask_one_query(fits.methods[0], data, split, config.eval_on)
-            unused = options.warn_of_unheeded(inputs.reads, fits.methods[0], data) if in_full else None
+            # `Method.fit` of every fold; models/{splat/method,peers/trained}.py call `Trainer.fit`.
+            keep = partial(folds.keep_fold, split, contexts, run_id)
+            fits = folds.fit_folds(method, data, split, contexts, learned=inputs.learned, keep=keep)
+            unused = options.warn_of_unheeded(config, fits.methods[0], data) if in_full else None
             evaluation = evaluate(
                 fits.methods, fits.train_s, data, split, eval_on=config.eval_on, baselines=config.baselines,
                 shared=same_as_baseline(config, method), timed=in_full,

@@ -27,7 +27,6 @@ import torch
 from joblib.externals.loky.process_executor import BrokenProcessPool
 from threadpoolctl import threadpool_limits
 
-from gsparc.data import heeded
 from gsparc.data.errors import explain_error
 from gsparc.data.limits import Checked, SettingError, choice, or_null, setting, whole
 
@@ -105,7 +104,7 @@ def run_each(
     elif not uses_other_processes():
         results = _in_threads(lambda number: (number, work(pieces[number])), numbers, threads)
     else:
-        blob = cloudpickle.dumps((heeded.return_with_reads(work), os.getcwd(), torch.get_num_threads()))
+        blob = cloudpickle.dumps((work, os.getcwd(), torch.get_num_threads()))
         results = (_on_ray if _chosen.engine == "ray" else _in_processes)(blob, pieces, numbers)
     with closing(results):  # what has begun is cancelled
         for count, (number, result) in enumerate(results, 1):
@@ -119,7 +118,7 @@ def run_each(
             if what and count < len(pieces) and now - logged > max(SAY_S, whole / LINES):
                 logged = now
                 log.info("%d of %d %s, about %.0f s left", count, len(pieces), what, to_come)
-            yield number, heeded.take_result(result) if uses_other_processes() else result
+            yield number, result
 
 
 def run_all(work: Callable[[_Piece], _Result], pieces: Sequence[_Piece], what: str = "") -> list[_Result]:

@@ -19,7 +19,6 @@ import torch
 from lightning.pytorch.plugins.io import CheckpointIO
 from torch.multiprocessing.spawn import ProcessException, ProcessExitedException
 
-from gsparc.data import heeded
 from gsparc.data.datamodule import DataModule, Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -80,9 +79,9 @@ def requested_steps(context: FitContext, rows: int, model_steps: int | None = No
         if value is not None and (type(value) is not int or value < 0):
             raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or -1")
     if model_steps == 0 or (steps is None and epochs is None):  # 0 of either is the start alone
-        heeded.count_reads("model.steps")
         return model_steps
-    heeded.count_reads("trainer.max_steps", "trainer.max_epochs")
+    if model_steps is not None:
+        log.warning("model.steps=%d gives way to the Trainer's max_steps or max_epochs", model_steps)
     size = context.batch_size if context.datamodule is None else context.datamodule.batch_size
     of_epochs = None if epochs is None else epochs * -(-rows // size)
     return min(one for one in (steps, of_epochs) if one is not None)
@@ -234,9 +233,6 @@ def make_trainer(
         options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
     options["max_steps"] = module.total_steps
     options["max_epochs"] = -1
-    # Without validation rows nothing is looked at, however often that was asked for.
-    unwatched = (f"trainer.{name}" for name in make.keywords if name != "val_check_interval")
-    heeded.count_reads("callbacks", *(["trainer"] if len(fold.val) else unwatched))
     processes = SummedGradients.from_strategy(make.keywords.get("strategy"))
     if module.count is None:  # networks of published methods make tensors of their own, on the CPU
         if processes is not None or make.keywords.get("accelerator", "cpu") != "cpu":
@@ -251,8 +247,6 @@ def make_trainer(
         default_root_dir=folder,
         **options,
     )
-    if processes is not None:  # which note nothing here
-        heeded.count_reads("*")
     if trainer.world_size > 1 and processes is None:
         raise ValueError("trainer.strategy: several devices need ddp, ddp_spawn or ddp_fork; say trainer=ddp")
     return trainer, batches

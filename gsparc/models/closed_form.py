@@ -58,11 +58,10 @@ class ClosedForm(Method):
     Attributes:
         held: rows of groups, predicted by searches that left their group out; None where none did.
         forgets: whether `condition` on other rows leaves nothing of earlier ones but a few numbers.
-        asks_visibility: whether a fit hangs on the switch of that name.
     """
 
     held: LeftOutRows | None = None
-    forgets = asks_visibility = False
+    forgets = False
     no_gradient: str | None = None
 
     @property

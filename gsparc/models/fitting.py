@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import yaml
 
-from gsparc.data import heeded
 from gsparc.data.assemble import auxiliary_hash
 from gsparc.data.errors import Caution, list_first
 from gsparc.data.row_order import order_rows
@@ -79,8 +78,6 @@ def fit_or_resume(
         context = replace(context, datamodule=module)
     (ordered, rows), resume_path = align_phases(ordered, rows), context.resume
     aligning = watch.seconds if ordered.site.unknown_factor != "none" else 0.0
-    if resume_path is not None:  # what was read then is not known
-        heeded.count_reads("*")
     if resume_path is not None and not resume_path.exists():  # the interrupted run had not begun this part
         context = replace(context, resume=None)
     elif resume_path is not None and resume_path.is_dir():

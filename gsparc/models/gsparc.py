@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from gsparc.data import heeded
 from gsparc.data.limits import check_arguments, number, or_null
 from gsparc.data.prior_levels import Files
 from gsparc.data.schema import Measurements, Site
@@ -35,7 +34,7 @@ def choose(data: Measurements, settings: Gsparc, quiet: bool = False) -> Method:
     Args:
         data: measurements; targets are not looked at.
         settings: as configured.
-        quiet: whether nothing is logged, and no setting counts as read.
+        quiet: whether nothing is logged.
 
     Returns:
         Unfitted, under the name by which `model=NAME` has it directly.
@@ -43,50 +42,41 @@ def choose(data: Measurements, settings: Gsparc, quiet: bool = False) -> Method:
     Raises:
         ValueError: a term that is asked for means nothing here.
     """
-    with heeded.set_apart():  # what decides is counted below; the method may heed more
-        switches, init, model, site = settings.switches, settings.init, settings.rendered.settings, data.site
-        count, falls = model.field.count, model.attenuation.inverse_distance
-        terms = resolve_terms(switches, init, data, model.emission.hidden, count, falls)
-        plain, hides = switches.residual is not False, switches.visibility
-        # No Gaussians means the residual alone, where that is not switched off.
-        placed = count > 0 or not plain
-        residual_alone = plain and site.has_waves and not terms.rendered
-        # The first that is called for: what was heard at the same moment tells more than where it was
-        # heard; phases relative to neighbours leave no source to be placed.
-        table: tuple[tuple[bool, type[Method]], ...] = (
-            (data.uplink is not None, UplinkField),
-            (site.phase_reference == "neighbours", Channels),
-            (carriers_obstacle(site) is None, CarrierField),
-            (terms.power, Powers),
-            (terms.moving_array and placed, Bearings),
-            (terms.phase and placed, ImageSources),
-            (residual_alone, Channels),
-            (terms.array, ArrayProcess),
-            (True, ImageProcess),
-        )
-        method_class = next(one for called, one in table if called)
-        for remark in settings.own_terms.said if method_class is not Powers else ():
-            raise ValueError(f"{remark} of received powers; the target is {site.kind} here")
-        rendered = issubclass(method_class, ImageProcess)
-        if (rendered and hides is False) or (method_class is Bearings and hides is True):
-            why = "rasterized Gaussians always occlude each other"
-            why = "spectra of a moving array hide nothing" if hides else why
-            raise ValueError(f"model.effects.visibility={str(hides).lower()} is not possible: {why}")
-        reasons, options = [*terms.reasons], [*terms.options, *["model.field.count"] * (not count)]
-        if method_class in (UplinkField, CarrierField) or site.phase_reference == "neighbours":
-            options = []  # whatever is said, it is one method
-        elif method_class is Channels:
-            why = "no Gaussians are asked for" if terms.phase else terms.obstacle or "no phase is asked for"
-            reasons.append(f"the residual is all there is: {why}")
-        method = settings.create_as(import_path(method_class))
-        if rendered:
-            options += ["init.name"] * (init.name in ("auto", "diffuse"))
-            options += ["model.effects.image"] * (switches.image is True and site.target.is_complex)
-        # Mixtures count it where a candidate hangs on it; powers always have their process.
-        options += ["model.effects.residual"] * (rendered or (method_class is Channels and plain))
+    switches, init, model, site = settings.switches, settings.init, settings.rendered.settings, data.site
+    count, falls = model.field.count, model.attenuation.inverse_distance
+    terms = resolve_terms(switches, init, data, model.emission.hidden, count, falls)
+    plain, hides = switches.residual is not False, switches.visibility
+    # No Gaussians means the residual alone, where that is not switched off.
+    placed = count > 0 or not plain
+    residual_alone = plain and site.has_waves and not terms.rendered
+    # The first that is called for: what was heard at the same moment tells more than where it was
+    # heard; phases relative to neighbours leave no source to be placed.
+    table: tuple[tuple[bool, type[Method]], ...] = (
+        (data.uplink is not None, UplinkField),
+        (site.phase_reference == "neighbours", Channels),
+        (carriers_obstacle(site) is None, CarrierField),
+        (terms.power, Powers),
+        (terms.moving_array and placed, Bearings),
+        (terms.phase and placed, ImageSources),
+        (residual_alone, Channels),
+        (terms.array, ArrayProcess),
+        (True, ImageProcess),
+    )
+    method_class = next(one for called, one in table if called)
+    for remark in settings.own_terms.said if method_class is not Powers else ():
+        raise ValueError(f"{remark} of received powers; the target is {site.kind} here")
+    rendered = issubclass(method_class, ImageProcess)
+    if (rendered and hides is False) or (method_class is Bearings and hides is True):
+        why = "rasterized Gaussians always occlude each other"
+        why = "spectra of a moving array hide nothing" if hides else why
+        raise ValueError(f"model.effects.visibility={str(hides).lower()} is not possible: {why}")
+    reasons = [*terms.reasons]
+    if method_class is Channels and site.phase_reference != "neighbours":
+        why = "no Gaussians are asked for" if terms.phase else terms.obstacle or "no phase is asked for"
+        reasons.append(f"the residual is all there is: {why}")
+    method = settings.create_as(import_path(method_class))
     if quiet:
         return method
-    heeded.count_reads(*options)
     for reason in reasons:
         log.info("%s", reason)
     return method
@@ -105,10 +95,6 @@ class Gsparc(LearnsTogether):
 
     hands_on: ClassVar[type[Method]] = LearnedField  # whose settings `field` are
     resumable = uses_censored = True
-    stored_names: ClassVar[dict[str, str]] = {
-        "steps": "", "position_std": "", "terms": "", "prior": "", "loss.snapshot": "init.snapshot",
-        "refit": "rendered.refit", "keep_best": "rendered.keep_best",
-    }  # fmt: skip
 
     def __init__(
         self, effects: EffectSettings = EffectSettings(), position_std: float | None = None,
@@ -146,13 +132,19 @@ class Gsparc(LearnsTogether):
         if target in alike:
             return alike[target]()
         solved = {import_path(one): one for one in (ImageSources, Channels, Powers, Bearings)}
-        if target in solved:
-            alone = not self.rendered.settings.field.count
-            terms: dict[str, Any] = vars(self.own_terms) if solved[target] is Powers else {}
-            return solved[target](self.switches, self.position_std, self.init, residual_alone=alone, **terms)
         rendered = {import_path(one): one for one in (ArrayProcess, ImageProcess)}
-        if target not in rendered:
+        alone = not self.rendered.settings.field.count
+        method: Method
+        if target in solved:
+            terms: dict[str, Any] = {**vars(self.own_terms)} if solved[target] is Powers else {}
+            method = solved[target](
+                self.switches, self.position_std, self.init, residual_alone=alone, **terms
+            )
+        elif target in rendered:
+            # `ArrayProcess` sets it again.
+            images = replace(self.rendered.settings.response, array=False)
+            method = rendered[target](plain=self.rendered.plain, **{**self._field, "response": images})
+        else:
             raise ValueError(f"model=gsparc makes no {target}: train again")
-        # `ArrayProcess` sets it again.
-        images = replace(self.rendered.settings.response, array=False)
-        return rendered[target](plain=self.rendered.plain, **{**self._field, "response": images})
+        method.further_settings = ("effects", "field") if alone else ("effects",)  # they choose
+        return method

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.instantiate import accepted_arguments
 from gsparc.data.moments import Snapshots
 from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements, Site
@@ -92,8 +93,6 @@ class MethodFactory(ABC):
     """Makes unfitted methods, and says what holds for all of them before any measurements are seen."""
 
     name: str  # of its methods, as it appears in tables
-    # Attributes that hold settings of other names, by setting; "": it tells `heeded.count_reads` itself.
-    stored_names: ClassVar[Mapping[str, str]] = {}
     guesses: tuple[str, ...] = ()  # settings that the source of a configuration does not give
     both_ends = False  # whether both ends may move: its query is then (tx, rx)
     uses_censored = False  # whether it learns from rows where nothing was heard (`Measurements.censored`)
@@ -167,6 +166,14 @@ class Method(MethodFactory):
     threads_pay: bool = (
         False  # whether several threads answer a single place sooner than one: where it renders
     )
+
+    # Groups of settings that its fit follows beside the arguments of its class; `trainer` and `callbacks`
+    # among them where it takes steps.
+    further_settings: tuple[str, ...] = ()
+
+    def settings_read(self) -> frozenset[str]:
+        """Return settings and groups that its fit follows: names below `model`, and groups of the run."""
+        return frozenset((*accepted_arguments(type(self)), *self.further_settings))
 
     def create_for(self, data: Measurements) -> Method:
         """See `MethodFactory`."""

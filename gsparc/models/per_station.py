@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data import heeded
 from gsparc.data.ends import NOBODY, SAME_PLACE_M, Ends, station_distances
 from gsparc.data.errors import Caution, list_first
 from gsparc.data.executor import run_all, uses_other_processes
@@ -122,6 +121,10 @@ class PerStation(Method):
         effects = [copy.effects for copy in self._copies.values() if copy.effects is not None]
         return ", ".join(dict.fromkeys(effects)) or None
 
+    def settings_read(self) -> frozenset[str]:
+        """See `Method.settings_read`: that of the copies."""
+        return frozenset().union(*(copy.settings_read() for copy in self._copies.values()))
+
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit every station that is asked for, or all together.
 
@@ -196,9 +199,7 @@ class PerStation(Method):
         stations = data.site.every_station
         how = context.stations
         if how == "auto":
-            # What trial fits read of the settings is not yet heeded by the fit itself.
-            with heeded.set_apart():
-                how, why = self.factory.choose_stations(data, fold, context)
+            how, why = self.factory.choose_stations(data, fold, context)
             log.log(logging.INFO if why else logging.DEBUG, "stations=auto -> %s: %s", how, why)
         together, joint = how == "together", self.factory.learns_jointly(data.site)
         self._shared = together and joint

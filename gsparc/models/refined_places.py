@@ -16,7 +16,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data import heeded
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.models.closed_form import ClosedForm
@@ -45,7 +44,7 @@ class Linearised:
 def position_errors(
     data: Measurements, rows: np.ndarray, position_std: float | None, can_refine: bool
 ) -> np.ndarray | None:
-    """Return errors (n,) of all rows' coordinates [m]; None where no known row has one, or none is heeded.
+    """Return errors (n,) of all rows' coordinates [m]; None where no known row has one, or none is used.
 
     Args:
         data: says errors where nobody asks.
@@ -53,12 +52,10 @@ def position_errors(
         position_std: of every coordinate [m].
         can_refine: whether what is fitted can place rows anew; where not, a warning says so.
     """
-    with heeded.set_apart():
-        std = data.position_std if position_std is None else np.full(len(data), position_std)
+    std = data.position_std if position_std is None else np.full(len(data), position_std)
     if std is None or not std[rows].any():
         return None
     if can_refine:
-        heeded.count_reads("model.position_std")
         return std
     what = "channels with phases of the carrier and powers, of one end that moves"
     log.warning("position_std is not used: it is for %s", what)

@@ -12,7 +12,6 @@ import yaml
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from gsparc.data import heeded
 from gsparc.data.instantiate import (
     accepted_arguments,
     config_node,
@@ -88,8 +87,7 @@ def build(config: Mapping[str, Any], *, trusted: bool = True) -> MethodFactory:
     if not trusted:
         for path in set(iterate_targets(OmegaConf.to_container(node, resolve=False))) - terms:
             refuse_foreign(path)
-    with heeded.set_apart():  # what is handed on is not used yet
-        method = instantiate(fill_defaults(deepcopy(node)), _convert_="all")
+    method = instantiate(fill_defaults(deepcopy(node)), _convert_="all")
     if not isinstance(method, MethodFactory):
         raise ValueError(f"model: {target} is not a gsparc.models.method.Method")
     return method

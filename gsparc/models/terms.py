@@ -47,7 +47,6 @@ class Terms:
         rendered: whether rendered Gaussians are asked for.
         obstacle: why there is no carrier phase, where there can be none.
         reasons: one line each.
-        options: switches that mean something here.
     """
 
     array: bool
@@ -57,7 +56,6 @@ class Terms:
     rendered: bool
     obstacle: str | None
     reasons: tuple[str, ...]
-    options: tuple[str, ...]
 
 
 def resolve_terms(
@@ -85,7 +83,7 @@ def resolve_terms(
         "phase": phase_obstacle(data) or (request and f"{request} asks for rendered Gaussians"),
         "power": None if site.target.is_level else f"the target is {site.kind}",
     }
-    on, reasons, options = {}, list[str](), list[str]()
+    on, reasons = {}, list[str]()
     for name, obstacle in obstacles.items():
         switch = getattr(switches, name)
         if switch is True and obstacle is not None:
@@ -93,16 +91,11 @@ def resolve_terms(
         on[name] = switch is not False and obstacle is None
         if obstacle is None or "=" in obstacle:  # other settings decide, not the data
             why = obstacle if switch == "auto" else "as configured"
-            options.append(f"model.effects.{name}")
             reasons.append(f"effects.{name} -> {str(on[name]).lower()}" + (f": {why}" if why else ""))
     if init.name == "scene":
         _refuse_scene(data, switches, obstacles, on, count)
     rendered = request is not None or switches.image is True
-    options += ["model.loss.snapshot"] if site.target.is_complex else []
-    obstacle = obstacles["phase"]
-    return Terms(
-        **on, rendered=rendered, obstacle=obstacle, reasons=tuple(reasons), options=tuple(options)
-    )  # fmt: skip
+    return Terms(**on, rendered=rendered, obstacle=obstacles["phase"], reasons=tuple(reasons))
 
 
 def _refuse_scene(

@@ -147,11 +147,11 @@ def test_the_curve_of_a_closed_form_had_no_held_out_error(spectra_file, tmp_path
 
 def test_options_without_effect_are_said_and_stored(spectra_file, tmp_path, monkeypatch, caplog):
     """`effects.array=true effort=.5`, or `trainer.max_steps=3` of a plain method, went without a word."""
-    given = {name: f"{name}=3" for name in ("trainer.max_steps", "effort", "split.folds", "seed")}
+    given = {name: f"{name}=3" for name in ("trainer.max_steps", "effort", "seed")}
     monkeypatch.setattr(options, "command_line_options", lambda: given)
-    train(plain(spectra_file, "nearest", "+split.folds=3"), tmp_path)
+    train(plain(spectra_file, "nearest"), tmp_path)
     stored = json.loads((tmp_path / "summary.json").read_text())
-    assert stored["options/unused"] == "trainer.max_steps=3, effort=3, split.folds=3"
+    assert stored["options/unused"] == "trainer.max_steps=3, effort=3"
     (record,) = [r for r in caplog.records if "without effect" in r.message]
     assert record.levelno == logging.WARNING and "(nearest counts nothing)" in record.message
 

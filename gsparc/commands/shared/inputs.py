@@ -11,7 +11,6 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.shared.settings import RunSettings, to_dict
-from gsparc.data import heeded
 from gsparc.data.checks.describe import summarise
 from gsparc.data.datamodule import DataModule
 from gsparc.data.load import datamodule, split_for
@@ -19,7 +18,6 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.data.walls import read_walls
 from gsparc.evaluation.align_site import align_to_site
-from gsparc.evaluation.experiment import options
 from gsparc.models import checkpoint
 from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, fill_defaults
@@ -37,7 +35,6 @@ class RunInputs:
     Attributes:
         method: unfitted, or what chooses it.
         module, split: the data, read, and their folds.
-        reads: which of the given options were heeded so far.
         walls: known ones, drawn beside what is found.
         learned: what a fold learns from instead, such as displaced or fewer measurements; None: these.
     """
@@ -45,7 +42,6 @@ class RunInputs:
     method: MethodFactory
     module: DataModule
     split: Split
-    reads: heeded.Reads
     walls: Any = None
     learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None
 
@@ -69,14 +65,12 @@ def read_inputs(config: DictConfig, known: Measurements | None = None) -> RunInp
     method = build(fill_defaults(config.model))  # once: each fold, and each station, fits a copy of it
     RunSettings.from_config(config)
     tracking.refuse_missing_loggers(config)
-    reads = options.options_to_note(config, method)
-    with heeded.record_reads(reads):
-        module = _data(config, known)
-        split = split_for(to_dict(config.split), module.measurements)
+    module = _data(config, known)
+    split = split_for(to_dict(config.split), module.measurements)
     file = config.get("known_walls") or OmegaConf.select(config, "init.file")
     walls = None if file is None else read_walls(file)
     split.check()
-    return RunInputs(method, module, split, reads, walls)
+    return RunInputs(method, module, split, walls)
 
 
 def _data(config: DictConfig, known: Measurements | None) -> DataModule:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -112,7 +111,6 @@ class GaussianProcess(Differentiable, ClosedForm):
     name = "gp"
     baseline_order = 90
     stored = ("mean", "axes", "pixels", "lost", "scores", "powers")
-    stored_names: ClassVar[dict[str, str]] = {"components": "limit", "mean": "about"}
     uses_censored = True
     count_gaussians = 0  # type: ignore[assignment]
     powers: PowerProcess | None = None  # None: not powers

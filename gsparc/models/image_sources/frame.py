@@ -107,7 +107,6 @@ class SourcesInFrame(ClosedForm):
 
     frame: SourceFrame
     factors = torch.ones(1, dtype=torch.complex64)
-    asks_visibility = True
 
     @abstractmethod
     def _predict_normalised(self, places: Tensor, tones: Tensor, float64: bool) -> Moments:

@@ -187,7 +187,6 @@ class ImageSourceGP(SourcesInFrame):
     ) -> list[Member]:  # fmt: skip
         """What `run_searches` finds about the static end, best first."""
         still, floor = self._transmitter_in_frame(), self.noise_floor
-        self.asks_visibility = ensemble.occludes_antennas_alike(row_sets[0])
         return ensemble.run_searches(row_sets, still, settings, floor, effort, look, start)
 
     def _log_look(

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsparc.data import heeded
 from gsparc.data.inner_folds import InnerFolds
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -34,8 +33,8 @@ BESIDE = 2  # searches then, of the usual effort
 def fit_candidates(
     parts: Mapping[str, Candidate], init: InitSettings, effects: EffectSettings, data: Measurements,
     fold: Fold, context: FitContext, watch: Stopwatch, cut: InnerFolds | None,
-) -> tuple[dict[str, ClosedForm], dict[str, FitReport], dict[str, set[str]]]:  # fmt: skip
-    """Fit candidates; return them, what each cost, and which settings each read.
+) -> tuple[dict[str, ClosedForm], dict[str, FitReport]]:  # fmt: skip
+    """Fit candidates; return them, and what each cost.
 
     Where they are several, training rows are cut into groups as the test was cut, and each solution
     predicts every group from the others (`ClosedForm.held`): errors to weigh them by.
@@ -55,7 +54,6 @@ def fit_candidates(
     # Searches come last: they race against the best before them, and end where they fall behind.
     fields: dict[str, ClosedForm] = {}
     reports: dict[str, FitReport] = {}
-    read: dict[str, set[str]] = {}
     race: Race | None = None
 
     def add_to_curve(what: str, error: float) -> None:
@@ -71,11 +69,8 @@ def fit_candidates(
             near = name in SEARCHES and race is not None and race.error < NEAR
             settings = replace(init, searches=min(init.searches, BESIDE)) if near else init
             within = replace(context, leave_out=leave_out, race=race, beside=fields)
-            with heeded.set_apart() as read[name]:
-                field = parts[name](settings, effects.visibility is not False, within)
-                report = field.fit(data, Fold.of_all(rows), within)
-            if not field.asks_visibility:
-                read[name].discard("model.effects.visibility")
+            field = parts[name](settings, effects.visibility is not False, within)
+            report = field.fit(data, Fold.of_all(rows), within)
             fields[name] = field
             if name not in OPEN_ENDED:
                 field.held = leave_out_groups(field, data, rows, groups)
@@ -97,7 +92,7 @@ def fit_candidates(
         reports[name] = report
     if not fields:
         raise ValueError("no candidate could solve this: the lines above say why")
-    return fields, reports, read
+    return fields, reports
 
 
 def _why_not_searched(race: Race | None) -> str | None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -67,7 +67,6 @@ class Powers(Mixture):
 
     name = "powers"
     uses_censored = True
-    stored_names: ClassVar[dict[str, str]] = {**Mixture.stored_names, "terms": "", "prior": ""}
 
     def __init__(
         self,

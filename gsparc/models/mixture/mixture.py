@@ -8,13 +8,12 @@ from abc import abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data import heeded
 from gsparc.data.inner_folds import cut_folds
 from gsparc.data.limits import check_arguments, number, or_null, switch
 from gsparc.data.query import Query
@@ -60,7 +59,6 @@ class Mixture(LearnsTogether, ClosedForm):
     """
 
     has_gaussians = resumable = True
-    stored_names: ClassVar[dict[str, str]] = {"position_std": ""}
 
     def __init__(
         self, effects: EffectSettings = EffectSettings(), position_std: float | None = None,
@@ -98,16 +96,16 @@ class Mixture(LearnsTogether, ClosedForm):
             ValueError: these measurements are of another kind, or the only initialiser cannot solve this.
         """
         self.site, self.runs = data.site, RunFactors.identity()
-        with heeded.set_apart():
-            if (why := self.why_not(data)) is not None:
-                raise ValueError(f"{self.name}: {why}")
-            with heeded.set_apart() as read:
-                parts = self.list_candidates(data)
-            named = self.init.name in ("auto", "diffuse", *parts)
-            # An initialiser of another kind of site means nothing here: what this kind has is tried.
-            name = "diffuse" if self.residual_alone else self.init.name if named else "auto"
-            init = replace(self.init, name=name)
-        heeded.count_reads(*["init.name"] * named, *read & {"model.effects.residual"})
+        if (why := self.why_not(data)) is not None:
+            raise ValueError(f"{self.name}: {why}")
+        parts = self.list_candidates(data)
+        named = self.init.name in ("auto", "diffuse", *parts)
+        if not named:  # an initialiser of another kind of site
+            log.warning(
+                "init=%s has no effect here: what is tried is %s", self.init.name, " and ".join(parts)
+            )
+        name = "diffuse" if self.residual_alone else self.init.name if named else "auto"
+        init = replace(self.init, name=name)
         if "scene" in parts:
             read_walls(self.init.file)  # its errors come before anything is computed
         # Places are refined by slopes of predictions: of one end that moves, with phases that rows share.
@@ -155,13 +153,12 @@ class Mixture(LearnsTogether, ClosedForm):
         data = self.runs.remove_factors(data)
         stages = {"factors of runs": watch.seconds} if len(self.runs) > 1 else {}
         cut = cut_folds(data, fold, context.split, fit_candidates.GROUPS, context.seed) if several else None
-        found, reports, read = fit_candidates.fit_candidates(
+        found, reports = fit_candidates.fit_candidates(
             parts, init, self.switches, data, fold, context, watch, cut
         )
         # Searches have errors of their own, and of few squares nothing is sure: a mixture need not be.
         sure = 0.0 if set(found).intersection((*fit_candidates.SEARCHES, "neighbours")) else 1.0
         chosen = weigh_members(found, data, fold.val, cut, sure)
-        heeded.count_reads(*(path for name in chosen for path in read[name]))
         self.members, self.weights = [found[name] for name in chosen], tuple(chosen.values())
         self.started = "+".join(chosen)
         self.site, self.init_s = data.site, watch.seconds

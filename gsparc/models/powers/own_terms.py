@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data import heeded
 from gsparc.data.prior_levels import Files, read_prior_levels
 from gsparc.data.schema import OF_STATION, Measurements, Site
 from gsparc.models.powers.prior_map import NetworkMaps, PriorMap
@@ -60,12 +59,12 @@ class OwnTerms:
         return [f"model.{name} {verb}" for name, verb in verbs.items() if getattr(self, name)]
 
     def columns(self, data: Measurements) -> tuple[Columns, ...]:
-        """Return all as columns for measurements of a station or a network; count what is used as heeded."""
-        # A tuple is not noted when it is read, nor what the class that makes a method was given.
-        heeded.count_reads(*["model.terms"] * bool(self.terms))
-        if self.prior is None or data.site.paired:  # a map is about one end that moves
+        """Return all as columns for measurements of a station or a network."""
+        if self.prior is None:
             return self.terms
-        heeded.count_reads("model.prior")
+        if data.site.paired:
+            log.warning("model.prior has no effect here: a map is about one end that moves, and both do")
+            return self.terms
         if data.site.several:
             return (*self.terms, NetworkMaps.from_file(self.prior, data))
         station = data.site.name.rpartition(OF_STATION)[2] if OF_STATION in data.site.name else ""

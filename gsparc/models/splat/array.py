@@ -5,6 +5,7 @@ from __future__ import annotations
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitSettings
 from gsparc.field.response import ResponseSettings
+from gsparc.models.method import Method
 from gsparc.models.splat.method import LearnedField
 
 
@@ -31,3 +32,7 @@ class ArrayField(LearnedField):
             name=name,
             steps=0,
         )
+
+    def settings_read(self) -> frozenset[str]:
+        """See `Method.settings_read`."""
+        return Method.settings_read(self)

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.data import heeded
 from gsparc.data.limits import check_arguments, switch
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
@@ -70,18 +69,17 @@ class ImageProcess(LearnedField):
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Train by rendering, and weigh a process against what came of it; see `LearnedField.fit`."""
         self._average = None
-        with heeded.set_apart():
-            array = self.settings.response.array
-            why = array_obstacle(data.site, "rx", "the receiver moves") if array else None
-            if why is not None:
-                raise ValueError(f"{self.name}: {why}")
-            choices, _ = resolve_auto(self.settings, self.init.name, data.site)
-            log.info(
-                "training by rendering: %d Gaussians, terms %s, init=%s; configured callbacks: %s",
-                self.settings.field.count, self.effects, choices.init,
-                ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
-            )  # fmt: skip
-        report = super().fit(data, fold, context)  # what it reads decides the weight of Gaussians, too
+        array = self.settings.response.array
+        why = array_obstacle(data.site, "rx", "the receiver moves") if array else None
+        if why is not None:
+            raise ValueError(f"{self.name}: {why}")
+        choices, _ = resolve_auto(self.settings, self.init.name, data.site)
+        log.info(
+            "training by rendering: %d Gaussians, terms %s, init=%s; configured callbacks: %s",
+            self.settings.field.count, self.effects, choices.init,
+            ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
+        )  # fmt: skip
+        report = super().fit(data, fold, context)
         spent = dict(self.spent)
         if self._average is not None:
             method = self._average[0]
@@ -92,8 +90,7 @@ class ImageProcess(LearnedField):
             report = replace(report, seconds=report.seconds + more.seconds)
             spent["averaged process"] = more.seconds
         spent["weighing"] = max(report.seconds - sum(spent.values()), 0.0)
-        with heeded.set_apart():
-            log.info("%s: %s", self.name, self.description)
+        log.info("%s: %s", self.name, self.description)
         # Steps that no look kept, or all of the field: paid for, and not in the answer.
         unused = {} if self.steps else {name: s for name, s in spent.items() if name.startswith("gradient")}
         if self._is_process_alone:

@@ -6,7 +6,7 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import lightning.pytorch as L
 import numpy as np
@@ -14,7 +14,6 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.data import heeded
 from gsparc.data.inner_folds import cut_folds
 from gsparc.data.limits import check_arguments, or_word, switch, whole
 from gsparc.data.query import Query
@@ -55,6 +54,7 @@ log = logging.getLogger(__name__)
 THIRDS = 3  # of the rows: one is for validation where few were set apart
 LEAST_TOLD = 8  # validation rows: fewer say by chance which steps and which mixtures pay
 ENOUGH = 2  # times the antennas of an array: so many Gaussians give it any vector, and more the same
+STEP_COUNTS = ("trainer.max_steps", "trainer.max_epochs")  # which ask for no step, too
 QUERY_CHUNK = 256  # bounds the memory of one prediction call
 
 
@@ -104,7 +104,6 @@ class LearnedField(Method):
     has_gaussians = True
     resumable = True  # every step's state is in `last.ckpt`
     takes_effort = takes_weights = True
-    stored_names: ClassVar[dict[str, str]] = {"steps": "", "loss.snapshot": "init.snapshot"}
     _is_process_alone = False  # whether a process beside it has all the weight: another stage gains nothing
     _ended: tuple[str, ...] = ()
     # The float64 copy of a version of the model, for an array or not.
@@ -153,6 +152,11 @@ class LearnedField(Method):
 
     # -- learning ----------------------------------------------------------------------------------
 
+    def settings_read(self) -> frozenset[str]:
+        """See `Method.settings_read`; without a step, the Trainer's is their number alone."""
+        steps = ("trainer", "callbacks", "dataset.batch_size") if self.steps_taken else STEP_COUNTS
+        return super().settings_read() | {*steps}
+
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Train on `fold.train`; `fold.val` is watched, calibrates the confidence, and is then learned too.
 
@@ -173,7 +177,6 @@ class LearnedField(Method):
             if module is None:
                 continue
             files = GsparcCheckpointIO(self, context.config_yaml, self._extra(stage, watch, origin))
-            heeded.count_reads("dataset.batch_size")
             began = watch.seconds
             trainer, batches = gradient_stage.make_trainer(
                 module, data, stage.fold, stage.context, files, watch, self._stage_callbacks(stage)
@@ -190,8 +193,7 @@ class LearnedField(Method):
     def describe_fit(self, data: Measurements, effort: Effort, steps: int | None = None) -> str:
         """See `MethodFactory`."""
         self._refuse_site(data.site)
-        with heeded.set_apart():
-            choices, _ = resolve_auto(self.settings, self.init.name, data.site)
+        choices, _ = resolve_auto(self.settings, self.init.name, data.site)
         count = self.most_steps if steps is None else steps
         if choices.closed_form:
             usual = f"at most {effort.steps_after_solving}"

@@ -28,7 +28,6 @@ from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import Prediction
 from gsparc.models.powers.prior_map import NetworkMaps, describe_use
 from gsparc.models.powers.together.learning import (
-    LEAST_STATIONS,
     TRIED_EACH,
     StationPriors,
     learn_shared_terms,
@@ -113,7 +112,6 @@ class JointPowerField(ClosedForm):
                 # Second: a table shows the first few.
                 remarks.insert(1, describe_use(used_maps, len(maps.maps)))
             self.own = StationPriors(prior, {})
-        self.asks_visibility = network is None and len(used.stations) >= LEAST_STATIONS
         most, largest = rows_per_station(len(used.stations)), int(np.bincount(used.station).max())
         if largest > most:
             remarks.append(f"at most {most} rows of each station are learned from, of up to {largest}")
