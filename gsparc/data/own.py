@@ -17,6 +17,7 @@ import numpy as np
 from gsparc.data.amplitudes import amplitudes_to_levels
 from gsparc.data.assemble import centre_positions, check_positions, rounded_rms
 from gsparc.data.blocks import is_big, write_blocks
+from gsparc.data.checks.constant import leave_out_unmeasured, mark_constants
 from gsparc.data.checks.outliers import check_static_ends, find_strong_outliers, peak_magnitudes
 from gsparc.data.conventions import convert_conventions
 from gsparc.data.errors import Caution
@@ -192,8 +193,10 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
         site, tx, rx, rotation, values, mask, noise, directions, row_names, release_split, provenance,
         position_std=position_std, device=devices, sequence=check.read_sequence(rows, kind), **of_rows,
     )  # fmt: skip
-    # Conventions turn values before they are scaled: the constant is that of what is stored.
-    data = convert_conventions(data, named)
+    data, constant = mark_constants(data)
+    check.notes += constant
+    # Conventions turn values before they are scaled: the scale is that of what is stored.
+    data = leave_out_unmeasured(convert_conventions(data, named))
     if facts.is_complex:
         _note_plane(check, tx if static_end == "rx" else rx, carrier)
     target, scale = _scaled(measured, data.target, data.mask, data.censored)
