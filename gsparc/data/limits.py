@@ -129,10 +129,10 @@ def most_text(packed: int | None = None) -> int:
     Raises:
         SettingError: `GSPARC_MOST_BYTES` is no whole number.
     """
-    said = os.environ.get(LIFTED_BY, "")
-    if said:
-        whole(1).check(LIFTED_BY, int(said) if said.isdecimal() else said)
-        return int(said)
+    lifted = os.environ.get(LIFTED_BY, "")
+    if lifted:
+        whole(1).check(LIFTED_BY, int(lifted) if lifted.isdecimal() else lifted)
+        return int(lifted)
     return MOST_BYTES if packed is None else min(MOST_BYTES, max(LEAST_UNPACKED, MOST_UNPACKED * packed))
 
 

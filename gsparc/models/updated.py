@@ -66,8 +66,10 @@ class Changes(Stored):
     def shift(self, station: int | np.ndarray, number: int | np.ndarray = NOW) -> Any:
         """Return what was said of stations () or (n,) before the rows of these numbers came [dB]."""
         # Older files do not say when.
-        said = [(change * (station == one), since) for one, change, *since in self.shifts]
-        return sum((change * (number >= (*since, 0)[0]) for change, since in said), 0.0 * np.asarray(station))
+        parts = [(change * (station == name), since) for name, change, *since in self.shifts]
+        return sum(
+            (change * (number >= (*since, 0)[0]) for change, since in parts), 0.0 * np.asarray(station)
+        )
 
 
 @dataclass(frozen=True)
@@ -182,12 +184,12 @@ def stored_changes(extra: Mapping[str, Any], path: Path | str = "the checkpoint"
         CheckpointError: any version of it is damaged.
     """
     with sound_updates(path):
-        parts = [one["state"]["changes"] for one in extra.get(STORED, ())]
+        parts = [version["state"]["changes"] for version in extra.get(STORED, ())]
         if where := find_non_finite(parts, STORED):
             raise ValueError(f"{where} is NaN or infinite")
         changes = [from_plain(part) for part in parts]
-        for one in changes:
-            one.check()
+        for version in changes:
+            version.check()
     return changes[-1] if changes else None
 
 

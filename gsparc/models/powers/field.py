@@ -127,7 +127,7 @@ class PowerField(ClosedForm):
             if self.fringes is not None:  # their share was learned beside this process
                 return (found[0].description, *found[0].notes, note)
         self.priors, notes = mix_candidates(seen, found, self.seed, chosen_on)
-        own = tuple(one for one in terms if not isinstance(one.term, PriorMap))
+        own = tuple(term for term in terms if not isinstance(term.term, PriorMap))
         if len(own) < len(terms) and not self._used_maps():
             # Kernels were sought beside the map's: a map that is left out leaves what there is without it.
             found = candidate_priors(seen, site, self.seed, chosen_on, own)
@@ -138,18 +138,18 @@ class PowerField(ClosedForm):
         """Maps from before that the mean has a share of."""
         terms = [part for _, prior in self.priors for part in prior.known_trend.more]
         own = [part.term for part in terms if isinstance(part, UserTerm)]
-        return [one for one in own if isinstance(one, PriorMap)]
+        return [term for term in own if isinstance(term, PriorMap)]
 
     def _judge_maps(self, rows: PowerRows) -> list[Caution]:
         """What must be said of maps from before: that one is left out, and what may be wrong with it."""
         heard = rows.heard_rows
-        used, said = self._used_maps(), list[Caution]()
-        for one in self.own_terms:
-            if isinstance(one, PriorMap):
+        used, cautions = self._used_maps(), list[Caution]()
+        for term in self.own_terms:
+            if isinstance(term, PriorMap):
                 unused = "" if used else LEFT_OUT
-                fault = one.explain_misfit(heard.places + self.site.origin, heard.decibels)
-                said += [Caution(text) for text in (unused, fault) if text]
-        return said
+                fault = term.explain_misfit(heard.places + self.site.origin, heard.decibels)
+                cautions += [Caution(text) for text in (unused, fault) if text]
+        return cautions
 
     @property
     def trend(self) -> Trend:

@@ -102,14 +102,14 @@ class PriorMap(Columns):
         """Say what is wrong with a map by levels (n,) [dB] at world places (n, D) [m]; empty: nothing.
 
         >>> at = np.c_[np.arange(20.0), np.zeros(20)]
-        >>> PriorMap.from_levels(at, at[:, 0], np.full(3, np.nan)).explain_misfit(at, -50 - at[:, 0])[:46]
-        'model.prior: levels fall by 1 dB where those of'
+        >>> PriorMap.from_levels(at, at[:, 0], np.full(3, np.nan)).explain_misfit(at, -50 - at[:, 0])[:45]
+        'model.prior: levels fall by 1 dB where those '
         """
         inside, level = self.look_up(torch.from_numpy(places[:, :2]))
-        here = (inside == 1).numpy()
-        if here.sum() < LEAST_TOLD or (spread := float(level[here].std())) == 0:
+        whole = (inside == 1).numpy()
+        if whole.sum() < LEAST_TOLD or (spread := float(level[whole].std())) == 0:
             return ""
-        known, values = level.numpy()[here], decibels[here] - decibels[here].mean()
+        known, values = level.numpy()[whole], decibels[whole] - decibels[whole].mean()
         known = (known - known.mean()) / spread
         slope = float(known @ values) / len(known) / spread
         error = float(np.std(values - slope * spread * known)) / spread / math.sqrt(len(known) - 2)
@@ -179,9 +179,9 @@ class NetworkMaps(Columns):
     def explain_misfits(self, rows: StationRows, names: Sequence[str]) -> list[str]:
         """Say what is wrong with maps of stations by rows of these, see `PriorMap.explain_misfit`."""
         heard = rows.side == 0
-        own = [(names[n], one, heard & (rows.station == n)) for n, is_own, one in self.maps if is_own]
-        said = [(name, one.explain_misfit(rows.places[at], rows.decibels[at])) for name, one, at in own]
-        return group_warnings([f"station {name}: {fault}" for name, fault in said if fault])
+        own = [(names[n], level, heard & (rows.station == n)) for n, is_own, level in self.maps if is_own]
+        faults = [(name, level.explain_misfit(rows.places[at], rows.decibels[at])) for name, level, at in own]
+        return group_warnings([f"station {name}: {fault}" for name, fault in faults if fault])
 
     def put_under(self, network: Sectors, places: np.ndarray) -> Sectors:
         """Return a network about these maps, whose stations at (T, 3) have no other pattern and power."""
