@@ -62,8 +62,9 @@ def judge_fit(method: Method, report: FitReport, data: Measurements, fold: Fold)
         return method, report
     watch = Stopwatch()
     with torch.no_grad():
-        closed = isinstance(method, ClosedForm)
-        members = list(method.weighted_members()) if closed else [(1.0, method)]
+        members: list[tuple[float, Method]] = [(1.0, method)]
+        if isinstance(method, ClosedForm):
+            members = [*method.weighted_members()]
         learned = method.members_data(data) if isinstance(method, HasMembers) else data
         kept, texts = _refuse_members(members, learned, fold)
         if texts and kept and isinstance(method, HasMembers):
@@ -101,7 +102,8 @@ def _refuse_members(
     rows = reduce(np.intersect1d, [answer.rows for answer in answers.values()])
     rows = _draw_over_stations(rows, data.stations_of(rows))
     means = {name: _select_rows(answer, rows) for name, answer in answers.items()}
-    kept, texts, groups = list[tuple[float, Method]](), list[str](), {False: [], True: []}
+    kept, texts = list[tuple[float, Method]](), list[str]()
+    groups: dict[bool, list[tuple[float, Method]]] = {False: [], True: []}
     for weight, one in members:
         wrong = find_non_finite(one.state(), "state") or find_non_finite(means[id(one)], "row left out ")
         if wrong:
@@ -113,7 +115,8 @@ def _refuse_members(
 
     def missed(those: Sequence[tuple[float, Method]]) -> np.ndarray:
         total = sum(weight for weight, _ in those)
-        return _squared_errors(sum(weight / total * means[id(one)] for weight, one in those), data, rows)
+        parts = [weight / total * means[id(one)] for weight, one in those]
+        return _squared_errors(torch.stack(parts).sum(0), data, rows)
 
     held = max(answers.values(), key=lambda answer: answer.group is not None)
     simpler, least = MEAN, _errors_of_mean(data, fold, rows, held)
