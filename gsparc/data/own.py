@@ -174,7 +174,6 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
         _static(check, links, ends, rotation)
     check.problems.raise_if_any()
     assert rotation is not None
-    static_end = links.static_end
     # Copies, as broadcast views are read-only.
     rx, tx = (np.broadcast_to(np.asarray(ends[end]), (rows, 3)).copy() for end in ("rx", "tx"))
     directions = _directions(check, offsets, rx, rotation)
@@ -184,7 +183,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
             f"{SSIM_WINDOW} x {SSIM_WINDOW}: losses are L1 alone, ssim_gauss is undefined"
         )
     site = Site(
-        kind=kind, static_end=static_end, grid=grid, array=array, carrier_hz=carrier,
+        kind=kind, static_end=links.static_end, grid=grid, array=array, carrier_hz=carrier,
         subcarriers_hz=frequency if facts.is_complex else None, stations=links.stations,
         georeference=links.georeference, **about,
     )  # fmt: skip
@@ -193,12 +192,11 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
         site, tx, rx, rotation, values, mask, noise, directions, row_names, release_split, provenance,
         position_std=position_std, device=devices, sequence=check.read_sequence(rows, kind), **of_rows,
     )  # fmt: skip
-    data, constant = mark_constants(data)
-    check.notes += constant
+    data = mark_constants(data, check.notes)
     # Conventions turn values before they are scaled: the scale is that of what is stored.
     data = leave_out_unmeasured(convert_conventions(data, named))
     if facts.is_complex:
-        _note_plane(check, tx if static_end == "rx" else rx, carrier)
+        _note_plane(check, tx if links.static_end == "rx" else rx, carrier)
     target, scale = _scaled(measured, data.target, data.mask, data.censored)
     # A damaged row of 1e300 overflows float32 once it is divided by the others' scale: it is named.
     if scale > 0:

@@ -173,14 +173,14 @@ def levels_near(
     station, at = np.nonzero((lists.listed_near(places) & answered).T)
     level = np.full((2, len(places), len(answered)), -np.inf)
     for block in np.split(np.arange(len(at)), range(BLOCK, len(at), BLOCK)) if len(at) else ():
-        here, who = at[block], station[block]
-        query = Query.from_places(site, torch.from_numpy(places[here]).float(), torch.from_numpy(who))
+        moment, who = at[block], station[block]
+        query = Query.from_places(site, torch.from_numpy(places[moment]).float(), torch.from_numpy(who))
         prediction = method.predict(query)
         if device is not None:
-            prediction = prediction.of_devices(site, torch.from_numpy(device[here]))
-        variance = torch.zeros(len(here)) if prediction.variance is None else prediction.variance
+            prediction = prediction.of_devices(site, torch.from_numpy(device[moment]))
+        variance = torch.zeros(len(moment)) if prediction.variance is None else prediction.variance
         power = prediction.mean[:, 0].double().numpy() * site.target_scale
         with np.errstate(divide="ignore", invalid="ignore"):  # of no power, which has no decibels
             spread = variance.double().numpy() * site.target_scale**2
-            level[:, here, who] = power_in_decibels(power, spread)
+            level[:, moment, who] = power_in_decibels(power, spread)
     return level

@@ -138,12 +138,12 @@ def place_warnings(data: Measurements) -> list[str]:
     apart = apart[where[apart[:, 0]] != where[apart[:, 1]]][:MOST]
     if not len(apart):
         return []
-    here, there = (_unlike(rows, pairs).mean(0) for pairs in (again, apart))
-    best = int((here / np.maximum(there, UNLIKE)).argmin())
-    if here[best] < max(UNLIKE, AS_FAR * there[best]):
+    within, between = (_unlike(rows, pairs).mean(0) for pairs in (again, apart))
+    best = int((within / np.maximum(between, UNLIKE)).argmin())
+    if within[best] < max(UNLIKE, AS_FAR * between[best]):
         return []
-    found = f"rows at one place differ by {here[0]:.2f} of their power even after a free phase"
-    return [f"{found}, rows at different places by {there[0]:.2f} ({len(again)} pairs): places tell nothing"]
+    text = f"rows at one place differ by {within[0]:.2f} of their power even after a free phase"
+    return [f"{text}, rows at different places by {between[0]:.2f} ({len(again)} pairs): places tell nothing"]
 
 
 def _unlike(rows: Snapshots, pairs: np.ndarray) -> np.ndarray:

@@ -20,31 +20,31 @@ ROUNDING = 1e-4  # of an entry: four digits of a table
 NOTHING = 1e-6  # of the median entry, what a transform leaves of 0
 
 
-def mark_constants(data: Measurements) -> tuple[Measurements, list[str]]:
-    """Return channels with what is constant over rows marked as not measured, and notes that name it.
+def mark_constants(data: Measurements, notes: list[str]) -> Measurements:
+    """Return channels with what is constant over rows marked as not measured; `notes` that name it are added.
 
     Of spectra and powers it is named alone. Values are those of the file, before they are scaled.
     """
     facts, shape = data.site.target, data.target.shape[1:]
     if len(np.unique(data.moving[: 20 * LEAST], axis=0)) < LEAST:
-        return data, []
+        return data
     together = is_big(data.target) or not data.site.several
     labels = np.zeros(len(data), np.int64) if together else data.stations_of()
     heard = data.censored_side() == 0
     constant = {t: _constant_of(data, rows) for t, rows in rows_by(labels) if heard[rows].sum() >= LEAST}
     stuck = [t for t, entries in constant.items() if entries.all()]
     names = [data.site.every_station.shown[t] for t in stuck]
-    notes: list[str] = []
     if stuck:
         who = f"of station{'s' if len(names) > 1 else ''} {list_first(names)} " if data.site.several else ""
-        notes = [Caution(f"all rows {who}are the same: are they measurements?")]
-    every = [entries for t, entries in constant.items() if t not in stuck]
-    common = np.asarray(np.array(every or [np.zeros(shape)]).all(axis=0))
+        notes += [Caution(f"all rows {who}are the same: are they measurements?")]
+    alive = [entries for t, entries in constant.items() if t not in stuck]
+    common = np.asarray(np.array(alive or [np.zeros(shape)]).all(axis=0))
     if not common.any() or facts.is_level:
-        return data, notes
+        return data
     if facts.is_image:
         pixels = list_first([f"({row}, {column})" for row, column in np.argwhere(common)])
-        return data, [*notes, f"{common.sum()} of {common.size} pixels are constant over all rows: {pixels}"]
+        notes.append(f"{common.sum()} of {common.size} pixels are constant over all rows: {pixels}")
+        return data
     antennas = np.asarray(common.all(axis=1))
     tones = np.asarray(common[~antennas].all(axis=0))
     which = [f"antenna {number}" for number in np.flatnonzero(antennas)]
@@ -54,7 +54,8 @@ def mark_constants(data: Measurements) -> tuple[Measurements, list[str]]:
     fault = f"{what} over all rows: guards, nulls or a dead input? left out of learning and of all figures"
     measured = np.broadcast_to(~common, data.target.shape)
     mask = measured if data.mask is None else measured & data.mask
-    return replace(data, mask=mask), [*notes, Caution(fault)]
+    notes.append(Caution(fault))
+    return replace(data, mask=mask)
 
 
 def leave_out_unmeasured(data: Measurements) -> Measurements:
