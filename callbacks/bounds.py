@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 import lightning.pytorch as L
 import torch
 
-from gsparc.data.limits import Checked, number, setting
+from gsparc.base.limits import Checked, number, setting
 
 
 @dataclass(eq=False)

@@ -7,7 +7,7 @@ from typing import Any
 
 import lightning.pytorch as L
 
-from gsparc.data.limits import Checked, setting
+from gsparc.base.limits import Checked, setting
 from gsparc.field.gradient_stage import step_is_complete
 from gsparc.field.schedule import INTERVAL, to_steps
 

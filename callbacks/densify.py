@@ -11,7 +11,7 @@ import lightning.pytorch as L
 import torch
 from torch import Tensor
 
-from gsparc.data.limits import POSITIVE, Checked, number, or_null, setting, whole
+from gsparc.base.limits import POSITIVE, Checked, number, or_null, setting, whole
 from gsparc.field import edit
 from gsparc.field.distributed import process_max, process_sum
 from gsparc.field.model import GaussianModel
@@ -34,7 +34,7 @@ class Densify(Checked, L.Callback):
     >>> Densify(children=1)
     Traceback (most recent call last):
         ...
-    gsparc.data.limits.SettingError: children=1: a whole number of at least 2 is needed
+    gsparc.base.limits.SettingError: children=1: a whole number of at least 2 is needed
 
     Args:
         start, stop, interval: first step, last step and spacing of the edits; below 1 a share of all steps.

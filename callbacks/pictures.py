@@ -10,8 +10,8 @@ import lightning.pytorch as L
 import numpy as np
 import torch
 
+from gsparc.base.limits import Checked, setting, whole
 from gsparc.callbacks.ledger import CostLedger
-from gsparc.data.limits import Checked, setting, whole
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.examples import Examples
 from gsparc.evaluation.pictures import draw_spectra
@@ -27,7 +27,7 @@ class Pictures(Checked, L.Callback):
     >>> Pictures(count=0)
     Traceback (most recent call last):
         ...
-    gsparc.data.limits.SettingError: count=0: a whole number of at least 1 is needed
+    gsparc.base.limits.SettingError: count=0: a whole number of at least 1 is needed
 
     Args:
         every: steps between pictures, or a share of all; the last step is always drawn.

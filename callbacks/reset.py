@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import lightning.pytorch as L
 import torch
 
-from gsparc.data.limits import SHARE, Checked, setting, whole
+from gsparc.base.limits import SHARE, Checked, setting, whole
 from gsparc.field.schedule import INTERVAL, STEPS, acts_at_step, to_steps
 from gsparc.training.tracking import log_event
 
@@ -28,7 +28,7 @@ class OpacityReset(Checked, L.Callback):
     >>> OpacityReset(ceiling=1.5)
     Traceback (most recent call last):
         ...
-    gsparc.data.limits.SettingError: ceiling=1.5: a number above 0 and below 1 is needed
+    gsparc.base.limits.SettingError: ceiling=1.5: a number above 0 and below 1 is needed
 
     Args:
         interval: steps between resets; below 1 a share of all steps.

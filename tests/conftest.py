@@ -81,7 +81,7 @@ def elsewhere():
     """`elsewhere("joblib")`, `elsewhere("ray", nodes=2)`: other processes do pieces of work until the end."""
     import torch
 
-    from gsparc.data import executor
+    from gsparc.base import executor
 
     cluster, threads = None, torch.get_num_threads()
 

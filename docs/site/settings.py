@@ -13,7 +13,7 @@ from typing import Any
 import yaml
 from cells import cell, in_cells
 
-from gsparc.data.instantiate import config_node, import_target
+from gsparc.base.instantiate import config_node, import_target
 
 CONF = Path(__file__).parents[2] / "conf"
 LEFT_OUT = {"hydra", "defaults", "_target_"}

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
+from gsparc.base.limits import check_arguments, choice
 from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.data.limits import check_arguments, choice
 from gsparc.evaluation.table import Column, Table
 from gsparc.ops.backends import backend_named
 from gsparc.prediction.bench import Call, kernel_cases, loss_case, training_step_case

@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
-from gsparc.data.errors import Caution, DataError, group_warnings
+from gsparc.base.errors import Caution, DataError, group_warnings
 
 TILTED = (
     "antenna tilts are given, but no heights, so that all is at 0 m: give a column Height in the list of "

@@ -11,10 +11,10 @@ from typing import Any
 import pandas as pd
 from omegaconf import DictConfig
 
+from gsparc.base.files import platform_cache
 from gsparc.commands.shared.output import begin_run, show_result
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.train import train_job
-from gsparc.data.files import platform_cache
 from gsparc.evaluation.drawing import PRINTED, save
 from gsparc.evaluation.examples import join_examples
 from gsparc.evaluation.experiment.cells import plan_jobs

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.data.public.fetch import MIRROR, PublicSet, fetch, public_sets
 
 

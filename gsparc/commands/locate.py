@@ -11,9 +11,9 @@ from gsparc.apps.locate.fingerprints import locate_fingerprints
 from gsparc.apps.locate.judging import locate_by_model
 from gsparc.apps.locate.neighbours import PLAIN
 from gsparc.apps.maps.floor_plan import read_plan_settings
+from gsparc.base.limits import POSITIVE, SHARE, check_arguments, choice, number, or_null, switch, whole
 from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.commands.shared.settings import RunSettings, to_dict
-from gsparc.data.limits import POSITIVE, SHARE, check_arguments, choice, number, or_null, switch, whole
 
 LIMITS = {
     "prior": choice("box", "trained"), "share": SHARE, "offset_db": or_null(number(0)),

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.base.files import SUMMARY
 from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.data.files import SUMMARY
 from gsparc.evaluation.drawing import PRINTED
 from gsparc.evaluation.experiment.runner import time_again
 from gsparc.evaluation.report.page import write_report

@@ -13,9 +13,9 @@ from importlib.util import find_spec
 
 from omegaconf import DictConfig
 
+from gsparc.base.errors import DataError
+from gsparc.base.limits import SettingError, whole
 from gsparc.commands.shared.settings import RunSettings
-from gsparc.data.errors import DataError
-from gsparc.data.limits import SettingError, whole
 from gsparc.evaluation.console import open_console
 from gsparc.models import checkpoint
 from gsparc.prediction.operating_point import load

@@ -9,10 +9,10 @@ from typing import Any
 from hydra.utils import to_absolute_path
 from omegaconf import DictConfig
 
+from gsparc.base.instantiate import from_settings
 from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import to_dict
-from gsparc.data.instantiate import from_settings
 from gsparc.evaluation import simulated
 from gsparc.evaluation.console import open_console
 from gsparc.prediction.timing import machine_facts

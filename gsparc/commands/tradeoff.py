@@ -13,10 +13,10 @@ import numpy as np
 import torch
 from omegaconf import DictConfig
 
+from gsparc.base.limits import whole
 from gsparc.commands.shared.output import finish_run, in_multirun, run_directory
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.settings import to_dict
-from gsparc.data.limits import whole
 from gsparc.evaluation.drawing import save
 from gsparc.evaluation.experiment import tradeoff
 from gsparc.evaluation.ledger import FitInputs, measurements_hash, run_once

@@ -11,12 +11,12 @@ from typing import Any
 from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.base.files import SUMMARY
 from gsparc.commands.shared import cli
 from gsparc.commands.shared.inputs import RunInputs, describe_inputs, read_inputs
 from gsparc.commands.shared.output import show_training
 from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.shared.train_once import objective, train_once
-from gsparc.data.files import SUMMARY
 from gsparc.data.split_files import write_split
 from gsparc.evaluation import summary
 from gsparc.evaluation.baselines import same_as_baseline

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
+from gsparc.base.errors import DataError
+from gsparc.base.files import write_whole
+from gsparc.base.limits import check_arguments, or_null, switch, whole
 from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.data.errors import DataError
-from gsparc.data.files import write_whole
-from gsparc.data.limits import check_arguments, or_null, switch, whole
 from gsparc.evaluation.open_runs import read_like_stored
 from gsparc.evaluation.summary import coordinates
 from gsparc.evaluation.table import Column, Table

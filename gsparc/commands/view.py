@@ -14,10 +14,10 @@ from gsparc.apps.view.building import cloud_colours, model_gaussians
 from gsparc.apps.view.ply import write_ply
 from gsparc.apps.view.site_view import SiteView, lay_power_plane
 from gsparc.apps.view.viewed import open_model
+from gsparc.base.errors import DataError
+from gsparc.base.files import write_whole
+from gsparc.base.limits import whole
 from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.data.errors import DataError
-from gsparc.data.files import write_whole
-from gsparc.data.limits import whole
 from gsparc.evaluation.open_runs import check_dataset
 from gsparc.prediction.query import read_place
 from gsparc.prediction.timing import peak_memory

@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gsparc.base.errors import DataError
+from gsparc.base.limits import choice
 from gsparc.data.blocks import allocate_on_disk, is_big, row_blocks
-from gsparc.data.errors import DataError
-from gsparc.data.limits import choice
 from gsparc.data.schema import LIGHT, OTHER, End, Measurements
 from gsparc.data.units import UNITS
 from gsparc.ops import SphereGrid

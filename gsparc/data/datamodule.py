@@ -13,9 +13,9 @@ import lightning.pytorch as pl
 import numpy as np
 import torch
 
+from gsparc.base.limits import check_arguments, whole
 from gsparc.data.checks import outliers
 from gsparc.data.checks.coherence import set_unknown_factor
-from gsparc.data.limits import check_arguments, whole
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.data.schema import TrainTest
 from gsparc.data.spacing import number_squares, path_order, rows_far_from, tenth_of_extent
 

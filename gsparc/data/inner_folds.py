@@ -13,8 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.base.errors import DataError
 from gsparc.data import spacing
-from gsparc.data.errors import DataError
 from gsparc.data.schema import Measurements, TrainTest
 from gsparc.data.spacing import neighbour_distance
 from gsparc.data.splits import CORNERS, WHOLE, AnySplit, FileSettings, Fold, SplitSettings, make_split

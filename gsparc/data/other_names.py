@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsparc.base.errors import Caution
 from gsparc.data.amplitudes import join_polar
-from gsparc.data.errors import Caution
 from gsparc.data.raw import Raw, rename_arrays
 from gsparc.data.schema import FIELDS
 from gsparc.data.tables.heads import CHANNELS, LISTS, PARTS, POLAR, words_of

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.base.errors import Caution
+from gsparc.base.limits import number, or_null
 from gsparc.data.amplitudes import amplitudes_to_levels
 from gsparc.data.assemble import centre_positions, check_positions, rounded_rms
 from gsparc.data.blocks import is_big, write_blocks
 from gsparc.data.checks.constant import leave_out_unmeasured, mark_constants
 from gsparc.data.checks.outliers import check_static_ends, find_strong_outliers, peak_magnitudes
 from gsparc.data.conventions import convert_conventions
-from gsparc.data.errors import Caution
-from gsparc.data.limits import number, or_null
 from gsparc.data.links.expand import expand_links
 from gsparc.data.other_names import name_arrays
 from gsparc.data.own_checks import Checker, are_infinite, rows_with

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from gsparc.base.errors import Problems, list_first, suggest_name
 from gsparc.data.assemble import check_positions
 from gsparc.data.blocks import row_blocks
-from gsparc.data.errors import Problems, list_first, suggest_name
 from gsparc.data.raw import Raw, numbered_rows
 from gsparc.data.schema import FIELDS, HOLDS, MEASUREMENTS, POWER, Stations, TrainTest
 from gsparc.data.target import TARGETS, Kind

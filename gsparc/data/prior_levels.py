@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gsparc.base.errors import Caution, DataError, list_first
 from gsparc.data.checks.plausibility import find_marks
 from gsparc.data.datasets.own import read_own
-from gsparc.data.errors import Caution, DataError, list_first
 from gsparc.data.links.stations import site_name
 from gsparc.data.own import interpret
 from gsparc.data.own_checks import MOST_DB

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.data.schema import ENDS, End
 from gsparc.data.tables.columns import choose_columns
 from gsparc.data.tables.heads import AXES

@@ -27,10 +27,10 @@ from numpy.lib.format import read_array_header_1_0 as header_1
 from numpy.lib.format import read_array_header_2_0 as header_2
 from scipy.io import loadmat, netcdf_file
 
+from gsparc.base.errors import DataError, absent, explain_error, readable
+from gsparc.base.files import check_fetched, whole_file
+from gsparc.base.hdf5_text import hdf5_text_error
 from gsparc.data.blocks import BIG, is_big, iterate_bytes, machine_memory, map_from_disk
-from gsparc.data.errors import DataError, absent, explain_error, readable
-from gsparc.data.files import check_fetched, whole_file
-from gsparc.data.hdf5_text import hdf5_text_error
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 NETCDF_SUFFIXES = (".nc", ".nc3", ".nc4", ".cdf")

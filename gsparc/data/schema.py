@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.base.files import read_shipped_table
 from gsparc.data.blocks import take
-from gsparc.data.files import read_shipped_table
 from gsparc.data.query import Batch
 from gsparc.data.target import TARGETS, Kind, Target
 from gsparc.data.units import PowerUnit

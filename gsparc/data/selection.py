@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.base.errors import DataError, list_first, suggest_name
+from gsparc.base.limits import Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.blocks import take
-from gsparc.data.errors import DataError, list_first, suggest_name
-from gsparc.data.limits import Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.links.stations import find_station
 from gsparc.data.row_order import find_copies, hash_rows
 from gsparc.data.schema import FIELDS, Stations, list_arrays_with_axis

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.errors import DataError, readable
-from gsparc.data.files import write_whole
+from gsparc.base.errors import DataError, readable
+from gsparc.base.files import write_whole
 from gsparc.data.splits import Fold, Split
 
 log = logging.getLogger(__name__)

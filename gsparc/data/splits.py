@@ -11,9 +11,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
+from gsparc.base.limits import POSITIVE, SHARE, Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.held_out import block_rows, corner_fold, grouped_folds, last_rows
-from gsparc.data.limits import POSITIVE, SHARE, Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.schema import TrainTest
 from gsparc.data.spacing import thin_rows
 from gsparc.processes.few_rows import draw_rows
@@ -108,7 +108,7 @@ class SplitSettings(Checked):
     >>> SplitSettings(test_fraction=1.5)
     Traceback (most recent call last):
         ...
-    gsparc.data.limits.SettingError: test_fraction=1.5: a number above 0 and below 1 is needed
+    gsparc.base.limits.SettingError: test_fraction=1.5: a number above 0 and below 1 is needed
 
     Attributes:
         name: `random`, `grouped`, `corner`, `blocks`, `sparse`, `later`, `stations`, `carriers` or

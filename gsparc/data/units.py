@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from torch import Tensor
 
-from gsparc.data.files import read_shipped_table
+from gsparc.base.files import read_shipped_table
 from gsparc.physics.decibels import RELATIVE_DB, from_decibels, to_decibels
 
 

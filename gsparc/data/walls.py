@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.errors import DataError, Problems
-from gsparc.data.files import read_yaml
-from gsparc.data.instantiate import from_settings, suggest_or_list
-from gsparc.data.limits import Checked, Limit, finite_array, or_null, setting
+from gsparc.base.errors import DataError, Problems
+from gsparc.base.files import read_yaml
+from gsparc.base.instantiate import from_settings, suggest_or_list
+from gsparc.base.limits import Checked, Limit, finite_array, or_null, setting
 
 EXPECTED = "`walls` (a list of `corners_m`) or `room` (`size_m`, `boxes_m`)"
 SIMULATED = {  # of scenes that are simulated: known, and not needed here

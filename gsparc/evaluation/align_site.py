@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.base.errors import list_first
 from gsparc.data.ends import SAME_PLACE_M
-from gsparc.data.errors import list_first
 from gsparc.data.links.stations import all_names
 from gsparc.data.schema import Measurements, Site, Stations
 from gsparc.data.units import WATTS

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.data.errors import DataError
-from gsparc.data.executor import run_each
-from gsparc.data.files import write_archive
+from gsparc.base.errors import DataError
+from gsparc.base.executor import run_each
+from gsparc.base.files import write_archive
 from gsparc.data.query_places import QueryPlaces, read_query_places
 from gsparc.data.schema import End, Site
 from gsparc.data.target import Target

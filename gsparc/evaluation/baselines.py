@@ -9,7 +9,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from gsparc.data.instantiate import config_node, import_target
+from gsparc.base.instantiate import config_node, import_target
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.console import to_dict

@@ -18,8 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue, OmegaConfBaseException
 from rich.console import Console
 
-from gsparc.data.errors import DataError, Severe, warning_kind
-from gsparc.data.instantiate import GROUPS, cause_of, plugin_node, plugins, suggest_or_list
+from gsparc.base.errors import DataError, Severe, warning_kind
+from gsparc.base.instantiate import GROUPS, cause_of, plugin_node, plugins, suggest_or_list
 
 FULL_ERROR = "HYDRA_FULL_ERROR"
 CONFIGS = "pkg://gsparc.conf"

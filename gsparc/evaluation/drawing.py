@@ -14,8 +14,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from gsparc.data.files import whole_file
-from gsparc.data.limits import choice
+from gsparc.base.files import whole_file
+from gsparc.base.limits import choice
 from gsparc.evaluation.metric_formats import axis_of, lower_is_better
 
 # Colours that are told apart with any colour vision (Okabe and Ito 2008, the yellow darker; Tol 2021).

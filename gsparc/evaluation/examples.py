@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from gsparc.data.files import write_archive
+from gsparc.base.files import write_archive
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.results import distinct_baselines
 from gsparc.models.method import Method

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.base.errors import DataError, list_first
+from gsparc.base.files import SUMMARY, set_aside, write_whole
 from gsparc.data.assemble import content_hash, identity_hash
-from gsparc.data.errors import DataError, list_first
-from gsparc.data.files import SUMMARY, set_aside, write_whole
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.results import read_summary
 from gsparc.evaluation.summary import provenance, run_git

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.base.errors import DataError
 from gsparc.data.datamodule import DataModule
-from gsparc.data.errors import DataError
 from gsparc.data.inner_folds import cut_folds
 from gsparc.data.load import answerable, datamodule, split_for
 from gsparc.data.own import interpret_and_log

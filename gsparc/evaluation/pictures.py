@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from matplotlib.figure import Figure
 
-from gsparc.data.errors import list_first
+from gsparc.base.errors import list_first
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.data.walls import SceneWalls

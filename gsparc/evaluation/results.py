@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.data.files import SUMMARY, load_yaml
+from gsparc.base.files import SUMMARY, load_yaml
 from gsparc.evaluation.metric_formats import main_figure, score_of, scored_kind
 from gsparc.models.checkpoint import MODEL
 from gsparc.models.fitting import dotted_settings

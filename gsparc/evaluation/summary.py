@@ -20,8 +20,8 @@ from uuid import uuid4
 import numpy as np
 import pandas as pd
 
-from gsparc.data.executor import SAY_S
-from gsparc.data.files import write_whole
+from gsparc.base.executor import SAY_S
+from gsparc.base.files import write_whole
 from gsparc.evaluation.metric_formats import (
     BEST_SERVER,
     CALIBRATION,

@@ -9,7 +9,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor, nn
 
-from gsparc.data.limits import Checked, number, setting, whole
+from gsparc.base.limits import Checked, number, setting, whole
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 
 

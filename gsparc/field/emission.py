@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.limits import Checked, choice, number, setting, whole
+from gsparc.base.limits import Checked, choice, number, setting, whole
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
 from gsparc.ops.transforms import full_precision
 

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.limits import Checked, setting, whole
+from gsparc.base.limits import Checked, setting, whole
 from gsparc.processes.features import Correlation, correlation, whitened_features
 
 JITTER = 1e-5  # relative to the unit variance of the kernel: repeated positions stay invertible

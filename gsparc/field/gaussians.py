@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.limits import POSITIVE, SHARE, Checked, internal, number, or_null, setting, whole
+from gsparc.base.limits import POSITIVE, SHARE, Checked, internal, number, or_null, setting, whole
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.ops.geometry import Gaussians
 

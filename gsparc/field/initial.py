@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from torch import Tensor
 
-from gsparc.data.limits import POSITIVE, Checked, choice, setting, whole
+from gsparc.base.limits import POSITIVE, Checked, choice, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.field.encoding import Smoothness
 from gsparc.field.model import GaussianModel, ModelSettings

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.limits import Checked, choice, number, setting
+from gsparc.base.limits import Checked, choice, number, setting
 from gsparc.data.query import Batch
 from gsparc.data.target import Target, Values
 from gsparc.field.initial import Snapshot

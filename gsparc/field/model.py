@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from gsparc import ops
-from gsparc.data.limits import POSITIVE, Checked, or_null, setting
+from gsparc.base.limits import POSITIVE, Checked, or_null, setting
 from gsparc.data.schema import Site
 from gsparc.field.confidence import Confidence, ConfidenceSettings, ErrorModel
 from gsparc.field.emission import Emission, EmissionSettings

@@ -10,7 +10,7 @@ from torch import nn
 from torch.optim import Adam
 from torch.optim.lr_scheduler import LambdaLR
 
-from gsparc.data.limits import Checked, internal, number, setting, whole
+from gsparc.base.limits import Checked, internal, number, setting, whole
 
 RateOf = Callable[[str], tuple[str, float]]
 

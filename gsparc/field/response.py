@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor, nn
 
-from gsparc.data.limits import Checked, choice, internal, number, setting
+from gsparc.base.limits import Checked, choice, internal, number, setting
 from gsparc.data.schema import Site
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import array_output, element_pattern, normalise_spectrum, steering_matrix

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from gsparc.data.limits import Limit
+from gsparc.base.limits import Limit
 
 FIRST = 50  # steps of gradient before a schedule of shares acts
 

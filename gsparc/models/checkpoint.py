@@ -16,9 +16,9 @@ import torch
 import yaml
 from torch import Tensor
 
-from gsparc.data.errors import DataError
-from gsparc.data.files import list_causes, load_yaml, whole_file
-from gsparc.data.locks import hold_file
+from gsparc.base.errors import DataError
+from gsparc.base.files import list_causes, load_yaml, whole_file
+from gsparc.base.locks import hold_file
 from gsparc.data.raw import verified_archive
 from gsparc.data.schema import Site, Stations
 from gsparc.models.method import Method, import_path

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeVar, get_type_hints
 import numpy as np
 from torch import Tensor
 
-from gsparc.data.instantiate import import_target, refuse_foreign
+from gsparc.base.instantiate import import_target, refuse_foreign
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.method import Method, import_path

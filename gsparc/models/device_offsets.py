@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsparc.data.errors import list_first
+from gsparc.base.errors import list_first
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.physics.decibels import from_decibels, to_decibels

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from gsparc.base.errors import Caution, list_first
 from gsparc.data.assemble import auxiliary_hash
-from gsparc.data.errors import Caution, list_first
 from gsparc.data.row_order import order_rows
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold, hash_indices

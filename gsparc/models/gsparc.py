@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from gsparc.data.limits import check_arguments, number, or_null
+from gsparc.base.limits import check_arguments, number, or_null
 from gsparc.data.prior_levels import Files
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.carriers.array import carriers_obstacle

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.instantiate import accepted_arguments
+from gsparc.base.instantiate import accepted_arguments
 from gsparc.data.moments import Snapshots
 from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements, Site

@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.base.errors import Caution, group_warnings, list_first
+from gsparc.base.executor import run_all, uses_other_processes
 from gsparc.data.ends import NOBODY, SAME_PLACE_M, Ends, station_distances
-from gsparc.data.errors import Caution, group_warnings, list_first
-from gsparc.data.executor import run_all, uses_other_processes
 from gsparc.data.query import Query
 from gsparc.data.schema import OF_STATION, Measurements, Site
 from gsparc.data.site_objects import SiteObjects

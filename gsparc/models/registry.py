@@ -12,7 +12,7 @@ import yaml
 from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from gsparc.data.instantiate import (
+from gsparc.base.instantiate import (
     accepted_arguments,
     config_node,
     import_target,
@@ -21,7 +21,7 @@ from gsparc.data.instantiate import (
     refuse_foreign,
     suggest_or_list,
 )
-from gsparc.data.limits import SettingError
+from gsparc.base.limits import SettingError
 
 if TYPE_CHECKING:  # brings torch, which a list of choices does not need
     from gsparc.models.method import MethodFactory

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.errors import Severe
+from gsparc.base.errors import Severe
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.abilities import HasMembers

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from gsparc.data.limits import Checked, setting, switch
+from gsparc.base.limits import Checked, setting, switch
 from gsparc.data.schema import Measurements, Site
 from gsparc.field.initial import InitSettings
 

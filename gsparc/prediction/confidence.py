@@ -12,7 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.data.limits import SHARE, Checked, setting
+from gsparc.base.limits import SHARE, Checked, setting
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.base.errors import Caution, DataError
+from gsparc.base.instantiate import accepted_arguments, suggest_or_list
 from gsparc.data.checks.coherence import set_unknown_factor
 from gsparc.data.datasets.campaign import find_implausible
-from gsparc.data.errors import Caution, DataError
-from gsparc.data.instantiate import accepted_arguments, suggest_or_list
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 from gsparc.data.row_order import order_rows

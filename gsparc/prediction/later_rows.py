@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsparc.base.errors import DataError, name_row_ranges
 from gsparc.data.assemble import content_hash
 from gsparc.data.checks.outliers import are_kilometres, far_from_box
-from gsparc.data.errors import DataError, name_row_ranges
 from gsparc.data.links.strongest import strongest_lists
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import Raw, numbered_rows

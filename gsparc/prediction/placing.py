@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsparc.base.errors import DataError
+from gsparc.base.instantiate import suggest_or_list
 from gsparc.data.assemble import FARTHEST
-from gsparc.data.errors import DataError
-from gsparc.data.instantiate import suggest_or_list
 from gsparc.data.links.stations import all_names, find_station
 from gsparc.data.query_places import QueryPlaces
 from gsparc.data.schema import ENDS, End, Site

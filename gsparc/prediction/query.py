@@ -9,10 +9,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.base.errors import DataError
+from gsparc.base.limits import finite_array
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.ends import SAME_PLACE_M
-from gsparc.data.errors import DataError
-from gsparc.data.limits import finite_array
 from gsparc.data.query import Query
 from gsparc.data.schema import End, Site
 from gsparc.ops import Pose

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 
-from gsparc.data.limits import Checked, setting, whole
+from gsparc.base.limits import Checked, setting, whole
 from gsparc.data.schema import Measurements
 from gsparc.models.method import Method, predict_with_threads
 

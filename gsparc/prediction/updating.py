@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.data.errors import DataError
-from gsparc.data.limits import POSITIVE, check_arguments, switch, whole
-from gsparc.data.limits import number as limit_number
+from gsparc.base.errors import DataError
+from gsparc.base.limits import POSITIVE, check_arguments, switch, whole
+from gsparc.base.limits import number as limit_number
 from gsparc.data.links.stations import find_station
 from gsparc.data.own_checks import MOST_DB
 from gsparc.data.query import Query

@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import yaml
 
+from gsparc.base.files import whole_folder
+from gsparc.base.limits import Checked, setting, whole
 from gsparc.data.datasets import argos
 from gsparc.data.datasets.argos import CARRIER_HZ, SPACING_HZ, STAND_IN
 from gsparc.data.datasets.campaign import make_once, write_split
-from gsparc.data.files import whole_folder
-from gsparc.data.limits import Checked, setting, whole
 from gsparc.data.schema import LIGHT
 from gsparc.physics.decibels import from_decibels
 from gsparc.simulate.streets import StreetPaths, Streets, trace_streets

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.limits import SHARE, Checked, number, setting, whole
+from gsparc.base.limits import SHARE, Checked, number, setting, whole
 from gsparc.processes.uncertainty import most_failures
 from gsparc.simulate.attribution import Deliverable, SurveyProbe, list_effect_sets, list_removals
 from gsparc.simulate.effects import Effects

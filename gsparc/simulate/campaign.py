@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.executor import run_each
+from gsparc.base.executor import run_each
 from gsparc.data.schema import Measurements
 from gsparc.simulate import deciding
 from gsparc.simulate.assembly import SECONDS, ShardRows, assemble_dataset, join_shards, shard_arrays

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.instantiate import from_settings
-from gsparc.data.limits import Checked, setting, whole
+from gsparc.base.instantiate import from_settings
+from gsparc.base.limits import Checked, setting, whole
 
 # Bits of one interaction; the first four are Sionna's, an edge is a wedge with one face.
 SPECULAR, DIFFUSE, REFRACTION, DIFFRACTION, EDGE = 1, 2, 4, 8, 16

@@ -19,7 +19,7 @@ from hashlib import sha256
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from gsparc.data.files import platform_cache, whole_file
+from gsparc.base.files import platform_cache, whole_file
 
 VARIABLE = "DRJIT_LIBLLVM_PATH"
 FETCHED = Path(sys.prefix) / "lib" / "llvm19" / "libLLVM.so.19.1"

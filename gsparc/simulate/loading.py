@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.limits import choice
+from gsparc.base.limits import choice
 from gsparc.simulate.scenes.shipped import list_shipped_scenes
 from gsparc.simulate.scenes.solid import LISTED_MATERIALS, Solid
 

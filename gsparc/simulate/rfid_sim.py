@@ -16,11 +16,11 @@ from PIL import Image
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
+from gsparc.base.files import whole_folder
+from gsparc.base.limits import Checked, setting, whole
 from gsparc.data.datamodule import DataModule
 from gsparc.data.datasets.campaign import load_stand_in, make_once, write_split
 from gsparc.data.datasets.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, load_rfid, planar_array
-from gsparc.data.files import whole_folder
-from gsparc.data.limits import Checked, setting, whole
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import steering_matrix

@@ -6,7 +6,7 @@ import hashlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from gsparc.data.limits import Checked, choice, setting, whole
+from gsparc.base.limits import Checked, choice, setting, whole
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import Sampling

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.files import whole_file, write_whole
+from gsparc.base.files import whole_file, write_whole
 
 ROWS = "rows"  # of a shard: which rows of the dataset it holds
 NOTE = "choice.json"

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 import torch
 
-from gsparc.data.limits import POSITIVE, Checked, setting, whole
+from gsparc.base.limits import POSITIVE, Checked, setting, whole
 from gsparc.ops import SphereGrid
 from gsparc.simulate.paths import TracedPaths
 

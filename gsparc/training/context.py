@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
-from gsparc.data.limits import POSITIVE, Checked, choice, setting, whole
+from gsparc.base.limits import POSITIVE, Checked, choice, setting, whole
 from gsparc.data.splits import FileSettings, Fold, SplitSettings
 from gsparc.training import curve
 from gsparc.training.cost import LINE, NO_COST, Cost

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from gsparc.data.files import whole_file
+from gsparc.base.files import whole_file
 
 FILE = "learning_curve.csv"
 FIGURES = ("num_gaussians", "train/task_loss", "val/ssim_gauss", "val/psnr_db", "val/mse")

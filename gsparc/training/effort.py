@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
-from gsparc.data.limits import SettingError
+from gsparc.base.limits import SettingError
 
 LEAST_ROWS = 150  # that settings are chosen on, however little the effort
 GONE = ("budget_s", "budget_clock", "budgets")

@@ -27,7 +27,7 @@ class RayLauncher(Launcher):
         """Do the jobs; one that fails leaves the others alone, one whose process dies is begun again."""
         import torch  # seconds, and Hydra imports all launchers whatever is chosen
 
-        from gsparc.data import executor
+        from gsparc.base import executor
 
         task, context, sweep = (self.given[k] for k in ("task_function", "hydra_context", "config"))
         configure_log(sweep.hydra.hydra_logging, sweep.hydra.verbose)

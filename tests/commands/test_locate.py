@@ -11,8 +11,8 @@ from campaigns import compose, powers, spectra
 from PIL import Image
 
 from gsparc.apps.locate import locator
+from gsparc.base.errors import DataError
 from gsparc.commands.locate import locate
-from gsparc.data.errors import DataError
 from gsparc.evaluation.summary import write_as_found
 from gsparc.models import checkpoint
 

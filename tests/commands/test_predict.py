@@ -16,10 +16,10 @@ from refusals import refused_as
 
 import gsparc
 from gsparc.apps.maps.promise import Promise
+from gsparc.base.errors import DataError
 from gsparc.commands.check import main as check
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import train
-from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
 from gsparc.evaluation.align_site import align_to_site

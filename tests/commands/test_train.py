@@ -11,9 +11,9 @@ from doors import knock
 from lightning.pytorch.loggers import CSVLogger
 
 import gsparc
+from gsparc.base.limits import SettingError
 from gsparc.commands import evaluate
 from gsparc.commands.train import TrainedRun, main, train
-from gsparc.data.limits import SettingError
 from gsparc.evaluation.console import error_in_one_line
 from gsparc.evaluation.experiment import options
 from gsparc.models.baselines.gp import GaussianProcess

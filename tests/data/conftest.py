@@ -6,7 +6,7 @@ import pytest
 from refusals import refused_as
 from releases import write_release
 
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 
 
 @pytest.fixture

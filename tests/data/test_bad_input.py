@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from releases import SPOILT
 
+from gsparc.base.errors import DataError
 from gsparc.data.datasets.newrf import read_newrf
 from gsparc.data.datasets.own import read_any
 from gsparc.data.datasets.rfid import load_rfid
-from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import from_arrays, load_own, write_own
 

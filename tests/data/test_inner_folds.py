@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.data.inner_folds import NOT_TESTED, cut_folds, inner_folds
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import FileSettings, Fold, SplitSettings, make_split

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from networks import network
 
+from gsparc.base.errors import Caution, DataError
 from gsparc.data.datasets.own import read_any
-from gsparc.data.errors import Caution, DataError
 from gsparc.data.tables.sectors import band_hz, earfcn_hz
 
 

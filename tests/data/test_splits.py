@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from releases import real
 
+from gsparc.base.errors import DataError
 from gsparc.data.datasets.rfid import load_rfid
-from gsparc.data.errors import DataError
 from gsparc.data.inner_folds import inner_folds
 from gsparc.data.load import load, split_for
 from gsparc.data.own import from_arrays

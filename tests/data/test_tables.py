@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from gsparc.data.errors import Caution, DataError
+from gsparc.base.errors import Caution, DataError
 from gsparc.data.own import interpret
 from gsparc.data.query_places import read_query_places
 from gsparc.data.tables.heads import parse_head

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import yaml
 
-from gsparc.data import limits
-from gsparc.data.errors import DataError
-from gsparc.data.files import load_yaml, read_csv
+from gsparc.base import limits
+from gsparc.base.errors import DataError
+from gsparc.base.files import load_yaml, read_csv
 from gsparc.data.own import interpret
 from gsparc.data.tables import opening
 from gsparc.data.tables.read import parse_table

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.data.own import from_arrays
 from gsparc.data.units import LINEAR, PowerUnit
 

@@ -9,8 +9,8 @@ from hydra import compose, initialize_config_module
 from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
+from gsparc.base.errors import Severe
 from gsparc.data.datasets.own import Own
-from gsparc.data.errors import Severe
 from gsparc.evaluation.console import ConsoleHandler, config_folder, error_in_one_line, repeated_warnings
 
 

@@ -8,7 +8,7 @@ import pytest
 from refusals import refused
 
 import gsparc
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.data.load import answerable
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, Split, SplitSettings, make_split

@@ -1,6 +1,6 @@
 """Every command on a full disk, and under Ctrl-C in every stage: one line, and the exit status that says it.
 
-Remedy: files appear by renaming (gsparc/data/files.py), errors pass one door (gsparc/commands/shared/cli.py),
+Remedy: files appear by renaming (gsparc/base/files.py), errors pass one door (gsparc/commands/shared/cli.py),
 and a thread that computes asks whether to go on (gsparc/processes/worker.py). The disk is a limit on the
 size of files, failing like a full one in the middle of writing.
 """

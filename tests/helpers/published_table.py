@@ -12,7 +12,7 @@ from typing import Any
 
 import yaml
 
-from gsparc.data.instantiate import config_node
+from gsparc.base.instantiate import config_node
 from gsparc.models.registry import method_class
 
 ROOT = Path(__file__).parents[2]

@@ -5,7 +5,8 @@ from functools import cache
 
 from PIL import Image
 
-from gsparc.data import instantiate, load
+from gsparc.base import instantiate
+from gsparc.data import load
 from gsparc.evaluation import summary
 from gsparc.prediction.timing import ClockSettings
 

@@ -15,8 +15,8 @@ import numpy as np
 from doors import said
 from releases import REAL
 
+from gsparc.base.errors import DataError
 from gsparc.data.datasets.own import read_any
-from gsparc.data.errors import DataError
 from gsparc.data.load import split_for
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.evaluation.baselines import fit_baseline

@@ -9,7 +9,7 @@ from posts import POSTS, heard
 from refusals import refused
 from scenes import fold_of
 
-from gsparc.data import executor
+from gsparc.base import executor
 from gsparc.models import checkpoint, fitting
 from gsparc.models.baselines.nearest import Nearest
 from gsparc.models.per_station import PerStation, station_site

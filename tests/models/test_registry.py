@@ -3,7 +3,7 @@
 import pytest
 from refusals import refused
 
-from gsparc.data import instantiate
+from gsparc.base import instantiate
 from gsparc.models import registry
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.idw import InverseDistance
@@ -48,7 +48,7 @@ def test_entry_points_of_plugins_were_read_for_every_class_of_a_checkpoint(monke
     instantiate.refuse_foreign("gsparc.models.baselines.gp.GaussianProcess")
     monkeypatch.setattr(instantiate, "plugins", lambda group: {})
     for path in (
-        "gsparc.data.instantiate.import_target",
+        "gsparc.base.instantiate.import_target",
         "os.system",
         "gsparc.models.baselines.gp.torch.nn.Linear",
         None,

@@ -9,7 +9,7 @@ from boxes import room_of_spectra
 from closed import fitted_to
 from scenes import fold_of
 
-from gsparc.data.errors import Severe
+from gsparc.base.errors import Severe
 from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold

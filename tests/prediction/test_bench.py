@@ -7,8 +7,8 @@ import pytest
 import torch
 from campaigns import compose
 
+from gsparc.base.limits import SettingError
 from gsparc.commands import bench
-from gsparc.data.limits import SettingError
 from gsparc.ops import cuda_library
 from gsparc.ops.backends import BackendUnavailable
 from gsparc.prediction import bench as timed

@@ -6,8 +6,8 @@ from campaigns import plain
 from refusals import refused
 
 import gsparc
+from gsparc.base.errors import DataError
 from gsparc.commands.train import train
-from gsparc.data.errors import DataError
 
 RNG = np.random.default_rng(0)
 PLACES = np.c_[RNG.uniform(0, 9, (60, 2)), np.full(60, 1.2)]

@@ -14,10 +14,10 @@ import pytest
 from crashes import small_campaign
 from refusals import refused
 
+from gsparc.base.errors import DataError
 from gsparc.commands.check import main as check
 from gsparc.data import blocks
 from gsparc.data.datasets.sionna import _in_decibels
-from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.own import load_own
 from gsparc.data.schema import LIGHT

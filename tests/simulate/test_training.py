@@ -9,9 +9,9 @@ from campaigns import compose
 from crashes import small_campaign
 
 import gsparc
+from gsparc.base.errors import DataError
 from gsparc.commands.train import train
 from gsparc.data.datasets.sionna import with_true_targets
-from gsparc.data.errors import DataError
 from gsparc.data.load import load
 from gsparc.simulate.campaign import simulate
 

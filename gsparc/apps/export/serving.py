@@ -26,8 +26,8 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from gsparc.apps.export.told_file import ToldFile
-from gsparc.data.files import is_out_of_space, list_causes, refuse_repeated
-from gsparc.data.limits import POSITIVE, Checked, SettingError, number, setting, whole
+from gsparc.base.files import is_out_of_space, list_causes, refuse_repeated
+from gsparc.base.limits import POSITIVE, Checked, SettingError, number, setting, whole
 from gsparc.models.checkpoint import CheckpointError
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import read_places

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.limits import choice
+from gsparc.base.limits import choice
 from gsparc.physics.decibels import from_decibels, to_decibels
 
 # 14 symbols of a slot less two of pilots.

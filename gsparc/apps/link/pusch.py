@@ -12,7 +12,7 @@ from scipy.linalg import toeplitz
 from torch import Tensor
 
 from gsparc.apps.link.adaptation import Band
-from gsparc.data.limits import choice
+from gsparc.base.limits import choice
 
 Prior = Callable[[], tuple[Tensor, Tensor] | None]
 Estimator = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]

@@ -14,7 +14,7 @@ from gsparc.apps.link import study
 from gsparc.apps.link.adaptation import RULES, Rates
 from gsparc.apps.link.channels import band_evidence, predict_channels
 from gsparc.apps.link.pusch import NEEDED, RECEIVERS, Pusch, frequency_correlation
-from gsparc.data.limits import SHARE, or_null
+from gsparc.base.limits import SHARE, or_null
 from gsparc.evaluation.open_runs import Opened
 from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred_grid
 from gsparc.prediction.confidence import Guarantee, as_confidence, confidence_threshold

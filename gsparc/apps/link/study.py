@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gsparc.apps.link.adaptation import Adaptation, Band, Rates
 from gsparc.apps.link.pusch import Pusch
-from gsparc.data.executor import run_all
+from gsparc.base.executor import run_all
 from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.processes.uncertainty import binomial_interval
 

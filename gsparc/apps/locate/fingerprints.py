@@ -12,8 +12,8 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.apps.locate.judging import Report, columns_of_places, report, sample_rows
 from gsparc.apps.locate.neighbours import locate_by_neighbours
 from gsparc.apps.locate.snapshots import Scans
+from gsparc.base.limits import POSITIVE, SHARE
 from gsparc.data.datasets.fingerprints import Fingerprints, read_fingerprints, split_fingerprints
-from gsparc.data.limits import POSITIVE, SHARE
 
 METHOD = "weighted_knn"
 

@@ -23,7 +23,7 @@ from gsparc.apps.locate.neighbours import locate_by_neighbours
 from gsparc.apps.locate.search import Nuisances
 from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import Scans, group_snapshots
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.drawing import PALETTE, panels, save
 from gsparc.evaluation.open_runs import Opened, open_files, read_like_stored

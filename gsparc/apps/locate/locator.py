@@ -20,7 +20,7 @@ from gsparc.apps.locate.posterior import PlacePosterior, densest_cells
 from gsparc.apps.locate.search import Nuisances, PlaceSearch, compute_misfit
 from gsparc.apps.locate.site_field import HeardMoments, SiteField
 from gsparc.apps.locate.snapshots import Scans, group_snapshots
-from gsparc.data.executor import run_all, run_each
+from gsparc.base.executor import run_all, run_each
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 

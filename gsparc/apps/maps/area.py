@@ -10,10 +10,10 @@ from matplotlib.path import Path as Outline
 
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.geojson import is_drawn, read_shapes
+from gsparc.base.errors import DataError
+from gsparc.base.limits import POSITIVE, check_arguments, finite_array, number, or_null
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.blocks import machine_memory
-from gsparc.data.errors import DataError
-from gsparc.data.limits import POSITIVE, check_arguments, finite_array, number, or_null
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.schema import Site
 from gsparc.prediction.query import usual_heights

@@ -13,9 +13,9 @@ from scipy.special import ndtr, ndtri
 
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.geojson import write_shapes
-from gsparc.data.errors import DataError
-from gsparc.data.files import whole_file, write_archive
-from gsparc.data.limits import finite_array
+from gsparc.base.errors import DataError
+from gsparc.base.files import whole_file, write_archive
+from gsparc.base.limits import finite_array
 from gsparc.physics.decibels import from_decibels, to_decibels
 
 REFUSED = -1  # of `best_server`

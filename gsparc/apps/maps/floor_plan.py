@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from PIL import Image, UnidentifiedImageError
 
+from gsparc.base.errors import DataError, explain_error
+from gsparc.base.limits import finite_array
 from gsparc.data.assemble import FARTHEST
-from gsparc.data.errors import DataError, explain_error
-from gsparc.data.limits import finite_array
 
 LEAST_PIXELS = 2.0  # between the reference points: nearer ones tell no scale
 DARK = 128  # of 255: walls are darker

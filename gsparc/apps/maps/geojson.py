@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pyproj import Transformer
 
+from gsparc.base.errors import DataError, explain_error
+from gsparc.base.files import write_whole
 from gsparc.data.assemble import FARTHEST
-from gsparc.data.errors import DataError, explain_error
-from gsparc.data.files import write_whole
 from gsparc.data.links.georeference import Georeference, find_invalid_coordinate
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from matplotlib.image import imsave
 
 from gsparc.apps.maps.field_map import FieldMap, raster_profile
 from gsparc.apps.maps.pictures import Layer
-from gsparc.data.files import whole_file
+from gsparc.base.files import whole_file
 
 NAMESPACE = "http://www.opengis.net/kml/2.2"
 DEGREES = "EPSG:4326"

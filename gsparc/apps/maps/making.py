@@ -17,11 +17,11 @@ from gsparc.apps.maps.intervals import IntervalScales
 from gsparc.apps.maps.promise import Promise, read_promise
 from gsparc.apps.maps.refining import sample_adaptively
 from gsparc.apps.maps.scoring import Scoring
-from gsparc.data import limits
-from gsparc.data.errors import DataError
-from gsparc.data.executor import run_each
-from gsparc.data.instantiate import suggest_or_list
-from gsparc.data.limits import finite_array
+from gsparc.base import limits
+from gsparc.base.errors import DataError
+from gsparc.base.executor import run_each
+from gsparc.base.instantiate import suggest_or_list
+from gsparc.base.limits import finite_array
 from gsparc.data.links.stations import all_names, find_station
 from gsparc.data.schema import Site
 from gsparc.data.spacing import neighbour_distance

@@ -16,9 +16,9 @@ from gsparc.apps.maps.geojson import draws_shapes
 from gsparc.apps.maps.making import predict_levels, predict_map
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
 from gsparc.apps.maps.promise import Promise
-from gsparc.data.errors import DataError
-from gsparc.data.executor import run_all
-from gsparc.data.limits import (
+from gsparc.base.errors import DataError
+from gsparc.base.executor import run_all
+from gsparc.base.limits import (
     POSITIVE,
     Checked,
     check_arguments,

@@ -20,8 +20,8 @@ from gsparc.apps.maps.geojson import read_shapes
 from gsparc.apps.maps.making import MOST_DB, choose_stations
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import StreetGraph, Tour, Ways
-from gsparc.data.errors import DataError
-from gsparc.data.limits import POSITIVE, check_arguments, choice, number, or_null, whole
+from gsparc.base.errors import DataError
+from gsparc.base.limits import POSITIVE, check_arguments, choice, number, or_null, whole
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import read_place
 

@@ -12,9 +12,9 @@ import numpy as np
 
 from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.intervals import Coverage, IntervalScales, calibrate, cross_validate
-from gsparc.data.errors import DataError
-from gsparc.data.executor import run_all
-from gsparc.data.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
+from gsparc.base.errors import DataError
+from gsparc.base.executor import run_all
+from gsparc.base.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.splits import SplitSettings
 from gsparc.evaluation.open_runs import check_dataset, open_files
 from gsparc.models import checkpoint

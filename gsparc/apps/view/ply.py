@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.errors import DataError
-from gsparc.data.files import write_whole
+from gsparc.base.errors import DataError
+from gsparc.base.files import write_whole
 from gsparc.data.site_objects import GaussianCloud
 
 FIELDS = (

@@ -22,10 +22,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from rich.console import Console
 
+from gsparc.base.files import check_yaml, list_causes
+from gsparc.base.instantiate import GROUPS, plugins
 from gsparc.commands.shared.plugins import offer_plugins, offer_scenes
 from gsparc.commands.shared.run_lock import InUse, release_folders
-from gsparc.data.files import check_yaml, list_causes
-from gsparc.data.instantiate import GROUPS, plugins
 from gsparc.evaluation import console
 from gsparc.evaluation.console import CONFIGS, FULL_ERROR, config_folder, error_in_one_line, list_choices
 from gsparc.models import registry

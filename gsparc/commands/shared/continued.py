@@ -7,7 +7,7 @@ from pathlib import Path
 
 import yaml
 
-from gsparc.data.files import SUMMARY
+from gsparc.base.files import SUMMARY
 from gsparc.training.effort import GONE
 
 PATHS = ("init_from", "known_walls")  # settings that may be files, beside those of groups

@@ -8,8 +8,8 @@ from typing import Any
 
 from hydra.core.config_store import ConfigStore
 
-from gsparc.data.errors import DataError
-from gsparc.data.instantiate import GROUPS, import_target, plugin_node, plugins
+from gsparc.base.errors import DataError
+from gsparc.base.instantiate import GROUPS, import_target, plugin_node, plugins
 from gsparc.simulate.scenes.shipped import list_shipped_scenes, shipped_scene_settings
 
 log = logging.getLogger(__name__)

@@ -16,7 +16,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.files import SUMMARY, delete_partial_files, set_aside
+from gsparc.base.files import SUMMARY, delete_partial_files, set_aside
 
 LOCK, HOLDER = ".lock", ".held-by"
 _locks: list[FileLock] = []  # by the command that is running

@@ -12,10 +12,10 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 from threadpoolctl import threadpool_limits
 
-from gsparc.data import executor
-from gsparc.data.executor import Engine
-from gsparc.data.instantiate import suggest_or_list
-from gsparc.data.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
+from gsparc.base import executor
+from gsparc.base.executor import Engine
+from gsparc.base.instantiate import suggest_or_list
+from gsparc.base.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
 from gsparc.evaluation.console import to_dict as to_dict
 from gsparc.models.registry import all_methods
 from gsparc.training.effort import refuse_seconds

@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.base.limits import SettingError, choice
 from gsparc.data.blocks import rows_by
-from gsparc.data.limits import SettingError, choice
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Measurements
 from gsparc.data.spacing import neighbour_distance

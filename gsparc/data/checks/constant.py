@@ -11,8 +11,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsparc.base.errors import Caution, list_first, name_row_ranges
 from gsparc.data.blocks import is_big, row_blocks, rows_by, write_blocks
-from gsparc.data.errors import Caution, list_first, name_row_ranges
 from gsparc.data.schema import Measurements
 
 LEAST = 8  # rows, at places of their own

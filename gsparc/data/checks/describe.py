@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsparc.base.errors import list_first
 from gsparc.data.checks.coherence import estimate_coherence
-from gsparc.data.errors import list_first
 from gsparc.data.load import split_for
 from gsparc.data.schema import ENDS, LIGHT, Measurements, Site
 from gsparc.data.spacing import neighbour_distance

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from gsparc.data.errors import Severe, list_first
+from gsparc.base.errors import Severe, list_first
 from gsparc.data.links.strongest import strongest_lists
 from gsparc.data.schema import Measurements
 from gsparc.data.selection import FROM_ROW

@@ -8,8 +8,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import cdist
 
+from gsparc.base.errors import list_first
 from gsparc.data.checks.link_levels import LinkLevels
-from gsparc.data.errors import list_first
 from gsparc.processes.level_field import fit_level_field
 
 LEAST, MOST, SITES = 20, 100, 100  # places where a site was heard, that tell; those, and sites, looked at

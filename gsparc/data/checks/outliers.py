@@ -10,8 +10,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from gsparc.base.errors import list_first
 from gsparc.data.blocks import row_blocks
-from gsparc.data.errors import list_first
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.schema import Measurements
 

@@ -14,11 +14,11 @@ import numpy as np
 from scipy.ndimage import median_filter
 from scipy.spatial import cKDTree
 
+from gsparc.base.errors import Severe, list_first
 from gsparc.data.blocks import rows_by
 from gsparc.data.checks.level_steps import MOST_BLOCKS, LevelStep, detect_level_steps
 from gsparc.data.checks.link_levels import UNNAMED, LinkLevels
 from gsparc.data.checks.misplaced import misplaced_warnings
-from gsparc.data.errors import Severe, list_first
 
 NAMED = 5  # wild rows that a station may have, however few its rows
 SATURATED = 0.01  # of all levels, at least

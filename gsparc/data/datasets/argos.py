@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.base.errors import DataError, Problems, readable
+from gsparc.base.files import read_yaml
+from gsparc.base.limits import choice, finite_array, or_word, whole
 from gsparc.data.assemble import centre_positions, rounded_rms
 from gsparc.data.datasets.campaign import Release, StandIn, load_stand_in, read_split
-from gsparc.data.errors import DataError, Problems, readable
-from gsparc.data.files import read_yaml
-from gsparc.data.limits import choice, finite_array, or_word, whole
 from gsparc.data.own_checks import Checker
 from gsparc.data.position_encoder import encode_positions
 from gsparc.data.raw import Raw

@@ -11,6 +11,9 @@ from typing import Any, ClassVar, Protocol
 
 import numpy as np
 
+from gsparc.base.errors import Caution, DataError, Problems, Severe
+from gsparc.base.files import read_shipped_table, read_text
+from gsparc.base.limits import SettingError
 from gsparc.data.assemble import check_positions
 from gsparc.data.checks.coherence import place_warnings
 from gsparc.data.checks.column_effects import run_warnings
@@ -21,9 +24,6 @@ from gsparc.data.checks.link_levels import LinkLevels, link_levels
 from gsparc.data.checks.plausibility import find_level_steps, sanity_warnings
 from gsparc.data.checks.unit_warnings import unit_warnings
 from gsparc.data.datamodule import DataModule
-from gsparc.data.errors import Caution, DataError, Problems, Severe
-from gsparc.data.files import read_shipped_table, read_text
-from gsparc.data.limits import SettingError
 from gsparc.data.own import interpret
 from gsparc.data.own_checks import Checker
 from gsparc.data.public.fetch import fetched_path, fetched_path_or_none

@@ -13,9 +13,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from gsparc.base.errors import DataError, list_first, readable
+from gsparc.base.limits import choice
 from gsparc.data.datasets.campaign import check_layout
-from gsparc.data.errors import DataError, list_first, readable
-from gsparc.data.limits import choice
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.splits import SplitSettings, make_split
 from gsparc.data.tables import is_table

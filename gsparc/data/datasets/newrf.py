@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gsparc.base.errors import DataError, readable
+from gsparc.base.pickles import read_pickled_frame
 from gsparc.data.datasets.campaign import Campaign
-from gsparc.data.errors import DataError, readable
-from gsparc.data.pickles import read_pickled_frame
 from gsparc.data.raw import Raw, read_raw, rename_arrays
 
 NAMES = {"tx_pos": "tx_position", "rx_pos": "rx_position"}

@@ -8,6 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from gsparc.base.errors import DataError
+from gsparc.base.instantiate import from_settings
+from gsparc.base.limits import finite_array, or_null, switch
 from gsparc.data.conventions import CONVENTIONS
 from gsparc.data.datasets.ble import BLE
 from gsparc.data.datasets.campaign import Campaign
@@ -18,9 +21,6 @@ from gsparc.data.datasets.techtile import Techtile
 from gsparc.data.datasets.techtile_power import TechtilePower
 from gsparc.data.datasets.wifi_csi import WifiCsi
 from gsparc.data.datasets.wsr import WSR
-from gsparc.data.errors import DataError
-from gsparc.data.instantiate import from_settings
-from gsparc.data.limits import finite_array, or_null, switch
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import Raw, read_raw
 from gsparc.data.selection import Selection, take_selection

@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
+from gsparc.base.errors import DataError, Problems, shorten
+from gsparc.base.files import read_text
+from gsparc.base.limits import choice, finite_array, number
 from gsparc.data.datasets.campaign import Campaign, read_converted
-from gsparc.data.errors import DataError, Problems, shorten
-from gsparc.data.files import read_text
-from gsparc.data.limits import choice, finite_array, number
 from gsparc.data.links.georeference import find_invalid_coordinate
 from gsparc.data.raw import Raw
 

@@ -27,13 +27,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from PIL import Image
 
+from gsparc.base.errors import DataError, Problems, readable
+from gsparc.base.files import read_text, read_yaml
+from gsparc.base.limits import finite_array, parse_numbers
 from gsparc.data.assemble import centre_positions, check_positions
 from gsparc.data.blocks import allocate
 from gsparc.data.conventions import convert_conventions
 from gsparc.data.datasets.campaign import Release, read_split
-from gsparc.data.errors import DataError, Problems, readable
-from gsparc.data.files import read_text, read_yaml
-from gsparc.data.limits import finite_array, parse_numbers
 from gsparc.data.links.stations import number_places
 from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, is_unit, quaternion_to_matrix
 from gsparc.data.schema import LIGHT, End, Measurements, Site, Stations, TrainTest

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.base.errors import DataError
 from gsparc.data.datamodule import DataModule
-from gsparc.data.errors import DataError
 from gsparc.data.own import interpret_and_log
 from gsparc.data.raw import Raw, read_raw, rename_arrays
 from gsparc.data.schema import Measurements

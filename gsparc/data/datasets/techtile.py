@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.base.errors import DataError
+from gsparc.base.files import read_yaml
+from gsparc.base.limits import finite_array
 from gsparc.data.datasets.campaign import Campaign, check_layout, read_converted, read_layout
-from gsparc.data.errors import DataError
-from gsparc.data.files import read_yaml
-from gsparc.data.limits import finite_array
 from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_raw
 
 CARRIER_HZ = 920e6  # the tone; files of the release do not name it

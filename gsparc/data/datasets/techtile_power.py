@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.base.errors import DataError, readable
+from gsparc.base.pickles import read_pickle
 from gsparc.data.datasets.campaign import Campaign
-from gsparc.data.errors import DataError, readable
-from gsparc.data.pickles import read_pickle
 from gsparc.data.raw import Raw, read_raw
 from gsparc.physics.decibels import to_decibels
 

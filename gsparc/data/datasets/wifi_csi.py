@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from gsparc.base.errors import DataError, list_first, readable
+from gsparc.base.files import read_csv
+from gsparc.base.limits import choice, or_null
 from gsparc.data.datasets.campaign import Campaign
 from gsparc.data.datasets.wifi_logs import READERS, SUFFIXES, Packets, channel_hz, read_packets
 from gsparc.data.datasets.wsr import SPACING_HZ
-from gsparc.data.errors import DataError, list_first, readable
-from gsparc.data.files import read_csv
-from gsparc.data.limits import choice, or_null
 from gsparc.data.raw import Raw
 from gsparc.physics.decibels import to_decibels
 

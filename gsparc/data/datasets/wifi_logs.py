@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.base.errors import DataError, readable
 from gsparc.data.datasets.wsr import RECORD, TONES, read_log
-from gsparc.data.errors import DataError, readable
 from gsparc.physics.decibels import to_decibels
 
 SUFFIXES = {".pcap": "nexmon", ".dat": "intel", ".csv": "esp32"}

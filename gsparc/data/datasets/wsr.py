@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
+from gsparc.base.errors import DataError, readable
+from gsparc.base.files import read_csv
 from gsparc.data.datasets.campaign import Campaign, read_converted
-from gsparc.data.errors import DataError, readable
-from gsparc.data.files import read_csv
 from gsparc.data.raw import Raw
 from gsparc.physics.decibels import from_decibels
 

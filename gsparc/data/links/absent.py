@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsparc.base.errors import Severe, list_first
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.checks.plausibility import find_marks
-from gsparc.data.errors import Severe, list_first
 from gsparc.data.links.strongest import StrongestLists
 from gsparc.data.own_checks import Checker
 from gsparc.data.schema import OTHER, End, Stations

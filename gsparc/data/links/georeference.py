@@ -8,7 +8,7 @@ from typing import Self
 import numpy as np
 from pyproj import Proj
 
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 
 DIGITS = 4  # of an origin's degrees: 11 m, so that the same campaign with a few rows more keeps its origin
 # Latitude and longitude [deg]; both customs of longitude are taken: -180 to 180, and 0 to 360.

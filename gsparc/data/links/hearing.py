@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from gsparc.base.errors import Caution
+from gsparc.base.limits import Limit, choice, number, or_null, or_word
 from gsparc.data.blocks import is_big
 from gsparc.data.checks.plausibility import APART_DB, find_marks, find_saturation
-from gsparc.data.errors import Caution
-from gsparc.data.limits import Limit, choice, number, or_null, or_word
 from gsparc.data.own_checks import MOST_DB, Checker
 from gsparc.data.schema import OTHER, Links
 from gsparc.data.selection import take_rows

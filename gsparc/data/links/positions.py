@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from gsparc.base.errors import Caution, Severe, list_first, name_row_ranges
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.checks.outliers import FEW
 from gsparc.data.checks.plausibility import degree_warnings
-from gsparc.data.errors import Caution, Severe, list_first, name_row_ranges
 from gsparc.data.links.georeference import ON_EARTH, Georeference, find_invalid_coordinate
 from gsparc.data.own_checks import Checker
 from gsparc.data.raw import numbered_rows

@@ -16,8 +16,8 @@ from urllib.parse import quote
 import yaml
 from filelock import FileLock, Timeout
 
-from gsparc.data.errors import DataError, Problems, explain_error, suggest_name
-from gsparc.data.files import platform_cache, read_shipped_table
+from gsparc.base.errors import DataError, Problems, explain_error, suggest_name
+from gsparc.base.files import platform_cache, read_shipped_table
 from gsparc.data.public.hub import fetch_from_hub
 
 log = logging.getLogger(__name__)

@@ -7,8 +7,8 @@ import logging
 from hashlib import sha256
 from pathlib import Path
 
-from gsparc.data.errors import DataError, explain_error
-from gsparc.data.files import write_whole
+from gsparc.base.errors import DataError, explain_error
+from gsparc.base.files import write_whole
 
 log = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.data.errors import list_first
+from gsparc.base.errors import list_first
 from gsparc.data.tables.heads import AXIS_WORDS, LISTS, SHEET, parse_head, words_of
 from gsparc.data.tables.records import unfold_places
 from gsparc.data.tables.sheet import Sheet

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from gsparc.data.errors import Caution, list_first, suggest_name
+from gsparc.base.errors import Caution, list_first, suggest_name
 from gsparc.data.tables import heads
 from gsparc.data.tables.heads import CHANNELS, ENDS, KINDS, LISTS, POLAR, Head, unit_of, unit_suits, words_of
 from gsparc.data.tables.sheet import Sheet

@@ -10,7 +10,7 @@ from unicodedata import combining, normalize
 
 import yaml
 
-from gsparc.data.limits import LONGEST_HEAD
+from gsparc.base.limits import LONGEST_HEAD
 from gsparc.data.units import UNITS, Unit
 
 PERCENT = (

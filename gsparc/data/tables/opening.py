@@ -15,9 +15,9 @@ from pathlib import Path
 
 import pandas as pd
 
-from gsparc.data.errors import Caution, DataError, Problems, absent, name_row_ranges, readable
-from gsparc.data.files import check_content, check_fetched, check_line_length
-from gsparc.data.limits import LIFTED_BY, MOST_CELLS, MOST_COLUMNS, most_text
+from gsparc.base.errors import Caution, DataError, Problems, absent, name_row_ranges, readable
+from gsparc.base.files import check_content, check_fetched, check_line_length
+from gsparc.base.limits import LIFTED_BY, MOST_CELLS, MOST_COLUMNS, most_text
 from gsparc.data.raw import ARRAY_SUFFIXES
 from gsparc.data.tables import is_table
 from gsparc.data.tables.cells import unfold_cells

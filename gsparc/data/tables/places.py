@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from gsparc.data.errors import Caution, DataError, list_first, name_row_ranges
+from gsparc.base.errors import Caution, DataError, list_first, name_row_ranges
 from gsparc.data.links.georeference import find_invalid_coordinate
 from gsparc.data.links.stations import PER_STATION, SECTOR
 from gsparc.data.tables.columns import BY_ROW, Chosen, choose_columns, rename_for_stations, say_column

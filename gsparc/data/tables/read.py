@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from gsparc.base.errors import Caution, list_first, suggest_name
 from gsparc.data.amplitudes import join_polar
-from gsparc.data.errors import Caution, list_first, suggest_name
 from gsparc.data.links.stations import PER_STATION
 from gsparc.data.own_checks import LOWEST_HZ, MOST_DB
 from gsparc.data.raw import Raw

@@ -11,8 +11,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 
-from gsparc.data.files import check_content, check_depth, refuse_repeated
-from gsparc.data.limits import MOST_VALUES
+from gsparc.base.files import check_content, check_depth, refuse_repeated
+from gsparc.base.limits import MOST_VALUES
 
 POINTS = {"trkpt", "wpt", "Placemark"}  # of GPX and KML
 DEGREES, METRES = ["longitude", "latitude", "height"], ["x", "y", "z"]  # as GeoJSON and KML order coordinates

@@ -8,8 +8,8 @@ from collections.abc import Container
 import numpy as np
 import pandas as pd
 
-from gsparc.data.errors import Caution, DataError, list_first
-from gsparc.data.files import read_shipped_table
+from gsparc.base.errors import Caution, DataError, list_first
+from gsparc.base.files import read_shipped_table
 from gsparc.data.tables.heads import LISTS, SHEET, unit_of, words_of
 from gsparc.data.tables.sheet import Sheet
 from gsparc.data.units import UNITS, Unit

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from gsparc.data.errors import Problems
+from gsparc.base.errors import Problems
 from gsparc.data.tables.heads import PERCENT, SHEET, UNITS, Unit
 
 NOT_HEARD = re.compile(SHEET["not_heard"])

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pandas as pd
 
-from gsparc.data.errors import list_first
+from gsparc.base.errors import list_first
 from gsparc.data.tables.heads import KINDS, LISTS, meaning_by_word, parse_head, unit_of, words_of
 from gsparc.data.tables.sheet import Sheet
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsparc.base.errors import Caution
 from gsparc.data.checks.column_effects import LEAST_ROWS, LevelsAtPlaces, find_effects, find_filled
-from gsparc.data.errors import Caution
 from gsparc.data.schema import Measurements
 from gsparc.data.tables.columns import Chosen, say_column, used_heads
 from gsparc.data.tables.sheet import Sheet

@@ -16,8 +16,8 @@ from typing import Any, TypeVar
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-from gsparc.data.instantiate import from_settings
-from gsparc.data.limits import POSITIVE
+from gsparc.base.instantiate import from_settings
+from gsparc.base.limits import POSITIVE
 from gsparc.data.load import load, split_for
 from gsparc.data.public.fetch import fetched_path_or_none
 from gsparc.data.schema import Measurements, Scored

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING
 
-from gsparc.data.files import load_yaml
-from gsparc.data.instantiate import import_target
+from gsparc.base.files import load_yaml
+from gsparc.base.instantiate import import_target
 from gsparc.evaluation.console import config_folder
 from gsparc.models.registry import (
     all_methods,

@@ -13,8 +13,8 @@ import numpy as np
 from hydra.utils import instantiate
 from lightning import Callback
 
-from gsparc.data.errors import Caution, Severe
-from gsparc.data.executor import run_each, uses_other_processes
+from gsparc.base.errors import Caution, Severe
+from gsparc.base.executor import run_each, uses_other_processes
 from gsparc.data.load import split_settings
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split

@@ -18,9 +18,9 @@ import pandas as pd
 import torch
 from omegaconf import DictConfig
 
-from gsparc.data.errors import list_first
-from gsparc.data.executor import run_each
-from gsparc.data.files import is_out_of_space
+from gsparc.base.errors import list_first
+from gsparc.base.executor import run_each
+from gsparc.base.files import is_out_of_space
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.console import error_in_one_line

@@ -15,7 +15,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import Console
 
-from gsparc.data.errors import list_first
+from gsparc.base.errors import list_first
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import error_in_one_line, open_console
 from gsparc.evaluation.experiment.options import REDRAW

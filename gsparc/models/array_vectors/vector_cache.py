@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.base.errors import list_first
 from gsparc.data.assemble import identity_hash
-from gsparc.data.errors import list_first
 from gsparc.data.schema import Measurements
 from gsparc.models.array_vectors.phase_retrieval import RecoveredVectors, recover_vectors
 from gsparc.models.target_rows import training_targets

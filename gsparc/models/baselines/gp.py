@@ -11,8 +11,8 @@ import torch
 from scipy.linalg import eigh
 from torch import Tensor
 
+from gsparc.base.limits import check_arguments, choice, whole
 from gsparc.data.blocks import row_blocks
-from gsparc.data.limits import check_arguments, choice, whole
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.target import Target

@@ -13,7 +13,7 @@ from typing import get_args
 import torch
 from torch import Tensor
 
-from gsparc.data.limits import POSITIVE, Checked, choice, setting, switch, whole
+from gsparc.base.limits import POSITIVE, Checked, choice, setting, switch, whole
 from gsparc.field.initial import InitSettings, Snapshot
 from gsparc.models.image_sources import reflection_orders as orders
 from gsparc.models.image_sources.backprojection import (

@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.base.limits import check_arguments, number, or_null, switch
 from gsparc.data.inner_folds import cut_folds
-from gsparc.data.limits import check_arguments, number, or_null, switch
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.limits import internal
+from gsparc.base.limits import internal
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gsparc.data.limits import internal
+from gsparc.base.limits import internal
 from gsparc.data.schema import Measurements
 from gsparc.models.apart import keep_apart
 from gsparc.models.terms import array_obstacle

@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Literal, get_args
 import numpy as np
 import torch
 
-from gsparc.data.limits import Checked, choice, setting, whole
+from gsparc.base.limits import Checked, choice, setting, whole
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold

@@ -18,7 +18,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gsparc.data.errors import group_warnings
+from gsparc.base.errors import group_warnings
 from gsparc.data.prior_levels import Files, read_prior_maps
 from gsparc.data.schema import Measurements
 from gsparc.processes.places import first_end, other_end

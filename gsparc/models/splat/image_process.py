@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.data.limits import check_arguments, switch
+from gsparc.base.limits import check_arguments, switch
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold

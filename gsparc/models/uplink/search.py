@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from gsparc.data.limits import internal
+from gsparc.base.limits import internal
 from gsparc.models.uplink.interface import mean_power
 from gsparc.physics.plane_waves import Aperture, SourceColumns, antenna_responses, tone_responses
 from gsparc.processes.factor import Factor

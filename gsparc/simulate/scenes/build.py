@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.base.instantiate import from_settings
 from gsparc.data.ends import SAME_PLACE_M
-from gsparc.data.instantiate import from_settings
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.walls import SIZE, RoomSettings
 from gsparc.simulate.raytracer import RayTracer, Sampling

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsparc.data.files import read_shipped_table
+from gsparc.base.files import read_shipped_table
 from gsparc.simulate.scenes.solid import Solid, box, sheet
 
 SIZE = np.array([14.0, 10.0, 4.0])

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.errors import list_first, suggest_name
-from gsparc.data.instantiate import from_settings
-from gsparc.data.limits import MOST_NAMED, Checked, Limit, finite_array, or_null, setting
+from gsparc.base.errors import list_first, suggest_name
+from gsparc.base.instantiate import from_settings
+from gsparc.base.limits import MOST_NAMED, Checked, Limit, finite_array, or_null, setting
 from gsparc.data.walls import BOXES
 from gsparc.simulate.scenes.solid import Solid, box
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.data.query_places import read_query_places, read_times
 from gsparc.simulate.scenes.settings import Layout, SceneSettings
 from gsparc.simulate.scenes.solid import Solid

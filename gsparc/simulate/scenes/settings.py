@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data import limits
-from gsparc.data.instantiate import from_settings
-from gsparc.data.limits import POSITIVE, Checked, choice, or_null, setting, whole
+from gsparc.base import limits
+from gsparc.base.instantiate import from_settings
+from gsparc.base.limits import POSITIVE, Checked, choice, or_null, setting, whole
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.moved import PLACE
 

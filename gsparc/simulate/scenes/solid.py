@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from gsparc.data.files import read_shipped_table, write_whole
+from gsparc.base.files import read_shipped_table, write_whole
 
 LISTED_MATERIALS = read_shipped_table(__package__, "materials.csv")
 MILLIMETRES = 3  # digits of a corner in a file

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.instantiate import from_settings
-from gsparc.data.limits import Checked, Limit, choice, finite_array, or_null, setting, whole
+from gsparc.base.instantiate import from_settings
+from gsparc.base.limits import Checked, Limit, choice, finite_array, or_null, setting, whole
 from gsparc.data.links.georeference import Georeference
 
 NUMBERS = Limit("a list of two or three finite numbers", lambda v: finite_array(v).shape in ((2,), (3,)))

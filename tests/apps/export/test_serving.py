@@ -21,7 +21,7 @@ import pytest
 from crashes import Limited
 
 import gsparc
-from gsparc.data.limits import SettingError
+from gsparc.base.limits import SettingError
 from gsparc.models import checkpoint
 from gsparc.prediction.updating import versions_extra
 

@@ -10,7 +10,7 @@ import gsparc
 from gsparc.apps.maps import predict_map
 from gsparc.apps.maps.field_map import NO_CLASS, check_geotiff, write_classes, write_geotiff
 from gsparc.apps.maps.planning import plan_measurements
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 
 
 def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):

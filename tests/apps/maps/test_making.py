@@ -26,7 +26,7 @@ from gsparc.apps.maps.making import _hearing_floors, choose_stations, predict_ma
 from gsparc.apps.maps.pictures import Layer, Legend, assign_colours, label_places, list_layers
 from gsparc.apps.maps.promise import Promise, map_notes
 from gsparc.apps.maps.refining import sample_adaptively
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.data.links.georeference import Georeference
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold

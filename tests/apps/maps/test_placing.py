@@ -22,7 +22,7 @@ from gsparc.apps.maps.placing import (
     place_station,
 )
 from gsparc.apps.maps.promise import Promise
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint

@@ -12,7 +12,7 @@ from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances, weig
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import StreetGraph, Tour, Ways
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.models.abilities import JointLevels
 from gsparc.prediction.jointly import JointMixin
 from gsparc.prediction.left_out import HeldOutLevels

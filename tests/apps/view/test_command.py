@@ -10,8 +10,8 @@ from towns import town_model
 from gsparc.apps.maps.making import predict_levels
 from gsparc.apps.view.building import GAUSSIANS, build_scene
 from gsparc.apps.view.viewed import open_model
+from gsparc.base.errors import DataError
 from gsparc.commands import view as command
-from gsparc.data.errors import DataError
 from gsparc.models import checkpoint
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsparc.apps.view.ply import FIELDS, Y00, write_ply
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.data.site_objects import GaussianCloud
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import packets
 import pytest
 
+from gsparc.base.limits import SettingError
 from gsparc.data.checks.coherence import estimate_coherence, place_warnings, set_unknown_factor
-from gsparc.data.limits import SettingError
 from gsparc.data.own import interpret
 from gsparc.data.raw import Raw
 

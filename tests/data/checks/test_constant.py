@@ -7,7 +7,7 @@ import pytest
 from doors import said
 from releases import real
 
-from gsparc.data.errors import Caution
+from gsparc.base.errors import Caution
 from gsparc.data.own import from_arrays, interpret
 from gsparc.data.raw import Raw
 from gsparc.data.splits import Fold, Split

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from releases import real
 
+from gsparc.base.errors import DataError
 from gsparc.data.checks.conventions import convention_warnings
 from gsparc.data.datasets.own import Own, read_any
-from gsparc.data.errors import DataError
 from gsparc.data.own import from_arrays
 
 LIGHT = 299_792_458.0

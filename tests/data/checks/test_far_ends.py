@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.data.own import Reading, interpret
 from gsparc.data.raw import Raw
 

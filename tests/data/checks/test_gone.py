@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from networks import draw_network
 
+from gsparc.base.errors import Severe
 from gsparc.data.checks.gone import find_gone
 from gsparc.data.datasets.campaign import find_implausible
-from gsparc.data.errors import Severe
 
 
 @pytest.mark.parametrize("buildings", [False, True])

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from releases import real, write_release
 
+from gsparc.base.errors import DataError
+from gsparc.base.pickles import FRAMES, read_pickle
 from gsparc.data.datasets.ble import read_ble
 from gsparc.data.datasets.newrf import read_newrf
 from gsparc.data.datasets.own import read_any
 from gsparc.data.datasets.powder import read_powder
 from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.datasets.techtile_power import read_techtile_power
-from gsparc.data.errors import DataError
 from gsparc.data.load import load
-from gsparc.data.pickles import FRAMES, read_pickle
 
 ROOM = "releases/newrf/dataset_conference_ch1_rt_image_fc.pkl"
 

@@ -5,10 +5,10 @@ import re
 import numpy as np
 import pytest
 
+from gsparc.base.errors import DataError
+from gsparc.base.limits import SettingError
 from gsparc.data.checks.describe import describe
 from gsparc.data.checks.unit_warnings import unit_warnings
-from gsparc.data.errors import DataError
-from gsparc.data.limits import SettingError
 from gsparc.data.own import from_arrays, interpret
 from gsparc.data.raw import Raw
 from gsparc.data.selection import Selection

@@ -7,10 +7,10 @@ import pytest
 from networks import network
 from releases import release
 
+from gsparc.base.errors import DataError, Severe
 from gsparc.data.checks.link_levels import link_levels
 from gsparc.data.checks.plausibility import floor_warnings, sanity_warnings
 from gsparc.data.datasets.powder import read_powder
-from gsparc.data.errors import DataError, Severe
 from gsparc.data.links.strongest import number_lists
 from gsparc.data.own import from_arrays, interpret
 from gsparc.data.raw import Raw

@@ -18,8 +18,8 @@ from filelock import FileLock
 from mirrors import begin, mirrored, offer, sound, source_of
 from releases import real
 
+from gsparc.base.errors import DataError
 from gsparc.commands import data as command
-from gsparc.data.errors import DataError
 from gsparc.data.load import datamodule
 from gsparc.data.public import fetch as fetching
 from gsparc.data.public.fetch import fetch, fetched_path, public_sets

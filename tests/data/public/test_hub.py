@@ -7,7 +7,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 import pytest
 
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.data.load import load
 from gsparc.data.public import fetch as fetching
 from gsparc.data.public import hub

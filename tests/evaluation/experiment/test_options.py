@@ -14,8 +14,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 from worlds import World, arrays
 
-from gsparc.data import executor
-from gsparc.data.executor import Engine
+from gsparc.base import executor
+from gsparc.base.executor import Engine
 from gsparc.data.load import datamodule, split_for
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.experiment import options

@@ -1,6 +1,6 @@
 """Configurations with a slip of the finger at any depth: the nearest right name, before anything is computed.
 
-Remedy: gsparc/data/limits.py (what a setting may be), gsparc/commands/shared/cli.py (one line, nearest name).
+Remedy: gsparc/base/limits.py (what a setting may be), gsparc/commands/shared/cli.py (one line, nearest name).
 """
 
 import pytest

@@ -1,6 +1,6 @@
 """Files whose bytes are damaged: cut short, overwritten, made to hang or crash the library that reads them.
 
-Remedy: gsparc/data/hdf5_text.py; text of variable length is first read by a program of its own, for a
+Remedy: gsparc/base/hdf5_text.py; text of variable length is first read by a program of its own, for a
 bounded time. Found: damage in a global heap of HDF5 that hangs or crashes libhdf5.
 """
 
@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 import pytest
 
-from gsparc.data import hdf5_text
-from gsparc.data.errors import DataError
+from gsparc.base import hdf5_text
+from gsparc.base.errors import DataError
 from gsparc.data.own import load_own
 
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from doors import assert_found_bad, knock
 
+from gsparc.base.errors import DataError
 from gsparc.commands.check import main as check
-from gsparc.data.errors import DataError
 from gsparc.data.own import load_own
 
 Arrays = dict[str, np.ndarray]

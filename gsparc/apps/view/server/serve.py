@@ -12,7 +12,7 @@ import viser
 from gsparc.apps.view.latest_job import LatestJobQueue
 from gsparc.apps.view.server.session import Session
 from gsparc.apps.view.site_view import SiteView
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 
 log = logging.getLogger(__name__)
 

@@ -18,8 +18,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsparc.base.errors import Caution, DataError
 from gsparc.data.ends import NOBODY, Ends, stations_at
-from gsparc.data.errors import Caution, DataError
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold

@@ -16,8 +16,8 @@ import torch
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from gsparc.base.errors import Caution, list_first
 from gsparc.data.checks.plausibility import find_noise
-from gsparc.data.errors import Caution, list_first
 from gsparc.data.links.stations import site_name
 from gsparc.data.schema import Measurements, Stations
 from gsparc.models.baselines.distance_law import fit_law

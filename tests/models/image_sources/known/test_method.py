@@ -5,7 +5,7 @@ import pytest
 from closed import fitted_to, read_back
 from rooms import nmse, shoebox
 
-from gsparc.data.errors import DataError
+from gsparc.base.errors import DataError
 from gsparc.data.splits import Fold
 from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings

@@ -7,11 +7,11 @@ from contextlib import contextmanager
 
 import pytest
 
-from gsparc.data.locks import hold_file
+from gsparc.base.locks import hold_file
 
 HOLDS = """
 import sys, time
-from gsparc.data.locks import hold_file
+from gsparc.base.locks import hold_file
 while True:
     with hold_file(sys.argv[1], 60):
         print("held", flush=True)

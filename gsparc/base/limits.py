@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.errors import DataError, list_first, suggest_name
+from gsparc.base.errors import DataError, list_first, suggest_name
 
 
 class SettingError(DataError):
@@ -63,7 +63,7 @@ def number(low: float, high: float = math.inf, *, open_low: bool = False, open_h
     >>> number(0, 1, open_low=True).check("share", 0)
     Traceback (most recent call last):
         ...
-    gsparc.data.limits.SettingError: share=0: a number above 0 and at most 1 is needed
+    gsparc.base.limits.SettingError: share=0: a number above 0 and at most 1 is needed
     """
     words = f"a number {'above' if open_low else 'of at least'} {low:g}" if low > -math.inf else "a number"
     words += "" if high == math.inf else f" and {'below' if open_high else 'at most'} {high:g}"
@@ -79,7 +79,7 @@ def choice(*values: str) -> Limit:
     >>> choice("random", "blocks").check("name", "blok")
     Traceback (most recent call last):
         ...
-    gsparc.data.limits.SettingError: name='blok': one of random, blocks is needed; did you mean 'blocks'?
+    gsparc.base.limits.SettingError: name='blok': one of random, blocks is needed; did you mean 'blocks'?
     """
     return Limit(f"one of {list_first(values, MOST_NAMED)}", lambda v: v in values, values)
 
@@ -190,7 +190,7 @@ class Checked:
     >>> Search(steps=0)
     Traceback (most recent call last):
         ...
-    gsparc.data.limits.SettingError: steps=0: a whole number of at least 1 is needed
+    gsparc.base.limits.SettingError: steps=0: a whole number of at least 1 is needed
     """
 
     def __post_init__(self) -> None:

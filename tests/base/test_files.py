@@ -3,9 +3,9 @@
 import pytest
 from doors import assert_refused, knock
 
+from gsparc.base.errors import DataError
+from gsparc.base.files import _partial, check_yaml, read_yaml, whole_file, whole_folder
 from gsparc.commands.listing import COMMANDS
-from gsparc.data.errors import DataError
-from gsparc.data.files import _partial, check_yaml, read_yaml, whole_file, whole_folder
 
 
 @pytest.mark.parametrize("error", [OSError("no space left"), KeyboardInterrupt()])

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from joblib.externals.loky.process_executor import BrokenProcessPool
 
-from gsparc.data import executor
-from gsparc.data.executor import Engine, run_each
-from gsparc.data.limits import SettingError
+from gsparc.base import executor
+from gsparc.base.executor import Engine, run_each
+from gsparc.base.limits import SettingError
 
 cloudpickle.register_pickle_by_value(sys.modules[__name__])
 COUNT = 12

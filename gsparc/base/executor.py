@@ -27,8 +27,8 @@ import torch
 from joblib.externals.loky.process_executor import BrokenProcessPool
 from threadpoolctl import threadpool_limits
 
-from gsparc.data.errors import explain_error
-from gsparc.data.limits import Checked, SettingError, choice, or_null, setting, whole
+from gsparc.base.errors import explain_error
+from gsparc.base.limits import Checked, SettingError, choice, or_null, setting, whole
 
 log = logging.getLogger(__name__)
 

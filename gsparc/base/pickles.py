@@ -12,7 +12,7 @@ import numpy as np
 from numpy._core import multiarray
 from numpy.lib.format import MAGIC_LEN
 
-from gsparc.data.errors import readable
+from gsparc.base.errors import readable
 
 
 class Placeholder:

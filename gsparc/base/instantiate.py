@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 
 from hydra.errors import InstantiationException
 
-from gsparc.data.errors import DataError, suggest_name
-from gsparc.data.limits import SettingError
+from gsparc.base.errors import DataError, suggest_name
+from gsparc.base.limits import SettingError
 
 _Kind = TypeVar("_Kind")
 

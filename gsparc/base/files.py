@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from gsparc.data.errors import DataError, readable
-from gsparc.data.limits import DEEPEST, LEAST_CONTENT, LEAST_NODES, LONGEST_LINE, MOST_GROWTH
+from gsparc.base.errors import DataError, readable
+from gsparc.base.limits import DEEPEST, LEAST_CONTENT, LEAST_NODES, LONGEST_LINE, MOST_GROWTH
 
 SUMMARY = "summary.json"  # of a finished run, written last
 POINTER = b"version https://git-lfs"

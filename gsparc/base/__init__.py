@@ -1,0 +1,1 @@
+"""What every room may use: errors, limits of settings, files, other processes."""
