@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import PlaceValues, condition_on_nearest
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend
+from gsparc.tables.own import from_arrays
 
 SIDE_M = 3_000.0
 SCALES = ((6.0, 250.0), (3.0, 40.0), (1.5, 8.0))  # deviation [dB] and wavelength / 2 pi [m] of shadowing

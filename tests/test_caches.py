@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gsparc.data.assemble import identity_hash
-from gsparc.data.links.georeference import Georeference
+from gsparc.data.georeference import Georeference
 from gsparc.data.schema import Site, Stations
 from gsparc.evaluation.ledger import measurements_hash
 from gsparc.models.array_vectors import vector_cache

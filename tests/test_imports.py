@@ -22,25 +22,27 @@ ARROWS = {
     "ops": "",
     "processes": "ops",
     "physics": "ops",
-    "data": "base conf ops physics processes",
-    "simulate": "base data ops physics processes",
+    "data": "base conf ops physics processes tables",
+    "tables": "base data ops physics processes",
+    "simulate": "base data ops physics processes tables",
     "training": "base data processes",
     "field": "base data ops physics processes training",
-    "models": "base conf data field ops physics processes simulate training",
-    "prediction": "base data field models ops physics processes training",
-    "evaluation": "base conf data field models physics prediction processes simulate training",
+    "models": "base conf data field ops physics processes simulate tables training",
+    "prediction": "base data field models ops physics processes tables training",
+    "evaluation": "base conf data field models physics prediction processes simulate tables "
+    "training",
     "callbacks": "base evaluation field processes training",
     "apps.locate": "base data evaluation models prediction processes",
-    "apps.maps": "base data evaluation models physics prediction processes",
-    "apps.export": "base data field models ops physics prediction processes",
+    "apps.maps": "base data evaluation models physics prediction processes tables",
+    "apps.export": "base data field models ops physics prediction processes tables",
     "apps.link": "base data evaluation models physics prediction processes simulate",
     "apps.view": "apps.maps base data evaluation physics prediction processes",
     "commands": "apps.export apps.link apps.locate apps.maps apps.view base conf data "
-    "evaluation models ops prediction simulate training",
+    "evaluation models ops prediction simulate tables training",
     "conf": "",
 }
 ROOMS = tuple(ARROWS)
-LARGEST = ("models", "data", "commands")
+LARGEST = ("models", "tables", "commands")
 GROUPS = ("gsparc.models", "gsparc.datasets")  # of entry points: what plugins bring, by these very words
 
 

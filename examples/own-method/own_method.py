@@ -5,10 +5,10 @@ import torch
 from scipy.spatial import cKDTree
 
 from gsparc.data.datamodule import DataModule
-from gsparc.data.own import interpret
-from gsparc.data.raw import Raw
 from gsparc.models.baselines.interpolation import Interpolator
 from gsparc.models.method import Prediction
+from gsparc.tables.own import interpret
+from gsparc.tables.raw import Raw
 
 
 class NearestK(Interpolator):

@@ -36,13 +36,13 @@ def check(
         draw: PNG file for a map; None draws none.
     """
     # Here: they bring torch, which --help does not need.
-    from gsparc.data.checks.array_layout import carrier_warnings, layout_warnings
-    from gsparc.data.checks.describe import describe
-    from gsparc.data.checks.outliers import outlier_warnings
     from gsparc.data.datasets.campaign import find_implausible
     from gsparc.data.datasets.own import read_any
     from gsparc.data.load import split_for
+    from gsparc.data.outliers import outlier_warnings
     from gsparc.models.powers.together.network import check_azimuths
+    from gsparc.tables.checks.array_layout import carrier_warnings, layout_warnings
+    from gsparc.tables.checks.describe import describe
 
     try:
         reading = read_any(path, columns=columns, stations_file=stations_file, **settings)

@@ -18,10 +18,10 @@ from gsparc.base.files import whole_folder
 from gsparc.base.limits import POSITIVE, SettingError, check_arguments, choice, or_null, whole
 from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.commands.shared.settings import to_dict
-from gsparc.data.query_places import read_query_places, read_times
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.placing import fill_heights, to_world
 from gsparc.prediction.predictor import Predictor
+from gsparc.tables.query_places import read_query_places, read_times
 
 SOURCES = Path(gsparc.ops.__file__).parent / "csrc"
 # Sources of GPU kernels, of projections and of the Python module are no part of the C library.

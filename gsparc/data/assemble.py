@@ -11,7 +11,7 @@ import numpy as np
 
 from gsparc.base.errors import Problems
 from gsparc.data.blocks import iterate_bytes, row_blocks
-from gsparc.data.checks.outliers import find_strong_outliers, peak_magnitudes, too_far
+from gsparc.data.outliers import find_strong_outliers, peak_magnitudes, too_far
 from gsparc.data.schema import Measurements
 
 FARTHEST = 1e7  # [m]; an Earth radius and a half: anything beyond is not a position in metres

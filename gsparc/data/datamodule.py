@@ -14,11 +14,11 @@ import numpy as np
 import torch
 
 from gsparc.base.limits import check_arguments, whole
-from gsparc.data.checks import outliers
-from gsparc.data.checks.coherence import set_unknown_factor
+from gsparc.data import outliers
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.tables.checks.coherence import set_unknown_factor
 
 log = logging.getLogger(__name__)
 

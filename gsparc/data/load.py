@@ -20,8 +20,8 @@ from gsparc.base import instantiate
 from gsparc.base.errors import DataError, list_first
 from gsparc.base.limits import choice
 from gsparc.data import spacing, splits
-from gsparc.data.checks.outliers import find_outliers
 from gsparc.data.datamodule import DataModule
+from gsparc.data.outliers import find_outliers
 from gsparc.data.row_order import content_order
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import read_split

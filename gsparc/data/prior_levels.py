@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from gsparc.base.errors import Caution, DataError, list_first
-from gsparc.data.checks.plausibility import find_marks
 from gsparc.data.datasets.own import read_own
-from gsparc.data.links.stations import site_name
-from gsparc.data.own import interpret
-from gsparc.data.own_checks import MOST_DB
 from gsparc.data.schema import Measurements
-from gsparc.data.tables import is_table
+from gsparc.data.station_names import site_name
 from gsparc.data.units import UNITS
 from gsparc.physics.decibels import to_decibels
+from gsparc.tables import is_table
+from gsparc.tables.checks.plausibility import find_marks
+from gsparc.tables.own import interpret
+from gsparc.tables.own_checks import MOST_DB
 
 log = logging.getLogger(__name__)
 
@@ -208,7 +208,7 @@ def _read_rows(
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield name, places and levels of each station of a table, whose heads may be their names, or an npz."""
     if is_table(path):
-        from gsparc.data.tables.read import parse_table  # here, as pandas takes half a second to import
+        from gsparc.tables.read import parse_table  # here, as pandas takes half a second to import
 
         raw = parse_table(path, stations=stations)
         for note in [note for note in raw.notes if isinstance(note, Caution) and "not used" in note]:

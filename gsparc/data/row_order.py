@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 
 from gsparc.data.blocks import row_blocks, take
-from gsparc.data.links.stations import number_places
 from gsparc.data.moments import number_moments
 from gsparc.data.schema import Measurements
+from gsparc.data.spacing import number_places
 from gsparc.data.splits import Fold
 
 BITS = 20  # of a coordinate, of three; of both ends half as many

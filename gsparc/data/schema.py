@@ -20,7 +20,7 @@ from gsparc.ops import Pose, SphereGrid
 from gsparc.physics.row_factors import UnknownFactor, describe_factor
 
 if TYPE_CHECKING:
-    from gsparc.data.links.georeference import Georeference
+    from gsparc.data.georeference import Georeference
 
 Places = TypeVar("Places")
 Channels = TypeVar("Channels", np.ndarray, Tensor)

@@ -17,10 +17,10 @@ from gsparc.base.errors import DataError, list_first, suggest_name
 from gsparc.base.limits import Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.blocks import take
-from gsparc.data.links.stations import find_station
 from gsparc.data.row_order import find_copies, hash_rows
 from gsparc.data.schema import FIELDS, Stations, list_arrays_with_axis
 from gsparc.data.spacing import group_visits
+from gsparc.data.station_names import find_station
 from gsparc.physics.decibels import to_decibels
 
 FROM_ROW = " from row "  # in the name of a station that another one became by a step of its level

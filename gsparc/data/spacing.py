@@ -7,7 +7,6 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from gsparc.data.links.stations import number_places
 from gsparc.processes.few_rows import evenly_spaced
 
 # Rows form a path while their median step is below this many nearest-neighbour distances.
@@ -152,3 +151,11 @@ def thin_rows(
             subset.append(i)
             free[tree.query_ball_point(positions[rows[i]], distance)] = False
     return rows[np.sort(subset)]
+
+
+def number_places(places: np.ndarray) -> np.ndarray:
+    """Number each of `places` (n, 3), (n,) int64, in the order in which they first appear."""
+    _, first, which = np.unique(places, axis=0, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[which.reshape(-1)]

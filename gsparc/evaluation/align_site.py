@@ -10,8 +10,8 @@ import numpy as np
 
 from gsparc.base.errors import list_first
 from gsparc.data.ends import SAME_PLACE_M
-from gsparc.data.links.stations import all_names
 from gsparc.data.schema import Measurements, Site, Stations
+from gsparc.data.station_names import all_names
 from gsparc.data.units import WATTS
 from gsparc.models.method import MEAN_DEVICE
 

@@ -15,7 +15,6 @@ import torch
 from gsparc.base.errors import DataError
 from gsparc.base.executor import run_each
 from gsparc.base.files import write_archive
-from gsparc.data.query_places import QueryPlaces, read_query_places
 from gsparc.data.schema import End, Site
 from gsparc.data.target import Target
 from gsparc.data.units import PowerUnit, power_in_decibels
@@ -32,6 +31,7 @@ from gsparc.prediction.placing import (
     to_world,
 )
 from gsparc.prediction.predictor import Predictor
+from gsparc.tables.query_places import QueryPlaces, read_query_places
 
 log = logging.getLogger(__name__)
 

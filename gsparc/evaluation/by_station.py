@@ -9,12 +9,12 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
-from gsparc.data.links.strongest import strongest_lists
 from gsparc.data.schema import Measurements, show_names
 from gsparc.evaluation.metric_formats import BEST_SERVER, number_format
 from gsparc.evaluation.scores import FEW, Scores
 from gsparc.evaluation.table import Column, Table
 from gsparc.models.powers.groups import number_squares
+from gsparc.tables.links.strongest import strongest_lists
 
 WORST = 3  # stations shown; the file has all
 OFFSET = 0.5  # of the squared errors of a station, that one offset explains

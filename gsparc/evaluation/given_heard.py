@@ -6,10 +6,10 @@ import numpy as np
 import pandas as pd
 from scipy.spatial import cKDTree
 
-from gsparc.data.links.strongest import StrongestLists, levels_db
 from gsparc.data.schema import Measurements
 from gsparc.models.method import Method
 from gsparc.prediction.hearing import Hearing, levels_near
+from gsparc.tables.links.strongest import StrongestLists, levels_db
 
 
 def names_every_station(data: Measurements, rows: np.ndarray) -> bool:

@@ -15,11 +15,8 @@ from gsparc.base.errors import DataError
 from gsparc.data.datamodule import DataModule
 from gsparc.data.inner_folds import cut_folds
 from gsparc.data.load import answerable, datamodule, split_for
-from gsparc.data.own import interpret_and_log
-from gsparc.data.raw import read_raw
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split, hash_indices
-from gsparc.data.tables import is_table
 from gsparc.evaluation.align_site import align_to_site
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.folds import effort_settings
@@ -39,6 +36,9 @@ from gsparc.prediction.confidence import (
 from gsparc.prediction.left_out import Evidence, gather_evidence
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
+from gsparc.tables import is_table
+from gsparc.tables.own import interpret_and_log
+from gsparc.tables.raw import read_raw
 from gsparc.training.context import FitContext
 
 log = logging.getLogger(__name__)
@@ -170,7 +170,7 @@ def read_like_stored(stored: checkpoint.StoredModel, path: str | Path) -> tuple[
             # A diagonal, so that no two are one.
             raw.arrays[place] = np.linspace(low, high, count)
         return align_to_site(interpret_and_log(raw, path), site), placed
-    from gsparc.data.tables.places import place_by_row  # here, as pandas takes half a second
+    from gsparc.tables.places import place_by_row  # here, as pandas takes half a second
 
     before = stored.configuration.get("dataset") or {}
     row_columns = place_by_row(path, before.get("columns") or {}, site.moving_end)

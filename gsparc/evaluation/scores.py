@@ -11,7 +11,6 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from gsparc.data.links.strongest import strongest_lists
 from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Fold, Split
 from gsparc.data.units import power_in_decibels
@@ -26,6 +25,7 @@ from gsparc.evaluation.metrics import power_errors
 from gsparc.models.method import Method, predict_in_batches
 from gsparc.physics.decibels import from_decibels
 from gsparc.prediction.hearing import Hearing
+from gsparc.tables.links.strongest import strongest_lists
 
 SUBSETS = ("train", "val", "test")
 # 64 spectra of 90 x 360 pixels take 8 MB in float32, and their targets as much.

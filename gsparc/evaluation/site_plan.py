@@ -13,11 +13,7 @@ import pandas as pd
 from matplotlib.patches import Polygon, Rectangle
 from scipy.spatial import cKDTree
 
-from gsparc.data.checks.describe import distinct_places, held_out_block_rows, propose_side, spacing_words
-from gsparc.data.checks.level_steps import LevelStep
-from gsparc.data.checks.link_levels import LinkLevels
-from gsparc.data.checks.outliers import find_outliers, too_far
-from gsparc.data.checks.plausibility import find_outlier_rows
+from gsparc.data.outliers import find_outliers, too_far
 from gsparc.data.schema import ENDS, Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
@@ -32,6 +28,10 @@ from gsparc.evaluation.from_above import (
     set_bounds,
 )
 from gsparc.physics.decibels import to_decibels
+from gsparc.tables.checks.describe import distinct_places, held_out_block_rows, propose_side, spacing_words
+from gsparc.tables.checks.level_steps import LevelStep
+from gsparc.tables.checks.link_levels import LinkLevels
+from gsparc.tables.checks.plausibility import find_outlier_rows
 
 NAMED = 15  # stations; of more only their number is said
 MOST_JUMPS = 4  # stations in the second column: those that change most

@@ -19,10 +19,10 @@ from torch import Tensor
 from gsparc.base.errors import DataError
 from gsparc.base.files import list_causes, load_yaml, whole_file
 from gsparc.base.locks import hold_file
-from gsparc.data.raw import verified_archive
 from gsparc.data.schema import Site, Stations
 from gsparc.models.method import Method, import_path
 from gsparc.ops import SphereGrid
+from gsparc.tables.raw import verified_archive
 
 VERSION = 2  # of what a checkpoint holds
 FORMAT = "gsparc-checkpoint"
@@ -304,7 +304,7 @@ def _site_from(facts: Mapping[str, Any]) -> Site:
         stations = values["stations"]
         values["stations"] = Stations(**{**stations, "name": tuple(stations["name"])})
     if values.get("georeference") is not None:
-        from gsparc.data.links.georeference import Georeference
+        from gsparc.data.georeference import Georeference
 
         values["georeference"] = Georeference(**values["georeference"])
     return Site(**values)

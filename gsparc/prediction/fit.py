@@ -12,10 +12,7 @@ import numpy as np
 
 from gsparc.base.errors import Caution, DataError
 from gsparc.base.instantiate import accepted_arguments, suggest_or_list
-from gsparc.data.checks.coherence import set_unknown_factor
 from gsparc.data.datasets.campaign import find_implausible
-from gsparc.data.own import interpret
-from gsparc.data.raw import Raw
 from gsparc.data.row_order import order_rows
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
@@ -25,6 +22,9 @@ from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.hearing import Hearing
 from gsparc.prediction.predictor import Predictor
+from gsparc.tables.checks.coherence import set_unknown_factor
+from gsparc.tables.own import interpret
+from gsparc.tables.raw import Raw
 from gsparc.training.context import FitContext
 from gsparc.training.effort import refuse_seconds
 

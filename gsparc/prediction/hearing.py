@@ -11,7 +11,6 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
-from gsparc.data.links.strongest import StrongestLists, levels_db, strongest_lists
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.units import power_in_decibels
@@ -19,6 +18,7 @@ from gsparc.models.method import MEAN_DEVICE, Method
 from gsparc.models.per_station import UNHEARD, PerStation
 from gsparc.processes.censored import truncated_moments
 from gsparc.processes.stored import Stored, from_plain, to_plain
+from gsparc.tables.links.strongest import StrongestLists, levels_db, strongest_lists
 
 KEY = "hearing"  # of a checkpoint's `extra`
 NEAREST = 30  # silent rows of a station

@@ -11,16 +11,16 @@ import torch
 
 from gsparc.base.errors import DataError, name_row_ranges
 from gsparc.data.assemble import content_hash
-from gsparc.data.checks.outliers import are_kilometres, far_from_box
-from gsparc.data.links.strongest import strongest_lists
-from gsparc.data.own_checks import Checker
-from gsparc.data.raw import Raw, numbered_rows
+from gsparc.data.outliers import are_kilometres, far_from_box
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.units import PowerUnit
 from gsparc.models.device_offsets import without_devices
 from gsparc.ops.transforms import to_numpy
 from gsparc.physics.decibels import to_decibels
 from gsparc.processes.powers import PowerRows
+from gsparc.tables.links.strongest import strongest_lists
+from gsparc.tables.own_checks import Checker
+from gsparc.tables.raw import Raw, numbered_rows
 
 ABOVE_DB = 120.0  # over the mean power of a site: more than receivers' levels span
 

@@ -9,10 +9,10 @@ import numpy as np
 from gsparc.base.errors import DataError
 from gsparc.base.instantiate import suggest_or_list
 from gsparc.data.assemble import FARTHEST
-from gsparc.data.links.stations import all_names, find_station
-from gsparc.data.query_places import QueryPlaces
 from gsparc.data.schema import ENDS, End, Site
+from gsparc.data.station_names import all_names, find_station
 from gsparc.prediction.query import usual_heights
+from gsparc.tables.query_places import QueryPlaces
 
 MARGIN = 0.1  # of the largest side of the box of training places: what lies farther out is far outside
 SPECK = 1e-3  # of that side: in degrees a site is 1e-5 as wide as in metres, in kilometres 1e-3

@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.links.stations import find_station
 from gsparc.data.query import Query
 from gsparc.data.schema import Site
+from gsparc.data.station_names import find_station
 from gsparc.data.target import Kind
 from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models.abilities import AddsCarriers, HasGaussians

@@ -19,7 +19,7 @@ from gsparc.ops import Pose
 from gsparc.ops.transforms import to_numpy
 
 if TYPE_CHECKING:
-    from gsparc.data.links.georeference import Georeference
+    from gsparc.data.georeference import Georeference
 
 COARSE_M = 0.01  # steps of float32 from 131 km from the world's origin on, as in UTM: phases are lost
 

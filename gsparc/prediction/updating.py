@@ -14,10 +14,9 @@ import torch
 from gsparc.base.errors import DataError
 from gsparc.base.limits import POSITIVE, check_arguments, switch, whole
 from gsparc.base.limits import number as limit_number
-from gsparc.data.links.stations import find_station
-from gsparc.data.own_checks import MOST_DB
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
+from gsparc.data.station_names import find_station
 from gsparc.data.units import PowerUnit
 from gsparc.models.method import Method, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
@@ -38,6 +37,7 @@ from gsparc.prediction.later_rows import LevelRows, check_updatable, read_level_
 from gsparc.prediction.query import Queries
 from gsparc.processes.changes import Belief, LaterRows, learn, refit_scale
 from gsparc.processes.stored import Stored, from_plain, to_plain
+from gsparc.tables.own_checks import MOST_DB
 
 WINDOW = 1_000  # later rows of a station that are kept
 FADE_DB = 1.0  # deviation that a hundred later rows of a station add to one of it that came before

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from gsparc.data.blocks import allocate, row_blocks
-from gsparc.data.own import write_own
 from gsparc.data.schema import Measurements
 from gsparc.physics.decibels import from_decibels
 from gsparc.simulate.auto import Choice
@@ -19,6 +18,7 @@ from gsparc.simulate.settings import CampaignSettings
 from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.spectrum import render_spectra
 from gsparc.simulate.survey import Survey, TracingEngine
+from gsparc.tables.own import write_own
 
 STORED = ("offsets", "direction", "gain", "delay", "order", "mechanisms")  # arrays of paths in the file
 WEAKEST = 1e-6  # of the power of a receiver's strongest path: weaker ones are not listed in the file

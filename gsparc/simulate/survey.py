@@ -8,7 +8,7 @@ from typing import Any, Protocol, Self
 
 import numpy as np
 
-from gsparc.data.links.georeference import Georeference
+from gsparc.data.georeference import Georeference
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import TracedPaths, join_receivers
 from gsparc.simulate.scenes.receivers import farthest_points

@@ -7,7 +7,7 @@ from rich.console import Console
 
 from gsparc.commands.check import check, main, read_settings
 from gsparc.data.load import load
-from gsparc.data.own import write_own
+from gsparc.tables.own import write_own
 
 
 @pytest.fixture

@@ -11,14 +11,15 @@ import pytest
 from opened import say
 from releases import write_release
 
-from gsparc.data import blocks, raw
+from gsparc.data import blocks
 from gsparc.data.assemble import content_hash
-from gsparc.data.checks.constant import leave_out_unmeasured, mark_constants
 from gsparc.data.datasets.own import read_any
 from gsparc.data.datasets.rfid import load_rfid
-from gsparc.data.own import load_own, write_own
 from gsparc.data.schema import Measurements, Site
 from gsparc.models.target_rows import training_targets
+from gsparc.tables import raw
+from gsparc.tables.checks.constant import leave_out_unmeasured, mark_constants
+from gsparc.tables.own import load_own, write_own
 
 
 def arrays(rows: int = 40) -> dict[str, np.ndarray]:

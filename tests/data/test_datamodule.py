@@ -9,8 +9,8 @@ from campaigns import compose
 import gsparc.conf
 from gsparc.data.datamodule import DataModule, Loaded, StepLoader, rows_of_step, steps_per_epoch
 from gsparc.data.load import datamodule
-from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
+from gsparc.tables.own import from_arrays
 
 
 @pytest.fixture

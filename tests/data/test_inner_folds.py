@@ -6,9 +6,9 @@ from scipy.spatial import cKDTree
 
 from gsparc.base.errors import DataError
 from gsparc.data.inner_folds import NOT_TESTED, cut_folds, inner_folds
-from gsparc.data.own import from_arrays
 from gsparc.data.splits import FileSettings, Fold, SplitSettings, make_split
 from gsparc.models.per_station import UNHEARD, station_site
+from gsparc.tables.own import from_arrays
 
 KINDS = ("random", "grouped", "corner", "blocks", "sparse")
 SIDE = 0.2

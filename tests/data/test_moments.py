@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsparc.data.moments import Snapshots
-from gsparc.data.own import from_arrays
+from gsparc.tables.own import from_arrays
 
 
 def test_what_was_not_measured_counts_nowhere(csi_arrays):

@@ -7,15 +7,15 @@ import pytest
 from layouts import KINDS, POSTS, rows_of
 
 import gsparc
-from gsparc.data.checks.describe import describe
-from gsparc.data.own import from_arrays, interpret
-from gsparc.data.raw import Raw
 from gsparc.data.row_order import find_copies, order_rows
 from gsparc.data.splits import Fold
-from gsparc.data.tables.heads import KINDS as TABLE_KINDS
-from gsparc.data.tables.read import parse_table
 from gsparc.models import device_offsets
 from gsparc.models.channels.columns import group_channels
+from gsparc.tables.checks.describe import describe
+from gsparc.tables.heads import KINDS as TABLE_KINDS
+from gsparc.tables.own import from_arrays, interpret
+from gsparc.tables.raw import Raw
+from gsparc.tables.read import parse_table
 
 NONE = np.zeros(0, np.int64)
 

@@ -7,10 +7,10 @@ from measured import ble_arrays, techtile_arrays
 from releases import release
 
 from gsparc.data import selection
-from gsparc.data.own import Reading, interpret
-from gsparc.data.raw import Raw, read_raw
 from gsparc.data.schema import Measurements
 from gsparc.data.selection import Selection
+from gsparc.tables.own import Reading, interpret
+from gsparc.tables.raw import Raw, read_raw
 
 
 def part(raw: Raw, **settings) -> Reading:

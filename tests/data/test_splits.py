@@ -10,12 +10,12 @@ from gsparc.base.errors import DataError
 from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.inner_folds import inner_folds
 from gsparc.data.load import load, split_for
-from gsparc.data.own import from_arrays
 from gsparc.data.spacing import group_visits, path_order
 from gsparc.data.split_files import read_split, write_split
 from gsparc.data.splits import SplitSettings, hash_indices, make_split
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 

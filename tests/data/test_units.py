@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from gsparc.base.errors import DataError
-from gsparc.data.own import from_arrays
 from gsparc.data.units import LINEAR, PowerUnit
+from gsparc.tables.own import from_arrays
 
 # Of a stored power of 2 that times 3 has a level in the unit of levels: its value in another unit.
 DB = 10 * np.log10(6)

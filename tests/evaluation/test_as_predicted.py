@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 
 from gsparc.data.datasets.own import read_any
-from gsparc.data.own import from_arrays, write_own
 from gsparc.data.schema import LIGHT
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.align_site import align_to_site
@@ -18,6 +17,7 @@ from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.hearing import Hearing, read_hearing
 from gsparc.prediction.operating_point import load
+from gsparc.tables.own import from_arrays, write_own
 from gsparc.training.context import FitContext
 
 PLACES, STATIONS, FLOOR_DB = 60, 4, -72.0

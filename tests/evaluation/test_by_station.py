@@ -7,7 +7,6 @@ import pandas as pd
 import pytest
 import torch
 
-from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.align_site import align_to_site
 from gsparc.evaluation.baselines import fit_baseline
@@ -26,6 +25,7 @@ from gsparc.evaluation.scores import Scores, score_methods
 from gsparc.evaluation.summary import remarks, results_table
 from gsparc.models.method import Method, Prediction
 from gsparc.prediction.timing import ClockSettings
+from gsparc.tables.own import from_arrays
 
 PLACES, NAMES = 60, ["north", "south", "roof"]
 

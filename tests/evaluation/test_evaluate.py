@@ -7,7 +7,6 @@ import pytest
 import torch
 from refusals import refused
 
-from gsparc.data.own import from_arrays
 from gsparc.evaluation.baselines import baselines_for, fit_baseline
 from gsparc.evaluation.evaluate import evaluate
 from gsparc.evaluation.scores import score_methods
@@ -15,6 +14,7 @@ from gsparc.evaluation.summary import decided_by_a_row, results_table, write_sam
 from gsparc.models.baselines.idw import InverseDistance
 from gsparc.models.baselines.mean import Mean
 from gsparc.prediction.timing import ClockSettings
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 QUICK = ClockSettings(rounds=3, least=2, warmup=1)

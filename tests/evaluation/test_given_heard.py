@@ -7,7 +7,6 @@ import pytest
 import torch
 from networks import network
 
-from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.evaluate import evaluate
 from gsparc.evaluation.summary import remarks
@@ -16,6 +15,7 @@ from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.per_station import wrap_per_station
 from gsparc.prediction.hearing import Hearing
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 NONE = np.zeros(0, np.int64)

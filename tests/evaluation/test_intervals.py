@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gsparc.data.own import from_arrays
 from gsparc.evaluation.intervals import power_intervals, reduced_chi_squared, rmse_with_silent
 from gsparc.evaluation.scores import Scores, errors_with_silent
 from gsparc.models.baselines.kriging import Kriging
 from gsparc.prediction.hearing import Hearing
+from gsparc.tables.own import from_arrays
 
 COUNT, LEVEL = 4000, -80.0
 

@@ -10,9 +10,7 @@ from refusals import refused
 import gsparc
 from gsparc.base.errors import DataError
 from gsparc.data.load import answerable
-from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, Split, SplitSettings, make_split
-from gsparc.data.tables.read import parse_table
 from gsparc.evaluation import open_runs
 from gsparc.evaluation.align_site import align_to_site
 from gsparc.evaluation.baselines import fit_baseline
@@ -20,6 +18,8 @@ from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.scores import score_methods
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
+from gsparc.tables.own import from_arrays
+from gsparc.tables.read import parse_table
 from gsparc.training.context import FitContext
 
 RNG = np.random.default_rng(0)

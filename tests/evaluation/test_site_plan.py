@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from gsparc.data.checks.level_steps import LevelStep
-from gsparc.data.checks.link_levels import link_levels
-from gsparc.data.checks.plausibility import find_level_steps
-from gsparc.data.own import from_arrays
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.evaluation import site_plan
 from gsparc.evaluation.site_plan import draw_found, draw_site, find_spots
+from gsparc.tables.checks.level_steps import LevelStep
+from gsparc.tables.checks.link_levels import link_levels
+from gsparc.tables.checks.plausibility import find_level_steps
+from gsparc.tables.own import from_arrays
 
 
 def scattered(count=80):

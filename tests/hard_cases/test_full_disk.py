@@ -1,7 +1,7 @@
 """Full disk: a checkpoint or a dataset that no longer fits.
 
 Remedy: written beside and renamed, so that the good one survives; the error is one line that says which
-file (gsparc/models/checkpoint.py, gsparc/data/raw.py). Shown with a limit on the size of files, which
+file (gsparc/models/checkpoint.py, gsparc/tables/raw.py). Shown with a limit on the size of files, which
 fails like a full disk does: in the middle of writing.
 """
 

@@ -1,7 +1,7 @@
 """Three hundred ways to damage each kind of file: refused in one line, or read exactly as before.
 
 Remedy: checksums of archives (gsparc/models/checkpoint.py), of arrays and of everything together
-(gsparc/data/raw.py). Tolerance: none. Naive: HDF5 checks no scalar and no attribute, so a changed carrier is
+(gsparc/tables/raw.py). Tolerance: none. Naive: HDF5 checks no scalar and no attribute, so a changed carrier is
 read like a sound one.
 """
 
@@ -15,10 +15,10 @@ import torch
 from campaigns import channels, spectra
 from contexts import loaded
 
-from gsparc.data.own import load_own, write_own
-from gsparc.data.raw import read_raw
 from gsparc.models import checkpoint, loading
 from gsparc.models.registry import build
+from gsparc.tables.own import load_own, write_own
+from gsparc.tables.raw import read_raw
 from gsparc.training.context import FitContext
 
 TIMES, TOGETHER = 300, 50

@@ -3,11 +3,11 @@
 import numpy as np
 from shoeboxes import scatter
 
-from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.shoebox import Room, ShoeboxEngine
 from gsparc.simulate.spectrum import SpectrumSettings, render_spectra
+from gsparc.tables.own import from_arrays
 
 ROOM = Room(np.zeros(3), np.array([6.0, 5.0, 3.0]), np.full(6, -0.5))
 TRANSMITTER = np.array([1.0, 1.5, 2.6])

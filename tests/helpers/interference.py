@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from gsparc.data.own import from_arrays
 from gsparc.data.schema import LIGHT, Measurements
+from gsparc.tables.own import from_arrays
 
 WAVELENGTH = 0.3
 

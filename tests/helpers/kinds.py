@@ -12,10 +12,10 @@ from known_arrays import array_site, measure, room_vectors, walk
 
 from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.load import load
-from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import bartlett_spectrum, steering_matrix
+from gsparc.tables.own import from_arrays
 
 CARRIERS, PLACES, WALL, CEILING = 5, 30, 4.0, 3.0
 HERTZ = np.array([1.0, 2.0, 5.0, 20.0, 60.0]) * 1e9

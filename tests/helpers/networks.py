@@ -5,8 +5,8 @@ from functools import cache
 
 import numpy as np
 
-from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
+from gsparc.tables.own import from_arrays
 
 SITES, SECTORS, SIDE_M, STEP_M, BLOCK_M = 10, 3, 2500.0, 18.0, 125.0
 COMMON_DB, OWN_DB, NOISE_DB, LENGTH_M = 5.0, 3.5, 1.5, 70.0  # shadowing of a site, of a cell; noise

@@ -3,10 +3,10 @@
 import numpy as np
 from releases import release
 
-from gsparc.data.own import interpret
-from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.tables.own import interpret
+from gsparc.tables.raw import Raw
 
 RUNS = 5
 

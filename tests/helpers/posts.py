@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
+from gsparc.tables.own import from_arrays
 
 POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5], [20, 20, 5]])
 

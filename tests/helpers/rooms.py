@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 from shoeboxes import as_arrays, scatter
 
-from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.simulate.shoebox import Room, Trace, trace_room
+from gsparc.tables.own import from_arrays
 
 WAVELENGTH = 299_792_458.0 / 2.4e9
 PILLAR = np.array([[[1.6, 1.2, 0.0], [2.0, 1.6, 2.5]]])

@@ -8,12 +8,12 @@ from campaigns import spectra
 from shoeboxes import as_arrays, scatter
 
 from gsparc.data.load import split_for
-from gsparc.data.own import from_arrays, load_own
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.ops import SphereGrid
 from gsparc.simulate.shoebox import Room, trace_room
+from gsparc.tables.own import from_arrays, load_own
 
 
 def fold_of(data: Measurements, **split: Any) -> Fold:

@@ -12,7 +12,7 @@ from scipy.spatial.distance import cdist
 
 import gsparc
 from gsparc.commands.train import train
-from gsparc.data.links.georeference import Georeference
+from gsparc.data.georeference import Georeference
 from gsparc.prediction.predictor import Predictor
 
 MASTS = np.array([[10.0, 20, 8], [70, 45, 8]])

@@ -7,13 +7,13 @@ import pytest
 import torch
 from scipy.spatial.distance import cdist
 
-from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.powers.settings import process_and_notes
 from gsparc.models.registry import build
 from gsparc.models.target_rows import heard_rows
 from gsparc.processes.powers import PowerRows
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 STATION = np.array([500.0, 500.0, 20.0])

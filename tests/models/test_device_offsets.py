@@ -8,12 +8,12 @@ import pytest
 import torch
 
 import gsparc
-from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.evaluation.answers import predict_file
 from gsparc.evaluation.baselines import fit_baseline
 from gsparc.models.device_offsets import take_off_devices, without_devices
 from gsparc.models.method import Prediction
+from gsparc.tables.own import from_arrays
 
 RNG = np.random.default_rng(5)
 PLACES = np.c_[RNG.uniform(0, 300, (240, 2)), np.full(240, 1.5)]

@@ -12,7 +12,6 @@ from scenes import fold_of
 
 import gsparc
 from gsparc.data.load import split_for
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.baselines import baselines_for
@@ -24,6 +23,7 @@ from gsparc.models.fitting import fit_or_resume
 from gsparc.models.per_station import PerStation, station_site, stations_of_fold, wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.timing import ClockSettings
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 

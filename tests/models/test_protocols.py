@@ -24,7 +24,6 @@ from scenes import fold_of, lobes, room
 from worlds import World, arrays
 
 from gsparc.data.load import load
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -40,6 +39,7 @@ from gsparc.models.splat.array import ArrayField
 from gsparc.models.uplink.search import SearchSettings as UplinkSearch
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 NAMED = ("array_process", "image_process", "image_sources", "channels", "powers", "bearings")

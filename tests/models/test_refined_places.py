@@ -9,13 +9,13 @@ import torch
 from kinds import KINDS
 from scenes import fold_of
 
-from gsparc.data.own import from_arrays
 from gsparc.data.schema import LIGHT
 from gsparc.data.splits import Fold
 from gsparc.models import fitting
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.refined_places import Linearised, estimate_place_errors, move_rows
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 BRIEF = FitContext(effort=0.1)

@@ -10,7 +10,6 @@ from closed import fitted_to
 from scenes import fold_of
 
 from gsparc.base.errors import Severe
-from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint, fitting, loading, sanity
@@ -22,6 +21,7 @@ from gsparc.models.per_station import PerStation
 from gsparc.models.powers.together import learning
 from gsparc.prediction.left_out import predict_rows
 from gsparc.processes.kernel import Kernel
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 

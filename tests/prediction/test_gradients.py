@@ -19,7 +19,6 @@ from rooms import directed, shoebox
 from torch.autograd import forward_ad
 
 from gsparc.data.load import load
-from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines import gp
@@ -37,6 +36,7 @@ from gsparc.models.registry import build, method_class
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
 from gsparc.processes import powers
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext, FitReport
 
 WORLD = np.array([430.0, -510.0, 12.0])  # float32 moves in steps of 30 micrometres there

@@ -11,7 +11,6 @@ from refusals import refused
 from towns import town_file
 
 import gsparc
-from gsparc.data.own import from_arrays, load_own
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import GaussianProcess
@@ -19,6 +18,7 @@ from gsparc.models.baselines.mean import Mean
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.predictor import Predictor
+from gsparc.tables.own import from_arrays, load_own
 from gsparc.training.context import FitContext
 
 

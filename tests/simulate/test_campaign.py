@@ -19,7 +19,6 @@ from gsparc.commands.check import main as check
 from gsparc.data import blocks
 from gsparc.data.datasets.sionna import _in_decibels
 from gsparc.data.load import load
-from gsparc.data.own import load_own
 from gsparc.data.schema import LIGHT
 from gsparc.evaluation.simulated import draw_floor_plan
 from gsparc.simulate import assembly, deciding
@@ -34,6 +33,7 @@ from gsparc.simulate.scenes.settings import SceneSettings
 from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.shoebox import Room, ShoeboxEngine, trace_room
 from gsparc.simulate.spectrum import ArraySettings
+from gsparc.tables.own import load_own
 
 BOX = small_campaign(60)
 SCENE, MIRROR, SMALL = BOX.scene, BOX.effects, BOX.spectrum

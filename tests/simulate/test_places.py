@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from refusals import refused
 
-from gsparc.data.links.georeference import Georeference
+from gsparc.data.georeference import Georeference
 from gsparc.data.walls import polygon_area, read_walls
 from gsparc.simulate.raytracer import RayTracer
 from gsparc.simulate.scenes.receivers import (

@@ -14,7 +14,7 @@ from gsparc.base.errors import DataError
 from gsparc.base.limits import POSITIVE, check_arguments, finite_array, number, or_null
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.blocks import machine_memory
-from gsparc.data.links.georeference import Georeference
+from gsparc.data.georeference import Georeference
 from gsparc.data.schema import Site
 from gsparc.prediction.query import usual_heights
 

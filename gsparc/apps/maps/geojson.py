@@ -16,7 +16,7 @@ from pyproj import Transformer
 from gsparc.base.errors import DataError, explain_error
 from gsparc.base.files import write_whole
 from gsparc.data.assemble import FARTHEST
-from gsparc.data.links.georeference import Georeference, find_invalid_coordinate
+from gsparc.data.georeference import Georeference, find_invalid_coordinate
 
 if TYPE_CHECKING:
     from shapely import LineString

@@ -22,9 +22,9 @@ from gsparc.base.errors import DataError
 from gsparc.base.executor import run_each
 from gsparc.base.instantiate import suggest_or_list
 from gsparc.base.limits import finite_array
-from gsparc.data.links.stations import all_names, find_station
 from gsparc.data.schema import Site
 from gsparc.data.spacing import neighbour_distance
+from gsparc.data.station_names import all_names, find_station
 from gsparc.data.units import PowerUnit
 from gsparc.models.powers.together.network import number_sites
 from gsparc.prediction.levels import MAPPED, joint_levels, predicted_levels

@@ -28,7 +28,6 @@ from gsparc.base.limits import (
     setting,
     whole,
 )
-from gsparc.data.query_places import read_query_places
 from gsparc.data.schema import Site, Stations
 from gsparc.data.splits import Fold
 from gsparc.models.powers.together.network import ONE_BAND, number_sites
@@ -38,6 +37,7 @@ from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
 from gsparc.processes.few_rows import evenly_spaced
 from gsparc.processes.uncertainty import central_interval
+from gsparc.tables.query_places import read_query_places
 
 LEAST_STATIONS = 3  # for leaving one out
 NO_PATTERN = -1.0  # in place of an azimuth

@@ -11,7 +11,6 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.shared.settings import RunSettings, to_dict
-from gsparc.data.checks.describe import summarise
 from gsparc.data.datamodule import DataModule
 from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Measurements
@@ -21,6 +20,7 @@ from gsparc.evaluation.align_site import align_to_site
 from gsparc.models import checkpoint
 from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, fill_defaults
+from gsparc.tables.checks.describe import summarise
 from gsparc.training import tracking
 from gsparc.training.effort import Effort
 

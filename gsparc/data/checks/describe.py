@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from gsparc.base.errors import list_first
-from gsparc.data.checks.coherence import estimate_coherence
 from gsparc.data.load import split_for
 from gsparc.data.schema import ENDS, LIGHT, Measurements, Site
 from gsparc.data.spacing import neighbour_distance
 from gsparc.data.splits import Split
 from gsparc.ops import SphereGrid
+from gsparc.tables.checks.coherence import estimate_coherence
 
 
 def describe(data: Measurements) -> list[tuple[str, str]]:

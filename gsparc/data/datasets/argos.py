@@ -18,10 +18,10 @@ from gsparc.base.files import read_yaml
 from gsparc.base.limits import choice, finite_array, or_word, whole
 from gsparc.data.assemble import centre_positions, rounded_rms
 from gsparc.data.datasets.campaign import Release, StandIn, load_stand_in, read_split
-from gsparc.data.own_checks import Checker
 from gsparc.data.position_encoder import encode_positions
-from gsparc.data.raw import Raw
 from gsparc.data.schema import Measurements, Site, TrainTest
+from gsparc.tables.own_checks import Checker
+from gsparc.tables.raw import Raw
 
 UPLINK = 26  # tones
 CARRIER_HZ = 2.4e9

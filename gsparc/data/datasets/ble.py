@@ -18,7 +18,7 @@ from gsparc.base.errors import DataError, Problems
 from gsparc.base.files import read_text
 from gsparc.base.limits import parse_numbers
 from gsparc.data.datasets.campaign import Campaign, read_converted
-from gsparc.data.raw import Raw
+from gsparc.tables.raw import Raw
 
 CARRIER_HZ = 2.44e9  # the middle of the three frequencies that beacons use in turns
 

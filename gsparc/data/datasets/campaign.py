@@ -15,21 +15,21 @@ from gsparc.base.errors import Caution, DataError, Problems, Severe
 from gsparc.base.files import read_shipped_table, read_text
 from gsparc.base.limits import SettingError
 from gsparc.data.assemble import check_positions
-from gsparc.data.checks.coherence import place_warnings
-from gsparc.data.checks.column_effects import run_warnings
-from gsparc.data.checks.conventions import convention_warnings
-from gsparc.data.checks.gone import gone_warnings
-from gsparc.data.checks.level_steps import LevelStep
-from gsparc.data.checks.link_levels import LinkLevels, link_levels
-from gsparc.data.checks.plausibility import find_level_steps, sanity_warnings
-from gsparc.data.checks.unit_warnings import unit_warnings
 from gsparc.data.datamodule import DataModule
-from gsparc.data.own import interpret
-from gsparc.data.own_checks import Checker
 from gsparc.data.public.fetch import fetched_path, fetched_path_or_none
-from gsparc.data.raw import Raw, numbered_rows, read_raw, rename_arrays
 from gsparc.data.schema import Field, Measurements, TrainTest
 from gsparc.data.selection import Selection, take_selection
+from gsparc.tables.checks.coherence import place_warnings
+from gsparc.tables.checks.column_effects import run_warnings
+from gsparc.tables.checks.conventions import convention_warnings
+from gsparc.tables.checks.gone import gone_warnings
+from gsparc.tables.checks.level_steps import LevelStep
+from gsparc.tables.checks.link_levels import LinkLevels, link_levels
+from gsparc.tables.checks.plausibility import find_level_steps, sanity_warnings
+from gsparc.tables.checks.unit_warnings import unit_warnings
+from gsparc.tables.own import interpret
+from gsparc.tables.own_checks import Checker
+from gsparc.tables.raw import Raw, numbered_rows, read_raw, rename_arrays
 
 log = logging.getLogger(__name__)
 

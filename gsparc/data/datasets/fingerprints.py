@@ -16,9 +16,9 @@ import numpy as np
 from gsparc.base.errors import DataError, list_first, readable
 from gsparc.base.limits import choice
 from gsparc.data.datasets.campaign import check_layout
-from gsparc.data.raw import Raw, read_raw
 from gsparc.data.splits import SplitSettings, make_split
-from gsparc.data.tables import is_table
+from gsparc.tables import is_table
+from gsparc.tables.raw import Raw, read_raw
 
 How = Literal["released", "random", "places", "blocks", "walks", "later"]
 SILENT = 100.0  # of a table: not heard

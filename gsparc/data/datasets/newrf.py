@@ -17,7 +17,7 @@ import numpy as np
 from gsparc.base.errors import DataError, readable
 from gsparc.base.pickles import read_pickled_frame
 from gsparc.data.datasets.campaign import Campaign
-from gsparc.data.raw import Raw, read_raw, rename_arrays
+from gsparc.tables.raw import Raw, read_raw, rename_arrays
 
 NAMES = {"tx_pos": "tx_position", "rx_pos": "rx_position"}
 COLUMNS = ("TxPos", "RxPos", "CSI", "Frequency", "LastXPts", "RxChanPerRay", "LineOfSight")

@@ -11,7 +11,6 @@ from typing import Any
 from gsparc.base.errors import DataError
 from gsparc.base.instantiate import from_settings
 from gsparc.base.limits import finite_array, or_null, switch
-from gsparc.data.conventions import CONVENTIONS
 from gsparc.data.datasets.ble import BLE
 from gsparc.data.datasets.campaign import Campaign
 from gsparc.data.datasets.newrf import NeWRF
@@ -21,10 +20,11 @@ from gsparc.data.datasets.techtile import Techtile
 from gsparc.data.datasets.techtile_power import TechtilePower
 from gsparc.data.datasets.wifi_csi import WifiCsi
 from gsparc.data.datasets.wsr import WSR
-from gsparc.data.own import Reading, interpret
-from gsparc.data.raw import Raw, read_raw
 from gsparc.data.selection import Selection, take_selection
-from gsparc.data.tables import is_table
+from gsparc.tables import is_table
+from gsparc.tables.conventions import CONVENTIONS
+from gsparc.tables.own import Reading, interpret
+from gsparc.tables.raw import Raw, read_raw
 
 
 def read_own(
@@ -166,6 +166,6 @@ def read_file_or_table(
         for name in [name for name, entry in (("columns", named), ("stations_file", stations_file)) if entry]:
             raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
         return read_raw(path)
-    from gsparc.data.tables.read import parse_table  # here, as pandas takes half a second to import
+    from gsparc.tables.read import parse_table  # here, as pandas takes half a second to import
 
     return parse_table(path, columns or {}, stations_file)

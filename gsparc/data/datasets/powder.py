@@ -22,8 +22,8 @@ from gsparc.base.errors import DataError, Problems, shorten
 from gsparc.base.files import read_text
 from gsparc.base.limits import choice, finite_array, number
 from gsparc.data.datasets.campaign import Campaign, read_converted
-from gsparc.data.links.georeference import find_invalid_coordinate
-from gsparc.data.raw import Raw
+from gsparc.data.georeference import find_invalid_coordinate
+from gsparc.tables.raw import Raw
 
 CARRIER_HZ = 462.7e6
 NO_VALUE_DB = -101.0
@@ -85,9 +85,9 @@ def _of_npz(path: Path) -> Raw:
 
 
 def _of_csv(path: Path, table: Path) -> Raw:
-    from gsparc.data.tables.columns import Column  # here, as pandas takes half a second to import
-    from gsparc.data.tables.opening import read_sheet
-    from gsparc.data.tables.places import read_places
+    from gsparc.tables.columns import Column  # here, as pandas takes half a second to import
+    from gsparc.tables.opening import read_sheet
+    from gsparc.tables.places import read_places
 
     sheet, stations = read_sheet(path), read_station_places(table)
     missing = [head for head in PLACE.values() if head not in sheet.heads]

@@ -32,15 +32,15 @@ from gsparc.base.files import read_text, read_yaml
 from gsparc.base.limits import finite_array, parse_numbers
 from gsparc.data.assemble import centre_positions, check_positions
 from gsparc.data.blocks import allocate
-from gsparc.data.conventions import convert_conventions
 from gsparc.data.datasets.campaign import Release, read_split
-from gsparc.data.links.stations import number_places
-from gsparc.data.own_checks import HIGHEST_HZ, LOWEST_HZ, is_unit, quaternion_to_matrix
 from gsparc.data.schema import LIGHT, End, Measurements, Site, Stations, TrainTest
+from gsparc.data.spacing import number_places
 from gsparc.ops import SphereGrid
+from gsparc.tables.conventions import convert_conventions
+from gsparc.tables.own_checks import HIGHEST_HZ, LOWEST_HZ, is_unit, quaternion_to_matrix
 
 if TYPE_CHECKING:
-    from gsparc.data.tables.sheet import Sheet
+    from gsparc.tables.sheet import Sheet
 
 HEIGHT, WIDTH = 90, 360
 WAVELENGTH = 0.3259  # [m], 920 MHz; fitted to the release's spectra: 0.3258 to 0.3260
@@ -155,7 +155,7 @@ def _read_list(path: Path, count: int, problems: Problems) -> tuple[np.ndarray, 
 
 def _sheet(path: Path, heads: list[str], problems: Problems) -> Sheet:
     """A table of these columns; `DataError` where it is none, or has others."""
-    from gsparc.data.tables.opening import read_sheet  # here, as pandas takes half a second to import
+    from gsparc.tables.opening import read_sheet  # here, as pandas takes half a second to import
 
     sheet = read_sheet(path, problems)
     sheet = replace(sheet, frame=sheet.frame.rename(columns=str.lower))

@@ -11,10 +11,10 @@ import numpy as np
 
 from gsparc.base.errors import DataError
 from gsparc.data.datamodule import DataModule
-from gsparc.data.own import interpret_and_log
-from gsparc.data.raw import Raw, read_raw, rename_arrays
 from gsparc.data.schema import Measurements
 from gsparc.physics.decibels import to_decibels
+from gsparc.tables.own import interpret_and_log
+from gsparc.tables.raw import Raw, read_raw, rename_arrays
 
 TARGETS = ("spectrum", "csi", "rssi")
 STORED = {"spectrum": "spectrum", "csi": "csi", "rssi": "received_power"}  # array that a target is read from

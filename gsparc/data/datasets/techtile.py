@@ -21,7 +21,7 @@ from gsparc.base.errors import DataError
 from gsparc.base.files import read_yaml
 from gsparc.base.limits import finite_array
 from gsparc.data.datasets.campaign import Campaign, check_layout, read_converted, read_layout
-from gsparc.data.raw import NETCDF_SUFFIXES, Raw, read_raw
+from gsparc.tables.raw import NETCDF_SUFFIXES, Raw, read_raw
 
 CARRIER_HZ = 920e6  # the tone; files of the release do not name it
 CHANNEL = 1  # of the two antennas of a tile, the one that received

@@ -17,8 +17,8 @@ import numpy as np
 from gsparc.base.errors import DataError, readable
 from gsparc.base.pickles import read_pickle
 from gsparc.data.datasets.campaign import Campaign
-from gsparc.data.raw import Raw, read_raw
 from gsparc.physics.decibels import to_decibels
+from gsparc.tables.raw import Raw, read_raw
 
 CARRIER_HZ = 920e6
 PICOWATT_DB = -90.0  # relative to a milliwatt

@@ -20,8 +20,8 @@ from gsparc.base.limits import choice, or_null
 from gsparc.data.datasets.campaign import Campaign
 from gsparc.data.datasets.wifi_logs import READERS, SUFFIXES, Packets, channel_hz, read_packets
 from gsparc.data.datasets.wsr import SPACING_HZ
-from gsparc.data.raw import Raw
 from gsparc.physics.decibels import to_decibels
+from gsparc.tables.raw import Raw
 
 if TYPE_CHECKING:
     import pandas as pd

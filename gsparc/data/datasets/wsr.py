@@ -21,8 +21,8 @@ import numpy as np
 from gsparc.base.errors import DataError, readable
 from gsparc.base.files import read_csv
 from gsparc.data.datasets.campaign import Campaign, read_converted
-from gsparc.data.raw import Raw
 from gsparc.physics.decibels import from_decibels
+from gsparc.tables.raw import Raw
 
 CARRIER_HZ = 5.54e9  # Wi-Fi channel 108
 TONES = np.array([*range(-28, 0, 2), -1, *range(1, 28, 2), 28])  # of 64 that an Intel 5300 reports, at 20 MHz

@@ -13,7 +13,7 @@ import numpy as np
 
 from gsparc.base.instantiate import from_settings
 from gsparc.data.ends import SAME_PLACE_M
-from gsparc.data.links.georeference import Georeference
+from gsparc.data.georeference import Georeference
 from gsparc.data.walls import SIZE, RoomSettings
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.moved import move_solids, read_moves

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.links.georeference import Georeference, find_invalid_coordinate
+from gsparc.data.georeference import Georeference, find_invalid_coordinate
 from gsparc.simulate.scenes.solid import LISTED_MATERIALS, Solid, sheet
 
 LEVEL_M = 3.0  # of a storey

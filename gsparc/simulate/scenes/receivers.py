@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.base.errors import DataError
-from gsparc.data.query_places import read_query_places, read_times
 from gsparc.simulate.scenes.settings import Layout, SceneSettings
 from gsparc.simulate.scenes.solid import Solid
+from gsparc.tables.query_places import read_query_places, read_times
 
 if TYPE_CHECKING:
     from gsparc.simulate.scenes.osm import Town

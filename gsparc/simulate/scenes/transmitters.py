@@ -10,7 +10,7 @@ import numpy as np
 
 from gsparc.base.instantiate import from_settings
 from gsparc.base.limits import Checked, Limit, choice, finite_array, or_null, setting, whole
-from gsparc.data.links.georeference import Georeference
+from gsparc.data.georeference import Georeference
 
 NUMBERS = Limit("a list of two or three finite numbers", lambda v: finite_array(v).shape in ((2,), (3,)))
 PATTERNS = ("iso", "dipole", "hw_dipole", "tr38901")  # Sionna's; the last is 3GPP TR 38.901, table 7.3-1

@@ -16,9 +16,9 @@ from gsparc.apps.locate import locate
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import group_snapshots
-from gsparc.data.own import from_arrays
 from gsparc.models import checkpoint
 from gsparc.prediction.predictor import Predictor
+from gsparc.tables.own import from_arrays
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from gsparc.apps.maps import predict_map
 from gsparc.apps.maps.area import lay_grid
 from gsparc.apps.maps.floor_plan import read_floor_plan
 from gsparc.apps.maps.geojson import read_shapes
-from gsparc.data.links.georeference import Georeference
+from gsparc.data.georeference import Georeference
 
 SQUARE = [[[0, 0], [10, 0], [10, 10], [0, 10], [0, 0]], [[4, 4], [6, 4], [6, 6], [4, 6], [4, 4]]]
 

@@ -27,12 +27,12 @@ from gsparc.apps.maps.pictures import Layer, Legend, assign_colours, label_place
 from gsparc.apps.maps.promise import Promise, map_notes
 from gsparc.apps.maps.refining import sample_adaptively
 from gsparc.base.errors import DataError
-from gsparc.data.links.georeference import Georeference
-from gsparc.data.own import load_own
+from gsparc.data.georeference import Georeference
 from gsparc.data.splits import Fold
 from gsparc.models.registry import method_class
 from gsparc.prediction.left_out import HeldOutLevels
 from gsparc.prediction.predictor import Predictor
+from gsparc.tables.own import load_own
 from gsparc.training.context import FitContext
 
 

@@ -23,7 +23,6 @@ from gsparc.apps.maps.placing import (
 )
 from gsparc.apps.maps.promise import Promise
 from gsparc.base.errors import DataError
-from gsparc.data.own import load_own
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.per_station import wrap_per_station
@@ -31,6 +30,7 @@ from gsparc.models.registry import method_class
 from gsparc.prediction.left_out import HeldOutLevels, held_out_levels
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned
+from gsparc.tables.own import load_own
 from gsparc.training.context import FitContext
 
 

@@ -7,11 +7,11 @@ from scipy.spatial.distance import cdist
 
 from gsparc.apps.maps.intervals import cross_validate
 from gsparc.apps.maps.promise import PromiseSettings, gather_promise
-from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.prediction.left_out import held_out_levels
 from gsparc.prediction.refit import Learned
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 TOWNS, ROWS, SHARE = 30, 200, 0.9

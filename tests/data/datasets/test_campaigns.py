@@ -25,7 +25,7 @@ from gsparc.data.datasets.own import CAMPAIGNS, read_any
 from gsparc.data.datasets.powder import read_powder
 from gsparc.data.datasets.techtile import read_techtile
 from gsparc.data.load import load
-from gsparc.data.raw import Raw, read_raw, write_raw
+from gsparc.tables.raw import Raw, read_raw, write_raw
 
 LOADERS = {kind.choice: kind.reader for kind in CAMPAIGNS}
 EVERY_KIND = pytest.mark.parametrize("kind", KINDS)

@@ -13,7 +13,7 @@ import pytest
 
 from gsparc.base import hdf5_text
 from gsparc.base.errors import DataError
-from gsparc.data.own import load_own
+from gsparc.tables.own import load_own
 
 
 def users_file(path: Path) -> Path:

@@ -1,6 +1,6 @@
 """Files of one's own, npz and HDF5, every array spoilt in every way: `gsparc check` and `load_own`.
 
-Remedy: gsparc/data/own_checks.py; damage and Python objects: gsparc/data/raw.py.
+Remedy: gsparc/tables/own_checks.py; damage and Python objects: gsparc/tables/raw.py.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from doors import assert_found_bad, knock
 
 from gsparc.base.errors import DataError
 from gsparc.commands.check import main as check
-from gsparc.data.own import load_own
+from gsparc.tables.own import load_own
 
 Arrays = dict[str, np.ndarray]
 

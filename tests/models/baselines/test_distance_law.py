@@ -8,7 +8,6 @@ import pytest
 import torch
 from scipy.integrate import quad
 
-from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.distance_law import (
@@ -24,6 +23,7 @@ from gsparc.models.baselines.distance_law import (
     log_probability_below,
 )
 from gsparc.processes.powers import PowerRows
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 STILL = np.array([3.0, -8.0, 6.0])

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -15,6 +14,7 @@ from gsparc.models.baselines import kriging
 from gsparc.models.baselines.idw import InverseDistance
 from gsparc.models.baselines.kriging import Kriging, Variogram
 from gsparc.models.registry import method_class
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 

@@ -10,7 +10,6 @@ import torch
 from kinds import CARRIERS, CEILING, ELEMENTS, WALL
 from refusals import refused
 
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
@@ -25,6 +24,7 @@ from gsparc.models.registry import method_class
 from gsparc.ops import Pose, SphereGrid
 from gsparc.physics.lags import SpectrumLags
 from gsparc.prediction.predictor import Predictor
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 

@@ -6,7 +6,6 @@ import torch
 from rooms import nmse, shoebox
 from scenes import error
 
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models.channels import complex_gp
@@ -14,6 +13,7 @@ from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.run_factors import best_run_factors, factor_matrix
 from gsparc.physics.waves import LIGHT
 from gsparc.prediction.predictor import Predictor
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 

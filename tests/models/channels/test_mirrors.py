@@ -10,7 +10,6 @@ from closed import fitted_to
 from rooms import WAVELENGTH, nmse
 from scenes import answer_error, fold_of
 
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.models.channels.columns import group_channels
 from gsparc.models.channels.evidence import compress_groups, normalise_power
@@ -25,6 +24,7 @@ from gsparc.ops import Pose
 from gsparc.physics.mirror_planes import reflect
 from gsparc.processes.worker import Cancelled, cancel_when
 from gsparc.simulate.shoebox import Room, mirror_images
+from gsparc.tables.own import from_arrays
 
 K = 2 * np.pi / WAVELENGTH
 WALL = np.array([np.cos(0.3), np.sin(0.3), 0.0, 2.1])  # no axis of the room

@@ -8,7 +8,6 @@ import packets
 import pytest
 import torch
 
-from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.models.aligned_rows import align_phases
 from gsparc.models.channels.complex_gp import ComplexGP
@@ -17,6 +16,7 @@ from gsparc.models.closed_form import method_from_state, method_state
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import factors_to_measured
 from gsparc.physics.row_factors import align_factors
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 TONES = 5.2e9 + 312.5e3 * np.arange(16)

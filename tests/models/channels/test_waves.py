@@ -10,7 +10,6 @@ from rooms import WAVELENGTH, shoebox
 from scenes import answer_error
 
 from gsparc.data.ends import NOBODY, Ends
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.schema import Stations
 from gsparc.data.splits import Fold
@@ -30,6 +29,7 @@ from gsparc.models.channels.terms import Direct, Directions, Drift, Images, Isot
 from gsparc.models.channels.terms.term import ChannelTerm, Frame
 from gsparc.ops import Pose
 from gsparc.processes.left_out import rows_of_groups
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 PLAIN = ChannelSettings(constant=False, direct=False, directions=False, correlated=False)

@@ -8,7 +8,6 @@ from releases import real
 from rooms import WAVELENGTH, nmse
 from scenes import answer_error, fold_of
 
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models.channels.columns import Slot, SlotPlaces
@@ -24,6 +23,7 @@ from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.terms import EffectSettings
 from gsparc.prediction.predictor import Predictor
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 K = 2 * np.pi / WAVELENGTH

@@ -15,7 +15,6 @@ from scenes import error
 from shoeboxes import as_arrays
 
 from gsparc import load
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
@@ -24,6 +23,7 @@ from gsparc.models.image_sources.rows import rows_of_measurements
 from gsparc.models.mixture.methods import ImageSources
 from gsparc.physics.mirror_planes import reflect
 from gsparc.prediction.predictor import Predictor
+from gsparc.tables.own import from_arrays
 from gsparc.training import race
 from gsparc.training.context import FitContext
 from gsparc.training.race import FellBehind, Race

@@ -11,7 +11,6 @@ from gains import fitted, phased
 from rooms import shoebox
 from scenes import error, fold_of
 
-from gsparc.data.own import from_arrays
 from gsparc.models.image_sources.backprojection import gains_and_amplitudes, rough_gains
 from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, _nll
 from gsparc.models.image_sources.gp_likelihood import GainPosterior
@@ -21,6 +20,7 @@ from gsparc.models.image_sources.rows import rows_of_measurements, static_array
 from gsparc.models.image_sources.scene import KernelVisibility, SourceScene, spherical_waves
 from gsparc.physics.mirror_planes import bisector, image_rotations, images, reflect
 from gsparc.physics.waves import LIGHT
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 CARRIER = 2.4e9

@@ -8,7 +8,6 @@ import pytest
 import torch
 from refusals import refused
 
-from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint, loading
 from gsparc.models.peers.calibrated_raytracer import CalibratedRayTracer
@@ -25,6 +24,7 @@ from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import RayTracer, Sampling
 from gsparc.simulate.scenes.build import has_known_scene, known_scene
 from gsparc.simulate.scenes.settings import SceneSettings
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 STATION = np.array([-2.5, 0.0, 3.0])

@@ -10,7 +10,6 @@ from scenes import answer_error, error, fold_of, lobes, room, shadowed, wanderin
 from scipy.special import eval_legendre
 
 from gsparc.data.datasets.rfid import planar_array
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.kriging import fit_variogram
@@ -18,6 +17,7 @@ from gsparc.models.peers.gsrf import count_terms, fourier_legendre
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose, SphereGrid
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 

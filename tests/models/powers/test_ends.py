@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint, loading
 from gsparc.models.baselines.gp import GaussianProcess
@@ -12,6 +11,7 @@ from gsparc.models.powers.settings import candidate_priors
 from gsparc.models.target_rows import power_rows
 from gsparc.processes import powers
 from gsparc.processes.kernel import EndShadowing, Kernel, Shadowing, WhiteNoise
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 KNOWN = 250

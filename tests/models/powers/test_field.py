@@ -8,11 +8,11 @@ import pytest
 import torch
 from closed import fitted_to, read_back
 
-from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.walls import read_walls
 from gsparc.models.powers.field import PowerField
 from gsparc.processes.nearest import Nearest
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 STATION = (5.0, 20.0, 3.0)

@@ -8,7 +8,6 @@ import torch
 from closed import fitted_to, read_back
 from releases import real
 
-from gsparc.data.own import from_arrays
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
@@ -19,6 +18,7 @@ from gsparc.models.target_rows import power_rows
 from gsparc.processes import powers
 from gsparc.processes.kernel import ExponentialShadowing
 from gsparc.processes.powers import condition_on_powers
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 

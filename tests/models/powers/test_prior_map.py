@@ -11,13 +11,13 @@ from rasterio.transform import from_origin
 from refusals import refused
 
 import gsparc
-from gsparc.data.own import from_arrays
 from gsparc.data.prior_levels import read_prior_levels
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.powers import prior_map
 from gsparc.models.powers.prior_map import NetworkMaps, PriorMap, describe_use
 from gsparc.models.powers.together.network import find_sectors
 from gsparc.processes.sectors import NO_AZIMUTH
+from gsparc.tables.own import from_arrays
 
 POST = [0.0, 0.0, 20.0]
 AXIS = np.arange(5.0, 700, 10)  # centres of squares

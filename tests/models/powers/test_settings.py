@@ -7,7 +7,6 @@ import pytest
 import torch
 from releases import real
 
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -20,6 +19,7 @@ from gsparc.ops import Pose
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.powers import PowerRows
 from gsparc.processes.trend import Trend
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 from tests.models.powers.test_mixture import station
 

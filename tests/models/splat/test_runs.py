@@ -8,12 +8,12 @@ from worlds import World, arrays
 
 from gsparc.commands.train import train
 from gsparc.data.load import split_for
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.evaluation.scores import score_methods, unseen_runs
 from gsparc.models import loading
 from gsparc.models.method import Method, Prediction
 from gsparc.models.run_factors import RunFactors
+from gsparc.tables.own import from_arrays
 
 
 @pytest.mark.slow

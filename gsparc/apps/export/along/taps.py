@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.data.raw import Raw, write_raw
 from gsparc.data.schema import LIGHT
 from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.predictor import Predictor
+from gsparc.tables.raw import Raw, write_raw
 
 PER_WAVE = 8  # instants per wavelength of the fastest motion: four times what its Doppler needs
 MOST = 50_000  # instants

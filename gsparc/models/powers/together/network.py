@@ -17,9 +17,8 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from gsparc.base.errors import Caution, list_first
-from gsparc.data.checks.plausibility import find_noise
-from gsparc.data.links.stations import site_name
 from gsparc.data.schema import Measurements, Stations
+from gsparc.data.station_names import site_name
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.together.terms import StationRows, places_and_notes, rows_of_stations
 from gsparc.processes.censored import PseudoValues
@@ -41,6 +40,7 @@ from gsparc.processes.sectors import (
     sector_of,
 )
 from gsparc.processes.trend import LEAST_SPREAD
+from gsparc.tables.checks.plausibility import find_noise
 
 SAME_SITE_M = 5.0  # stations closer than this are of one site
 SAME_NAME_M = 100.0  # the same of those whose names differ in their last part alone

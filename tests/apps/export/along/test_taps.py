@@ -8,10 +8,10 @@ from scipy.interpolate import CubicSpline
 import gsparc
 from gsparc.apps.export.along.taps import Trajectory, fit_taps
 from gsparc.commands import export
-from gsparc.data.raw import read_raw
 from gsparc.data.schema import LIGHT, Site
 from gsparc.models import checkpoint
 from gsparc.prediction.channels import Paths
+from gsparc.tables.raw import read_raw
 
 CARRIER = 3.5e9
 

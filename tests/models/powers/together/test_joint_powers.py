@@ -14,7 +14,6 @@ from releases import real
 from scenes import fold_of
 
 from gsparc.data.datasets.ble import BLE
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -33,6 +32,7 @@ from gsparc.processes.kernel import Kernel
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import left_out_processes
 from gsparc.processes.trend import Law, Trend
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 POSTS = np.array([[0.0, 0, 6], [60, 5, 6], [5, 55, 6], [50, 60, 6], [30, -5, 6], [-5, 30, 6]])

@@ -11,7 +11,6 @@ import torch
 from known_fields import known_field
 from networks import Network, draw_network, judged, network, reference
 
-from gsparc.data.own import from_arrays
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -38,6 +37,7 @@ from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import NO_AZIMUTH, Sectors, SectorShadowing
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.processes.trend import Law
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext, FitReport
 
 NONE = np.zeros(0, np.int64)

@@ -1,0 +1,445 @@
+"""Which column holds which quantity: said by `dataset.columns`, else guessed from its head."""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+import re
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from gsparc.base.errors import Caution, list_first, suggest_name
+from gsparc.data.units import SCHEMA, UNITS, Unit, list_units
+from gsparc.tables import heads
+from gsparc.tables.heads import CHANNELS, ENDS, KINDS, LISTS, POLAR, Head, unit_of, unit_suits, words_of
+from gsparc.tables.sheet import Sheet
+from gsparc.tables.times import find_times
+
+MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in heads.LEVELS), CHANNELS, POLAR)
+# Of each group one way of saying it: the measurement, and the place of each end in metres or degrees.
+ONE_OF = (MEASURED, *(((f"{end}x", f"{end}y"), (f"{end}latitude", f"{end}longitude")) for end in ENDS))
+LESS = LISTS["labels"] | LISTS["plain"]  # words that are no part of a name
+_STATIONS = "|".join(sorted(heads.STATION_WORDS))
+# A letter or a number that remains of a head names a station; a whole word says another quantity.
+STATION = re.compile(rf"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|{_STATIONS})?[\W_]*\d+)[\W_]*$")
+MOST_LOOKED_AT = 10_000  # rows, for columns that may be levels
+BY_ROW = "#"  # in place of a head: the number of the row; before heads: of what they hold together
+REPEATED = 4  # rows for each name of a column that may hold stations
+
+
+@dataclass(frozen=True)
+class Column(Head):
+    """A column, or a number that stands for one.
+
+    Attributes:
+        head: of the column; None for a number.
+        value: the number, or the first and the last of evenly spaced ones; none: the number of the row.
+        plus: columns and numbers that are added to it.
+        **rest: see `Head`; no unit is the schema's, no word a column that was said.
+    """
+
+    role: str = ""
+    head: str | None = None
+    value: tuple[float, ...] = ()
+    plus: tuple[Column, ...] = ()
+
+    @property
+    def by_row(self) -> bool:
+        """Whether it is the number of the row."""
+        return self.head is None and not self.value
+
+    @property
+    def schema_unit(self) -> str:
+        """Unit of its values once they are read."""
+        unit, raw_unit = SCHEMA.get(KINDS[self.role], "deg"), self.unit
+        if (raw_unit is None or not raw_unit.name) and "rsrp" in words_of(self.head or ""):
+            return unit  # dBm by definition (3GPP TS 36.214)
+        # Other levels of which nobody said more are in dB; calling them dBm would invent a reference.
+        relative = raw_unit is None or (raw_unit.name != "dBm" and (raw_unit.times or not raw_unit.changes))
+        return "dB" if unit == "dBm" and relative else unit
+
+    def numbers(self, sheet: Sheet) -> np.ndarray | None:
+        """Read (S,) float64 in the schema's unit, NaN: no value; None, and noted, where unusable."""
+        if self.by_row:
+            moments = sheet.joined(self.label.split(BY_ROW)) if self.label else np.array(sheet.rows)
+            return pd.factorize(moments)[0].astype(float)
+        if self.head is None:
+            return np.full(len(sheet), self.value[0])
+        if self.unit is not None and not unit_suits(self.role, self.unit):
+            wanted = f"one of {list_units(kind)}" if (kind := KINDS[self.role]) in SCHEMA else "no unit"
+            remedy = heads.PERCENT if self.unit.kind == "quality" else f"{self.role} needs {wanted}"
+            return sheet.refuse(f"is in {self.unit.name}: {remedy}", self.head)
+        marks = self.role == "rssi_db"
+        values = sheet.numbers(self.head, self.unit, lambda unit: unit_suits(self.role, unit), marks)
+        for other in self.plus:
+            more = other.numbers(sheet)
+            values = None if values is None or more is None else values + more
+        return values
+
+
+Chosen = dict[str, tuple[Column, ...]]
+
+
+def used_heads(chosen: Chosen) -> set[str | None]:
+    """Return the heads of all columns that are used."""
+    columns = [column for one in chosen.values() for column in one]
+    return {column.head for one in columns for column in (one, *one.plus)}
+
+
+def choose_columns(
+    sheet: Sheet,
+    settings: Mapping[str, object],
+    labelled: Mapping[str, str] = {},
+    only: Container[str] | None = None,
+) -> Chosen:
+    """Choose the columns of each quantity; what was guessed is noted.
+
+    Args:
+        sheet: the table.
+        settings: heads, patterns with a `*` or numbers by quantity, as in `dataset.columns`.
+        labelled: names of stations by heads of columns that are taken as their levels.
+        only: quantities that are guessed; None: all.
+    """
+    chosen: Chosen = {}
+    for key, value in settings.items():
+        columns = () if value is None else _by_setting(sheet, key, value)
+        if columns:
+            # Settings come first: what is said needs no guess, and its column is not guessed again.
+            chosen[columns[0].role] = columns
+    if sheet.problems:
+        return chosen
+    chosen_heads = used_heads(chosen)
+    guesses: dict[str, list[Column]] = {}
+    for head in sheet.heads:
+        meaning = heads.parse_head(head) if head not in chosen_heads else Head()
+        if head not in chosen_heads and head in labelled:
+            power = "rssi" if meaning.role == "rssi" else "rssi_db"
+            meaning = Head(power, labelled[head], meaning.unit, "station", meaning.strange)
+        role = meaning.role
+        areas = heads.TOGETHER[meaning.word] if meaning.word in LISTS["beside"] else set()
+        # `ci` is a cell identity only beside an area code: alone it may be a confidence interval.
+        alone = bool(areas) and not any(areas & set(words_of(other)) for other in sheet.heads)
+        # What was said of one way (metres) rules out guesses of another (degrees) for the same end.
+        if not role or alone or (only is not None and role not in only) or _settled(role, chosen):
+            continue
+        if meaning.strange:
+            expected = list_units(KINDS[role])
+            sheet.refuse(f"[{meaning.strange}] is no known unit; expected one of {expected}", head)
+        guesses.setdefault(role, []).append(Column(**vars(meaning), head=head))
+    # First of all, as a second measurement is no second candidate for the first one.
+    _one_way(sheet, guesses)
+    for role, found in guesses.items():
+        # Columns whose head says less than others of the quantity count only where there is nothing better.
+        candidates = [column for column in found if not column.less] or found
+        if role == "station":
+            candidates = _finest(sheet, _identity(sheet, candidates, always=only is not None))
+        tones = role in (*CHANNELS, *POLAR)  # of a row, or stations
+        # With a column of stations a row is of one: several columns of levels would contradict it.
+        one_each = tones or "station" not in {**chosen, **guesses}
+        several = role in heads.MANY and len(candidates) > 1 and one_each and all(c.label for c in candidates)
+        # Columns of different words (`rssi_1`, `power_2`) are no family of stations.
+        several &= len({column.word for column in candidates}) == 1
+        several |= role == "station" and candidates[0].label == JOINED
+        # A head spelt as in the schema is a statement, no guess.
+        exact = [column for column in candidates if column.head == role]
+        if len(candidates) > 1 and not several and not exact:
+            _ambiguous(sheet, role, candidates)
+            continue
+        # `rssi_delta` or `predicted_rssi` are levels by their words and not what was received.
+        if role in heads.LEVELS and len(candidates) == 1 and not _is_plain(candidates[0], labelled.values()):
+            fault = "a received level or power, or something else? if it is one, say "
+            sheet.refuse(fault + _choice(candidates[0]), candidates[0].head)
+            continue
+        chosen[role] = tuple(candidates) if several else tuple((exact or candidates)[:1])
+        if not exact or several:
+            sheet.notes.append(_note(chosen[role]))
+    for column in (columns[0] for columns in chosen.values()):
+        if not column.word and column.unit is not None and column.unit.changes:
+            sheet.notes.append(_turned(column, column.unit))
+    _one_unit(sheet, chosen)
+    # Only where nothing was found by its head: columns called like stations may be their levels.
+    if only is None and not any(roles[0] in chosen for roles in MEASURED):
+        _wide_survey(sheet, chosen)
+    if only is None and "time_s" not in chosen and any(role in chosen for role in heads.MANY):
+        timed = tuple(Column("time_s", head=head) for head in find_times(sheet, used_heads(chosen)))
+        chosen |= {"time_s": timed} if timed else {}
+    used = used_heads(chosen)
+    unused = [repr(head) for head in sheet.heads if head not in used]
+    if unused:
+        timed = heads.SHEET["times"] * any(LISTS["time"] & set(words_of(head)) for head in unused)
+        sheet.notes.append(f"not used: column{'s' * (len(unused) > 1)} {list_first(unused, 8)}{timed}")
+    if only is None:
+        _warn_of_levels(sheet, chosen.get("rssi_db", ()), used)
+    return chosen
+
+
+def _finest(sheet: Sheet, columns: list[Column]) -> list[Column]:
+    """The first column that tells all stations apart that several do; all where none does."""
+    every = len(set(sheet.joined(column.head for column in columns).tolist()))
+    fine = [c for c in columns if len(set(sheet.joined([c.head]).tolist())) == every]
+    return columns if columns[0].label == JOINED or len(columns) < 2 else fine[:1] or columns
+
+
+JOINT = ("station", "device")
+JOINED = "joined"  # label of columns whose values together name a station
+
+
+def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Column]:
+    """A station's column and those that tell it from others of its name, `always` or where some do."""
+    for first in candidates:
+        parts = heads.TOGETHER.get(first.word, set())
+        bare = {head: set(words_of(head)) - LESS for head in sheet.heads if head != first.head}
+        more = [head for head, words in bare.items() if words and words <= parts]
+        if not parts or not all(column is first or column.head in more for column in candidates):
+            continue
+        columns = [first]
+        for head in more:
+            longer = [*columns, replace(first, head=head)]
+            fewer, many = (len(set(sheet.joined(c.head for c in one).tolist())) for one in (columns, longer))
+            # A column that tells rows rather than stations apart has nearly as many values as there are rows.
+            if always or fewer < many <= len(sheet) // REPEATED:
+                columns = longer
+        return columns if len(columns) == 1 else [replace(column, label=JOINED) for column in columns]
+    return candidates
+
+
+MAC = re.compile(r"(?i)(?<![0-9a-f])(?:[0-9a-f]{2}[:-]){5}[0-9a-f]{2}(?![0-9a-f])")
+# With a number behind the word: `AP1` is a station's levels, `ap` a column of their names.
+NAMED = re.compile(rf"(?i)^[\W_]*({_STATIONS}|beam|ssb)[\W_]*[a-z]?\d+[\W_]*$")
+
+
+def _wide_survey(sheet: Sheet, chosen: Chosen) -> None:
+    """Take columns called like stations (`AP1`, `WAP001`, a MAC address) as their levels."""
+    used = used_heads(chosen)
+    rest = [head for head in sheet.heads if head not in used]
+    named = [head for head in rest if MAC.search(head) or NAMED.match(head)]
+    alike = named or [head for head in rest if _may_be_levels(sheet, head)]
+    if alike and "station" not in chosen:
+        chosen["rssi_db"] = tuple(Column("rssi_db", head, head=head, word="station") for head in alike)
+        note = _note(chosen["rssi_db"])
+        sheet.notes.append(note if named else Caution(f"{note}, by their values: no head says so"))
+
+
+def _may_be_levels(sheet: Sheet, head: str) -> bool:
+    """Whether a column holds numbers of `BY_VALUE` alone, but for one mark that repeats."""
+    if LISTS["no_level"] & set(words_of(head)):
+        return False
+    values = pd.to_numeric(sheet.frame[head].iloc[:MOST_LOOKED_AT], errors="coerce").dropna()
+    inside = values.between(*BY_VALUE)
+    return 2 * int(inside.sum()) > len(values) > 0 and values[~inside].nunique() < 2
+
+
+BY_VALUE = (-140.0, -20.0)  # dBm, of columns that no head says to be levels
+
+
+def _warn_of_levels(sheet: Sheet, columns: tuple[Column, ...], used: Container[str | None]) -> None:
+    """Warn of columns that are not used, with values like those of several `columns` of levels."""
+    if len(columns) < 2:
+        return
+    rest = [h for h in sheet.heads if h not in used and not LISTS["no_level"] & set(words_of(h))]
+    numbers = sheet.frame.iloc[:MOST_LOOKED_AT].apply(pd.to_numeric, errors="coerce")
+    levels = numbers[[column.head for column in columns]].stack()
+    low, high = levels.min(), min(levels.max(), 0)
+    alike = [Column(head=h) for h in rest if (numbers[h].between(low, high) & (numbers[h] < 0)).mean() > 0.5]
+    if alike:
+        finding = f"{_names(alike)} hold{'s' * (len(alike) == 1)} values like these levels and are not used: "
+        sheet.notes.append(Caution(f"{finding}of stations, too? call them as {columns[0].head!r} is called"))
+
+
+def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
+    role, where = heads.OTHER_NAMES.get(key, key), f"dataset.columns.{key}={value}"
+    if role not in KINDS:
+        hint = suggest_name(key, [*KINDS, *heads.OTHER_NAMES], 0.4) or f"; known are {', '.join(KINDS)}"
+        return sheet.problems.add(where, f"no such quantity{hint}") or ()
+    text = str(value).strip()
+    if text.startswith(BY_ROW):  # before heads, whose words alone are compared
+        return (Column(role, text.removeprefix(BY_ROW)),)
+    head = _head(sheet, text)
+    if head is not None:
+        return (Column(role, unit=_unit(head, role), head=head),)
+    # After the head as it is: heads may hold a `*`, a `+` or a `-`.
+    if KINDS[role] != "text" and (column := _sum_of_columns(sheet, role, text)) is not None:
+        return (column,)
+    joined = [_head(sheet, part.strip()) for part in text.split("+")] if role in JOINT else []
+    if len(joined) > 1 and all(joined):
+        return tuple(Column(role, JOINED, head=part) for part in joined)
+    if "*" in text and role in heads.MANY:
+        named = [h for h in sheet.heads if fnmatch.fnmatchcase(h, text)]
+        # A pattern has one star: what it stands for in a head is the name of the station or tone.
+        before, _, after = text.partition("*")
+        labels = {h: unit_of(h[len(before) : len(h) - len(after)])[0].strip() for h in named}
+        if named and "*" not in after:
+            return tuple(Column(role, label, _unit(h, role), head=h) for h, label in labels.items())
+        fault = "expected one * only" if "*" in after else "no column is called so"
+        return sheet.problems.add(where, fault) or ()
+    # `FIRST:LAST` of frequencies, or one number for all rows; other text becomes NaN and no constant.
+    numbers = tuple(pd.to_numeric(np.array(text.split(":"), object), errors="coerce").tolist())
+    constant = all(map(math.isfinite, numbers)) and KINDS[role] != "text" and role not in heads.MANY
+    if constant and len(numbers) <= (2 if role == "frequency_hz" else 1):
+        return (Column(role, value=numbers),)
+    hint = suggest_name(text, sheet.heads, 0.4) or f"; there are {sheet.first_heads()}"
+    hint += f"; or say dataset.columns.{key}=null"
+    return sheet.problems.add(where, f"{sheet.source} has no such column{hint}") or ()
+
+
+def _sum_of_columns(sheet: Sheet, role: str, text: str) -> Column | None:
+    """A column times a factor, as in `pathloss*-1`, with others and numbers: `asu*2-113`, `rssi-tx_power`."""
+    for cut in [len(text), *(found.start() for found in re.finditer(r"[-+]", text))]:
+        times = re.fullmatch(r"(.+)\*([-+]?\d*\.?\d+)", text[:cut].strip())
+        head = _head(sheet, times[1].strip() if times else text[:cut].strip()) if cut else None
+        if head is None:
+            continue
+        column, rest = Column(role, unit=_unit(head, role), head=head), text[cut + 1 :].strip()
+        column = _times(column, times[2]) if times else column
+        if cut == len(text):
+            return column
+        if re.fullmatch(r"\d*\.?\d+", rest):
+            return replace(column, plus=(Column(role, value=(float(text[cut] + rest),)),))
+        more = _sum_of_columns(sheet, role, rest)
+        if more is not None:
+            first = replace(more, plus=())
+            first = _times(first, "-1") if text[cut] == "-" else first
+            return replace(column, plus=(first, *more.plus))
+    return None
+
+
+def _times(column: Column, factor: str) -> Column:
+    """The same times a number, or, where it already is, times -1."""
+    unit = column.unit or Unit("", KINDS[column.role])
+    multiplier = f"-{unit.times}" if unit.times else factor
+    return replace(column, unit=replace(unit, times=multiplier, factor=unit.factor * float(factor)))
+
+
+def _head(sheet: Sheet, text: str) -> str | None:
+    """The column called `text`, else the only one called so but for case, spaces and unit."""
+    if text in sheet.heads:
+        return text
+    words = words_of(text)
+    # Case, spaces and a unit in brackets are layout; where two heads differ in them alone, none is meant.
+    alike = [h for h in sheet.heads if words and words in (words_of(h), words_of(unit_of(h)[0]))]
+    return alike[0] if len(alike) == 1 else None
+
+
+def _unit(head: str, role: str) -> Unit | None:
+    unit, words = unit_of(head)[1], words_of(head)
+    if unit is None and len(words) > 1 and words[-1] in UNITS and unit_suits(role, UNITS[words[-1]]):
+        return UNITS[words[-1]]
+    return unit
+
+
+def _settled(role: str, chosen: Chosen) -> bool:
+    """Whether what was said leaves no room for a guess of `role`."""
+    other = [way for ways in ONE_OF if role in sum(ways, ()) for way in ways if role not in way]
+    return role in chosen or any(name in chosen for way in other for name in way)
+
+
+def _one_way(sheet: Sheet, guesses: dict[str, list[Column]]) -> None:
+    """Refuse several measurements (levels, powers, channels), and an end that has both metres and degrees."""
+    for ways in ONE_OF:
+        by_way = [[column for role in way for column in guesses.get(role, ())] for way in ways]
+        by_way = [columns for columns in by_way if columns]
+        if len(by_way) < 2:
+            continue
+        first = [replace(cols[0], head=_pattern(cols)) if ways is MEASURED else cols[0] for cols in by_way]
+        fault = f"{' and '.join(map(_names, by_way))} both say where"
+        if ways is MEASURED:
+            fault = f"{_names(first)} are different measurements"
+        sheet.refuse(f"{fault}; say {' or '.join(map(_choice, first))}")
+        for role in sum(ways, ()):
+            guesses.pop(role, None)
+
+
+def _pattern(columns: list[Column]) -> str | None:
+    """A column's head, or what those of one quantity begin with, and a star."""
+    names = [column.head or "" for column in columns if column.role == columns[0].role]
+    return names[0] if len(names) == 1 else re.sub(r"\d+(?=\D*$)", "*", names[0])
+
+
+def _is_plain(column: Column, stations: Iterable[str]) -> bool:
+    """Whether the head of a guessed column says a level and nothing beyond that it may be of a station."""
+    absolute = column.unit is not None and column.unit.name != "dB"
+    named = column.label in stations or re.fullmatch(r"\W*", column.label)
+    plain = set(words_of(column.label)) <= LISTS["plain"] | {column.word}
+    return bool(absolute or named or plain or STATION.search(column.label))
+
+
+def _one_unit(sheet: Sheet, chosen: Chosen) -> None:
+    """Refuse a column in another unit than the schema's beside one of its kind that says none."""
+    for kind in SCHEMA:
+        # Kinds rather than quantities: a position in mm beside another axis without a unit mixes both.
+        columns = [c for one in chosen.values() for c in one if c.head and KINDS[c.role] == kind]
+        turned = [c for c in columns if c.unit is not None and c.unit.changes and not c.unit.times]
+        silent = [c for c in columns if c.unit is None or c.unit.name == "dB"]  # to watts or milliwatts?
+        if turned and silent and turned[0].unit is not None:
+            other = silent[0].unit
+            fault = f"{turned[0].head!r} is in {turned[0].unit.name}, {silent[0].head!r} "
+            fault += "says no unit" if other is None else f"in {other.name} of nothing"
+            plain = unit_of(silent[0].head or "")[0]
+            sheet.refuse(f"{fault}; rename one, e.g. to '{plain} [{SCHEMA[kind]}]'")
+
+
+def say_column(role: str, text: str) -> str:
+    """Return the setting that says what a column is, as a shell takes it.
+
+    >>> print(say_column("rssi_db", "RSRP*-1"), say_column("station", "Cell id"))
+    dataset.columns.rssi_db=RSRP*-1 'dataset.columns.station="Cell id"'
+    """
+    name = role.replace("latitude", "lat").replace("longitude", "lon")
+    plain = re.fullmatch(r"[\w.*+-]+", text)
+    return f"dataset.columns.{name}={text}" if plain else f"'dataset.columns.{name}=\"{text}\"'"
+
+
+def _choice(column: Column) -> str:
+    return say_column(column.role, column.head or "")
+
+
+def _ambiguous(sheet: Sheet, role: str, columns: list[Column]) -> None:
+    stations = role in heads.LEVELS and all(c.label for c in columns)
+    more = f", or dataset.columns.{role}='NAME_*' where they are stations" if stations else ""
+    sheet.refuse(f"{_names(columns)} could each be {role}; say which: {_choice(columns[0])}{more}")
+
+
+def _names(columns: Iterable[Column]) -> str:
+    quoted = [repr(column.head) for column in columns]
+    if len(quoted) > 4:
+        quoted = [*quoted[:3], f"{len(quoted) - 3} more"]
+    plural = f"columns {', '.join(quoted[:-1])} and {quoted[-1]}"
+    return plural if len(quoted) > 1 else f"column {quoted[0]}"
+
+
+def _note(columns: tuple[Column, ...]) -> str:
+    first = columns[0]
+    kind = KINDS[first.role]
+    unit = f" [{first.schema_unit}]" if kind in SCHEMA else ""
+    what = f"{_names(columns)} taken as {first.role}{unit}"
+    if first.label == JOINED:
+        return f"{what}: their values together name one"
+    if len(columns) > 1:
+        labels = [column.label for column in columns]
+        of = "frequencies" if first.role in (*CHANNELS, *POLAR) else "stations"
+        what += f" of the {of} {', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''}"
+        what += " (dBm? set unit=dBm)" if unit == " [dB]" else ""
+    turned = first.unit is not None and first.unit.changes
+    return what + (f", {first.unit.name} turned into {first.schema_unit}" if turned and first.unit else "")
+
+
+def _turned(column: Column, unit: Unit) -> str:
+    """What becomes of a column that a setting chose; with a caution where its unit is counted twice."""
+    factor, bare, wanted = unit.times, unit.name, column.schema_unit
+    if not factor:
+        return f"column {column.head!r}: {bare} turned into {wanted}"
+    then = f", then {bare} (by its head) into {wanted}" if bare not in ("", wanted) else ""
+    value = float(unit.convert(np.array(100.0)))
+    note = f"column {column.head!r} times {factor}{then}: 100 in the file is {value:g} {wanted}"
+    if then and math.isclose(abs(float(factor)), UNITS[bare.lower()].factor):
+        return Caution(f"{note}; twice? {_choice(column)} turns {bare} alone")
+    return note
+
+
+def rename_for_stations(column: Column) -> Column:
+    """Return the same column of a list of stations, where ends need not be named."""
+    axis = next((a for a in heads.AXES for end in ENDS if column.role == f"{end}{a}"), None)
+    return column if axis is None else replace(column, role=f"station_{axis}")

@@ -1,0 +1,349 @@
+"""Coordinates out of a table, and the one place of each station."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from gsparc.base.errors import Caution, DataError, list_first, name_row_ranges
+from gsparc.data.georeference import find_invalid_coordinate
+from gsparc.tables.columns import BY_ROW, Chosen, choose_columns, rename_for_stations, say_column
+from gsparc.tables.heads import AXES, ENDS, LISTS, OTHER_NAMES, TOGETHER, parse_head, words_of
+from gsparc.tables.links.stations import PER_STATION, SECTOR
+from gsparc.tables.opening import read_sheet
+from gsparc.tables.sectors import TILTS, number_sites, read_sectors, sector_quantity
+from gsparc.tables.sheet import Sheet
+
+UNKNOWN_HEIGHT = 0.0
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where something was.
+
+    Attributes:
+        across: (n, 2) float64, x and y [m], or latitude and longitude [deg].
+        height: (n,) [m]; None where the table has none.
+        degrees: which of the two `across` is.
+    """
+
+    across: np.ndarray
+    height: np.ndarray | None
+    degrees: bool
+
+    @staticmethod
+    def unknown(count: int, degrees: bool = False) -> Places:
+        """Return so many that nobody knows."""
+        return Places(np.full((count, 2), np.nan), np.full(count, np.nan), degrees)
+
+    def all(self) -> np.ndarray:
+        """Return (n, 2) or (n, 3)."""
+        return self.across if self.height is None else np.column_stack([self.across, self.height])
+
+    def take(self, rows: np.ndarray) -> Places:
+        """Return those of some rows."""
+        return Places(self.across[rows], None if self.height is None else self.height[rows], self.degrees)
+
+
+def read_places(
+    sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False, strict: bool = True
+) -> Places | None:
+    """Read coordinates of an end (`rx_`, `tx_`, `station_`, or empty); None where the table has none.
+
+    Where places may be `unknown`, rows without any coordinate are NaN; what is not on Earth is refused where
+    it is `strict`, else left to `gsparc.tables.links.positions`.
+    """
+    for degrees, axes in ((False, ("x", "y")), (True, ("latitude", "longitude"))):
+        roles = [f"{end}{axis}" for axis in axes]
+        present = [role for role in roles if role in chosen]
+        if not present:
+            continue
+        if len(present) == 1:
+            missing = next(role for role in roles if role not in chosen)
+            found = f"column {chosen[present[0]][0].head!r} is {present[0]}, and none is {missing}"
+            return sheet.refuse(f"{found}; say {say_column(missing, 'COLUMN')}")
+        absent = np.zeros(len(sheet), bool)
+        if unknown:
+            present = [role for role in (*roles, f"{end}z") if role in chosen and chosen[role][0].head]
+            absent = np.all([sheet.words(chosen[role][0].head or "") == "" for role in present], axis=0)
+        columns = [_complete(sheet, chosen, role, absent) for role in roles]
+        height = _complete(sheet, chosen, f"{end}z", absent) if f"{end}z" in chosen else None
+        if columns[0] is None or columns[1] is None:
+            return None
+        across = np.stack([columns[0], columns[1]], axis=1)
+        if degrees:
+            _on_earth(sheet, chosen, roles, across, strict)
+        return Places(across, height, degrees)
+    return None
+
+
+def read_ends(sheet: Sheet, chosen: Chosen, strict: bool = True) -> dict[str, Places]:
+    """Read the coordinates that a table has of rows, `rx_` and `tx_`; see `read_places`."""
+    read = {end: read_places(sheet, chosen, end, strict=strict) for end in ENDS[:-1]}
+    return {end: where for end, where in read.items() if where is not None}
+
+
+def drop_rows_without_place(sheet: Sheet, chosen: Chosen) -> Sheet:
+    """Leave out rows in which a coordinate of an end is empty, as loggers write them between fixes."""
+    lost = np.zeros(len(sheet), bool)
+    for end in ENDS[:-1]:
+        for pair in (("x", "y"), ("latitude", "longitude")):
+            heads = [chosen[f"{end}{axis}"][0].head for axis in pair if f"{end}{axis}" in chosen]
+            if len(heads) == 2 and None not in heads:
+                lost |= np.any([sheet.words(head or "") == "" for head in heads], axis=0)
+    if not lost.any() or lost.all():
+        return sheet
+    named = np.array(sheet.rows)
+    remark = f"{name_row_ranges(named[lost].tolist())}: no place; these {lost.sum()} of {len(sheet)} rows are"
+    sheet.notes.append(Caution(f"{remark} left out"))
+    frame = sheet.frame[~lost].reset_index(drop=True)
+    return replace(sheet, frame=frame, rows=tuple(named[~lost].tolist()))
+
+
+def place_by_row(path: str | Path, columns: Mapping[str, object], end: str) -> dict[str, object]:
+    """Return `dataset.columns` that put rows of a table without places apart; empty: it has places.
+
+    Args:
+        path: of the table.
+        columns: settings of the training.
+        end: that moved, `tx` or `rx`.
+
+    Raises:
+        DataError: rows are of one station each, and no column of times says which are of one moment.
+    """
+    sheet = read_sheet(path)
+    roles = [f"{before}{axis}" for before in ENDS[:-1] for axis in AXES]
+    settings = {key: value for key, value in columns.items() if OTHER_NAMES.get(key, key) in roles}
+    here = {key: head for key, head in settings.items() if head in sheet.heads}
+    chosen = choose_columns(sheet, here, {}, [*roles, "station"])
+    if any(role in chosen for role in roles):
+        return {}
+    row_key = BY_ROW
+    if "station" in chosen:
+        row_key += BY_ROW.join(_times(sheet, sheet.joined(column.head for column in chosen["station"])))
+    return {**dict.fromkeys(settings), f"{end}_x": row_key, f"{end}_y": row_key, f"{end}_z": 0}
+
+
+def _times(sheet: Sheet, station: np.ndarray) -> list[str]:
+    """Heads of the columns that tell which rows, of a station (S,) each, are of one moment, or DataError."""
+    heads = [head for head in sheet.heads if LISTS["time"] & set(words_of(head))]
+    fault = f"{sheet.source}: no coordinates, and rows of one station each: which are of one moment?"
+    wanted = "expected a column of times, or one row a moment with a column of levels per station"
+    if not heads:
+        raise DataError(f"{fault} {wanted}")
+    moment, named = sheet.joined(heads), list_first([*map(repr, heads)])
+    links, moments = len({*zip(moment.tolist(), station.tolist(), strict=True)}), len(set(moment))
+    alone, empty = moments == len(moment) and len(set(station)) > 1, int((moment == "").sum())
+    # Clocks of whole seconds repeat now and then; those of days, or of each row, tell nothing.
+    if empty or alone or 2 * links < len(moment):
+        found = f"{named} has {moments} values in {len(moment)} rows, {empty} empty"
+        raise DataError(f"{fault} {found}; {wanted}")
+    return heads
+
+
+def _complete(sheet: Sheet, chosen: Chosen, role: str, absent: np.ndarray) -> np.ndarray | None:
+    column = chosen[role][0]
+    values = column.numbers(sheet)
+    if values is not None and (np.isnan(values) & ~absent).any():
+        rows = np.flatnonzero(np.isnan(values) & ~absent)
+        return sheet.refuse_rows(column.head, rows, f"no value; {role} is needed, or take the row out")
+    return values
+
+
+def _notation(lat: np.ndarray, lon: np.ndarray) -> str | None:
+    """What numbers (n,) that are no decimal degrees are instead; None: metres, it seems."""
+    # ddmm.mmmm is about a hundred times the degrees; minutes, its last two whole digits, are below 60.
+    if max(np.abs(lat).max() / 90, np.abs(lon).max() / 180) <= 100 and (np.abs([lat, lon]) % 100 < 60).all():
+        return "degrees and minutes as NMEA writes them (ddmm.mmmm): 4811.98 is 48 + 11.98 / 60; convert them"
+    # Receivers store degrees as integers in units of 1e-7: 1e7 is one degree, 9e8 the pole.
+    whole = np.abs(lat).min() >= 1e7 and np.abs(lat).max() <= 9e8 and np.abs(lon).max() <= 1.8e9
+    return "degrees times ten million; divide them" if whole else None
+
+
+def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray, strict: bool) -> None:
+    outside = np.flatnonzero(np.abs(across[:, 0]) > 90)
+    swapped = (np.abs(across[:, 1]) <= 90).all()
+    heads = [chosen[role][0].head or "" for role in roles]
+    # Where most rows are outside, the columns are no degrees; else these rows are faulty.
+    if 2 * len(outside) > len(across) and not swapped:
+        end = roles[0].removesuffix("latitude")
+        metres = f"metres? say {say_column(f'{end}x', heads[1])} {say_column(f'{end}y', heads[0])}"
+        fault = _notation(*across[np.isfinite(across).all(axis=1)].T) or metres
+        example = f"{across[outside[0], 0]:.10g} in {sheet.rows[outside[0]]}"
+        return sheet.refuse(f"columns {heads[0]!r} and {heads[1]!r} are no degrees ({example}): {fault}")
+    if strict and (wrong := find_invalid_coordinate(*np.nan_to_num(across).T)):
+        sheet.refuse(f"{sheet.rows[wrong[0]]}: {wrong[1]}")
+    return None
+
+
+def place_per_station(
+    sheet: Sheet, row_places: Places, station: np.ndarray, names: Sequence[str], ask: bool = False
+) -> Places | None:
+    """Return the place of each station, the same in all its rows; None, and noted, when it is not.
+
+    Args:
+        sheet: for the names of rows.
+        row_places: (S,) places, one for each row.
+        station: (S,) which station each row is of.
+        names: of the stations.
+        ask: say whether it is so, and note nothing.
+    """
+    values = row_places.all()
+    fixed = (values[:, :2] != 0).any(axis=1)  # 0, 0 in some of a station's rows: no fix there
+    # The station's first row with a fix, or its first row where none has one.
+    first = np.array([int(np.argmax((station == t) * (1 + fixed))) for t in range(len(names))])
+    moved = np.flatnonzero((values != values[first[station]]).any(axis=1) & fixed)
+    if len(moved) == 0:
+        return row_places.take(first)
+    if not ask:
+        row = moved[0]
+        both = (first[station[row]], row)
+        at = [f"at ({', '.join(f'{v:.10g}' for v in values[i])}) in {sheet.rows[i]}" for i in both]
+        sheet.refuse(f"station {names[station[row]]!r} is {' and '.join(at)}; expected one place for each")
+    return None
+
+
+LEAST_LISTED = 10  # stations of a drive: of fewer, one that the list lacks is a mistake
+
+
+@dataclass(frozen=True)
+class StationList:
+    """Stations in the order of their file.
+
+    Attributes:
+        names: (T,).
+        places: (T,).
+        extra: (T,) arrays by name: `PER_STATION`.
+        index: (S,) which station each row of another table is of; None where each has a column there.
+        aliases: other names of all of them.
+        repeated: names that several of them share, by the head of their column.
+        label: (T,) its own names, where `names` are others.
+    """
+
+    names: tuple[str, ...]
+    places: Places
+    extra: dict[str, np.ndarray] = field(default_factory=dict)
+    index: np.ndarray | None = None
+    aliases: tuple[tuple[str, ...], ...] = ()
+    repeated: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    label: tuple[str, ...] | None = None
+
+    def shared_name_problem(self, words: np.ndarray) -> str | None:
+        """Return what is wrong where words (S,) are of a column whose names several stations share."""
+        column = set(words.tolist())
+        for head, names in self.repeated.items():
+            twice = [name for name in dict.fromkeys(names) if names.count(name) > 1 and name in column]
+            if twice and len(column & set(names)) > len(column & set(self.names)):
+                which = [station for station, name in zip(self.names, names, strict=True) if name == twice[0]]
+                advice = "leave only those of the area in the list, or say dataset.columns.station=HEAD+HEAD"
+                return f"{head} {twice[0]} names {list_first(which)} of the list of stations; {advice}"
+        return None
+
+    def use_names_of(self, words: np.ndarray) -> StationList:
+        """Return the same under the names that most of words (S,) are of, its own first."""
+        column = set(words.tolist())
+        # Of names that fit alike the list's own are taken, as `max` keeps the first.
+        names = max((self.names, *self.aliases), key=lambda names: len(column & set(names)))
+        return replace(self, names=names, label=None if names == self.names else self.names)
+
+    def part_by(self, words: np.ndarray, longer: np.ndarray) -> StationList:
+        """Return a station for each of `longer` names (S,), where that of words (S,) is listed."""
+        names, first = np.unique(longer, return_index=True)
+        which = pd.Index(self.names).get_indexer(words[first])
+        facts = {name: array[which] for name, array in self.extra.items()}
+        return StationList(tuple(map(str, names)), self.places.take(which), facts)
+
+    def match_heads(self, parts: Mapping[str, str]) -> tuple[StationList, dict[str, str]]:
+        """Return the same under the names that heads, or their `parts`, hold, and that of each such head."""
+        renamed = self.use_names_of(np.array([*parts, *parts.values()]))
+        found = {head: one for head, part in parts.items() for one in (part, head) if one in renamed.names}
+        # One head alone may be called like a station by chance, unless by its own name.
+        return (renamed, found) if len(found) > 1 or renamed.label is None else (self, {})
+
+    def add_missing(self, words: np.ndarray, notes: list[str]) -> StationList:
+        """Add those of words (S,) that it lacks, if few, at unknown places, with a note; return it."""
+        names = [word for word in dict.fromkeys(words.tolist()) if word]
+        missing_names = [word for word in names if word not in self.names]
+        # Of few stations, or with a third of them missing, it is the wrong list rather than an old one.
+        if not missing_names or len(names) < LEAST_LISTED or len(names) < 3 * len(missing_names):
+            return self
+        rows, more = int(np.isin(words, missing_names).sum()), len(missing_names)
+        finding = f"{more} of {len(names)} stations are not in the list, with {rows} of {len(words)} rows"
+        notes.append(Caution(f"{finding}: {list_first(missing_names)}; their places are unknown"))
+        height = None if self.places.height is None else np.r_[self.places.height, np.full(more, np.nan)]
+        across = np.concatenate([self.places.across, np.full((more, 2), np.nan)])
+        extra = {
+            # Of what a list says besides, only facts of sectors may be unknown (`Stations.sector`).
+            name: np.r_[array, np.full(more, np.nan if name in SECTOR else array[0])]
+            for name, array in self.extra.items()
+        }
+        where = Places(across, height, self.places.degrees)
+        label = None if self.label is None else (*self.label, *missing_names)
+        return replace(self, names=(*self.names, *missing_names), places=where, extra=extra, label=label)
+
+
+def read_stations(sheet: Sheet) -> StationList | None:
+    """Read a table of stations: name, and x, y, z or latitude, longitude, height, empty: unknown."""
+    called = [head for head in sheet.heads if head.strip().lower() in ("name", "id")]
+    naming = [head for head in sheet.heads if parse_head(head).role == "station"]
+    if not called and len(naming) > 1:  # a list names a station in each row, and may name its site, too
+        called = [head for head in naming if len(set(sheet.words(head).tolist())) == len(sheet)][:1]
+    # What is of a beam, or a carrier, is no measurement, whatever its head says besides.
+    group = {*SECTOR, *TILTS, "carrier_hz"}
+    others = sheet.frame[[head for head in sheet.heads if sector_quantity(head) not in group]]
+    plain = replace(sheet, frame=others, notes=[])
+    columns = choose_columns(plain, {"station": called[0]} if len(called) == 1 else {}).values()
+    chosen = {rename_for_stations(group[0]).role: tuple(map(rename_for_stations, group)) for group in columns}
+    notes = (note for note in plain.notes if not note.startswith("not used"))
+    sheet.notes.extend(type(note)(f"{sheet.source}: {note}") for note in notes)
+    if "station" not in chosen:
+        return sheet.refuse("no column of names; expected one called name or station")
+    coordinates = read_places(sheet, chosen, "station_", unknown=True)
+    used = {column.head for columns in chosen.values() for column in columns}
+    aliases = _aliases(sheet, used)
+    sectors = read_sectors(sheet, used | {pair[0] for pair in aliases})
+    sites = number_sites(sheet)
+    if sites is not None:
+        sectors["station_site"] = sites[1]
+    if coordinates is not None and coordinates.height is None and "height" in sectors:
+        coordinates = replace(coordinates, height=np.nan_to_num(sectors["height"], nan=UNKNOWN_HEIGHT))
+    if coordinates is None:
+        if not sheet.problems:
+            sheet.refuse("no coordinates; expected columns x, y, z or latitude, longitude, height")
+        return None
+    names = sheet.joined(c.head for c in chosen["station"])
+    every = {"+".join(heads): tuple(sheet.joined(heads).tolist()) for heads in aliases}
+    unique = {head: each for head, each in every.items() if len(set(each)) == len(each)}
+    repeated = {head: each for head, each in every.items() if len(set(each)) < len(each)}
+    by = ["+".join(c.head or "" for c in chosen["station"]), *unique]
+    # Names that repeat, like sites in a list of sectors, give way to those of a column without copies.
+    if unique and len(set(names.tolist())) < len(names) and (names != "").all():
+        names, by = np.array(unique[by[1]]), by[1:]
+    of_sites = "" if sites is None else f", sites by {sites[0]!r}"
+    sheet.notes.append(f"{sheet.source}: stations are matched by {list_first([*map(repr, by)])}{of_sites}")
+    for i in np.flatnonzero(names == ""):
+        sheet.problems.add(f"{sheet.source}, {sheet.rows[i]}", "no name; expected the station's")
+    values, counts = np.unique(names, return_counts=True)
+    for name in values[(counts > 1) & (values != "")]:
+        rows = " and ".join(sheet.rows[i] for i in np.flatnonzero(names == name)[:2])
+        sheet.refuse(f"station {str(name)!r} is listed twice, in {rows}")
+    facts = sectors | {role: chosen[role][0].numbers(sheet) for role in PER_STATION if role in chosen}
+    extra = {role: array for role, array in facts.items() if role in PER_STATION and array is not None}
+    return StationList(tuple(map(str, names)), coordinates, extra, None, tuple(unique.values()), repeated)
+
+
+def _aliases(sheet: Sheet, used: set[str | None]) -> list[tuple[str, ...]]:
+    """Columns, alone and with those that make them unique, that may name the stations of a list besides."""
+    result: list[tuple[str, ...]] = []
+    for head in sheet.heads:
+        words = set(words_of(head)) & LISTS["station"]
+        if not words:
+            continue
+        result += [(head,)] if head not in used else []
+        beside = TOGETHER.get(min(words), set())
+        result += [(head, other) for other in sheet.heads if other != head and set(words_of(other)) & beside]
+    return result

@@ -1,0 +1,116 @@
+"""The verdict on phases: packets with phases of their own are told, coherent channels never are."""
+
+import logging
+from dataclasses import replace
+
+import numpy as np
+import packets
+import pytest
+
+from gsparc.base.limits import SettingError
+from gsparc.tables.checks.coherence import estimate_coherence, place_warnings, set_unknown_factor
+from gsparc.tables.own import interpret
+from gsparc.tables.raw import Raw
+
+
+@pytest.mark.parametrize("layout", ["los", "nlos"])
+@pytest.mark.parametrize("labelled", [True, False])
+def test_packets_of_a_robot_are_told_with_and_without_its_runs(layout, labelled):
+    for transmitter in range(3):
+        given, channel = packets.robot(transmitter, 10 * transmitter, layout)
+        tones = given["frequency_hz"] - given["frequency_hz"].mean()
+        coherent = estimate_coherence(packets.measurements(given, channel))
+        assert coherent is not None and coherent.unknown_factor == "none"
+        if not labelled:
+            del given["run"]
+        logged = packets.measurements(given, packets.logged(channel, tones, 0))
+        assert estimate_coherence(logged).unknown_factor == "phase+delay"
+        turned = packets.logged(channel, 0 * tones, 0)
+        assert estimate_coherence(packets.measurements(given, turned)).unknown_factor.startswith("phase")
+        if not labelled:  # millimetres apart
+            louder = packets.measurements(given, packets.logged(channel, tones, 0, 6.0))
+            assert estimate_coherence(louder).unknown_factor == "phase+delay+gain"
+
+
+def waves(seed, noise=0.0, spacing=0.03):
+    """Ten plane waves at 20 tones along a grid of 12 x 12 places."""
+    draw, tones = np.random.default_rng(seed), 2.4e9 + 1e6 * np.arange(20)
+    places = np.c_[np.stack(np.meshgrid(*2 * [spacing * np.arange(12)]), -1).reshape(-1, 2), np.ones(144)]
+    towards = draw.standard_normal((10, 3))
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    path = places @ towards.T + draw.uniform(5, 30, 10)
+    gain = draw.standard_normal(10) + 1j * draw.standard_normal(10)
+    channel = (gain * np.exp(-2j * np.pi / 299792458 * path[:, None] * tones[:, None])).sum(-1)
+    channel += noise * (draw.standard_normal(channel.shape) + 1j * draw.standard_normal(channel.shape))
+    station = np.array([9.0, 9, 3])
+    given = {"rx_position": places, "tx_position": station, "csi": channel, "frequency_hz": tones}
+    return interpret(Raw(given, {}), "waves").data
+
+
+@pytest.mark.parametrize("spacing", [0.01, 0.03, 0.05, 0.08])
+def test_no_false_alarm_on_coherent_waves(spacing):
+    for seed in range(5):
+        for noise in (0.0, 0.5, 3.0):
+            found = estimate_coherence(waves(seed, noise, spacing))
+            assert found is None or found.unknown_factor == "none", (seed, noise, str(found))
+
+
+def test_the_setting_wins_over_the_verdict(caplog):
+    data = waves(0)
+    assert set_unknown_factor(data, "auto") is data
+    assert set_unknown_factor(data, "phase").site.unknown_factor == "phase"
+    draw = np.random.default_rng(0)
+    turn = np.exp(2j * np.pi * draw.uniform(size=len(data)))
+    own = replace(data, target=(data.target * turn[:, None, None]).astype(np.complex64))
+    with caplog.at_level(logging.WARNING):
+        assert set_unknown_factor(own, "auto").site.unknown_factor == "phase"
+    assert "every row has a phase of its own" in caplog.text and "dataset.align=none" in caplog.text
+    assert set_unknown_factor(own, "none").site.unknown_factor == "none"
+    with pytest.raises(SettingError, match=r"dataset\.align='level'"):
+        set_unknown_factor(data, "level")
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_rows_without_power_divided_by_zero():
+    data = waves(0)
+    data.target[:30] = 0
+    assert estimate_coherence(data).unknown_factor == "none"
+
+
+def test_a_gain_for_each_packet_was_told_from_fifteen_pairs_that_fade():
+    """Fifteen pairs scatter by 3 dB of fading alone; four hundred of them do not."""
+    found = {}
+    for pairs in (15, 300):
+        draw, tones = np.random.default_rng(5), 5e9 + 1e6 * np.arange(30)
+        places = np.repeat(np.c_[7.0 * np.arange(pairs), np.zeros(pairs), np.ones(pairs)], 2, axis=0)
+        places[1::2, 0] += 0.002
+        shape = draw.standard_normal((pairs, 30)) + 1j * draw.standard_normal((pairs, 30))
+        level = 10 ** (draw.normal(0, 3.0, (2 * pairs, 1)) / 20)
+        turned = np.exp(2j * np.pi * draw.uniform(size=(2 * pairs, 1)))
+        given = {"rx_position": places, "tx_position": np.array([9.0, 9, 3]), "frequency_hz": tones}
+        data = interpret(
+            Raw({**given, "csi": np.repeat(shape, 2, axis=0) * level * turned}, {}), "pairs"
+        ).data
+        found[pairs] = estimate_coherence(data).unknown_factor
+    assert found == {15: "phase", 300: "phase+delay+gain"} or found == {15: "phase", 300: "phase+gain"}
+
+
+@pytest.mark.parametrize("shape", [(1, 8), (4, 1), (1, 1)])
+@pytest.mark.parametrize("noise, told", [(0.1, False), (0.5, False), (30.0, True)])
+def test_rows_of_one_place_that_do_not_agree_were_good(shape, noise, told):
+    """21 places of Bluetooth packets, each row another channel: `check` said good."""
+    rng = np.random.default_rng(0)
+    where, place = rng.uniform(0, 6, (21, 3)), np.repeat(np.arange(21), 20)
+
+    def draw(count):
+        return rng.normal(size=(count, *shape)) + 1j * rng.normal(size=(count, *shape))
+
+    channel = (1 + 2 * rng.random((21, 1, 1))) * draw(21)
+    turn = np.exp(2j * np.pi * rng.random((len(place), 1, 1)))
+    given = {
+        "rx_position": where[place], "tx_position": np.array([3.0, 3, 2]),
+        "csi": (channel[place] + noise * draw(len(place))) * turn,
+        "frequency_hz": 2.4e9 + 1e6 * np.arange(shape[1]),
+    }  # fmt: skip
+    found = place_warnings(interpret(Raw(given), "packets").data)
+    assert [text.startswith("rows at one place differ by ") for text in found] == [True] * told

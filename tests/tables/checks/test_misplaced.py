@@ -1,0 +1,76 @@
+"""Sites at places that their levels contradict; sites where they are stated."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from level_fields import fields, flight
+from networks import network
+
+from gsparc.tables.checks.column_effects import run_warnings
+from gsparc.tables.checks.link_levels import LinkLevels, link_levels
+from gsparc.tables.checks.misplaced import misplaced_warnings
+from gsparc.tables.own import from_arrays
+
+CITIES = {seed: link_levels(network(seed).data(6)) for seed in range(3)}
+
+
+def moved(levels: LinkLevels, how) -> list[str]:
+    """Warnings where the sites (K, 3) of a network stand elsewhere."""
+    sites, of = np.unique(levels.station_position, axis=0, return_inverse=True)
+    return misplaced_warnings(replace(levels, station_position=how(sites)[of.reshape(-1)]))
+
+
+@pytest.mark.parametrize("seed", CITIES)
+def test_a_list_of_sites_joined_to_rotated_names_was_good(seed):
+    (said,) = moved(CITIES[seed], lambda sites: np.roll(sites, 1, axis=0))
+    assert said.startswith("levels fall with distance from places of other stations, ")
+    assert said.endswith("are names or places exchanged?")
+
+
+@pytest.mark.parametrize("seed", [1, 2])  # of six cities five are told; beams point away from sites
+def test_a_list_of_sites_about_another_origin_was_good(seed):
+    (said,) = moved(CITIES[seed], lambda sites: np.add(sites, [400, -300, 0]))
+    assert re.match(
+        r"levels of all 10 sites fall with distance from places \(-\d{3}, \+\d{3}\) m beside", said
+    )
+
+
+def runs(moves: bool) -> list[str]:
+    """Warnings of powers of one transmitter on three days, which stood elsewhere on each where it `moves`."""
+    place, level = fields(0, 3)
+    run = np.arange(len(place)) % 3
+    level = np.where(moves, level[np.arange(len(place)), run], level[:, 0])
+    level = level + np.random.default_rng(0).normal(0, 2, len(place))
+    heights = np.full(len(place), 1.5)
+    arrays = {"rx_position": np.c_[place, heights], "tx_position": np.ones(3), "rssi_db": level, "run": run}
+    return run_warnings(from_arrays(arrays))
+
+
+def test_a_transmitter_that_moved_between_runs_was_good():
+    (said,) = runs(True)
+    assert said.startswith("runs explain ") and "did what stands still move between them?" in said
+    assert not runs(False)
+
+
+def test_one_site_of_many_in_kilometres_was_good():
+    levels, found = CITIES[0], 0
+    for one in range(10):
+        thousandths = np.where(np.arange(10) == one, 1e-3, 1.0)[:, None] * [1, 1, 0] + [0, 0, 1]
+        said = moved(levels, lambda sites, by=thousandths: sites * by)
+        found += len(said) == 1 and said[0].endswith("a place a thousand times as far: is it in kilometres?")
+    assert found >= 5
+
+
+@pytest.mark.parametrize("seed", CITIES)
+def test_places_that_levels_bear_out_are_not_doubted(seed):
+    assert not misplaced_warnings(CITIES[seed])
+    assert not misplaced_warnings(link_levels(from_arrays(flight(seed))))
+
+
+def test_levels_that_say_nothing_of_places_are_no_evidence():
+    right, rng = CITIES[0], np.random.default_rng(0)
+    for level in (np.full(len(right.level_db), -80.0), rng.normal(-80, 8, len(right.level_db))):
+        assert not misplaced_warnings(replace(right, level_db=level))
+    assert not misplaced_warnings(replace(right, station_position=np.full((30, 3), np.nan)))

@@ -1,0 +1,363 @@
+"""Warnings about readable measurements: each is given where it should be, and nowhere else."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from level_fields import flight
+from releases import real
+from scipy.spatial.distance import cdist
+
+from gsparc.data.datasets.own import read_any
+from gsparc.tables.checks import plausibility
+from gsparc.tables.checks.level_steps import detect_level_steps
+from gsparc.tables.checks.link_levels import LinkLevels, link_levels
+from gsparc.tables.checks.unit_warnings import unit_warnings
+from gsparc.tables.own import from_arrays
+
+
+def walk(seed, count=600, step=8.0):
+    """Places (n, 2) [m] of a walk, its levels (n,) [dB] with correlated shadowing, and the station (2,)."""
+    rng = np.random.default_rng(seed)
+    heading = np.cumsum(rng.normal(0, 0.25, count))
+    place = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], 1) * step, axis=0)
+    covariance = 25 * np.exp(-cdist(place, place) / 50) + 1e-9 * np.eye(count)
+    shadow = np.linalg.cholesky(covariance) @ rng.normal(size=count)
+    station = place.mean(0) + rng.normal(0, 200, 2)
+    distance = np.linalg.norm(place - station, axis=1)
+    return place, -30 - 35 * np.log10(distance + 5) + shadow + rng.normal(0, 2, count), station
+
+
+def as_links(position, level_db, names, station_position=None) -> LinkLevels:
+    """Links of a wide table: places (S, d), levels (S, T), stations (T, d)."""
+    rows, count = level_db.shape
+    return LinkLevels(
+        np.repeat(position, count, axis=0), np.tile(np.arange(count), rows), level_db.reshape(-1),
+        [f"row {i // count}" for i in range(rows * count)], np.repeat(np.arange(rows), count), names, names,
+        station_position,
+    )  # fmt: skip
+
+
+def warnings_of(levels: LinkLevels | None):
+    assert levels is not None
+    return plausibility.sanity_warnings(levels, plausibility.find_level_steps(levels))
+
+
+def room(seed=0, count=100):
+    rng = np.random.default_rng(seed)
+    place = rng.uniform([0, 0, 0.5], [6, 5, 2], (count, 3))
+    return place, -40 - 20 * np.log10(np.linalg.norm(place - [3, 2, 2.5], axis=1)) + rng.normal(0, 1, count)
+
+
+def test_a_sound_room_raises_none():
+    place, level = room()
+    assert warnings_of(as_links(place, level[:, None], ["a"], np.array([[3, 2, 2.5]]))) == []
+
+
+def measured_at(place):
+    return from_arrays({"rx_position": place, "tx_position": np.median(place, axis=0), "rssi_db": room()[1]})
+
+
+@pytest.mark.parametrize(
+    "position, said",
+    [
+        (lambda p: np.round(p * [600, 600, 1]), "whole numbers up to"),
+        (lambda p: p * [1, 1, 1000], "heights differ by"),
+        (lambda p: p / 1000, "if these are kilometres"),
+        (lambda p: p * [300, 300, 1] + 30e3 * np.outer(np.arange(len(p)) % 2, [1, 0, 0]), "reach over"),
+        (lambda p: np.array([40.76, -111.8, 0]) + p / 1e3, "degrees? then give"),
+        (lambda p: p, None),
+        (lambda p: p + np.array([4e5, 5e6, 100]), None),  # UTM
+        (lambda p: p / 5 + [3, 1, 0], None),  # a small table far from the origin
+        (np.round, None),
+    ],
+)
+def test_units_of_positions(position, said):
+    found = unit_warnings(measured_at(position(room()[0])))
+    assert len(found) == (said is not None) and all(said in line for line in found), found
+
+
+@pytest.mark.parametrize(
+    "latitude, longitude, said",
+    [
+        ([-74.0, -74.1], [40.7, 40.8], "Antarctic"),
+        ([80.2, 80.3], [13.0, 13.1], "Arctic"),
+        (np.radians([48.1, 48.2]), np.radians([11.5, 11.6]), "at sea: radians?"),  # was 57 times too small
+    ],
+)
+def test_degrees(latitude, longitude, said):
+    found = plausibility.degree_warnings(np.array(latitude), np.array(longitude))
+    assert len(found) == 1 and said in found[0], found
+
+
+def test_sound_degrees():
+    assert plausibility.degree_warnings(np.array([40.7, -33.9]), np.array([-111.8, 151.2])) == []
+
+
+@pytest.mark.parametrize("level, said", [
+    (lambda v: 10 ** (v / 10), "or linear (give it as rssi"),
+    (lambda v: -v + 40, "losses (store minus them; dataset.columns.rssi_db=HEAD*-1), per cent"),
+    (lambda v: np.round((v + 100) / 2), "an index, or linear"),
+    (lambda v: np.where(np.arange(len(v)) == 3, 80, v), "1 levels above 60 dBm, up to 80"),
+    (lambda v: v * 0 - 3, "all levels are -3 dB"),
+])  # fmt: skip
+def test_levels(level, said):
+    found = plausibility.level_warnings(level(room()[1]))
+    assert len(found) == 1 and said in found[0], found
+
+
+def test_whole_decibels_are_sound():
+    assert plausibility.level_warnings(np.round(room()[1])) == []
+    assert plausibility.level_warnings(np.array([np.nan, np.nan])) == []
+
+
+def test_a_fix_that_stands_still_while_levels_change_is_named():
+    place, level, _ = walk(0)
+    there = place.copy()
+    there[60:180] = place[60]
+    (found,) = plausibility.still_warnings(as_links(there, level[:, None], ["a"]))
+    assert "row 60 to row 179: one place for 120 rows, while levels change by" in found
+    waits = np.random.default_rng(0).normal(-70, 6, len(place))  # who waits there hears fading, no way
+    assert not plausibility.still_warnings(as_links(there, waits[:, None], ["a"]))
+    assert not plausibility.still_warnings(as_links(place, level[:, None], ["a"]))
+
+
+def test_a_wild_row_is_named():
+    place, level, _ = walk(0)
+    assert plausibility.outlier_row_warnings(as_links(place, level[:, None], ["a"])) == []
+    level[123] += 60
+    found = plausibility.outlier_row_warnings(as_links(place, level[:, None], ["a"]))
+    assert len(found) == 1 and found[0].startswith("row 123: up to") and "row 124" not in found[0]
+
+
+def test_two_steps_are_found():
+    """Walked thrice, another gain the second time."""
+    place, level, station = walk(4, 400)
+    rng = np.random.default_rng(0)
+    thrice = np.concatenate([level + rng.normal(0, 2, 400) for _ in range(3)])
+    thrice[400:800] += 14
+    steps = detect_level_steps(np.tile(place, (3, 1)), thrice, station)
+    assert [abs(s.first - at) <= 3 for s, at in zip(steps, (400, 800), strict=True)] == [True, True]
+    assert steps[0].change_db == pytest.approx(14, abs=1) and steps[1].change_db == pytest.approx(-14, abs=1)
+
+
+def test_no_wolf_on_thirty_sound_walks():
+    alarms = sum(bool(detect_level_steps(*walk(seed, 400))) for seed in range(30))
+    assert alarms == 0
+
+
+def test_steps_of_little_input():
+    place, level, station = walk(0)
+    assert detect_level_steps(place[:50], level[:50], station) == ()
+    assert detect_level_steps(np.zeros((600, 2)), level) == () and detect_level_steps(place, level * 0) == ()
+    assert detect_level_steps(place, np.full(600, np.nan)) == ()
+
+
+def test_outages_and_what_was_not_heard():
+    place, level, _ = walk(1)
+    level = np.stack([level, walk(2)[1], walk(5)[1]], axis=1)
+    level[100:160, 0] = np.nan  # off
+    level[:, 1][level[:, 1] < np.percentile(level[:, 1], 30)] = np.nan  # not heard
+    level[[7, 9, 200, 300, 555, 500], 2] = np.nan  # lost
+    found = plausibility.gap_warnings(as_links(place, level, ["a", "b", "c"]))
+    # What to do comes first: it was the third of three warnings, in words that no command took.
+    assert found[0].startswith("not heard? then say dataset.absent=silent: ")
+    assert "180 levels are missing of station b, beside the weakest ones" in found[0]
+    off = "no level in the 60 rows from row 100 to row 159 of station a: off, or not listed;"  # "an outage"
+    assert found[1].startswith(off)
+    assert found[2].startswith("6 single levels missing of station c") and len(found) == 3
+    assert plausibility.gap_warnings(as_links(place[:4], np.full((4, 1), np.nan), ["a"])) == [
+        "no level in any row"
+    ]
+
+
+def campus(stations=slice(None)) -> LinkLevels:
+    """Links of some of twelve stations."""
+    with np.load(real("real/powder-rss-462mhz.npz")) as stored:
+        level, names = stored["rssi_db"][:, stations].astype(float), stored["station"][stations].tolist()
+        return as_links(stored["mobile_position"], level, names, stored["station_position"][stations])
+
+
+def test_a_real_station_that_lost_its_gain():
+    """One of four changes: 17 dB more from row 350 on, 19 dB less from row 1461 on, after it was off."""
+    some = campus(slice(5, 9))
+    found = plausibility.step_warnings(some, plausibility.find_level_steps(some))
+    # Two lines proposed [350] and [1461], of which the later setting replaces the first.
+    assert len(found) == 1 and "dataset.level_steps={ebc-nuc1-b210:[350,1461]}" in found[0]
+    assert "rises by 17 dB between row 349 and row 350 and falls" in found[0]
+    assert "falls by 19 dB between row 1161 and row 1461" in found[0]
+
+
+def test_real_outages_are_not_taken_for_silence():
+    found = plausibility.gap_warnings(campus())
+    assert sum("off, or not listed" in line for line in found) == 8
+    assert any("the 811 rows from row 351 to row 1161 of stations bookstore" in line for line in found)
+    assert any(
+        "the 1162 rows from row 0 to row 1161 of station cnode-ustar-dd-b210" in line for line in found
+    )
+    assert not any("sensitivity_db" in line for line in found)
+
+
+def test_a_station_for_each_place_is_no_outage_of_the_others():
+    place, level, station = walk(0, 60)
+    links = {"rx_position": np.column_stack([place, np.ones(60)]), "station": np.arange(60) % 2}
+    posts = np.array([[*station, 5.0], [0.0, 0, 5]])
+    assert not warnings_of(link_levels(from_arrays({**links, "station_position": posts, "rssi_db": level})))
+
+
+def test_the_setting_of_a_level_step_named_no_row_of_a_table(tmp_path):
+    """Warnings name lines, the setting counts rows: `{STATION:[ROW]}` was left to be filled in."""
+    place, level, station = walk(4, 200)
+    place, other = place + 1e-3 * np.arange(200)[:, None], walk(3, 400)[1]
+    place, level = np.concatenate([place, place + 0.5]), np.concatenate([level, level + 20])
+    text = "# a remark\nx,y,A,B\n" + "".join(
+        f"{x:.2f},{y:.2f},{a:.2f},{b:.2f}\n" for (x, y), a, b in zip(place, level, other, strict=True)
+    )
+    posts = f"name,x,y\nA,{station[0]:.1f},{station[1]:.1f}\nB,0,0\n"
+    (tmp_path / "walk.csv").write_text(text)
+    (tmp_path / "posts.csv").write_text(posts)
+    reading = read_any(tmp_path / "walk.csv", stations_file=tmp_path / "posts.csv")
+    levels = link_levels(reading.data, reading.file_row)
+    steps = plausibility.find_level_steps(levels)
+    said = plausibility.step_warnings(levels, steps)[0]
+    first = levels.file_row[steps[0][1].first]
+    assert f"and line {first + 3}," in said and f"'dataset.level_steps={{A:[{first}]}}'" in said
+    # Once it is set, rows before and after the step were called outages of its parts.
+    parted = read_any(
+        tmp_path / "walk.csv", stations_file=tmp_path / "posts.csv", level_steps={"A": [int(first)]}
+    )
+    assert f"A from row {first}" in parted.data.site.stations.name
+    assert plausibility.gap_warnings(link_levels(parted.data)) == []
+
+
+def test_warnings_and_rows_had_other_names_of_a_cell_than_the_rest():
+    """`station 150: row 7` of `W03-2 (150)`; the setting that a warning gives takes the short one."""
+    place, level, station = walk(4, 200)
+    place, level = np.concatenate([place, place + 0.5]), np.concatenate([level, level + 20])
+    links = {
+        "rx_position": np.c_[place, np.ones(400)],
+        "station_position": np.array([[*station, 9], [0, 0, 9]]),
+    }
+    labels = {"station_name": np.array(["150", "212"]), "station_label": np.array(["W03-2", "W03-3"])}
+    data = from_arrays({**links, **labels, "rssi_db": np.c_[level, level[::-1].copy()]})
+    warnings = warnings_of(link_levels(data))
+    assert any(w.startswith("station W03-2 (150) rises") and "level_steps={150:[" in w for w in warnings)
+    assert data.row_names[:2] == ["row 0, station W03-2 (150)", "row 0, station W03-3 (212)"]
+
+
+def test_not_heard_or_lost_does_not_depend_on_the_order_of_rows():
+    """Rows shuffled were `few or beside strong ones`, in the order of the drive `not heard?`."""
+    rng, place, level, _ = np.random.default_rng(0), *walk(2)
+    lost = level.copy()
+    level[level < np.percentile(level, 30)] = np.nan
+    lost[rng.choice(len(lost), 60, replace=False)] = np.nan
+    for order in (np.arange(len(level)), np.arange(len(level))[::-1], rng.permutation(len(level))):
+        for values, said in ((level, "not heard?"), (lost, "60 single levels missing")):
+            found = plausibility.gap_warnings(as_links(place[order], values[order, None], ["a"]))
+            assert len(found) == 1 and found[0].startswith(said), found
+
+
+def test_levels_that_agree_but_for_one_are_named():
+    level = np.full(30, -70.0)
+    level[7] = -71
+    (said,) = plausibility.level_warnings(level)
+    assert said == "all levels but 1, -71 dB, are -70 dB: is it the column of levels?"
+    assert not plausibility.level_warnings(np.array([-70.0, -71, -70, -72, -73]))
+
+
+def test_a_station_copied_under_another_name_is_named():
+    place, level, _ = walk(0)
+    other = walk(1)[1]
+    for names, says in (
+        (["a", "b", "c"], "stations a, c hold the same levels at the same places"),
+        (["AP1", "b", "ap1"], "stations AP1, ap1 differ by capitals alone"),
+    ):
+        twins = as_links(place, np.stack([level, other, level], 1), names)
+        assert any(said.startswith(says) for said in plausibility.twin_warnings(twins))
+    assert not plausibility.twin_warnings(as_links(place, np.stack([level, other], 1), ["a", "b"]))
+
+
+def test_all_rows_of_a_station_at_one_place_are_named():
+    place, level, _ = walk(0)
+    levels = np.stack([level, np.full(len(level), np.nan)], 1)
+    still = np.flatnonzero((place == place[40]).all(1)).tolist() + list(range(41, 60))
+    place[still], levels[still, 1] = place[40], np.linspace(-90, -60, 20)
+    (said,) = plausibility.still_warnings(as_links(place, levels, ["a", "b"]))
+    assert said.startswith("all rows of station b are at one place, while levels change by up to 30 dB")
+
+
+@pytest.mark.parametrize("other", ["kilometres", "degrees"])
+def test_some_places_in_another_unit_are_named(other):
+    rng, half = np.random.default_rng(0), np.arange(80) % 2 == 0
+    place = rng.uniform(0, 2500, (80, 2))
+    mixed = place / 1e3 if other == "kilometres" else [11.5, 48.1] + place / 111e3
+    rows = np.c_[np.where(half[:, None], mixed, place), np.ones(80)]
+    found = unit_warnings(from_arrays({"rx_position": rows, "rssi_db": rng.normal(-80, 5, 80)}))
+    assert any("40 of 80 places lie within" in line and f"in {other}?" in line for line in found), found
+    whole = from_arrays({"rx_position": np.c_[place, np.ones(80)], "rssi_db": rng.normal(-80, 5, 80)})
+    assert not unit_warnings(whole)
+
+
+@pytest.mark.parametrize("axes", [[1e3, 1, 1], [1, 1e3, 1], [1e3, 1e3, 1]])
+@pytest.mark.parametrize("who", ["stations", "rows"])
+def test_places_of_stations_beside_rows_in_kilometres_are_named(axes, who):
+    rng = np.random.default_rng(0)
+    rows, posts = (np.c_[rng.uniform(0, 2500, (n, 2)), np.ones(n)] for n in (80, 6))
+    files = {"rx_position": rows, "station_position": posts, "station": np.arange(80) % 6}
+    files["rssi_db"] = rng.normal(-80, 5, 80)
+    assert not unit_warnings(from_arrays(files))
+    key = {"stations": "station_position", "rows": "rx_position"}[who]
+    found = unit_warnings(from_arrays({**files, key: files[key] / axes}))
+    assert any(f"of {who} reach over" in line and "in kilometres?" in line for line in found), found
+
+
+@pytest.mark.parametrize(
+    "other", [lambda v: v / 1e3, lambda v: v / 10, lambda v: 10 ** (v / 10), lambda v: v - 30]
+)
+@pytest.mark.parametrize("each", [2, 10])
+def test_some_levels_in_another_unit_are_named(other, each):
+    place, level, _ = walk(0)
+    assert not plausibility.two_unit_warnings(as_links(place, level[:, None], ["a"]))
+    level[::each] = other(level[::each])
+    (said,) = plausibility.two_unit_warnings(as_links(place, level[:, None], ["a"]))
+    assert said.endswith("in two units?"), said
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-3])
+def test_carriers_that_no_link_has_are_named(factor):
+    place, level = room()
+    arrays = {"rx_position": place, "tx_position": np.zeros(3), "rssi_db": level}
+    assert not unit_warnings(from_arrays({**arrays, "carrier_hz": np.array(1.8e9)}))
+    (said,) = unit_warnings(from_arrays({**arrays, "carrier_hz": np.array(1.8e9 * factor)}))
+    assert said.startswith("carriers of ") and said.endswith("MHz: another unit?")
+
+
+@pytest.mark.parametrize("factor, says", [(1e-2, "differ by"), (3.28, "thermal noise of a hertz")])
+def test_all_levels_in_another_unit_were_good(factor, says):
+    """-80 dBm as -.8, or as -262."""
+    place, level = room()
+    data = from_arrays({"rx_position": place, "tx_position": np.zeros(3), "rssi_db": (level - 40) * factor})
+    found = unit_warnings(data) + plausibility.level_warnings((level - 40) * factor)
+    assert any(says in line for line in found), found
+
+
+def test_rows_of_which_some_have_other_degrees_were_good():
+    """Half of the latitudes divided by ten: a box of 4,800 km, whose degrees nobody asked."""
+    rng = np.random.default_rng(0)
+    latitude, longitude = 48 + rng.uniform(0, 0.02, 80), 11 + rng.uniform(0, 0.02, 80)
+    arrays = {"longitude": longitude, "rssi_db": rng.normal(-80, 5, 80), "rx_height": np.array(1.5)}
+    assert not unit_warnings(from_arrays({**arrays, "latitude": latitude}))
+    half = np.where(np.arange(80) % 2, latitude, latitude / 10)
+    (said,) = unit_warnings(from_arrays({**arrays, "latitude": half}))
+    assert said.startswith("two groups of places ") and "km apart" in said
+
+
+@pytest.mark.parametrize("share", [0.5, 0.1])
+def test_rows_in_dbw_beside_others_in_dbm_were_good(share):
+    """Levels spread over 60 dB: no gap between two units, but none between near rows is as wide."""
+    rng, arrays = np.random.default_rng(0), flight(0)
+    levels = link_levels(from_arrays(arrays))
+    assert not plausibility.two_unit_warnings(levels)
+    half = rng.random(len(levels.level_db)) < share
+    (said,) = plausibility.two_unit_warnings(replace(levels, level_db=levels.level_db - 30 * half))
+    assert said.endswith("in two units?")
