@@ -24,10 +24,10 @@ import pandas as pd
 import torch
 from PIL import Image
 
-from gsparc.data.datasets.rfid import planar_array
-from gsparc.data.load import load
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.data.splits import Fold
+from gsparc.datasets.load import load
+from gsparc.datasets.rfid import planar_array
 from gsparc.field.losses import ssim
 from gsparc.models.carriers.plain import DirectBeam
 from gsparc.models.per_station import wrap_per_station

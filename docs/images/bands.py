@@ -9,9 +9,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.datasets.load import load, split_for
 from gsparc.models.baselines.idw import InverseDistance
 from gsparc.models.carriers.method import CarrierField
 from gsparc.models.carriers.plain import DirectBeam, OtherCarriers

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from gsparc.data.datamodule import DataModule
+from gsparc.datasets.datamodule import DataModule
 from gsparc.models.baselines.interpolation import Interpolator
 from gsparc.models.method import Prediction
 from gsparc.tables.own import interpret

@@ -36,10 +36,10 @@ def check(
         draw: PNG file for a map; None draws none.
     """
     # Here: they bring torch, which --help does not need.
-    from gsparc.data.datasets.campaign import find_implausible
-    from gsparc.data.datasets.own import read_any
-    from gsparc.data.load import split_for
     from gsparc.data.outliers import outlier_warnings
+    from gsparc.datasets.campaign import find_implausible
+    from gsparc.datasets.load import split_for
+    from gsparc.datasets.own import read_any
     from gsparc.models.powers.together.network import check_azimuths
     from gsparc.tables.checks.array_layout import carrier_warnings, layout_warnings
     from gsparc.tables.checks.describe import describe

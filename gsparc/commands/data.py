@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from gsparc.base.errors import DataError
-from gsparc.data.public.fetch import MIRROR, PublicSet, fetch, public_sets
+from gsparc.datasets.public.fetch import MIRROR, PublicSet, fetch, public_sets
 
 
 def describe_set(one: PublicSet) -> str:

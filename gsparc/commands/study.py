@@ -15,7 +15,7 @@ from gsparc.base.instantiate import config_node
 from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.commands.shared.settings import to_dict
 from gsparc.commands.train import train_job
-from gsparc.data.load import load, split_for
+from gsparc.datasets.load import load, split_for
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.cells import compose
 from gsparc.evaluation.experiment.runner import run_jobs

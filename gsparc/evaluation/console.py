@@ -25,7 +25,7 @@ FULL_ERROR = "HYDRA_FULL_ERROR"
 CONFIGS = "pkg://gsparc.conf"
 WIDE = 120
 AGAIN = 40  # characters of a warning that tell it from others
-READERS = "gsparc.data.datasets"  # loggers: one file may be read several times in a run
+READERS = "gsparc.datasets"  # loggers: one file may be read several times in a run
 PATH = r"^\S*/\S*: "  # at its head
 
 

@@ -39,7 +39,7 @@ OF_DATA = (  # paths that stand for what was read from them, or is written there
     "dataset.stand_in.root",
 )
 WORDS = (".name", "._target_")  # settings that are never paths: a folder may be called as a method is
-WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its settings name
+WHOLE = "gsparc.datasets.own.Own"  # reads no file but those that its settings name
 LEFT = (  # by a training: of another one, all of it would be read beside this one's
     *("summary.json", "split.json", "per_sample.csv", "by_station.csv", "render_ms.csv"),
     *("predictions.npz", "test.png", "found.png"),

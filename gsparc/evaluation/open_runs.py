@@ -12,11 +12,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.base.errors import DataError
-from gsparc.data.datamodule import DataModule
 from gsparc.data.inner_folds import cut_folds
-from gsparc.data.load import answerable, datamodule, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split, hash_indices
+from gsparc.datasets.datamodule import DataModule
+from gsparc.datasets.load import answerable, datamodule, split_for
 from gsparc.evaluation.align_site import align_to_site
 from gsparc.evaluation.evaluate import dataset_facts, split_facts
 from gsparc.evaluation.experiment.folds import effort_settings

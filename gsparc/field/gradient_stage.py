@@ -19,9 +19,9 @@ import torch
 from lightning.pytorch.plugins.io import CheckpointIO
 from torch.multiprocessing.spawn import ProcessException, ProcessExitedException
 
-from gsparc.data.datamodule import DataModule, Loaded
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.datasets.datamodule import DataModule, Loaded
 from gsparc.field.distributed import SummedGradients
 from gsparc.field.module import NetworkModule
 from gsparc.training.context import FitContext

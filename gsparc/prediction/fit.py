@@ -12,11 +12,11 @@ import numpy as np
 
 from gsparc.base.errors import Caution, DataError
 from gsparc.base.instantiate import accepted_arguments, suggest_or_list
-from gsparc.data.datasets.campaign import find_implausible
 from gsparc.data.row_order import order_rows
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.data.units import LINEAR, PowerUnit
+from gsparc.datasets.campaign import find_implausible
 from gsparc.models import checkpoint, fitting
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class

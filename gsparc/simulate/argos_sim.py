@@ -16,10 +16,10 @@ import yaml
 
 from gsparc.base.files import whole_folder
 from gsparc.base.limits import Checked, setting, whole
-from gsparc.data.datasets import argos
-from gsparc.data.datasets.argos import CARRIER_HZ, SPACING_HZ, STAND_IN
-from gsparc.data.datasets.campaign import make_once, write_split
 from gsparc.data.schema import LIGHT
+from gsparc.datasets import argos
+from gsparc.datasets.argos import CARRIER_HZ, SPACING_HZ, STAND_IN
+from gsparc.datasets.campaign import make_once, write_split
 from gsparc.physics.decibels import from_decibels
 from gsparc.simulate.streets import StreetPaths, Streets, trace_streets
 
@@ -171,7 +171,7 @@ def write_argos_sim(folder: Path, count: int, seed: int, offsets: Offsets, scatt
 
 @dataclass(frozen=True)
 class ArgosStandIn(Checked):
-    """What `dataset=argos` falls back on; a `gsparc.data.datasets.campaign.StandIn`.
+    """What `dataset=argos` falls back on; a `gsparc.datasets.campaign.StandIn`.
 
     Attributes:
         count: users, at least 10.

@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from gsparc.base.files import whole_folder
 from gsparc.base.limits import Checked, setting, whole
-from gsparc.data.datamodule import DataModule
-from gsparc.data.datasets.campaign import load_stand_in, make_once, write_split
-from gsparc.data.datasets.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, load_rfid, planar_array
 from gsparc.data.schema import LIGHT, Measurements
+from gsparc.datasets.campaign import load_stand_in, make_once, write_split
+from gsparc.datasets.datamodule import DataModule
+from gsparc.datasets.rfid import HEIGHT, STAND_IN, WAVELENGTH, WIDTH, load_rfid, planar_array
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import steering_matrix
 from gsparc.simulate.shoebox import Room, trace_room
@@ -90,7 +90,7 @@ def write_rfid_sim(folder: Path, count: int, seed: int) -> None:
 
 @dataclass(frozen=True)
 class RFIDStandIn(Checked):
-    """What `dataset=rfid` falls back on; a `gsparc.data.datasets.campaign.StandIn`.
+    """What `dataset=rfid` falls back on; a `gsparc.datasets.campaign.StandIn`.
 
     Attributes:
         count: tag positions, at least 2.

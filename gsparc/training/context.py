@@ -19,7 +19,7 @@ from gsparc.training.effort import Effort
 from gsparc.training.race import Race
 
 if TYPE_CHECKING:
-    from gsparc.data.datamodule import DataModule  # imports Lightning, which a loaded model does without
+    from gsparc.datasets.datamodule import DataModule  # imports Lightning, which a loaded model does without
 
 log = logging.getLogger(__name__)
 

@@ -6,7 +6,7 @@ from networks import network
 from rich.console import Console
 
 from gsparc.commands.check import check, main, read_settings
-from gsparc.data.load import load
+from gsparc.datasets.load import load
 from gsparc.tables.own import write_own
 
 

@@ -17,7 +17,7 @@ from refusals import refused
 import gsparc
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.listing import COMMANDS
-from gsparc.data.public.fetch import MIRROR
+from gsparc.datasets.public.fetch import MIRROR
 from gsparc.evaluation.console import ConsoleHandler
 from gsparc.evaluation.summary import remarks
 from gsparc.models import checkpoint, loading

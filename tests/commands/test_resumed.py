@@ -13,10 +13,10 @@ from lightning.pytorch import Trainer
 
 import gsparc
 from gsparc.commands.train import main, train
-from gsparc.data.datamodule import Loaded
-from gsparc.data.load import datamodule
-from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
+from gsparc.datasets.datamodule import Loaded
+from gsparc.datasets.load import datamodule
+from gsparc.datasets.load import load as load_data
 from gsparc.models import checkpoint
 from gsparc.models.fitting import Origin
 from gsparc.models.loading import load_module

@@ -13,9 +13,9 @@ from releases import write_release
 
 from gsparc.data import blocks
 from gsparc.data.assemble import content_hash
-from gsparc.data.datasets.own import read_any
-from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.schema import Measurements, Site
+from gsparc.datasets.own import read_any
+from gsparc.datasets.rfid import load_rfid
 from gsparc.models.target_rows import training_targets
 from gsparc.tables import raw
 from gsparc.tables.checks.constant import leave_out_unmeasured, mark_constants

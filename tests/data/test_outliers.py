@@ -6,8 +6,8 @@ from campaigns import channels, powers, spectra
 from releases import release
 
 from gsparc.commands.check import main as check
-from gsparc.data.load import load, split_for
 from gsparc.data.outliers import find_outliers, find_strong_outliers, too_far
+from gsparc.datasets.load import load, split_for
 
 MAKERS = {"spectrum": spectra, "csi": channels, "rssi": powers}
 KINDS = pytest.mark.parametrize("kind", MAKERS)

@@ -7,12 +7,12 @@ import pytest
 from releases import real
 
 from gsparc.base.errors import DataError
-from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.inner_folds import inner_folds
-from gsparc.data.load import load, split_for
 from gsparc.data.spacing import group_visits, path_order
 from gsparc.data.split_files import read_split, write_split
 from gsparc.data.splits import SplitSettings, hash_indices, make_split
+from gsparc.datasets.load import load, split_for
+from gsparc.datasets.rfid import load_rfid
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.tables.own import from_arrays

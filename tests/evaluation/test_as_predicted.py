@@ -6,9 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from gsparc.data.datasets.own import read_any
 from gsparc.data.schema import LIGHT
 from gsparc.data.splits import Fold, Split
+from gsparc.datasets.own import read_any
 from gsparc.evaluation.align_site import align_to_site
 from gsparc.evaluation.answers import predict_file
 from gsparc.evaluation.evaluate import evaluate

@@ -10,7 +10,7 @@ from hydra.core.global_hydra import GlobalHydra
 from omegaconf import OmegaConf
 
 from gsparc.base.errors import Severe
-from gsparc.data.datasets.own import Own
+from gsparc.datasets.own import Own
 from gsparc.evaluation.console import ConsoleHandler, config_folder, error_in_one_line, repeated_warnings
 
 
@@ -88,7 +88,7 @@ def test_twelve_stations_wrote_two_hundred_lines(monkeypatch, caplog):
 def test_a_wrong_convention_was_said_once_far_above_the_table(monkeypatch):
     screen = ConsoleHandler([], io.StringIO())
     monkeypatch.setattr(logging.getLogger(), "handlers", [screen])
-    log = logging.getLogger("gsparc.data.datasets.campaign")
+    log = logging.getLogger("gsparc.datasets.campaign")
     log.warning("%s: %s", "a.npz", Severe("conjugate=true mends it"))
     log.warning("%s: %s", "a.npz", "3 wild rows")
     # Untrue for powers given as losses: figures of nearest, idw, kriging and mean stayed the same.
@@ -100,7 +100,7 @@ def test_jobs_of_a_sweep_said_again_how_columns_are_read(monkeypatch):
     monkeypatch.setattr(ConsoleHandler, "read", set())
     said = []
     for text in ("a.csv: columns x", "data/a.csv: columns x", "b.csv: columns x"):
-        record = logging.LogRecord("gsparc.data.datasets.campaign", logging.INFO, "", 0, text, (), None)
+        record = logging.LogRecord("gsparc.datasets.campaign", logging.INFO, "", 0, text, (), None)
         said.append(ConsoleHandler([], io.StringIO()).filter(record))
     assert said == [True, False, True]
 

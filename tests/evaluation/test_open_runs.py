@@ -9,8 +9,8 @@ from refusals import refused
 
 import gsparc
 from gsparc.base.errors import DataError
-from gsparc.data.load import answerable
 from gsparc.data.splits import Fold, Split, SplitSettings, make_split
+from gsparc.datasets.load import answerable
 from gsparc.evaluation import open_runs
 from gsparc.evaluation.align_site import align_to_site
 from gsparc.evaluation.baselines import fit_baseline

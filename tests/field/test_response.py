@@ -6,7 +6,7 @@ import torch
 from known_arrays import array_site, spectra
 from torch import Tensor
 
-from gsparc.data.datasets.rfid import planar_array
+from gsparc.datasets.rfid import planar_array
 from gsparc.field.frozen import freeze_view, gaussian_vectors
 from gsparc.field.response import ArrayResponse, ChannelResponse
 from gsparc.ops import Pose, SphereGrid, StalePlan

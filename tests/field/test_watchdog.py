@@ -15,7 +15,7 @@ import torch
 from campaigns import channels, compose, fit_context, powers, spectra
 from kinds import moving_array, static_array
 
-from gsparc.data.load import load, split_for
+from gsparc.datasets.load import load, split_for
 from gsparc.models.registry import build
 from gsparc.processes import worker
 

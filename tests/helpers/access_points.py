@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsparc.data.datasets.fingerprints import Fingerprints
+from gsparc.datasets.fingerprints import Fingerprints
 
 
 def invented(count: int, floors: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:

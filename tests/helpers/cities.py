@@ -7,9 +7,9 @@ from tempfile import mkdtemp
 
 import numpy as np
 
-from gsparc.data.datasets.argos import load_argos
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.datasets.argos import load_argos
 from gsparc.models.uplink.method import UplinkField
 from gsparc.models.uplink.search import SearchSettings
 from gsparc.simulate.argos_sim import ArgosStandIn

@@ -8,9 +8,9 @@ from typing import Any
 from campaigns import brief, compose
 
 from gsparc.callbacks import Checkpoint
-from gsparc.data.load import load, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.datasets.load import load, split_for
 from gsparc.field.gradient_stage import DEFAULTS
 from gsparc.models.method import Method
 from gsparc.models.registry import build

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from releases import release
 
-from gsparc.data.datasets.powder import read_powder
+from gsparc.datasets.powder import read_powder
 
 STATIONS = ("ebc-nuc1-b210", "madsen-nuc2-b210")
 

@@ -10,9 +10,9 @@ from boxes import room_of_spectra
 from campaigns import channels, powers, spectra
 from known_arrays import array_site, measure, room_vectors, walk
 
-from gsparc.data.datasets.rfid import planar_array
-from gsparc.data.load import load
 from gsparc.data.schema import Measurements
+from gsparc.datasets.load import load
+from gsparc.datasets.rfid import planar_array
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import bartlett_spectrum, steering_matrix
 from gsparc.tables.own import from_arrays

@@ -8,8 +8,8 @@ from hashlib import sha256
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
-from gsparc.data.public import fetch as fetching
-from gsparc.data.public.fetch import PublicSet, Source
+from gsparc.datasets.public import fetch as fetching
+from gsparc.datasets.public.fetch import PublicSet, Source
 
 Answer = Callable[[BaseHTTPRequestHandler, bytes], None]
 

@@ -6,7 +6,7 @@ from functools import cache
 from PIL import Image
 
 from gsparc.base import instantiate
-from gsparc.data import load
+from gsparc.datasets import load
 from gsparc.evaluation import summary
 from gsparc.prediction.timing import ClockSettings
 

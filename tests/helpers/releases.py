@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from gsparc.data.datasets.rfid import HEIGHT, WIDTH
+from gsparc.datasets.rfid import HEIGHT, WIDTH
 
 REAL = Path(os.environ.get("GSPARC_MEASURED", Path(__file__).resolve().parents[3] / "shared" / "data"))
 

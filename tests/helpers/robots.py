@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from gsparc.data.datasets.wsr import CARRIER_HZ, LOS_SET_A, RECORD, SPACING_HZ, TONES, remove_delay_slope
+from gsparc.datasets.wsr import CARRIER_HZ, LOS_SET_A, RECORD, SPACING_HZ, TONES, remove_delay_slope
 
 RUN = "2021-06-27_202550"  # of the release, of which pieces are beside this checkout
 FREQUENCY = CARRIER_HZ + SPACING_HZ * TONES

@@ -7,10 +7,10 @@ import torch
 from campaigns import spectra
 from shoeboxes import as_arrays, scatter
 
-from gsparc.data.load import split_for
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.datasets.load import split_for
 from gsparc.ops import SphereGrid
 from gsparc.simulate.shoebox import Room, trace_room
 from gsparc.tables.own import from_arrays, load_own

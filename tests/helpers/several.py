@@ -18,10 +18,10 @@ from modules import module
 from torch import distributed
 
 from gsparc.callbacks import Checkpoint, Densify, OpacityReset
-from gsparc.data.datamodule import Loaded
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.datasets.datamodule import Loaded
 from gsparc.field.gradient_stage import DEFAULTS, interruptible, make_trainer
 from gsparc.field.module import GaussianModule
 from gsparc.field.optimizer import OptimizerSettings

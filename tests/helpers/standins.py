@@ -7,7 +7,7 @@ import numpy as np
 from measured import CAMPUS, DEGREES, ble_arrays, powder_arrays, techtile_arrays
 from robots import FREQUENCY, RUN, drive, true_root
 
-from gsparc.data.datasets.wsr import LOS_SET_A
+from gsparc.datasets.wsr import LOS_SET_A
 from gsparc.simulate.rfid_sim import write_rfid_sim
 
 

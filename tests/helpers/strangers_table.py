@@ -16,9 +16,9 @@ from doors import said
 from releases import REAL
 
 from gsparc.base.errors import DataError
-from gsparc.data.datasets.own import read_any
-from gsparc.data.load import split_for
 from gsparc.data.schema import LIGHT, Measurements
+from gsparc.datasets.load import split_for
+from gsparc.datasets.own import read_any
 from gsparc.evaluation.baselines import fit_baseline
 
 FILE = Path(__file__).parents[2] / "docs" / "results" / "strangers.csv"

@@ -11,9 +11,9 @@ from refusals import refused
 from scenes import fold_of
 
 import gsparc
-from gsparc.data.load import split_for
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold, Split
+from gsparc.datasets.load import split_for
 from gsparc.evaluation.baselines import baselines_for
 from gsparc.evaluation.evaluate import evaluate
 from gsparc.evaluation.experiment.folds import fit_folds, fold_contexts

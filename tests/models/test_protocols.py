@@ -23,10 +23,10 @@ from rooms import directed, shoebox
 from scenes import fold_of, lobes, room
 from worlds import World, arrays
 
-from gsparc.data.load import load
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.datasets.load import load
 from gsparc.field.gaussians import FieldSettings
 from gsparc.models import checkpoint, loading
 from gsparc.models.image_sources.method import ImageSourceGP

@@ -7,7 +7,7 @@ from invented import invent
 from known_arrays import array_site
 from refusals import refused
 
-from gsparc.data.datasets.rfid import planar_array
+from gsparc.datasets.rfid import planar_array
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitSettings

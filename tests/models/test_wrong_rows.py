@@ -12,7 +12,7 @@ from cities import fold as uplink_fold
 from contexts import short
 from rooms import directed
 
-from gsparc.data.load import load, split_for
+from gsparc.datasets.load import load, split_for
 from gsparc.models.registry import build, built_in_methods, method_class
 from gsparc.training.context import FitContext
 

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gsparc.data.datasets.rfid import planar_array
+from gsparc.datasets.rfid import planar_array
 from gsparc.ops import SphereGrid
 from gsparc.ops.queries import array_spectrum, has_query_kernel, nearest_weights
 from gsparc.physics.bartlett import SpectrumRenderer

@@ -18,9 +18,9 @@ from refusals import refused
 from rooms import directed, shoebox
 from torch.autograd import forward_ad
 
-from gsparc.data.load import load
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.datasets.load import load
 from gsparc.models.baselines import gp
 from gsparc.models.channels import complex_gp
 from gsparc.models.channels.field import ChannelField

@@ -17,9 +17,9 @@ from refusals import refused
 from gsparc.base.errors import DataError
 from gsparc.commands.check import main as check
 from gsparc.data import blocks
-from gsparc.data.datasets.sionna import _in_decibels
-from gsparc.data.load import load
 from gsparc.data.schema import LIGHT
+from gsparc.datasets.load import load
+from gsparc.datasets.sionna import _in_decibels
 from gsparc.evaluation.simulated import draw_floor_plan
 from gsparc.simulate import assembly, deciding
 from gsparc.simulate import campaign as campaigns

@@ -57,7 +57,7 @@ def test_missing_sionna_names_the_remedy(monkeypatch):
 def test_imports_leave_the_ray_tracer_alone():
     """Only `gsparc.simulate` may, and even there not before it is asked to trace."""
     code = (
-        "import sys, gsparc, gsparc.commands.train, gsparc.commands.evaluate, gsparc.data.load\n"
+        "import sys, gsparc, gsparc.commands.train, gsparc.commands.evaluate, gsparc.datasets.load\n"
         "import gsparc.simulate\n"
         "bad = [m for m in ('mitsuba', 'drjit', 'sionna.rt') if m in sys.modules]\n"
         "assert not bad, bad"

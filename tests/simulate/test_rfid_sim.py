@@ -3,7 +3,7 @@ import hashlib
 import numpy as np
 from poses import boresight_degrees
 
-from gsparc.data.datasets.rfid import load_rfid
+from gsparc.datasets.rfid import load_rfid
 from gsparc.simulate.rfid_sim import RFIDStandIn
 
 

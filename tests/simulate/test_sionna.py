@@ -10,7 +10,7 @@ import pytest
 import torch
 from refusals import refused
 
-from gsparc.data.load import load
+from gsparc.datasets.load import load
 from gsparc.simulate import llvm, raytracer
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate

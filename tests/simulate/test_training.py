@@ -11,8 +11,8 @@ from crashes import small_campaign
 import gsparc
 from gsparc.base.errors import DataError
 from gsparc.commands.train import train
-from gsparc.data.datasets.sionna import with_true_targets
-from gsparc.data.load import load
+from gsparc.datasets.load import load
+from gsparc.datasets.sionna import with_true_targets
 from gsparc.simulate.campaign import simulate
 
 BOX = small_campaign(70)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsparc.data.datasets.own import apply_settings
+from gsparc.datasets.own import apply_settings
 from gsparc.tables.amplitudes import amplitudes_to_levels
 from gsparc.tables.own import from_arrays, interpret
 from gsparc.tables.raw import Raw

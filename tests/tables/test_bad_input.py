@@ -14,10 +14,10 @@ import pytest
 from releases import SPOILT
 
 from gsparc.base.errors import DataError
-from gsparc.data.datasets.newrf import read_newrf
-from gsparc.data.datasets.own import read_any
-from gsparc.data.datasets.rfid import load_rfid
-from gsparc.data.load import load
+from gsparc.datasets.load import load
+from gsparc.datasets.newrf import read_newrf
+from gsparc.datasets.own import read_any
+from gsparc.datasets.rfid import load_rfid
 from gsparc.tables.own import from_arrays, load_own, write_own
 
 

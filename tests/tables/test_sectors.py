@@ -8,7 +8,7 @@ import pytest
 from networks import network
 
 from gsparc.base.errors import Caution, DataError
-from gsparc.data.datasets.own import read_any
+from gsparc.datasets.own import read_any
 from gsparc.tables.sectors import band_hz, earfcn_hz
 
 

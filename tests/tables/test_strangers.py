@@ -28,7 +28,7 @@ from strangers import (
 )
 
 from gsparc.commands.check import main
-from gsparc.data.datasets.own import Own, read_any
+from gsparc.datasets.own import Own, read_any
 from gsparc.tables.own import write_own
 from gsparc.tables.query_places import read_query_places
 

@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 from doors import said
 
-from gsparc.data.datasets.own import read_any
+from gsparc.datasets.own import read_any
 from gsparc.tables.columns import say_column
 from gsparc.tables.own import interpret
 from gsparc.tables.raw import Raw

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from gsparc.apps.link.adaptation import Band
-from gsparc.data.datasets.argos import FACTS
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.datasets.argos import FACTS
 from gsparc.models.method import Method, Prediction
 from gsparc.models.uplink.interface import SeparatesPaths
 from gsparc.physics.row_factors import align_factors

@@ -13,7 +13,7 @@ from gsparc.apps.locate.judging import Report, columns_of_places, report, sample
 from gsparc.apps.locate.neighbours import locate_by_neighbours
 from gsparc.apps.locate.snapshots import Scans
 from gsparc.base.limits import POSITIVE, SHARE
-from gsparc.data.datasets.fingerprints import Fingerprints, read_fingerprints, split_fingerprints
+from gsparc.datasets.fingerprints import Fingerprints, read_fingerprints, split_fingerprints
 
 METHOD = "weighted_knn"
 

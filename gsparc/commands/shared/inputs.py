@@ -11,11 +11,11 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.commands.shared.settings import RunSettings, to_dict
-from gsparc.data.datamodule import DataModule
-from gsparc.data.load import datamodule, split_for
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.data.walls import read_walls
+from gsparc.datasets.datamodule import DataModule
+from gsparc.datasets.load import datamodule, split_for
 from gsparc.evaluation.align_site import align_to_site
 from gsparc.models import checkpoint
 from gsparc.models.method import MethodFactory

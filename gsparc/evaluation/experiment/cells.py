@@ -18,10 +18,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.base.instantiate import from_settings
 from gsparc.base.limits import POSITIVE
-from gsparc.data.load import load, split_for
-from gsparc.data.public.fetch import fetched_path_or_none
 from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Split
+from gsparc.datasets.load import load, split_for
+from gsparc.datasets.public.fetch import fetched_path_or_none
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.experiment.contenders import Contender, unlisted_contenders
 from gsparc.evaluation.experiment.options import REDRAW

@@ -15,9 +15,9 @@ from lightning import Callback
 
 from gsparc.base.errors import Caution, Severe
 from gsparc.base.executor import run_each, uses_other_processes
-from gsparc.data.load import split_settings
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
+from gsparc.datasets.load import split_settings
 from gsparc.evaluation.console import to_dict
 from gsparc.models import checkpoint, fitting
 from gsparc.models.method import Method, MethodFactory

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.prior_levels import Files, read_prior_levels
 from gsparc.data.schema import OF_STATION, Measurements, Site
+from gsparc.datasets.prior_levels import Files, read_prior_levels
 from gsparc.models.powers.prior_map import NetworkMaps, PriorMap
 from gsparc.processes.places import has_both_ends
 from gsparc.processes.posterior import Exact

@@ -19,8 +19,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.base.errors import group_warnings
-from gsparc.data.prior_levels import Files, read_prior_maps
 from gsparc.data.schema import Measurements
+from gsparc.datasets.prior_levels import Files, read_prior_maps
 from gsparc.processes.places import first_end, other_end
 from gsparc.processes.sectors import ROUND, SHARED, Sectors, sector_of
 from gsparc.processes.term import Columns

@@ -10,7 +10,7 @@ from gsparc.apps.locate.fingerprints import fingerprint_snapshots
 from gsparc.apps.locate.judging import report
 from gsparc.apps.locate.neighbours import PLAIN, _count, feature_vectors, locate_by_neighbours
 from gsparc.apps.locate.snapshots import Scans
-from gsparc.data.datasets.fingerprints import read_fingerprints, split_fingerprints
+from gsparc.datasets.fingerprints import read_fingerprints, split_fingerprints
 
 
 def hall(count, seed):

@@ -16,7 +16,7 @@ from worlds import World, arrays
 
 from gsparc.base import executor
 from gsparc.base.executor import Engine
-from gsparc.data.load import datamodule, split_for
+from gsparc.datasets.load import datamodule, split_for
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.experiment import options
 from gsparc.evaluation.experiment.folds import fit_folds

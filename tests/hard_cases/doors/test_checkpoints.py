@@ -118,7 +118,7 @@ def test_commands_refuse_them_in_one_line(sound, tmp_path):
 
 @pytest.mark.parametrize(
     "target",
-    ["os.system", "builtins.exec", 3, "pathlib.Path.touch", "gsparc.models.checkpoint.os.system", "gsparc.data.load.log",
+    ["os.system", "builtins.exec", 3, "pathlib.Path.touch", "gsparc.models.checkpoint.os.system", "gsparc.datasets.load.log",
      "torch.load", "gsparc.models.registry.build", "gsparc.nowhere.Nothing", "gsparc", "", "hydra.utils.call"],
 )  # fmt: skip
 def test_configurations_that_ask_to_run_something(sound, tmp_path, target):

@@ -1,6 +1,6 @@
 """Folders in the RFID release's layout, spoilt: `gsparc check`.
 
-Remedy: gsparc/data/datasets/rfid.py. Cases of tests/helpers/releases.py and more, at the command's own door.
+Remedy: gsparc/datasets/rfid.py. Cases of tests/helpers/releases.py and more, at the command's own door.
 """
 # ruff: noqa: E501 (a case is a row of a table)
 

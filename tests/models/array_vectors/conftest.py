@@ -3,7 +3,7 @@
 import pytest
 from known_arrays import array_site, measure, room_vectors, walk
 
-from gsparc.data.datasets.rfid import planar_array
+from gsparc.datasets.rfid import planar_array
 from gsparc.ops import SphereGrid
 
 

@@ -8,9 +8,9 @@ import torch
 from known_arrays import array_site, measure, spectra, walk
 from releases import real
 
-from gsparc.data.datasets.rfid import planar_array
-from gsparc.data.load import load, split_for
 from gsparc.data.splits import Fold, Split
+from gsparc.datasets.load import load, split_for
+from gsparc.datasets.rfid import planar_array
 from gsparc.evaluation.scores import score_methods
 from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings

@@ -8,8 +8,8 @@ import torch
 from known_arrays import array_site, measure, room_vectors, spectra, walk
 from releases import release
 
-from gsparc.data.datasets.rfid import planar_array
-from gsparc.data.load import load
+from gsparc.datasets.load import load
+from gsparc.datasets.rfid import planar_array
 from gsparc.models.array_vectors import phase_retrieval, vector_cache
 from gsparc.models.array_vectors.phase_retrieval import recover_vectors
 from gsparc.models.array_vectors.vector_gp import index_mirror_elements, twin_vectors

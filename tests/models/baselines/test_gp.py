@@ -10,8 +10,8 @@ from sklearn.decomposition import PCA
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
-from gsparc.data.load import load, split_for
 from gsparc.data.target import TARGETS
+from gsparc.datasets.load import load, split_for
 from gsparc.evaluation.scores import score_methods
 from gsparc.models.baselines.gp import GaussianProcess, principal_components
 from gsparc.processes.density import left_out_density

@@ -167,7 +167,7 @@ def test_methods_of_one_end_are_refused_as_before():
 
 @pytest.mark.slow
 def test_measured_ceiling_in_squares():
-    from gsparc.data.datasets.techtile import Techtile
+    from gsparc.datasets.techtile import Techtile
 
     data = Techtile(
         real("real/techtile-csi-920mhz.npz"), runs=["EXP006"], stations=list(range(0, 42, 4))

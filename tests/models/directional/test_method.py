@@ -9,8 +9,8 @@ from releases import real
 from rooms import directed
 from scenes import error
 
-from gsparc.data.load import load
 from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.datasets.load import load
 from gsparc.evaluation.experiment.study import add_direction_errors
 from gsparc.field.initial import InitSettings
 from gsparc.models.directional.method import DirectionalGP

@@ -9,9 +9,9 @@ from known_arrays import array_site, measure, room_vectors, walk
 from scenes import answer_error, error, fold_of, lobes, room, shadowed, wandering
 from scipy.special import eval_legendre
 
-from gsparc.data.datasets.rfid import planar_array
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
+from gsparc.datasets.rfid import planar_array
 from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.peers.gsrf import count_terms, fourier_legendre
 from gsparc.models.per_station import wrap_per_station

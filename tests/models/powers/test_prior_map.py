@@ -11,7 +11,7 @@ from rasterio.transform import from_origin
 from refusals import refused
 
 import gsparc
-from gsparc.data.prior_levels import read_prior_levels
+from gsparc.datasets.prior_levels import read_prior_levels
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.powers import prior_map
 from gsparc.models.powers.prior_map import NetworkMaps, PriorMap, describe_use

@@ -13,9 +13,9 @@ from boxes import room_of_spectra
 from campaigns import brief, channels, compose, spectra
 
 from gsparc.commands.train import TrainedRun, train
-from gsparc.data.load import load
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.datasets.load import load
 from gsparc.field.gaussians import FieldSettings
 from gsparc.models import reduced
 from gsparc.models.baselines.gp import GaussianProcess

@@ -7,8 +7,8 @@ from campaigns import brief, channels, compose, spectra
 from contexts import short
 from scenes import fold_of
 
-from gsparc.data.load import load as load_data
 from gsparc.data.query import Query
+from gsparc.datasets.load import load as load_data
 from gsparc.models.registry import build
 from gsparc.models.splat import method as splatting
 from gsparc.models.splat.method import QUERY_CHUNK, LearnedField

@@ -7,7 +7,7 @@ from campaigns import brief, channels, compose, powers, spectra
 from contexts import short
 from scenes import fold_of
 
-from gsparc.data.load import load as load_data
+from gsparc.datasets.load import load as load_data
 from gsparc.models.registry import build
 from gsparc.models.splat.method import LearnedField
 from gsparc.training.effort import Effort

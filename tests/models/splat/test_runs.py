@@ -7,8 +7,8 @@ from campaigns import compose
 from worlds import World, arrays
 
 from gsparc.commands.train import train
-from gsparc.data.load import split_for
 from gsparc.data.query import Query
+from gsparc.datasets.load import split_for
 from gsparc.evaluation.scores import score_methods, unseen_runs
 from gsparc.models import loading
 from gsparc.models.method import Method, Prediction

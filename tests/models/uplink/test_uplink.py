@@ -7,8 +7,8 @@ import pytest
 import torch
 from cities import city, deaf, fold, folder, uplink_field
 
-from gsparc.data.datasets.argos import load_argos
 from gsparc.data.splits import Split
+from gsparc.datasets.argos import load_argos
 from gsparc.evaluation.baselines import baselines_for
 from gsparc.models.baselines.ridge import Ridge
 from gsparc.models.gsparc import Gsparc

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.data.datasets.rfid import planar_array
+from gsparc.datasets.rfid import planar_array
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import bartlett_spectrum, steering_matrix
 from gsparc.tables.checks.array_layout import carrier_warnings, layout_warnings

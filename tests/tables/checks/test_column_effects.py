@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 from level_fields import ROWS, fields, truths
 
-from gsparc.data.datasets.own import read_any
+from gsparc.datasets.own import read_any
 from gsparc.tables.checks.column_effects import LevelsAtPlaces, find_effects
 
 

@@ -8,7 +8,7 @@ import pytest
 from releases import real
 
 from gsparc.base.errors import DataError
-from gsparc.data.datasets.own import Own, read_any
+from gsparc.datasets.own import Own, read_any
 from gsparc.tables.checks.conventions import convention_warnings
 from gsparc.tables.own import from_arrays
 

@@ -7,7 +7,7 @@ import pytest
 from networks import draw_network
 
 from gsparc.base.errors import Severe
-from gsparc.data.datasets.campaign import find_implausible
+from gsparc.datasets.campaign import find_implausible
 from gsparc.tables.checks.gone import find_gone
 
 

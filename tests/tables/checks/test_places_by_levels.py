@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from level_fields import ROWS, flight
 
-from gsparc.data.datasets.own import apply_settings
+from gsparc.datasets.own import apply_settings
 from gsparc.tables.checks.conventions import convention_warnings
 from gsparc.tables.own import from_arrays, interpret
 from gsparc.tables.raw import Raw

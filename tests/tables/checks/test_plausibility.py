@@ -8,7 +8,7 @@ from level_fields import flight
 from releases import real
 from scipy.spatial.distance import cdist
 
-from gsparc.data.datasets.own import read_any
+from gsparc.datasets.own import read_any
 from gsparc.tables.checks import plausibility
 from gsparc.tables.checks.level_steps import detect_level_steps
 from gsparc.tables.checks.link_levels import LinkLevels, link_levels

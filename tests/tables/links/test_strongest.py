@@ -8,7 +8,7 @@ from networks import network
 from releases import release
 
 from gsparc.base.errors import DataError, Severe
-from gsparc.data.datasets.powder import read_powder
+from gsparc.datasets.powder import read_powder
 from gsparc.tables.checks.link_levels import link_levels
 from gsparc.tables.checks.plausibility import floor_warnings, sanity_warnings
 from gsparc.tables.links.strongest import number_lists

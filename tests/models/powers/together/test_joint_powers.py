@@ -13,10 +13,10 @@ from refusals import refused
 from releases import real
 from scenes import fold_of
 
-from gsparc.data.datasets.ble import BLE
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
+from gsparc.datasets.ble import BLE
 from gsparc.field.initial import InitSettings
 from gsparc.models.gsparc import Gsparc, choose
 from gsparc.models.per_station import wrap_per_station

@@ -1,0 +1,227 @@
+"""Levels that a file states of a site before any row: a GeoTIFF, or places and powers."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from gsparc.base.errors import Caution, DataError, list_first
+from gsparc.data.schema import Measurements
+from gsparc.data.station_names import site_name
+from gsparc.data.units import UNITS
+from gsparc.datasets.own import read_own
+from gsparc.physics.decibels import to_decibels
+from gsparc.tables import is_table
+from gsparc.tables.checks.plausibility import find_marks
+from gsparc.tables.own import interpret
+from gsparc.tables.own_checks import MOST_DB
+
+log = logging.getLogger(__name__)
+
+Files = str | Path | Sequence[str]
+Levels = tuple[np.ndarray, np.ndarray]  # places (M, 2) [m], world, and levels (M,) [dB] there
+BAND = "power_db"  # of the strongest station, as `gsparc map` writes; with a name behind it of one of several
+MOST = 4_000_000  # levels: they are kept with a model
+ABOUT_M = 100.0  # least distance from the box of rows and stations that levels are kept within [m]
+
+
+def read_prior_levels(path: Files, data: Measurements, station: str = "") -> Levels:
+    """Return places (M, 2) [m] in the world coordinates of the measurements, and levels (M,) [dB] there.
+
+    Args:
+        path: *.tif, or what `dataset=own` reads; several, or a folder of *.tif: each named by its station.
+        data: measurements, which the levels must overlap.
+        station: whose levels are wanted, as it is shown; empty: the measurements are of one station.
+
+    Raises:
+        DataError: no such file, no levels, none of this station, or of another place.
+    """
+    return read_prior_maps(path, data, (station,))[0][2]
+
+
+def read_prior_maps(
+    path: Files, data: Measurements, stations: Sequence[str]
+) -> list[tuple[int, bool, Levels]]:
+    """Return number, whether it is of the station and not of its site, and levels, of stations with a map.
+
+    Args:
+        path, data: see `read_prior_levels`.
+        stations: (T,) as they are shown; those without a map are warned of.
+
+    Raises:
+        DataError: as `read_prior_levels`, of none of them.
+    """
+    own = [names_of_station(shown) for shown in stations]
+    every = {name for names in own for name in names if name}
+    maps, faults = dict[str, Levels](), list[DataError]()
+    several = not isinstance(path, str | Path) or Path(path).is_dir()
+    files = [Path(one) for one in ([path] if isinstance(path, str | Path) else path)]
+    files = sorted(files[0].glob("*.tif")) if len(files) == 1 and files[0].is_dir() else files
+    for file in files:
+        for name, points, level in _read_file(file, data, every):
+            try:
+                named = name or file.stem * several
+                maps[named] = _near_rows(file, data, points, level)
+            except DataError as error:
+                faults.append(error)
+    if not maps:
+        raise faults[0] if faults else DataError(f"model.prior={path}: no level is known in it")
+    if stations == ("",) and len(maps) == 1:
+        return [(0, True, next(iter(maps.values())))]
+    found = list[tuple[int, bool, Levels]]()
+    for number, names in enumerate(own):
+        sites = [site_name(name) for name in names]
+        match = next(((one, one in names) for one in (*names, *sites) if one in maps), None)
+        found += [] if match is None else [(number, match[1], maps[match[0]])]
+    if not found:
+        shown = list_first(stations) or "one station"
+        advice = f"call bands of a GeoTIFF `{BAND} NAME`, columns of a table NAME, as the measurements do"
+        if list(maps) == [""]:
+            raise DataError(
+                f"model.prior={path}: one map of no station's name, and there are several: as of a best "
+                f"server it tells nothing of {shown}; {advice}"
+            )
+        raise DataError(f"model.prior={path}: of {list_first([*maps], 12)}, not of {shown}; {advice}")
+    with_map = {number for number, *_ in found}
+    if lacking := [shown for number, shown in enumerate(stations) if number not in with_map]:
+        log.warning("model.prior=%s: no map of %s", path, list_first(lacking))
+    return found
+
+
+def names_of_station(shown: str) -> tuple[str, ...]:
+    """Return all names of a station as it is shown, of which a file may have any.
+
+    >>> names_of_station("W03-2 (150)"), names_of_station("roof")
+    (('W03-2 (150)', 'W03-2', '150'), ('roof',))
+    """
+    both = re.fullmatch(r"(.+) \((.+)\)", shown)
+    return (shown, *both.groups()) if both else (shown,)
+
+
+def _read_file(
+    path: Path, data: Measurements, stations: Collection[str]
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield name, places and levels of each map in one file."""
+    if path.suffix == ".ckpt":
+        raise DataError(f"model.prior={path}: draw it first, gsparc map ckpt={path}, and give its map.tif")
+    if not path.is_file():
+        raise DataError(
+            f"model.prior={path}: no such file; a GeoTIFF is needed, or a table of places and powers"
+        )
+    read = _read_raster if path.suffix in (".tif", ".tiff") else _read_rows
+    yield from read(path, data, stations)
+
+
+def _near_rows(path: Path, data: Measurements, points: np.ndarray, level: np.ndarray) -> Levels:
+    """What is known about rows and stations; `DataError` where that is nothing, or too much."""
+    finite = np.isfinite(level) & (np.abs(level) <= MOST_DB) & np.isfinite(points).all(1)
+    _say_marks(path, int((np.isfinite(level) & (np.abs(level) > MOST_DB)).sum()), f"beyond {MOST_DB} dB")
+    if not finite.any():
+        raise DataError(f"model.prior={path}: no level is known in it")
+    points, level = points[finite], level[finite]
+    at = data.moving[:, :2] + data.site.origin[:2]
+    if not ((at >= points.min(0) - 1) & (at <= points.max(0) + 1)).all(1).any():
+        box, rows = (
+            f"x {a:.0f} to {b:.0f}, y {c:.0f} to {d:.0f} m" for (a, b), (c, d) in map(_extent, (points, at))
+        )
+        raise DataError(f"model.prior={path}: it is of {box}, and all rows lie elsewhere: {rows}")
+    # Of a whole country only what lies about rows and stations is kept.
+    margin, still = max(float(np.ptp(at, axis=0).max()), ABOUT_M), data.site.every_station.position[:, :2]
+    ends = np.r_[at, still[np.isfinite(still).all(1)] + data.site.origin[:2]]
+    near = ((points >= ends.min(0) - margin) & (points <= ends.max(0) + margin)).all(1)
+    if near.sum() > MOST:
+        raise DataError(
+            f"model.prior={path}: {near.sum():,} levels about the rows; {MOST:,} at most are kept"
+        )
+    points, level = points[near], level[near]
+    marks = find_marks(level)
+    marked = np.isin(level, marks)
+    _say_marks(path, int(marked.sum()), f"exactly {list_first([f'{mark:g}' for mark in marks])}")
+    return points[~marked], level[~marked]
+
+
+def _say_marks(path: Path, count: int, what: str) -> None:
+    if count:
+        advice = "left out as no levels; tag them as nodata of the file"
+        log.warning("model.prior=%s: %d levels are %s, apart from all others: %s", path, count, what, advice)
+
+
+def _extent(points: np.ndarray) -> np.ndarray:
+    """Lowest and highest (2, 2) of each coordinate."""
+    return np.stack([points.min(0), points.max(0)], 1)
+
+
+def _read_raster(
+    path: Path, data: Measurements, stations: Collection[str]
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield name, centres of squares and their levels, of named bands, else of `BAND` or of the first."""
+    try:
+        import rasterio
+        from rasterio.warp import transform
+    except ImportError:
+        raise DataError(f"model.prior={path}: needs rasterio; pip install 'gsparc[maps]'") from None
+    with rasterio.open(path) as file:
+        titles = [str(title or "") for title in file.descriptions]
+        one = {"": titles.index(BAND) if BAND in titles else 0}
+        known = {*stations, *map(site_name, stations)}
+        named = [t.removeprefix(f"{BAND} ") for t in titles]
+        bands = {t: k for k, t in enumerate(named) if t != titles[k] or t in known}
+        if not bands and file.count > 1 and BAND not in titles:
+            if stations and all(titles):  # of others: as a station alone is asked for, none of them is known
+                bands = {t: k for k, t in enumerate(named)}
+            else:
+                shown = list_first([title or f"{k}" for k, title in enumerate(titles, 1)])
+                log.warning("model.prior=%s: the first of its bands %s is taken", path, shown)
+        row, column = np.mgrid[: file.height, : file.width]
+        x, y = file.transform @ (column.ravel() + 0.5, row.ravel() + 0.5)
+        points, crs, origin = np.c_[x, y], file.crs, data.site.georeference
+        if crs is not None and origin is None:
+            raise DataError(
+                f"model.prior={path}: it has a place on Earth, which the measurements do not state"
+            )
+        if crs is not None and origin is not None:
+            longitude, latitude = (np.asarray(one) for one in transform(crs, "EPSG:4326", x, y))
+            points = origin.from_degrees(latitude, longitude)
+        for name, band in (bands or one).items():
+            stored = file.read(band + 1, masked=True).astype(float).filled(np.nan).ravel()
+            values = stored * file.scales[band] + file.offsets[band]
+            yield name, points, _to_decibels(path, values, str(file.units[band] or ""))
+
+
+def _to_decibels(path: Path, values: np.ndarray, name: str) -> np.ndarray:
+    """Levels of values whose unit a file names, if it names one; `DataError` where that is none of powers."""
+    unit = UNITS.get(name.lower())
+    if unit is None:
+        return values
+    if unit.kind not in ("level", "power"):
+        raise DataError(f"model.prior={path}: its unit is {name}; levels are needed, or powers such as mW")
+    with np.errstate(divide="ignore", invalid="ignore"):  # of no power nothing is known
+        return to_decibels(unit.convert(values)) + 30 if unit.kind == "power" else unit.convert(values)
+
+
+def _read_rows(
+    path: Path, data: Measurements, stations: Collection[str]
+) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+    """Yield name, places and levels of each station of a table, whose heads may be their names, or an npz."""
+    if is_table(path):
+        from gsparc.tables.read import parse_table  # here, as pandas takes half a second to import
+
+        raw = parse_table(path, stations=stations)
+        for note in [note for note in raw.notes if isinstance(note, Caution) and "not used" in note]:
+            log.warning("model.prior=%s: %s", path, note)
+    else:
+        raw = read_own(path)
+    rows = interpret(raw, path).data
+    if not rows.site.maps_levels:
+        raise DataError(f"model.prior={path}: no powers of one end that moves")
+    theirs, ours = rows.site.georeference, data.site.georeference
+    for number, name in enumerate(rows.site.every_station.name):
+        of_station = rows.stations_of() == number
+        points = (rows.moving + rows.site.origin)[of_station, :2]
+        if theirs is not None and ours is not None:
+            points = ours.from_degrees(*theirs.to_degrees(points))
+        yield name, points, rows.site.target.to_real(rows.target[of_station])[:, 0].astype(float)

@@ -1,0 +1,303 @@
+"""Public data from a local server: what comes, what is refused in one line, and what is kept."""
+# ruff: noqa: E501 (a case is a row of a table)
+
+import contextlib
+import csv
+import gzip
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import mirrors
+import pytest
+from filelock import FileLock
+from mirrors import begin, mirrored, offer, sound, source_of
+from releases import real
+
+from gsparc.base.errors import DataError
+from gsparc.commands import data as command
+from gsparc.datasets.load import datamodule
+from gsparc.datasets.public import fetch as fetching
+from gsparc.datasets.public.fetch import fetch, fetched_path, public_sets
+
+ONE, TWO = os.urandom(3000), b"x,y,z\n" * 200
+
+
+@pytest.fixture
+def mirror():
+    with pytest.MonkeyPatch.context() as patch, mirrored(patch) as server:
+        yield server
+
+
+def test_a_set_is_fetched_once(mirror, monkeypatch, tmp_path, caplog):
+    caplog.set_level("INFO")
+    room = offer(
+        monkeypatch,
+        tmp_path,
+        *(mirror.serve(f"release/{n}", c) for n, c in (("a/1.bin", ONE), ("2.csv", TWO))),
+    )
+    folder = fetch("room")
+    assert folder == tmp_path / "gsparc/data/room" and not room.missing()
+    assert (folder / "a/1.bin").read_bytes() == ONE and (folder / "2.csv").read_bytes() == TWO
+    assert caplog.text.count("licence MIT; cite its makers") == 1
+    fetch("room")
+    assert set(mirror.asked.values()) == {1} and caplog.text.count("licence MIT") == 1
+
+
+def test_what_is_damaged_is_fetched_again_and_alone(mirror, monkeypatch, tmp_path):
+    offer(
+        monkeypatch, tmp_path, *(mirror.serve(f"release/{n}", c) for n, c in (("1.bin", ONE), ("2.csv", TWO)))
+    )
+    folder = fetch("room")
+    (folder / "1.bin").write_bytes(ONE[:-1] + bytes([ONE[-1] ^ 1]))
+    assert (fetch("room") / "1.bin").read_bytes() == ONE
+    assert [mirror.asked[f"/makers/data/0123abc/release/{n}"] for n in ("1.bin", "2.csv")] == [2, 1]
+
+
+def cut(request, content):
+    begin(request, Content_Length=len(content))
+    request.wfile.write(content[:-7])
+    request.close_connection = True
+
+
+def stalls(request, content):
+    begin(request, Content_Length=len(content))
+    request.wfile.write(content[:10])
+    request.wfile.flush()
+    time.sleep(1.5)
+
+
+def silent(request, content):
+    time.sleep(1.5)
+
+
+def missing(request, content):
+    request.send_error(404)
+
+
+def moved(request, content):
+    request.send_response(302)
+    request.send_header("Location", request.path)
+    request.end_headers()
+
+
+def endless(request, content):
+    begin(request)
+    request.wfile.write(bytes(400_000))
+
+
+def short(request, content):
+    sound(request, content[:-1])
+
+
+def changed(request, content):
+    sound(request, bytes(len(content)))
+
+
+FAULTS = {
+    "wrong hash": (changed, r"not the 3,000 bytes of the pinned revision \(SHA-256\); it was not kept"),
+    "too short": (short, "not the 3,000 bytes of the pinned revision"),
+    "too long": (endless, "not the 3,000 bytes of the pinned revision"),
+    "cut short": (cut, r"cut short; what is there is kept: say `gsparc data room` again"),
+    "stalls": (stalls, "the server sends nothing; what is there is kept"),
+    "never answers": (silent, "the server sends nothing; what is there is kept"),
+    "not there": (missing, "404 Client Error: Not Found; what is there is kept"),
+    "redirects for ever": (moved, "Exceeded 30 redirects"),
+}
+
+
+@pytest.mark.parametrize("case", FAULTS)
+def test_a_file_that_is_not_the_pinned_one_is_said_and_not_kept(mirror, monkeypatch, tmp_path, case):
+    answer, says = FAULTS[case]
+    first = mirror.serve("release/first.csv", TWO)
+    offer(
+        monkeypatch, tmp_path, first,
+        mirror.serve("release/1.bin", ONE, *[answer] * (40 if answer is moved else 1)),
+    )  # fmt: skip
+    with pytest.raises(DataError, match=says) as error:
+        fetch("room", timeout_s=0.3, retries=0)
+    assert "\n" not in str(error.value) and "release/1.bin" in str(error.value)
+    left = sorted(path.name for path in (tmp_path / "gsparc/data/room").iterdir())
+    assert left == [".lock", "first.csv"]
+    mirror.answers.clear()
+    mirror.answers |= {url: [] for url in mirror.files}
+    assert (fetch("room", timeout_s=2, retries=0) / "1.bin").read_bytes() == ONE  # said again
+    assert mirror.asked["/makers/data/0123abc/release/first.csv"] == 1
+
+
+@pytest.mark.parametrize(("how", "retries"), [(cut, 1), (moved, 0)])
+def test_a_failure_that_passes_is_tried_again_and_a_redirect_followed(
+    mirror, monkeypatch, tmp_path, how, retries
+):
+    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, how))
+    assert (fetch("room", retries=retries) / "1.bin").read_bytes() == ONE
+
+
+@pytest.mark.parametrize(
+    "path", ["release/../../../escaped", "/etc/escaped", "release/..\\escaped", "release/link/escaped"]
+)
+def test_a_path_that_leaves_the_folder_is_refused_before_anything_is_fetched(
+    mirror, monkeypatch, tmp_path, path, refused
+):
+    room = offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE), mirror.serve(path, TWO))
+    room.folder.mkdir(parents=True)
+    (room.folder / "link").symlink_to(tmp_path)
+    refused(r"would leave .*room; nothing is fetched", fetch, "room")
+    assert not mirror.asked and not list(tmp_path.rglob("escaped"))
+
+
+def test_without_a_network_one_line_says_so(monkeypatch, tmp_path, refused):
+    offer(monkeypatch, tmp_path, source_of("release/1.bin", ONE))
+    monkeypatch.setenv("GSPARC_DATA_URL", "http://127.0.0.1:9")
+    refused("not reached; is there a network", fetch, "room", retries=0)
+
+
+def test_a_licence_that_is_not_stated_is_asked_for(mirror, monkeypatch, tmp_path, capsys):
+    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE), licence=None)
+    monkeypatch.setattr(command, "public_sets", fetching.public_sets)
+    assert command.main(["room"]) == 1
+    assert "state no licence" in capsys.readouterr().err and not mirror.asked
+    assert command.main(["room", "accept=true"]) == 0 and mirror.asked
+    assert command.main(["room"]) == 0  # nothing is left to be fetched
+
+
+def test_a_cache_that_cannot_be_written(mirror, monkeypatch, tmp_path, refused):
+    """Root may write into a folder without the permission: a file where the folder should be stands for it."""
+    room = offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE))
+    room.folder.parent.mkdir(parents=True)
+    room.folder.write_text("in the way")
+    refused(r"room: cannot be written \(.*\); set XDG_CACHE_HOME", fetch, "room")
+    room.folder.unlink()
+    fetch("room")
+    with monkeypatch.context() as patch:  # what is there needs no writing
+        patch.setattr("gsparc.datasets.public.fetch.FileLock", None)
+        assert fetch("room") == room.folder
+
+
+SLOW = """
+import sys
+sys.path[:0] = [{helpers!r}]
+import pytest
+from filelock import FileLock
+from mirrors import offer, source_of
+from gsparc.datasets.public.fetch import fetch
+with pytest.MonkeyPatch.context() as patch:
+    offer(patch, {folder!r}, source_of("release/1.bin", b"1" * 5000))
+    fetch("room", timeout_s=60)
+"""
+
+
+def test_a_fetch_that_was_killed_is_said_again(mirror, monkeypatch, tmp_path):
+    room = offer(
+        monkeypatch,
+        tmp_path,
+        mirror.serve("release/1.bin", b"1" * 5000, lambda r, c: (stalls(r, c), time.sleep(3))),
+    )
+    helpers = str(Path(mirrors.__file__).parent)
+    child = subprocess.Popen([sys.executable, "-c", SLOW.format(helpers=helpers, folder=str(tmp_path))])
+    deadline = time.monotonic() + 60
+    while not mirror.asked and time.monotonic() < deadline:
+        time.sleep(0.05)
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    assert len(list(room.folder.glob("tmp*"))) == 1  # begun, and left
+    with pytest.raises(DataError, match="gsparc data room"):
+        offer(monkeypatch, tmp_path, *room.sources, dataset="newrf")
+        fetched_path("newrf")
+    fetch("room", retries=0)
+    assert sorted(path.name for path in room.folder.iterdir()) == [".lock", "1.bin"]
+
+
+def test_data_without_files_say_in_one_line_how_to_get_them(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    for name, says in {
+        "newrf": "get it with `gsparc data newrf` (0.4 MB in 1 file), or say dataset.file=FILE for dataset=newrf",
+        "ble": "get it from https://github.com/philotuxo/Position-Annotated-BLE-RSSI-Dataset",
+        "sionna": "make one with `gsparc simulate`, or say dataset.file=FILE for dataset=sionna",
+        "own": "dataset.file is not set; say dataset.file=FILE for dataset=own",
+    }.items():
+        with pytest.raises(DataError) as error:
+            datamodule({"name": name})
+        assert says in str(error.value) and "\n" not in str(error.value)
+
+
+def test_every_pinned_file_is_listed_as_it_was_published():
+    text = real("releases/sources.csv").read_text()
+    rows = list(csv.DictReader(text.splitlines()))
+    pinned = {(s.path, s.bytes, s.sha256) for each in public_sets().values() for s in each.sources}
+    assert pinned == {(r["path"], int(r["bytes"]), r["sha256"]) for r in rows} and len(rows) == 422
+    for one in public_sets().values():
+        assert (one.licence is None) == any(
+            "see" in r["licence"] for r in rows if r["dataset"] == one.name
+        ) or not one.sources
+        assert one.sources or one.by_hand or one.hub
+        assert all(str(path).startswith(str(one.folder)) for path in one.files())
+
+
+def test_the_list_tells_size_licence_and_source(capsys):
+    assert command.main([]) == 0
+    listed = capsys.readouterr().out
+    assert "newrf-rooms: all nine rooms" in listed and "5.6 MB in 9 files; MIT; dataset=newrf" in listed
+    assert "github.com/wenchaozheng/WRF-GSplus at e564f31844" in listed and "no licence stated" in listed
+
+
+@pytest.mark.slow
+def test_more_than_the_known_size_is_not_read(mirror, monkeypatch, tmp_path, refused):
+    """A mirror that sent 300 MB for 386 kB was read thrice to its end."""
+    sent = []
+
+    def flood(request, content):
+        begin(request)
+        with contextlib.suppress(OSError):
+            for _ in range(1000):
+                request.wfile.write(os.urandom(2**16))
+                sent.append(2**16)
+
+    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, flood, flood, flood))
+    refused("not the 3,000 bytes of the pinned revision", fetch, "room")
+    assert sum(sent) < 3 * 20e6
+
+
+def test_a_byte_now_and_then_never_ended(mirror, monkeypatch, tmp_path, refused):
+    def drips(request, content):
+        begin(request, Content_Length=len(content))
+        with contextlib.suppress(OSError):
+            for one in content:
+                request.wfile.write(bytes([one]))
+                if mirror.stop.wait(0.02):
+                    return
+
+    monkeypatch.setattr(fetching, "PATIENCE", 2)
+    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, drips))
+    refused("the server sends too little in the time", fetch, "room", timeout_s=0.1, retries=0)
+
+
+def test_what_is_packed_on_the_wire_is_not_unpacked(mirror, monkeypatch, tmp_path, refused):
+    def packed(request, content):
+        body = gzip.compress(bytes(10**7))
+        begin(request, Content_Encoding="gzip", Content_Length=len(body))
+        with contextlib.suppress(OSError):
+            request.wfile.write(body)
+
+    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, packed))
+    refused("not the 3,000 bytes", fetch, "room", retries=0)
+
+
+def test_who_waits_for_another_fetch_is_told(mirror, monkeypatch, tmp_path, caplog):
+    room = offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE))
+    room.folder.mkdir(parents=True)
+    held = threading.Event()
+
+    def hold():
+        with FileLock(room.folder / ".lock"):
+            held.set()
+            time.sleep(0.3)
+
+    threading.Thread(target=hold).start()
+    held.wait()
+    fetch("room")
+    assert "another process fetches it" in caplog.text and not room.missing()
