@@ -22,11 +22,11 @@ from omegaconf import OmegaConf
 from town import shadowed
 
 from gsparc.commands.train import train_job
-from gsparc.evaluation.experiment.cells import plan_jobs
-from gsparc.evaluation.experiment.runner import run_jobs
-from gsparc.evaluation.experiment.table import average_cells
 from gsparc.models.registry import plain_methods
 from gsparc.physics.waves import point_wave
+from gsparc.runs.experiment.cells import plan_jobs
+from gsparc.runs.experiment.runner import run_jobs
+from gsparc.runs.experiment.table import average_cells
 
 MEASURED = Path(__file__).resolve().parents[2] / "shared" / "data"
 ROWS = 900  # of a case, of more

@@ -8,10 +8,10 @@ import pytest
 from gsparc.data.assemble import identity_hash
 from gsparc.data.georeference import Georeference
 from gsparc.data.schema import Site, Stations
-from gsparc.evaluation.ledger import measurements_hash
 from gsparc.models.array_vectors import vector_cache
 from gsparc.models.checkpoint import _site_from, _tensors_to_numpy, _to_plain
 from gsparc.ops import SphereGrid
+from gsparc.runs.ledger import measurements_hash
 
 ONE = np.ones(3)
 FACTS = {

@@ -9,11 +9,11 @@ import numpy as np
 from omegaconf import DictConfig
 
 from gsparc.base.limits import check_arguments, choice
-from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.evaluation.table import Column, Table
 from gsparc.ops.backends import backend_named
 from gsparc.prediction.bench import Call, kernel_cases, loss_case, training_step_case
 from gsparc.prediction.timing import ClockSettings, time_interleaved
+from gsparc.runs.output import finish_run, run_directory
 
 COLUMNS = (
     Column("kernel", ""), Column("size", ""), Column("seconds", ".3g"), Column("in torch", ".3g"),

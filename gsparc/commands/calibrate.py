@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.evaluation.open_runs import Unseen
 from gsparc.evaluation.pictures import NAMES, draw_calibration
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import write_summary
@@ -18,6 +16,8 @@ from gsparc.evaluation.table import Column, Interval, Table
 from gsparc.prediction.confidence import Guarantee
 from gsparc.prediction.left_out import Evidence
 from gsparc.prediction.risk import SHARES, calibration_facts, explain_too_few, run_trials
+from gsparc.runs.open_runs import Unseen
+from gsparc.runs.output import begin_run, finish_run
 
 log = logging.getLogger(__name__)
 

@@ -12,15 +12,16 @@ import pandas as pd
 from omegaconf import DictConfig
 
 from gsparc.base.files import platform_cache
-from gsparc.commands.shared.output import begin_run, show_result
-from gsparc.commands.shared.run_lock import locked
 from gsparc.commands.train import train_job
 from gsparc.evaluation.drawing import PRINTED, save
 from gsparc.evaluation.examples import join_examples
-from gsparc.evaluation.experiment.cells import plan_jobs
-from gsparc.evaluation.experiment.published import beside_published, read_published
-from gsparc.evaluation.experiment.runner import run_jobs, time_by_dataset
-from gsparc.evaluation.experiment.table import (
+from gsparc.evaluation.pictures import draw_spectra
+from gsparc.evaluation.plots import draw_efforts, draw_splits, draw_sweep
+from gsparc.evaluation.summary import provenance, write_samples, write_summary
+from gsparc.runs.experiment.cells import plan_jobs
+from gsparc.runs.experiment.published import beside_published, read_published
+from gsparc.runs.experiment.runner import run_jobs, time_by_dataset
+from gsparc.runs.experiment.table import (
     CELL,
     PROBLEM,
     average_cells,
@@ -31,9 +32,8 @@ from gsparc.evaluation.experiment.table import (
     table_of,
     title_of,
 )
-from gsparc.evaluation.pictures import draw_spectra
-from gsparc.evaluation.plots import draw_efforts, draw_splits, draw_sweep
-from gsparc.evaluation.summary import provenance, write_samples, write_summary
+from gsparc.runs.output import begin_run, show_result
+from gsparc.runs.run_lock import locked
 
 log = logging.getLogger(__name__)
 

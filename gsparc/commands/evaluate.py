@@ -8,18 +8,18 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from gsparc.commands.shared.output import begin_run, finish_run, tables_of
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
 from gsparc.evaluation.confidence_pictures import PICTURES, draw_confidences
-from gsparc.evaluation.evaluate import Evaluation, evaluate
-from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.plots import draw_sweep
 from gsparc.evaluation.results import Run, frame_of_runs
 from gsparc.evaluation.summary import remarks
 from gsparc.models import checkpoint
 from gsparc.prediction.hearing import read_hearing
+from gsparc.runs.evaluate import Evaluation, evaluate
+from gsparc.runs.open_runs import open_files
+from gsparc.runs.output import begin_run, finish_run, tables_of
 
 
 def evaluate_files(

@@ -16,11 +16,11 @@ from gsparc.apps.export.compiled.blob import pack_form
 from gsparc.apps.export.compiled.make import FIGURES, compile_model
 from gsparc.base.files import whole_folder
 from gsparc.base.limits import POSITIVE, SettingError, check_arguments, choice, or_null, whole
-from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.commands.shared.settings import to_dict
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.placing import fill_heights, to_world
 from gsparc.prediction.predictor import Predictor
+from gsparc.runs.output import begin_run, finish_run
+from gsparc.runs.settings import to_dict
 from gsparc.tables.query_places import read_query_places, read_times
 
 SOURCES = Path(gsparc.ops.__file__).parent / "csrc"

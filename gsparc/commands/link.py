@@ -14,11 +14,11 @@ from omegaconf import DictConfig
 
 from gsparc.apps.link.pictures import STYLES, draw_acceptance, draw_errors, draw_rates
 from gsparc.apps.link.run import LinkStudy
-from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.evaluation.open_runs import open_files
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import write_summary
 from gsparc.evaluation.table import Column, Table
+from gsparc.runs.open_runs import open_files
+from gsparc.runs.output import begin_run, finish_run
 
 log = logging.getLogger(__name__)
 

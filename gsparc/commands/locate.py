@@ -12,8 +12,8 @@ from gsparc.apps.locate.judging import locate_by_model
 from gsparc.apps.locate.neighbours import PLAIN
 from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.base.limits import POSITIVE, SHARE, check_arguments, choice, number, or_null, switch, whole
-from gsparc.commands.shared.output import finish_run, run_directory
-from gsparc.commands.shared.settings import RunSettings, to_dict
+from gsparc.runs.output import finish_run, run_directory
+from gsparc.runs.settings import RunSettings, to_dict
 
 LIMITS = {
     "prior": choice("box", "trained"), "share": SHARE, "offset_db": or_null(number(0)),

@@ -17,10 +17,10 @@ from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.pictures import Layer, draw_layer, file_name, list_layers
 from gsparc.apps.maps.promise import PromiseSettings, map_notes, read_or_gather
 from gsparc.base.errors import DataError
-from gsparc.commands.shared.output import begin_run, finish_run, warn_of_held_out
 from gsparc.evaluation.summary import write_samples
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.timing import peak_memory
+from gsparc.runs.output import begin_run, finish_run, warn_of_held_out
 
 SUFFIXES = (".png", ".pdf", ".svg")  # of pictures
 

@@ -10,11 +10,11 @@ from omegaconf import DictConfig
 from gsparc.apps.maps import placing
 from gsparc.apps.maps.pictures import draw_placement
 from gsparc.apps.maps.promise import read_or_gather, reopen_training
-from gsparc.commands.shared.output import begin_run, finish_run, warn_of_held_out
 from gsparc.evaluation.summary import coordinates, write_samples
 from gsparc.models import checkpoint
 from gsparc.models.per_station import UNHEARD
 from gsparc.prediction.operating_point import load
+from gsparc.runs.output import begin_run, finish_run, warn_of_held_out
 
 
 def task(config: DictConfig) -> dict[str, Any]:

@@ -14,9 +14,9 @@ from gsparc.apps.maps.pictures import draw_measurement_plan
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import read_or_gather
 from gsparc.commands.map import stations_of
-from gsparc.commands.shared.output import begin_run, finish_run, warn_of_held_out
 from gsparc.evaluation.summary import coordinates, write_samples
 from gsparc.prediction.operating_point import load
+from gsparc.runs.output import begin_run, finish_run, warn_of_held_out
 
 
 def task(config: DictConfig) -> dict[str, Any]:

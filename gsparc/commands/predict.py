@@ -7,9 +7,9 @@ from typing import Any
 from omegaconf import DictConfig
 
 from gsparc.apps.maps.promise import read_promise
-from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.evaluation.answers import predict_file
 from gsparc.prediction.operating_point import load
+from gsparc.runs.output import begin_run, finish_run
 
 
 def task(config: DictConfig) -> dict[str, Any]:

@@ -10,11 +10,11 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.base.files import SUMMARY
-from gsparc.commands.shared.output import finish_run, run_directory
 from gsparc.evaluation.drawing import PRINTED
-from gsparc.evaluation.experiment.runner import time_again
 from gsparc.evaluation.report.page import write_report
 from gsparc.evaluation.results import PROBLEM, frame, own_rows, read_columns, read_summary
+from gsparc.runs.experiment.runner import time_again
+from gsparc.runs.output import finish_run, run_directory
 
 
 def task(config: DictConfig) -> dict[str, Any]:

@@ -15,10 +15,10 @@ from omegaconf import DictConfig
 
 from gsparc.base.errors import DataError
 from gsparc.base.limits import SettingError, whole
-from gsparc.commands.shared.settings import RunSettings
 from gsparc.evaluation.console import open_console
 from gsparc.models import checkpoint
 from gsparc.prediction.operating_point import load
+from gsparc.runs.settings import RunSettings
 
 OTHERS = 64  # files that are open beside connections: the log, libraries
 

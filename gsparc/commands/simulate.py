@@ -10,12 +10,12 @@ from hydra.utils import to_absolute_path
 from omegaconf import DictConfig
 
 from gsparc.base.instantiate import from_settings
-from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.commands.shared.run_lock import locked
-from gsparc.commands.shared.settings import to_dict
 from gsparc.evaluation import simulated
 from gsparc.evaluation.console import open_console
 from gsparc.prediction.timing import machine_facts
+from gsparc.runs.output import begin_run, finish_run
+from gsparc.runs.run_lock import locked
+from gsparc.runs.settings import to_dict
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import Outcome, simulate
 from gsparc.simulate.effects import Effects

@@ -12,19 +12,19 @@ from hydra.utils import instantiate
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.base.instantiate import config_node
-from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.commands.shared.settings import to_dict
 from gsparc.commands.train import train_job
 from gsparc.datasets.load import load, split_for
-from gsparc.evaluation.evaluate import dataset_facts, split_facts
-from gsparc.evaluation.experiment.cells import compose
-from gsparc.evaluation.experiment.runner import run_jobs
-from gsparc.evaluation.experiment.study import Condition, average_rounds, plan_rounds
 from gsparc.evaluation.plots import draw_study
 from gsparc.evaluation.summary import run_conditions, write_samples
 from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, value_with_error
 from gsparc.models.registry import build, method_class
 from gsparc.prediction.timing import ClockSettings, machine_facts
+from gsparc.runs.evaluate import dataset_facts, split_facts
+from gsparc.runs.experiment.cells import compose
+from gsparc.runs.experiment.runner import run_jobs
+from gsparc.runs.experiment.study import Condition, average_rounds, plan_rounds
+from gsparc.runs.output import begin_run, finish_run
+from gsparc.runs.settings import to_dict
 
 
 def configs_of(config: DictConfig) -> dict[str, DictConfig]:

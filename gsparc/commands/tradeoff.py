@@ -14,19 +14,19 @@ import torch
 from omegaconf import DictConfig
 
 from gsparc.base.limits import whole
-from gsparc.commands.shared.output import finish_run, in_multirun, run_directory
-from gsparc.commands.shared.run_lock import locked
-from gsparc.commands.shared.settings import to_dict
 from gsparc.evaluation.drawing import save
-from gsparc.evaluation.experiment import tradeoff
-from gsparc.evaluation.ledger import FitInputs, measurements_hash, run_once
-from gsparc.evaluation.open_runs import Opened, open_files
 from gsparc.evaluation.plots import draw_front
 from gsparc.evaluation.summary import write_samples
 from gsparc.evaluation.table import Column, Table
 from gsparc.models.reduced import list_settings, with_reduction
 from gsparc.prediction import operating_point
 from gsparc.prediction.timing import BLOCKS, peak_memory
+from gsparc.runs.experiment import tradeoff
+from gsparc.runs.ledger import FitInputs, measurements_hash, run_once
+from gsparc.runs.open_runs import Opened, open_files
+from gsparc.runs.output import finish_run, in_multirun, run_directory
+from gsparc.runs.run_lock import locked
+from gsparc.runs.settings import to_dict
 from gsparc.training import tracking
 
 log = logging.getLogger(__name__)

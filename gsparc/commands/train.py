@@ -13,19 +13,19 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.base.files import SUMMARY
 from gsparc.commands.shared import cli
-from gsparc.commands.shared.inputs import RunInputs, describe_inputs, read_inputs
-from gsparc.commands.shared.output import show_training
-from gsparc.commands.shared.run_lock import locked
-from gsparc.commands.shared.train_once import objective, train_once
 from gsparc.data.split_files import write_split
 from gsparc.evaluation import summary
-from gsparc.evaluation.baselines import same_as_baseline
-from gsparc.evaluation.evaluate import TrainedRun, evaluate
-from gsparc.evaluation.experiment import folds, options
-from gsparc.evaluation.experiment.runner import Job
-from gsparc.evaluation.ledger import set_earlier_aside
 from gsparc.evaluation.pictures import draw_run
 from gsparc.models.array_vectors.vector_cache import forget_vectors
+from gsparc.runs.baselines import same_as_baseline
+from gsparc.runs.evaluate import TrainedRun, evaluate
+from gsparc.runs.experiment import folds, options
+from gsparc.runs.experiment.runner import Job
+from gsparc.runs.inputs import RunInputs, describe_inputs, read_inputs
+from gsparc.runs.ledger import set_earlier_aside
+from gsparc.runs.output import show_training
+from gsparc.runs.run_lock import locked
+from gsparc.runs.train_once import objective, train_once
 from gsparc.training import tracking
 from gsparc.training.context import FitContext
 

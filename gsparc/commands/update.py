@@ -13,8 +13,6 @@ from omegaconf import DictConfig
 from gsparc.base.errors import DataError
 from gsparc.base.files import write_whole
 from gsparc.base.limits import check_arguments, or_null, switch, whole
-from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.evaluation.open_runs import read_like_stored
 from gsparc.evaluation.summary import coordinates
 from gsparc.evaluation.table import Column, Table
 from gsparc.models import checkpoint
@@ -22,6 +20,8 @@ from gsparc.prediction.later_rows import check_updatable, read_level_rows
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.updating import LIMITS, ToldBefore, versions_extra
+from gsparc.runs.open_runs import read_like_stored
+from gsparc.runs.output import begin_run, finish_run
 from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)

@@ -17,10 +17,10 @@ from gsparc.apps.view.viewed import open_model
 from gsparc.base.errors import DataError
 from gsparc.base.files import write_whole
 from gsparc.base.limits import whole
-from gsparc.commands.shared.output import begin_run, finish_run
-from gsparc.evaluation.open_runs import check_dataset
 from gsparc.prediction.query import read_place
 from gsparc.prediction.timing import peak_memory
+from gsparc.runs.open_runs import check_dataset
+from gsparc.runs.output import begin_run, finish_run
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,6 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from gsparc.evaluation.drawing import numbered_style, panels, save, set_latency_axes, set_log_axis, style_of
-from gsparc.evaluation.experiment.table import methods_by_mean_behind, shown
 from gsparc.evaluation.metric_formats import (
     OF_KIND,
     axis_of,
@@ -30,6 +29,7 @@ from gsparc.evaluation.report.tables import groups_of, interval_of_figure
 from gsparc.evaluation.results import Run, average, distinct_baselines, own_rows
 from gsparc.evaluation.table import Row
 from gsparc.prediction.pareto import pareto_front
+from gsparc.runs.experiment.table import methods_by_mean_behind, shown
 
 WIDE, TALL = 7.0, 3.8
 BAND = 0.95

@@ -11,7 +11,6 @@ from refusals import refused
 from gsparc.commands.calibrate import calibration_tables
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.train import train
-from gsparc.evaluation.open_runs import Unseen
 from gsparc.evaluation.pictures import draw_calibration
 from gsparc.prediction.confidence import Guarantee, Trusted, as_confidence
 from gsparc.prediction.left_out import Evidence
@@ -27,6 +26,7 @@ from gsparc.prediction.risk import (
     split_choose_calibrate_test,
 )
 from gsparc.processes.uncertainty import least_accepted
+from gsparc.runs.open_runs import Unseen
 
 
 def _evidence(count: int = 900, seed: int = 0) -> Evidence:
@@ -65,7 +65,7 @@ def test_few_good_rows_promised_nothing_as_no_level_accepted_enough() -> None:
 
 def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> None:
     evidence, kept = _evidence(), []
-    monkeypatch.setattr("gsparc.evaluation.open_runs.store_trusted", lambda *stored: kept.append(stored))
+    monkeypatch.setattr("gsparc.runs.open_runs.store_trusted", lambda *stored: kept.append(stored))
     how, unseen = (
         ("auto", False, 0),
         Unseen("a.ckpt", {}, Trusted(), Trusted(known=evidence.position), evidence),

@@ -12,7 +12,7 @@ from doors import knock
 from pages import compare_files
 
 from gsparc.commands.listing import COMMANDS
-from gsparc.commands.shared.run_lock import locked
+from gsparc.runs.run_lock import locked
 
 ROOT = Path(__file__).parents[2]
 FILLED = re.compile(r"own/\S+: \S+ \S+ after ")  # a line of each cell

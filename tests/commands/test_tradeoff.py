@@ -14,12 +14,12 @@ from towns import town_file, town_model, trained
 
 import gsparc
 from gsparc.commands.tradeoff import task
-from gsparc.evaluation.experiment.tradeoff import closeness_db, why_irreducible
 from gsparc.evaluation.scores import score_methods
 from gsparc.models import checkpoint
 from gsparc.models.baselines.distance_law import DistanceLaw
 from gsparc.prediction import operating_point
 from gsparc.prediction.timing import ClockSettings, time_interleaved
+from gsparc.runs.experiment.tradeoff import closeness_db, why_irreducible
 from gsparc.training import tracking
 
 

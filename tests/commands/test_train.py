@@ -15,9 +15,9 @@ from gsparc.base.limits import SettingError
 from gsparc.commands import evaluate
 from gsparc.commands.train import TrainedRun, main, train
 from gsparc.evaluation.console import error_in_one_line
-from gsparc.evaluation.experiment import options
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.splat.method import LearnedField
+from gsparc.runs.experiment import options
 from gsparc.training import curve
 
 
@@ -130,7 +130,7 @@ def test_an_option_of_the_trainer_is_an_override(options, validated, spectra_fil
 def test_tensorboard_that_is_not_there_is_one_line(spectra_file, tmp_path, monkeypatch):
     """It was, but only after the data were read."""
     monkeypatch.setattr("gsparc.training.tracking.find_spec", lambda name: None)
-    monkeypatch.setattr("gsparc.commands.shared.inputs.datamodule", None)
+    monkeypatch.setattr("gsparc.runs.inputs.datamodule", None)
     folders = [f"logger.{name}.save_dir='{tmp_path}'" for name in ("csv", "tensorboard")]
     with pytest.raises(ValueError, match="TensorBoard is not installed") as error:
         train(compose(*brief(spectra_file), "logger=tensorboard", *folders), tmp_path)

@@ -9,14 +9,14 @@ import pytest
 from gsparc.data.schema import LIGHT
 from gsparc.data.splits import Fold, Split
 from gsparc.datasets.own import read_any
-from gsparc.evaluation.align_site import align_to_site
 from gsparc.evaluation.answers import predict_file
-from gsparc.evaluation.evaluate import evaluate
 from gsparc.models import checkpoint, fitting
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.hearing import Hearing, read_hearing
 from gsparc.prediction.operating_point import load
+from gsparc.runs.align_site import align_to_site
+from gsparc.runs.evaluate import evaluate
 from gsparc.tables.own import from_arrays, write_own
 from gsparc.training.context import FitContext
 

@@ -8,8 +8,6 @@ import pytest
 import torch
 
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.align_site import align_to_site
-from gsparc.evaluation.baselines import fit_baseline
 from gsparc.evaluation.by_station import (
     best_server,
     describe_never_listed,
@@ -19,12 +17,14 @@ from gsparc.evaluation.by_station import (
     unlisted_stations,
     worst_stations,
 )
-from gsparc.evaluation.evaluate import evaluate
 from gsparc.evaluation.metric_formats import BEST_SERVER, OF_LISTS, WITHOUT_OFF
 from gsparc.evaluation.scores import Scores, score_methods
 from gsparc.evaluation.summary import remarks, results_table
 from gsparc.models.method import Method, Prediction
 from gsparc.prediction.timing import ClockSettings
+from gsparc.runs.align_site import align_to_site
+from gsparc.runs.baselines import fit_baseline
+from gsparc.runs.evaluate import evaluate
 from gsparc.tables.own import from_arrays
 
 PLACES, NAMES = 60, ["north", "south", "roof"]

@@ -8,13 +8,13 @@ import torch
 from networks import network
 
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.evaluate import evaluate
 from gsparc.evaluation.summary import remarks
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.per_station import wrap_per_station
 from gsparc.prediction.hearing import Hearing
+from gsparc.runs.evaluate import evaluate
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 

@@ -13,8 +13,8 @@ from worlds import World, arrays
 from gsparc.commands.train import TrainedRun, train
 from gsparc.data.schema import Measurements
 from gsparc.data.target import Kind
-from gsparc.evaluation.baselines import baselines_for, fit_baseline
 from gsparc.evaluation.scores import score_methods
+from gsparc.runs.baselines import baselines_for, fit_baseline
 
 BEHIND = 1.05  # times the best plain method's error that ours may have
 FRESH = 5  # seeds that repeat a miss

@@ -37,7 +37,6 @@ from gsparc.apps.maps.planning import coarse_grid
 from gsparc.apps.maps.promise import Promise, PromiseSettings, gather_promise, read_promise
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.align_site import align_to_site
 from gsparc.evaluation.by_station import unlisted_stations
 from gsparc.evaluation.scores import score_methods
 from gsparc.models import checkpoint
@@ -50,6 +49,7 @@ from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import to_local
 from gsparc.prediction.refit import Learned
 from gsparc.processes.uncertainty import half_width
+from gsparc.runs.align_site import align_to_site
 from gsparc.training.context import FitContext
 
 LISTED, MOMENTS, EVEN, STEP_M, AREA = 6, 350, 1000, 50.0, (250.0, 250.0, 2250.0, 2250.0)

@@ -11,8 +11,8 @@ from judging import repeated, run
 from product import PARTS
 from worlds import CHOICES, World, arrays, covering, every, possible_pairs
 
-from gsparc.commands.shared.inputs import read_inputs
-from gsparc.evaluation.baselines import fit_baseline
+from gsparc.runs.baselines import fit_baseline
+from gsparc.runs.inputs import read_inputs
 
 FEW = covering(every((30,)), 1)[:14]  # seven of eight pairs; `make grid` has all
 QUICK = (0, 2, 3, 4, 7, 8)  # of them, at every change: those of under three seconds

@@ -76,7 +76,7 @@ def fit_context(config, run_dir: Path):
 
     from hydra.utils import instantiate
 
-    from gsparc.evaluation.experiment.folds import build_callbacks, effort_settings
+    from gsparc.runs.experiment.folds import build_callbacks, effort_settings
     from gsparc.training.context import FitContext
 
     made = {"trainer": instantiate(config.trainer, _partial_=True)}

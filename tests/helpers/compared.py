@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from gsparc.evaluation.experiment.table import average_cells, remarks, split_by_problem
 from gsparc.evaluation.results import Run, as_frame
+from gsparc.runs.experiment.table import average_cells, remarks, split_by_problem
 
 
 def filled(method, value, seed=None, effort=None, split="random", kind="spectrum", **more):

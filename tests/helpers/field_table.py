@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pandas as pd
 
-from gsparc.evaluation.experiment.published import read_published
-from gsparc.evaluation.experiment.table import GROUP, columns_of_csv, shown
 from gsparc.evaluation.metric_formats import score_heading
 from gsparc.evaluation.table import CPU, P50, Column, Interval, Row, Table
+from gsparc.runs.experiment.published import read_published
+from gsparc.runs.experiment.table import GROUP, columns_of_csv, shown
 
 ROOT = Path(__file__).parents[2]
 FILE, PAGE = ROOT / "docs" / "results" / "table.csv", ROOT / "docs" / "table.md"

@@ -19,7 +19,7 @@ from gsparc.base.errors import DataError
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.datasets.load import split_for
 from gsparc.datasets.own import read_any
-from gsparc.evaluation.baselines import fit_baseline
+from gsparc.runs.baselines import fit_baseline
 
 FILE = Path(__file__).parents[2] / "docs" / "results" / "strangers.csv"
 HEADS = ("file", "what is unusual", "check says", "as read", "advice followed", "advice", "right")

@@ -8,12 +8,12 @@ import pytest
 
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import Stations
-from gsparc.evaluation.align_site import align_to_site
 from gsparc.models import aligned_rows, fitting
 from gsparc.models.aligned_rows import align_phases, align_rows
 from gsparc.models.gsparc import Gsparc
 from gsparc.physics import row_factors
 from gsparc.physics.row_factors import align_factors
+from gsparc.runs.align_site import align_to_site
 from gsparc.tables.checks.coherence import set_unknown_factor
 from gsparc.training.context import FitContext
 

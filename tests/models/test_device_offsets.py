@@ -10,9 +10,9 @@ import torch
 import gsparc
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.evaluation.answers import predict_file
-from gsparc.evaluation.baselines import fit_baseline
 from gsparc.models.device_offsets import take_off_devices, without_devices
 from gsparc.models.method import Prediction
+from gsparc.runs.baselines import fit_baseline
 from gsparc.tables.own import from_arrays
 
 RNG = np.random.default_rng(5)

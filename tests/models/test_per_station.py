@@ -14,15 +14,15 @@ import gsparc
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold, Split
 from gsparc.datasets.load import split_for
-from gsparc.evaluation.baselines import baselines_for
-from gsparc.evaluation.evaluate import evaluate
-from gsparc.evaluation.experiment.folds import fit_folds, fold_contexts
 from gsparc.evaluation.scores import score_methods
 from gsparc.models import checkpoint, loading, per_station
 from gsparc.models.fitting import fit_or_resume
 from gsparc.models.per_station import PerStation, station_site, stations_of_fold, wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.timing import ClockSettings
+from gsparc.runs.baselines import baselines_for
+from gsparc.runs.evaluate import evaluate
+from gsparc.runs.experiment.folds import fit_folds, fold_contexts
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 

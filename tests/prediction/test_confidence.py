@@ -9,12 +9,12 @@ from refusals import refused
 from towns import trained
 
 import gsparc
-from gsparc.evaluation.open_runs import Unseen
 from gsparc.models import checkpoint, loading
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.prediction.confidence import Guarantee, Trusted, as_confidence, calibrated_box, store_trusted
 from gsparc.prediction.left_out import gather_evidence
 from gsparc.processes.kernel import WhiteNoise
+from gsparc.runs.open_runs import Unseen
 from gsparc.training.context import FitContext
 
 

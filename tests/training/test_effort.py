@@ -11,8 +11,8 @@ from refusals import refused
 
 import gsparc
 from gsparc.commands.listing import COMMANDS
-from gsparc.commands.shared.continued import add_settings_of_run
-from gsparc.commands.shared.settings import RunSettings
+from gsparc.runs.continued import add_settings_of_run
+from gsparc.runs.settings import RunSettings
 from gsparc.training.context import FitContext
 from gsparc.training.effort import INSTEAD, Effort
 from gsparc.training.stopwatch import Stopwatch

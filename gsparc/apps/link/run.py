@@ -15,10 +15,10 @@ from gsparc.apps.link.adaptation import RULES, Rates
 from gsparc.apps.link.channels import band_evidence, predict_channels
 from gsparc.apps.link.pusch import NEEDED, RECEIVERS, Pusch, frequency_correlation
 from gsparc.base.limits import SHARE, or_null
-from gsparc.evaluation.open_runs import Opened
 from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred_grid
 from gsparc.prediction.confidence import Guarantee, as_confidence, confidence_threshold
 from gsparc.prediction.risk import calibrate_threshold
+from gsparc.runs.open_runs import Opened
 
 log = logging.getLogger(__name__)
 

@@ -26,12 +26,12 @@ from gsparc.apps.locate.snapshots import Scans, group_snapshots
 from gsparc.base.errors import DataError
 from gsparc.evaluation.console import to_dict
 from gsparc.evaluation.drawing import PALETTE, panels, save
-from gsparc.evaluation.open_runs import Opened, open_files, read_like_stored
 from gsparc.evaluation.summary import coordinates, write_as_found, write_samples
 from gsparc.evaluation.table import Column, Table
 from gsparc.models import checkpoint
 from gsparc.prediction.predictor import Predictor
 from gsparc.processes.few_rows import draw_rows
+from gsparc.runs.open_runs import Opened, open_files, read_like_stored
 
 log = logging.getLogger(__name__)
 

@@ -16,10 +16,10 @@ from gsparc.base.errors import DataError
 from gsparc.base.executor import run_all
 from gsparc.base.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.splits import SplitSettings
-from gsparc.evaluation.open_runs import check_dataset, open_files
 from gsparc.models import checkpoint
 from gsparc.prediction.left_out import HeldOutLevels, leave_out, nearest_distances
 from gsparc.prediction.refit import Learned
+from gsparc.runs.open_runs import check_dataset, open_files
 
 log = logging.getLogger(__name__)
 

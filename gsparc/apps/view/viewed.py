@@ -12,11 +12,11 @@ import numpy as np
 
 from gsparc.apps.maps.making import choose_stations
 from gsparc.data.schema import End, Measurements, Site
-from gsparc.evaluation.align_site import align_to_site
-from gsparc.evaluation.open_runs import open_files
 from gsparc.prediction import levels
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.predictor import Predictor
+from gsparc.runs.align_site import align_to_site
+from gsparc.runs.open_runs import open_files
 
 log = logging.getLogger(__name__)
 

@@ -25,10 +25,10 @@ from rich.console import Console
 from gsparc.base.files import check_yaml, list_causes
 from gsparc.base.instantiate import GROUPS, plugins
 from gsparc.commands.shared.plugins import offer_plugins, offer_scenes
-from gsparc.commands.shared.run_lock import InUse, release_folders
 from gsparc.evaluation import console
 from gsparc.evaluation.console import CONFIGS, FULL_ERROR, config_folder, error_in_one_line, list_choices
 from gsparc.models import registry
+from gsparc.runs.run_lock import InUse, release_folders
 from gsparc.training.effort import refuse_seconds
 
 RETRY_S, MOST_RETRIES = 0.01, 100  # of an interrupt inside `logging`; writing a log may wait for its reader
@@ -62,7 +62,7 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     if config == "simulate":
         offer_scenes()
     if config == "train" and any(word.startswith("ckpt_path=") for word in sys.argv):
-        from gsparc.commands.shared.continued import add_settings_of_run  # which brings torch
+        from gsparc.runs.continued import add_settings_of_run  # which brings torch
 
         sys.argv[1:] = add_settings_of_run(sys.argv[1:])
     before = os.environ.get(FULL_ERROR)

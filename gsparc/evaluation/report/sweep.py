@@ -18,8 +18,8 @@ from rich.console import Console
 from gsparc.base.errors import list_first
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import error_in_one_line, open_console
-from gsparc.evaluation.experiment.options import REDRAW
-from gsparc.evaluation.ledger import FAILURE
+from gsparc.runs.experiment.options import REDRAW
+from gsparc.runs.ledger import FAILURE
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -82,10 +82,10 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
     # Here, as they take half a second, and a mistyped option is to be named at once.
     from gsparc.evaluation import plots
     from gsparc.evaluation.confidence_pictures import draw_confidences
-    from gsparc.evaluation.experiment.runner import time_again
     from gsparc.evaluation.report.page import write_report
     from gsparc.evaluation.report.tables import table_of_leads, table_of_seeds
     from gsparc.evaluation.results import frame, own_rows
+    from gsparc.runs.experiment.runner import time_again
 
     rows = frame(folder)
     if settings.retime:

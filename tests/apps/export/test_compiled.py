@@ -299,7 +299,7 @@ def test_sanitizers_see_nothing(tmp_path, portable, capsys):
 def test_the_command_writes_a_folder_whose_library_and_example_build(tmp_path, monkeypatch):
     predictor, path, out = of_powers(60), tmp_path / "model.ckpt", tmp_path / "out"
     checkpoint.save(path, predictor.method)
-    monkeypatch.setattr("gsparc.commands.shared.output.run_directory", lambda: tmp_path)
+    monkeypatch.setattr("gsparc.runs.output.run_directory", lambda: tmp_path)
     config = campaigns.compose(f"ckpt={path}", f"out={out}", config="export")
     facts = export.task(config)
     assert facts["export/error"] == 0 and (out / "field.gsparc").stat().st_size == facts["export/bytes"]

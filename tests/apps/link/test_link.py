@@ -223,8 +223,8 @@ def test_pilots_mend_a_prediction_and_a_prediction_mends_pilots() -> None:
 def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
     data, file = trained
     module = SimpleNamespace(measurements=data)
-    monkeypatch.setattr("gsparc.evaluation.open_runs.datamodule", lambda settings, trusted: module)
-    monkeypatch.setattr("gsparc.evaluation.open_runs.split_for", lambda settings, found: _split())
+    monkeypatch.setattr("gsparc.runs.open_runs.datamodule", lambda settings, trusted: module)
+    monkeypatch.setattr("gsparc.runs.open_runs.split_for", lambda settings, found: _split())
     answer = knock(COMMANDS["link"].run, "link", [
         f"ckpt={file}", "pusch.ebno_db.qpsk=[3.0,4.0]", "pusch.ebno_db.qam16=[7.0]", "pusch.coarse=16",
         "pusch.fine=32", "pusch.batch=16", "pusch.iterations=4", "mcs.snr_db=[15]",
@@ -248,10 +248,10 @@ def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
 def test_a_threshold_by_hand_the_paper_s_rule_and_receivers(trained, tmp_path, monkeypatch) -> None:
     """Where no curve crosses 10 % a table without columns stood there."""
     monkeypatch.setattr(
-        "gsparc.evaluation.open_runs.datamodule",
+        "gsparc.runs.open_runs.datamodule",
         lambda settings, trusted: SimpleNamespace(measurements=trained[0]),
     )
-    monkeypatch.setattr("gsparc.evaluation.open_runs.split_for", lambda settings, found: _split())
+    monkeypatch.setattr("gsparc.runs.open_runs.split_for", lambda settings, found: _split())
     words = [
         f"ckpt={trained[1]}", "pusch.ebno_db.qpsk=[9.0]", "pusch.ebno_db.qam16=[]", "pusch.coarse=16",
         "pusch.fine=16", "pusch.iterations=4", "mcs.snr_db=[15]", "threshold=0.59", "rule=target",

@@ -18,7 +18,7 @@ from gsparc.models import checkpoint
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     """A run folder, without Hydra."""
-    monkeypatch.setattr("gsparc.commands.shared.output.run_directory", lambda: tmp_path)
+    monkeypatch.setattr("gsparc.runs.output.run_directory", lambda: tmp_path)
     return tmp_path
 
 

@@ -11,7 +11,6 @@ from scenes import error
 
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.datasets.load import load
-from gsparc.evaluation.experiment.study import add_direction_errors
 from gsparc.field.initial import InitSettings
 from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.directional.position_refine import UncertainPositions
@@ -23,6 +22,7 @@ from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.mixture.candidates import CANDIDATES
 from gsparc.models.mixture.methods import ImageSources
 from gsparc.models.terms import EffectSettings
+from gsparc.runs.experiment.study import add_direction_errors
 from gsparc.training.context import FitContext
 
 

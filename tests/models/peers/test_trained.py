@@ -16,7 +16,6 @@ from scenes import lobes, room
 
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
-from gsparc.evaluation.experiment.folds import build_callbacks
 from gsparc.field.gradient_stage import DEFAULTS
 from gsparc.field.optimizer import rate_factor
 from gsparc.models import checkpoint
@@ -24,6 +23,7 @@ from gsparc.models.abilities import HasGaussians
 from gsparc.models.fitting import fit_or_resume
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose
+from gsparc.runs.experiment.folds import build_callbacks
 from gsparc.training.context import FitContext
 from gsparc.training.effort import Effort
 

@@ -9,13 +9,13 @@ from cities import city, deaf, fold, folder, uplink_field
 
 from gsparc.data.splits import Split
 from gsparc.datasets.argos import load_argos
-from gsparc.evaluation.baselines import baselines_for
 from gsparc.models.baselines.ridge import Ridge
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.uplink.error_model import estimate_noise
 from gsparc.models.uplink.method import UplinkField
 from gsparc.models.uplink.search import SearchSettings, Sources, SourceSearch
 from gsparc.physics.plane_waves import Aperture, SourceColumns, antenna_responses, tone_responses
+from gsparc.runs.baselines import baselines_for
 from gsparc.training.context import FitContext
 
 

@@ -9,10 +9,10 @@ from releases import real
 
 from gsparc.base.errors import Caution
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.align_site import align_to_site
-from gsparc.evaluation.evaluate import evaluate
 from gsparc.models.registry import method_class
 from gsparc.prediction.fit import fit
+from gsparc.runs.align_site import align_to_site
+from gsparc.runs.evaluate import evaluate
 from gsparc.tables.own import from_arrays, interpret
 from gsparc.tables.raw import Raw
 from gsparc.training.context import FitContext

@@ -97,7 +97,7 @@ def test_the_command_writes_taps_and_says_what_they_leave(tmp_path, monkeypatch)
     model = gsparc.fit(rx=rx, tx=ray.sources[0], csi=csi, frequency_hz=tones, model="complex_gp")
     checkpoint.save(tmp_path / "model.ckpt", model.method)
     (tmp_path / "drive.csv").write_text("time_s,x,y,z\n0,30,10,1.5\n0.02,30.2,10,1.5\n")
-    monkeypatch.setattr("gsparc.commands.shared.output.run_directory", lambda: tmp_path)
+    monkeypatch.setattr("gsparc.runs.output.run_directory", lambda: tmp_path)
 
     def run(*given):
         return export.task(compose(*given, config="export"))

@@ -1,0 +1,116 @@
+"""What a training begins with: checked settings, a method, data that are read, and their folds."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold, Split
+from gsparc.data.walls import read_walls
+from gsparc.datasets.datamodule import DataModule
+from gsparc.datasets.load import datamodule, split_for
+from gsparc.models import checkpoint
+from gsparc.models.method import MethodFactory
+from gsparc.models.registry import build, fill_defaults
+from gsparc.runs.align_site import align_to_site
+from gsparc.runs.settings import RunSettings, to_dict
+from gsparc.tables.checks.describe import summarise
+from gsparc.training import tracking
+from gsparc.training.effort import Effort
+
+log = logging.getLogger(__name__)
+log_of_models = logging.getLogger("gsparc.models")  # of which the console shows warnings alone
+
+
+@dataclass(frozen=True)
+class RunInputs:
+    """What a run begins with, before anything is fitted.
+
+    Attributes:
+        method: unfitted, or what chooses it.
+        module, split: the data, read, and their folds.
+        walls: known ones, drawn beside what is found.
+        learned: what a fold learns from instead, such as displaced or fewer measurements; None: these.
+    """
+
+    method: MethodFactory
+    module: DataModule
+    split: Split
+    walls: Any = None
+    learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None
+
+    @property
+    def data(self) -> Measurements:
+        """The measurements."""
+        return self.module.measurements
+
+
+def read_inputs(config: DictConfig, known: Measurements | None = None) -> RunInputs:
+    """Check the settings and read the data; nothing is written.
+
+    Args:
+        config: as composed from conf/train.yaml.
+        known: the measurements, where they were read before.
+
+    Raises:
+        ValueError: bad data, walls or settings, or a split without rows to learn from or to test on; one line
+            each.
+    """
+    method = build(fill_defaults(config.model))  # once: each fold, and each station, fits a copy of it
+    RunSettings.from_config(config)
+    tracking.refuse_missing_loggers(config)
+    module = _data(config, known)
+    split = split_for(to_dict(config.split), module.measurements)
+    file = config.get("known_walls") or OmegaConf.select(config, "init.file")
+    walls = None if file is None else read_walls(file)
+    split.check()
+    return RunInputs(method, module, split, walls)
+
+
+def _data(config: DictConfig, known: Measurements | None) -> DataModule:
+    """The data, read or known, in coordinates and units of the model that training starts from, if any."""
+    path, start = config.ckpt_path, config.get("init_from")
+    if path is not None and not Path(path).exists():  # before anything is read or simulated
+        raise ValueError(f"ckpt_path={path}: no such file; give an interrupted run's folder or last.ckpt")
+    module = datamodule(config.dataset)
+    if known is not None:
+        module.measurements = known
+    module.measurements  # noqa: B018 (read now, so that errors show the path that was typed)
+    for key in ("root", "file"):  # absolute, so that a checkpoint finds its data from any folder
+        location = None if OmegaConf.is_missing(config.dataset, key) else config.dataset.get(key)
+        if location:
+            config.dataset[key] = str(Path(location).resolve())
+    if start is not None:
+        try:
+            site = checkpoint.read(start).site
+            same = site.sha256 == module.measurements.site.sha256
+            module.measurements = align_to_site(module.measurements, site, whole=True)
+        except ValueError as error:
+            raise ValueError(f"init_from={start}: {error}") from None
+        if same:
+            learned = "its model learned from these data, perhaps from rows that validate here"
+            log.warning("init_from=%s: %s: choices made on them are too sure", start, learned)
+    return module
+
+
+def describe_inputs(config: DictConfig, inputs: RunInputs) -> None:
+    """Say what is learned from, and what is guessed."""
+    method = inputs.method
+    for topic, sentence in summarise(inputs.data, inputs.split):
+        log.info("%-10s%s", topic, sentence)
+    for guess in method.guesses:
+        log_of_models.info("guess: %s", guess)
+    name, guessed = method.name, ""
+    if method.guesses:
+        name += f" ({type(method).__name__})"
+        guessed = f", {len(method.guesses)} settings of it guessed, see train.log"
+    steps = config.trainer.max_steps
+    effort = Effort().scale_by(config.effort)
+    how = method.describe_fit(inputs.data, effort, None if steps == -1 else steps)
+    log.info("%-10s%s", "fitting", f"{name}{f': {how}' if how else ''}{guessed}")

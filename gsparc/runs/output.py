@@ -1,0 +1,103 @@
+"""Where a command writes, and what it says at its end."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig
+from rich.console import RenderableType
+
+from gsparc.data.splits import Split
+from gsparc.evaluation.by_station import worst_stations
+from gsparc.evaluation.console import open_console, repeated_warnings
+from gsparc.evaluation.summary import provenance, remarks, results_table, write_summary
+from gsparc.evaluation.table import Table
+from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.timing import machine_facts
+from gsparc.runs.settings import RunSettings, to_dict
+
+log = logging.getLogger(__name__)
+
+
+def run_directory() -> Path:
+    """Return where the running command writes."""
+    return Path(HydraConfig.get().runtime.output_dir)
+
+
+def begin_run(config: DictConfig) -> tuple[Path, dict[str, Any]]:
+    """Check the settings of a run, before anything is read; return where it writes, and plain settings.
+
+    Raises:
+        ValueError: a setting that cannot be.
+        MissingMandatoryValue: one that was not given.
+    """
+    RunSettings.from_config(config)
+    return run_directory(), to_dict(config)
+
+
+def warn_of_held_out(predictor: Predictor) -> None:
+    """Warn of rows that were held out for a test: to a map they are places where nobody measured."""
+    if count := predictor.extra.get("tested"):
+        log.warning(
+            "%d rows of its file were held out for the test and count as not measured here: train the final "
+            "model with split=none", count,
+        )  # fmt: skip
+
+
+def in_multirun() -> bool:
+    """Tell whether the running command is a job of a multirun."""
+    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+def show_result(run_dir: Path, *tables: RenderableType, lines: Iterable[str] = (), before: str = "") -> None:
+    """Show what a command ends with: tables, sentences, and `before` with where everything was written."""
+    console = open_console()
+    console.record = True
+    for one in tables:
+        console.print(one)
+    # Hydra opens a log for every job; one without a line is not worth a word.
+    log = "".join(f"; full log: {one.name}" for one in run_dir.glob("*.log") if one.stat().st_size)
+    for line in (*repeated_warnings(), *lines, f"{before}written to {run_dir}{log}"):
+        console.print(line, highlight=False)
+    files = [one for one in logging.getLogger().handlers if isinstance(one, logging.FileHandler)]
+    text = console.export_text().rstrip()
+    for file in files:  # to the log's file alone: the console has it
+        file.handle(logging.LogRecord(__name__, logging.INFO, __file__, 0, f"result:\n{text}", None, None))
+
+
+def show_training(
+    config: DictConfig, run_dir: Path, facts: Mapping[str, Any], split: Split, stations: Mapping[str, Any]
+) -> None:
+    """Show the table of a training, the worst of its `stations`, and remarks."""
+    drawn = config.split.get("seed") is not None and not split.of_release
+    draw = f" (split.seed={config.split.seed})" if drawn else ""
+    title = f"{facts['dataset/name']}, split {split.title}{draw}, {config.eval_on}, seed {config.seed}"
+    tables = tables_of(facts, title, config.eval_on, stations)
+    tested = any(name.startswith(f"{config.eval_on}/") for name in facts)
+    show_result(run_dir, *tables * tested, lines=remarks(facts, config.eval_on))
+
+
+def tables_of(
+    facts: Mapping[str, Any], title: str, eval_on: str, stations: Mapping[str, Any]
+) -> list[Table]:  # fmt: skip
+    """Return the table of a method beside others, and that of the worst of its `stations`, if any."""
+    label, later = facts["model/label"], not facts.get("split/train")
+    return [results_table(facts, label, title, eval_on), *worst_stations(stations, label, later)]
+
+
+def finish_run(
+    run_dir: Path, facts: Mapping[str, Any], *tables: RenderableType, **how: Any
+) -> dict[str, Any]:
+    """Write `summary.json` with the program and the machine, then `show_result`; returns the facts.
+
+    Of the machine, what `facts` says of it stands.
+    """
+    whole = {**machine_facts(), **facts, **provenance()}
+    write_summary(run_dir / "summary.json", whole)
+    show_result(run_dir, *tables, **how)
+    return whole
