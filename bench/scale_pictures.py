@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from gsparc.evaluation.drawing import panels, save, set_log_axis, style_of
+from gsparc.pictures.drawing import panels, save, set_log_axis, style_of
 
 MANY = 10_000  # rows from which slopes are taken: fewer are of exact methods, or too quick to time
 QUANTITIES = {

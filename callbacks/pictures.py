@@ -12,10 +12,10 @@ import torch
 
 from gsparc.base.limits import Checked, setting, whole
 from gsparc.callbacks.ledger import CostLedger
-from gsparc.evaluation.drawing import save
 from gsparc.evaluation.examples import Examples
-from gsparc.evaluation.pictures import draw_spectra
 from gsparc.field.schedule import INTERVAL, to_steps
+from gsparc.pictures.drawing import save
+from gsparc.pictures.pictures import draw_spectra
 from gsparc.processes.few_rows import evenly_spaced
 from gsparc.training.tracking import log_picture
 

@@ -30,18 +30,19 @@ ARROWS = {
     "field": "base data datasets ops physics processes training",
     "models": "base conf data datasets field ops physics processes simulate tables training",
     "prediction": "base data datasets field models ops physics processes tables training",
-    "evaluation": "base conf data field models physics prediction processes runs simulate tables "
-    "training",
+    "evaluation": "base conf data models physics prediction processes tables training",
     "runs": "base data datasets evaluation models physics prediction simulate tables "
     "training",
-    "callbacks": "base evaluation field processes training",
-    "apps.locate": "base data datasets evaluation models prediction processes runs",
-    "apps.maps": "base data evaluation models physics prediction processes runs tables",
+    "pictures": "base data evaluation field models physics prediction processes runs simulate "
+    "tables training",
+    "callbacks": "base evaluation field pictures processes training",
+    "apps.locate": "base data datasets evaluation models pictures prediction processes runs",
+    "apps.maps": "base data models physics pictures prediction processes runs tables",
     "apps.export": "base data field models ops physics prediction processes tables",
-    "apps.link": "base data datasets evaluation models physics prediction processes runs simulate",
-    "apps.view": "apps.maps base data evaluation physics prediction processes runs",
+    "apps.link": "base data datasets models physics pictures prediction processes runs simulate",
+    "apps.view": "apps.maps base data physics pictures prediction processes runs",
     "commands": "apps.export apps.link apps.locate apps.maps apps.view base conf data datasets "
-    "evaluation models ops prediction runs simulate tables training",
+    "evaluation models ops pictures prediction runs simulate tables training",
     "conf": "",
 }
 ROOMS = tuple(ARROWS)

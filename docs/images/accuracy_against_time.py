@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from gsparc.evaluation.drawing import panels, save, set_log_axis, style_of
+from gsparc.pictures.drawing import panels, save, set_log_axis, style_of
 
 HERE = Path(__file__).parent
 TABLE = HERE.parent / "results" / "table.csv"

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 from pathlib import Path
 
-from gsparc.evaluation.drawing import panels, save, style_of
+from gsparc.pictures.drawing import panels, save, style_of
 
 HERE = Path(__file__).parent
 TABLE = HERE.parent / "results" / "fronts" / "effort.csv"

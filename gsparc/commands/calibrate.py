@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig
 
-from gsparc.evaluation.pictures import NAMES, draw_calibration
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import write_summary
 from gsparc.evaluation.table import Column, Interval, Table
+from gsparc.pictures.pictures import NAMES, draw_calibration
 from gsparc.prediction.confidence import Guarantee
 from gsparc.prediction.left_out import Evidence
 from gsparc.prediction.risk import SHARES, calibration_facts, explain_too_few, run_trials

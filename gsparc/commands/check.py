@@ -67,7 +67,7 @@ def check(
     for topic, sentence in [*topics, *(("warning", doubt) for doubt in doubts)]:
         _line(console, f"{topic:<12}{sentence}")
     if draw is not None:
-        from gsparc.evaluation.site_plan import draw_site  # here: only a map needs it
+        from gsparc.pictures.site_plan import draw_site  # here: only a map needs it
 
         try:
             draw_site(reading.data, Path(draw), levels, steps)

@@ -13,11 +13,11 @@ from omegaconf import DictConfig
 
 from gsparc.base.files import platform_cache
 from gsparc.commands.train import train_job
-from gsparc.evaluation.drawing import PRINTED, save
 from gsparc.evaluation.examples import join_examples
-from gsparc.evaluation.pictures import draw_spectra
-from gsparc.evaluation.plots import draw_efforts, draw_splits, draw_sweep
 from gsparc.evaluation.summary import provenance, write_samples, write_summary
+from gsparc.pictures.drawing import PRINTED, save
+from gsparc.pictures.pictures import draw_spectra
+from gsparc.pictures.plots import draw_efforts, draw_splits, draw_sweep
 from gsparc.runs.experiment.cells import plan_jobs
 from gsparc.runs.experiment.published import beside_published, read_published
 from gsparc.runs.experiment.runner import run_jobs, time_by_dataset

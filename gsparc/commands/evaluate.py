@@ -11,11 +11,11 @@ from omegaconf import DictConfig
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
-from gsparc.evaluation.confidence_pictures import PICTURES, draw_confidences
-from gsparc.evaluation.plots import draw_sweep
 from gsparc.evaluation.results import Run, frame_of_runs
 from gsparc.evaluation.summary import remarks
 from gsparc.models import checkpoint
+from gsparc.pictures.confidence_pictures import PICTURES, draw_confidences
+from gsparc.pictures.plots import draw_sweep
 from gsparc.prediction.hearing import read_hearing
 from gsparc.runs.evaluate import Evaluation, evaluate
 from gsparc.runs.open_runs import open_files

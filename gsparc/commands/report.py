@@ -10,9 +10,9 @@ import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.base.files import SUMMARY
-from gsparc.evaluation.drawing import PRINTED
-from gsparc.evaluation.report.page import write_report
 from gsparc.evaluation.results import PROBLEM, frame, own_rows, read_columns, read_summary
+from gsparc.pictures.drawing import PRINTED
+from gsparc.pictures.report.page import write_report
 from gsparc.runs.experiment.runner import time_again
 from gsparc.runs.output import finish_run, run_directory
 

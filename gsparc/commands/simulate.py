@@ -10,8 +10,8 @@ from hydra.utils import to_absolute_path
 from omegaconf import DictConfig
 
 from gsparc.base.instantiate import from_settings
-from gsparc.evaluation import simulated
 from gsparc.evaluation.console import open_console
+from gsparc.pictures import simulated
 from gsparc.prediction.timing import machine_facts
 from gsparc.runs.output import begin_run, finish_run
 from gsparc.runs.run_lock import locked

@@ -14,10 +14,10 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.base.instantiate import config_node
 from gsparc.commands.train import train_job
 from gsparc.datasets.load import load, split_for
-from gsparc.evaluation.plots import draw_study
 from gsparc.evaluation.summary import run_conditions, write_samples
 from gsparc.evaluation.table import CPU, P50, P95, TRAIN, Column, Table, value_with_error
 from gsparc.models.registry import build, method_class
+from gsparc.pictures.plots import draw_study
 from gsparc.prediction.timing import ClockSettings, machine_facts
 from gsparc.runs.evaluate import dataset_facts, split_facts
 from gsparc.runs.experiment.cells import compose

@@ -14,11 +14,11 @@ import torch
 from omegaconf import DictConfig
 
 from gsparc.base.limits import whole
-from gsparc.evaluation.drawing import save
-from gsparc.evaluation.plots import draw_front
 from gsparc.evaluation.summary import write_samples
 from gsparc.evaluation.table import Column, Table
 from gsparc.models.reduced import list_settings, with_reduction
+from gsparc.pictures.drawing import save
+from gsparc.pictures.plots import draw_front
 from gsparc.prediction import operating_point
 from gsparc.prediction.timing import BLOCKS, peak_memory
 from gsparc.runs.experiment import tradeoff

@@ -15,8 +15,8 @@ from gsparc.base.files import SUMMARY
 from gsparc.commands.shared import cli
 from gsparc.data.split_files import write_split
 from gsparc.evaluation import summary
-from gsparc.evaluation.pictures import draw_run
 from gsparc.models.array_vectors.vector_cache import forget_vectors
+from gsparc.pictures.pictures import draw_run
 from gsparc.runs.baselines import same_as_baseline
 from gsparc.runs.evaluate import TrainedRun, evaluate
 from gsparc.runs.experiment import folds, options

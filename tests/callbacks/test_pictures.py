@@ -6,8 +6,8 @@ from PIL import Image
 
 from gsparc.callbacks import Pictures
 from gsparc.callbacks.pictures import draw_spectra
-from gsparc.evaluation.drawing import save
 from gsparc.evaluation.examples import Examples
+from gsparc.pictures.drawing import save
 
 
 def stage(data, fold, run_dir, step):

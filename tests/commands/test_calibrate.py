@@ -11,7 +11,7 @@ from refusals import refused
 from gsparc.commands.calibrate import calibration_tables
 from gsparc.commands.evaluate import evaluate_files
 from gsparc.commands.train import train
-from gsparc.evaluation.pictures import draw_calibration
+from gsparc.pictures.pictures import draw_calibration
 from gsparc.prediction.confidence import Guarantee, Trusted, as_confidence
 from gsparc.prediction.left_out import Evidence
 from gsparc.prediction.risk import (

@@ -52,7 +52,7 @@ def test_a_method_with_the_settings_of_a_baseline_is_fitted_once(
 
 def test_sectors_were_drawn_where_there_are_test_rows_alone(spectra_file, tmp_path, monkeypatch):
     drawn = []
-    drawing = "gsparc.evaluation.pictures.draw_sector_levels"
+    drawing = "gsparc.pictures.pictures.draw_sector_levels"
     monkeypatch.setattr(drawing, lambda *of: drawn.append(of[-1].name))
     train(plain(spectra_file, "gp", "baselines=[]", "split=none"), tmp_path)
     assert drawn == ["sectors.png"]

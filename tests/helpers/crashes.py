@@ -36,7 +36,7 @@ DENSIFIED = (
     "callbacks.densify.max_gaussians=200",
     "callbacks.reset.interval=20",
 )
-DRAWING = "gsparc.evaluation.pictures.draw_predictions"  # half of the seconds of a short run
+DRAWING = "gsparc.pictures.pictures.draw_predictions"  # half of the seconds of a short run
 VARYING = ("time/", "machine/", "memory/", "git", "run_id")
 TIMED = ("train_s", "render_ms", "ratio_to_copy")
 

@@ -25,6 +25,6 @@ def time_and_draw_less(patch) -> None:
     def dot(method, data, rows, examples, title, path):
         Image.new("L", (1, 1)).save(path)  # what loggers are given
 
-    patch.setattr("gsparc.evaluation.pictures.draw_predictions", dot)
+    patch.setattr("gsparc.pictures.pictures.draw_predictions", dot)
     patch.setattr("gsparc.runs.evaluate.ClockSettings", lambda: ClockSettings(5, least=2, warmup=1))
     patch.setattr("gsparc.prediction.timing.COPY_BYTES", 2**12)

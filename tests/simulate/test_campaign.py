@@ -20,7 +20,7 @@ from gsparc.data import blocks
 from gsparc.data.schema import LIGHT
 from gsparc.datasets.load import load
 from gsparc.datasets.sionna import _in_decibels
-from gsparc.evaluation.simulated import draw_floor_plan
+from gsparc.pictures.simulated import draw_floor_plan
 from gsparc.simulate import assembly, deciding
 from gsparc.simulate import campaign as campaigns
 from gsparc.simulate.assembly import SECONDS, assemble_dataset, join_shards, shard_arrays

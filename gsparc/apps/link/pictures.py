@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 
 from gsparc.apps.link.adaptation import Rates
-from gsparc.evaluation.drawing import PALETTE, panels, save
+from gsparc.pictures.drawing import PALETTE, panels, save
 from gsparc.processes.uncertainty import binomial_interval
 
 STYLES = {

@@ -25,10 +25,10 @@ from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import Scans, group_snapshots
 from gsparc.base.errors import DataError
 from gsparc.evaluation.console import to_dict
-from gsparc.evaluation.drawing import PALETTE, panels, save
 from gsparc.evaluation.summary import coordinates, write_as_found, write_samples
 from gsparc.evaluation.table import Column, Table
 from gsparc.models import checkpoint
+from gsparc.pictures.drawing import PALETTE, panels, save
 from gsparc.prediction.predictor import Predictor
 from gsparc.processes.few_rows import draw_rows
 from gsparc.runs.open_runs import Opened, open_files, read_like_stored

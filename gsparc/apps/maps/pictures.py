@@ -20,8 +20,8 @@ from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.placing import Placement
 from gsparc.apps.maps.planning import MeasurementPlan
 from gsparc.apps.maps.promise import Promise
-from gsparc.evaluation import from_above
-from gsparc.evaluation.drawing import panels, save
+from gsparc.pictures import from_above
+from gsparc.pictures.drawing import panels, save
 from gsparc.prediction.predictor import Predictor
 
 MOST_OVERLAP = 5.0  # stations that the colours end with

@@ -9,8 +9,8 @@ import numpy as np
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.answer import Answer
 from gsparc.data.schema import Site
-from gsparc.evaluation.drawing import panels
 from gsparc.physics.decibels import from_decibels, to_decibels
+from gsparc.pictures.drawing import panels
 from gsparc.processes.few_rows import evenly_spaced
 
 SPECTRUM = Legend("power by direction", 0.0, 1.0, "inferno")

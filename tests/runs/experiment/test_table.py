@@ -5,10 +5,10 @@ import pandas as pd
 import pytest
 from compared import averages, drawn, filled, said_of
 
-from gsparc.evaluation import plots
 from gsparc.evaluation.metric_formats import is_root, main_figure, sample_column, score_of
 from gsparc.evaluation.paired import lead_over_rows
-from gsparc.evaluation.plots import draw_efforts
+from gsparc.pictures import plots
+from gsparc.pictures.plots import draw_efforts
 from gsparc.runs.experiment import runner
 from gsparc.runs.experiment.table import (
     columns_of_csv,

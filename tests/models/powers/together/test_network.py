@@ -15,7 +15,6 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.data.units import power_in_decibels
-from gsparc.evaluation.pictures import draw_sector_levels
 from gsparc.models import checkpoint, loading
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.per_station import PerStation, wrap_per_station
@@ -32,6 +31,7 @@ from gsparc.models.powers.together.network import (
 )
 from gsparc.models.powers.together.terms import SharedTerms, StationRows, places_and_notes, rows_of_stations
 from gsparc.ops import Pose
+from gsparc.pictures.pictures import draw_sector_levels
 from gsparc.processes.kernel import Kernel, WhiteNoise
 from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import NO_AZIMUTH, Sectors, SectorShadowing
@@ -178,7 +178,7 @@ def test_a_contradicted_azimuth_was_in_no_picture(tmp_path, monkeypatch):
     method, report = fitted(one, 6, tmp_path)
     named = contradicted(report.notes)
     figures = []
-    monkeypatch.setattr("gsparc.evaluation.pictures.save", lambda figure, path: figures.append(figure))
+    monkeypatch.setattr("gsparc.pictures.pictures.save", lambda figure, path: figures.append(figure))
     draw_sector_levels(method, one.data(6), Fold(np.arange(3960), NONE, NONE), tmp_path / "sectors.png")
     titles = [axis.get_title() for axis in figures[0].axes]
     title = "12 of 30 sectors, contradicted azimuths first; too few rows to draw: 0-0, 0-2, "

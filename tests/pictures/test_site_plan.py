@@ -6,8 +6,8 @@ from matplotlib.figure import Figure
 
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
-from gsparc.evaluation import site_plan
-from gsparc.evaluation.site_plan import draw_found, draw_site, find_spots
+from gsparc.pictures import site_plan
+from gsparc.pictures.site_plan import draw_found, draw_site, find_spots
 from gsparc.tables.checks.level_steps import LevelStep
 from gsparc.tables.checks.link_levels import link_levels
 from gsparc.tables.checks.plausibility import find_level_steps

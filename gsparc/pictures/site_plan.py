@@ -17,8 +17,9 @@ from gsparc.data.outliers import find_outliers, too_far
 from gsparc.data.schema import ENDS, Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
-from gsparc.evaluation.drawing import PALETTE, panels, save
-from gsparc.evaluation.from_above import (
+from gsparc.physics.decibels import to_decibels
+from gsparc.pictures.drawing import PALETTE, panels, save
+from gsparc.pictures.from_above import (
     OUTLINE,
     annotate,
     draw_stations,
@@ -27,7 +28,6 @@ from gsparc.evaluation.from_above import (
     legend_below,
     set_bounds,
 )
-from gsparc.physics.decibels import to_decibels
 from gsparc.tables.checks.describe import distinct_places, held_out_block_rows, propose_side, spacing_words
 from gsparc.tables.checks.level_steps import LevelStep
 from gsparc.tables.checks.link_levels import LinkLevels

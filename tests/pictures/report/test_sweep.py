@@ -17,7 +17,7 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from gsparc.evaluation.console import ConsoleHandler
-from gsparc.evaluation.report.sweep import FAILURE, SweepReport, equal_settings
+from gsparc.pictures.report.sweep import FAILURE, SweepReport, equal_settings
 
 ROOT = Path(__file__).parents[3]
 

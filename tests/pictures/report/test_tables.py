@@ -9,11 +9,11 @@ import pytest
 from rich.console import Console
 
 from gsparc.evaluation.paired import lead_over_runs
-from gsparc.evaluation.report import tables
-from gsparc.evaluation.report.page import warnings
-from gsparc.evaluation.report.tables import bootstrap_interval
 from gsparc.evaluation.results import Run, frame, frame_of_runs, own_rows, short_settings
 from gsparc.evaluation.table import Column, Interval, Table
+from gsparc.pictures.report import tables
+from gsparc.pictures.report.page import warnings
+from gsparc.pictures.report.tables import bootstrap_interval
 
 
 def cells(table, row: int) -> dict:

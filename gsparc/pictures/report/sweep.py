@@ -80,11 +80,11 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
     and its table.
     """
     # Here, as they take half a second, and a mistyped option is to be named at once.
-    from gsparc.evaluation import plots
-    from gsparc.evaluation.confidence_pictures import draw_confidences
-    from gsparc.evaluation.report.page import write_report
-    from gsparc.evaluation.report.tables import table_of_leads, table_of_seeds
     from gsparc.evaluation.results import frame, own_rows
+    from gsparc.pictures import plots
+    from gsparc.pictures.confidence_pictures import draw_confidences
+    from gsparc.pictures.report.page import write_report
+    from gsparc.pictures.report.tables import table_of_leads, table_of_seeds
     from gsparc.runs.experiment.runner import time_again
 
     rows = frame(folder)

@@ -8,10 +8,10 @@ from matplotlib.colors import to_hex
 
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.report import task
-from gsparc.evaluation import plots
-from gsparc.evaluation.drawing import style_of
-from gsparc.evaluation.report.page import make_sections, render_html, warnings
 from gsparc.evaluation.results import Run, frame, frame_of_runs
+from gsparc.pictures import plots
+from gsparc.pictures.drawing import style_of
+from gsparc.pictures.report.page import make_sections, render_html, warnings
 
 arguments = COMMANDS["report"].arguments
 

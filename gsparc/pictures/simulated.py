@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.evaluation.drawing import panels, save
-from gsparc.evaluation.from_above import draw_stations, draw_values, draw_walls, legend_below, set_bounds
 from gsparc.evaluation.table import Column, Table
 from gsparc.physics.decibels import to_decibels
+from gsparc.pictures.drawing import panels, save
+from gsparc.pictures.from_above import draw_stations, draw_values, draw_walls, legend_below, set_bounds
 from gsparc.simulate.campaign import Outcome
 from gsparc.simulate.raytracer import RayTracer
 from gsparc.simulate.scenes.shipped import list_shipped_scenes

@@ -16,14 +16,15 @@ from jinja2 import Environment
 from matplotlib.figure import Figure
 from PIL import Image
 
-from gsparc.evaluation import plots, summary
-from gsparc.evaluation.drawing import save
+from gsparc.evaluation import summary
 from gsparc.evaluation.examples import join_examples
 from gsparc.evaluation.metric_formats import LISTED, OF_KIND, judged_by
-from gsparc.evaluation.pictures import draw_spectra
-from gsparc.evaluation.report import tables
 from gsparc.evaluation.results import PROBLEM, average, own_rows, score_db, short_settings
 from gsparc.evaluation.table import Table
+from gsparc.pictures import plots
+from gsparc.pictures.drawing import save
+from gsparc.pictures.pictures import draw_spectra
+from gsparc.pictures.report import tables
 
 # A page holds its pictures in base64, a third larger than their files.
 PICTURE_PX = 1000  # width at which pictures are kept
@@ -127,7 +128,7 @@ def _png(path: Path) -> str:
 def render_html(title: str, note: str, sections: Sequence[Section]) -> str:
     """Return the page; `note` says where it comes from."""
     text, script = (
-        (files("gsparc.evaluation.report") / name).read_text(encoding="utf-8")
+        (files("gsparc.pictures.report") / name).read_text(encoding="utf-8")
         for name in ("page.html.j2", "sort.js")
     )
     page = Environment(autoescape=True).from_string(text)

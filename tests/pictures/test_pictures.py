@@ -7,12 +7,12 @@ import pytest
 from PIL import Image
 
 from gsparc.data.splits import Fold
-from gsparc.evaluation import pictures
 from gsparc.evaluation.examples import FILE, Examples, join_examples
-from gsparc.evaluation.pictures import draw_points, draw_predictions, draw_spectra
 from gsparc.evaluation.results import Run, frame_of_runs
 from gsparc.models.baselines.mean import Mean
 from gsparc.models.registry import method_class
+from gsparc.pictures import pictures
+from gsparc.pictures.pictures import draw_points, draw_predictions, draw_spectra
 from gsparc.training.context import FitContext
 
 

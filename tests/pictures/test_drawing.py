@@ -7,7 +7,7 @@ import pytest
 from campaigns import compose
 from skimage.color import deltaE_ciede2000, rgb2lab
 
-from gsparc.evaluation.drawing import PALETTE, style_of
+from gsparc.pictures.drawing import PALETTE, style_of
 
 # Linear RGB as seen without cones for red, green or blue (Machado, Oliveira and Fernandes 2009, severity 1).
 VISION = {

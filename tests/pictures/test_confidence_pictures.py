@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from gsparc.evaluation.confidence_pictures import PICTURES, draw_confidences
 from gsparc.evaluation.results import Run, frame_of_runs
+from gsparc.pictures.confidence_pictures import PICTURES, draw_confidences
 
 RNG = np.random.default_rng(0)
 ERROR = RNG.uniform(0.01, 1, 100)  # of rows, the surest first in what follows

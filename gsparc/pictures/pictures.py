@@ -15,14 +15,14 @@ from gsparc.base.errors import list_first
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.data.walls import SceneWalls
-from gsparc.evaluation.drawing import PALETTE, panels, save
 from gsparc.evaluation.examples import Examples
 from gsparc.evaluation.metrics import SpectrumMetrics
-from gsparc.evaluation.site_plan import draw_found
 from gsparc.evaluation.summary import results_table
 from gsparc.models.method import Method
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.terms import rows_of_stations
+from gsparc.pictures.drawing import PALETTE, panels, save
+from gsparc.pictures.site_plan import draw_found
 from gsparc.prediction.confidence import Guarantee
 from gsparc.prediction.left_out import Evidence, predict_rows
 from gsparc.prediction.risk import Trial, bounded_loss

@@ -9,11 +9,11 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from gsparc.evaluation.drawing import GREY, PALETTE, numbered_style, panels, save, style_of
 from gsparc.evaluation.metric_formats import OF_KIND, axis_of, lower_is_better
 from gsparc.evaluation.results import own_rows
 from gsparc.evaluation.table import Row
 from gsparc.field.losses import weigh_losses
+from gsparc.pictures.drawing import GREY, PALETTE, numbered_style, panels, save, style_of
 from gsparc.prediction.risk import bounded_loss
 from gsparc.processes.uncertainty import rank_correlation
 

@@ -15,7 +15,6 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from gsparc.evaluation.drawing import numbered_style, panels, save, set_latency_axes, set_log_axis, style_of
 from gsparc.evaluation.metric_formats import (
     OF_KIND,
     axis_of,
@@ -25,9 +24,10 @@ from gsparc.evaluation.metric_formats import (
     score_heading,
     score_of,
 )
-from gsparc.evaluation.report.tables import groups_of, interval_of_figure
 from gsparc.evaluation.results import Run, average, distinct_baselines, own_rows
 from gsparc.evaluation.table import Row
+from gsparc.pictures.drawing import numbered_style, panels, save, set_latency_axes, set_log_axis, style_of
+from gsparc.pictures.report.tables import groups_of, interval_of_figure
 from gsparc.prediction.pareto import pareto_front
 from gsparc.runs.experiment.table import methods_by_mean_behind, shown
 

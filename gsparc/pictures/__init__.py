@@ -1,0 +1,1 @@
+"""Everything that draws: panels, plans, spectra, the report's page."""
