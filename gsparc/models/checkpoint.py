@@ -29,6 +29,7 @@ FORMAT = "gsparc-checkpoint"
 PARTS = {"format", "version", "config", "method", "target", "site", "state", "extra", "sha256"}
 DEEPEST = 50  # of containers in containers
 RENAMED = {"freedom": "unknown_factor"}  # facts of sites in older checkpoints
+MOVED = ("gsparc.data.datasets.", "gsparc.datasets.")  # classes in configurations of older checkpoints
 MODEL = "model.ckpt"  # of a run's folder
 WAIT_S = 60.0  # for others who write a file: a large file of later rows takes seconds
 
@@ -73,7 +74,7 @@ class StoredModel:
         ):  # ours are resolved; another's would fetch what the reader's environment holds
             raise CheckpointError(f"{self.path}: its configuration has ${{...}}, which gsparc never writes")
         try:
-            loaded = load_yaml(self.config, self.path)
+            loaded = load_yaml(self.config.replace(*MOVED), self.path)
         except DataError as error:
             raise CheckpointError(str(error)) from None
         except (yaml.YAMLError, RecursionError, ValueError):

@@ -15,6 +15,8 @@ import torch
 from refusals import refused_as
 from states import same
 
+from gsparc.base.instantiate import import_target
+from gsparc.datasets.own import Own
 from gsparc.models import checkpoint, loading
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.idw import InverseDistance
@@ -270,3 +272,11 @@ def test_tensors_of_other_kinds_and_an_empty_sum_were_tracebacks_or_loaded(path,
         }[kind]()
     torch.save(content, path)
     refused(r"m\.ckpt: damaged", checkpoint.read, path)
+
+
+def test_a_configuration_of_before_names_classes_where_they_are_now(fitted, tmp_path):
+    """Datasets had their classes in `gsparc.data.datasets`: older checkpoints name them so."""
+    older = "dataset:\n  _target_: gsparc.data.datasets.own.Own\n"
+    checkpoint.save(tmp_path / "old.ckpt", fitted[0], older)
+    target = checkpoint.read(tmp_path / "old.ckpt").configuration["dataset"]["_target_"]
+    assert import_target(target) is Own
