@@ -1,12 +1,14 @@
 """Places and carriers that nobody measured: rooms at ten carriers, ours beside plain methods.
 
-python bench/bands.py FOLDER SEED          # rooms of a seed; docs/results/bands.csv, half an hour of one core
-python bench/bands.py FOLDER SEED box      # rooms whose names begin so; a file that is there is added to
+python bench/bands.py FOLDER SEED          # rooms of a seed; docs/results/bands.csv, half an hour
+of one core python bench/bands.py FOLDER SEED box      # rooms whose names begin so;
+a file that is there is added to
 
-Three rooms of Sionna (`make sionna`): the meshes of `../shared/data/wideband`, the conference room, cabinets
-in a box; three shoeboxes of known mirrors; the last of either is turned. Fifty places .9 m apart, half of
-them in sight of the gateway; array and spectrum of XFreq-GS. Held out: ten places (three draws), half of the
-carriers there, every third carrier in its turn. `true_paths`: the paths that there are, without phases.
+Three rooms of Sionna (`make sionna`): the meshes of `../shared/data/wideband`, the conference room,
+cabinets in a box; three shoeboxes of known mirrors; the last of either is turned. Fifty places .9 m
+apart, half of them in sight of the gateway; array and spectrum of XFreq-GS. Held out: ten places
+(three draws), half of the carriers there, every third carrier in its turn. `true_paths`:
+the paths that there are, without phases.
 """
 
 from __future__ import annotations
@@ -49,8 +51,8 @@ EFFECTS = Effects(diffuse=False, edge_diffraction=False, polarisation=False)
 COUNT, APART_M, TURN, STRONGEST = 50, 0.9, 0.4, 60  # of places; of the world [rad]; paths
 CORNERS = {"home": [[-6, -3, 0], [6, 3, 3]], "hall": [[0, 0, 0], [14, 10, 4]]}  # [m]
 METHODS = ("gsparc", "mean", "nearest", "idw", "gp", "other_carriers", "direct_beam")
-# Of places (n, 3), a gateway (3,), a carrier [Hz] and most bounces: gains (n, P) without the carrier's phase,
-# metres (n, P), directions at the gateway (n, P, 3).
+# Of places (n, 3), a gateway (3,), a carrier [Hz] and most bounces: gains (n, P) without the
+# carrier's phase, metres (n, P), directions at the gateway (n, P, 3).
 Paths = tuple[np.ndarray, np.ndarray, np.ndarray]
 Trace = Callable[[np.ndarray, np.ndarray, float, int], Paths]
 
@@ -62,7 +64,9 @@ def rooms(seed: int) -> Iterator[tuple[str, np.ndarray, Trace]]:
         size = rng.uniform([8, 6, 2.6], [12, 9, 3.6])
         low = np.c_[rng.uniform(0.1, 0.8, (6, 2)) * size[:2], np.zeros(6)]
         cabinets = np.stack([low, low + rng.uniform([0.4, 0.4, 1.2], [1.6, 1.6, 2.4], (6, 3))], 1)
-        solids = [box(f"cabinet{i}", ("wood", "metal")[i % 2], *one) for i, one in enumerate(cabinets)]
+        solids = [
+            box(f"cabinet{i}", ("wood", "metal")[i % 2], *one) for i, one in enumerate(cabinets)
+        ]
         traces: dict[str, Trace] = {
             "home": partial(traced, SCENE),
             "hall": partial(traced, conference_room(int(1e6 * size[0]))),
@@ -95,16 +99,26 @@ def traced(
 
     for laws in ITU_MATERIALS_PROPERTIES.values():
         laws[0.0, 1e3] = [*laws.values()][-1]  # brick's ends at 40 GHz
-    engine = RayTracer(source, gateway, carrier, Sampling(30_000, len(places)), antenna=Antenna("dipole"))
+    engine = RayTracer(
+        source, gateway, carrier, Sampling(30_000, len(places)), antenna=Antenna("dipole")
+    )
     found = next(engine.trace_in_batches(places, replace(EFFECTS, depth=depth)))[0]
     away, turn, delay = (np.array(one)[:, 0] for one in (found.theta_t, found.phi_t, found.tau))
-    direction = np.stack([np.sin(away) * np.cos(turn), np.sin(away) * np.sin(turn), np.cos(away)], 2)
+    direction = np.stack(
+        [np.sin(away) * np.cos(turn), np.sin(away) * np.sin(turn), np.cos(away)], 2
+    )
     free = engine.clear_of_surfaces(places, 0.2) & engine.clear_of_surfaces(gateway[None], 0.2)
     gains = (np.array(found.a[0]) + 1j * np.array(found.a[1])).reshape(away.shape)
-    return gains * np.array(found.valid).reshape(away.shape) * free[:, None], LIGHT * delay, direction
+    return (
+        gains * np.array(found.valid).reshape(away.shape) * free[:, None],
+        LIGHT * delay,
+        direction,
+    )
 
 
-def make_room(folder: Path, rng: np.random.Generator, corners: np.ndarray, trace: Trace, turn: float) -> None:
+def make_room(
+    folder: Path, rng: np.random.Generator, corners: np.ndarray, trace: Trace, turn: float
+) -> None:
     """Write a room in the layout that `dataset=rfid` reads, and its strongest paths."""
     low, high = corners
     along = map(np.arange, low[:2] + rng.uniform(0.2, 0.7, 2), high[:2] - 0.2, [APART_M] * 2)
@@ -119,13 +133,19 @@ def make_room(folder: Path, rng: np.random.Generator, corners: np.ndarray, trace
     places = every[np.r_[np.flatnonzero(seen)[:half], np.flatnonzero(hidden)[: COUNT - half]]]
     cosine, sine = np.cos(turn), np.sin(turn)
     world = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]])  # of rows
-    zenith, azimuth = np.radians(np.meshgrid(np.arange(90), np.arange(360), indexing="ij"))  # runs clockwise
-    looks = np.stack([np.sin(zenith) * np.cos(azimuth), -np.sin(zenith) * np.sin(azimuth), np.cos(zenith)])
+    # Runs clockwise
+    zenith, azimuth = np.radians(np.meshgrid(np.arange(90), np.arange(360), indexing="ij"))
+    looks = np.stack(
+        [np.sin(zenith) * np.cos(azimuth), -np.sin(zenith) * np.sin(azimuth), np.cos(zenith)]
+    )
     steering = np.exp(-2j * np.pi * np.einsum("kij,mk->mij", looks, ELEMENTS))
     images, powers, directions = [], [], []
     for carrier in np.array(GHZ) * 1e9:
         gains, metres, direction = trace(places, gateway, carrier, 3)
-        waves, turned = gains * np.exp(-2j * np.pi * np.mod(carrier / LIGHT * metres, 1.0)), direction @ world
+        waves, turned = (
+            gains * np.exp(-2j * np.pi * np.mod(carrier / LIGHT * metres, 1.0)),
+            direction @ world,
+        )
         vectors = np.einsum("np,npm->nm", waves, np.exp(2j * np.pi * turned @ ELEMENTS.T))
         images.append(np.abs(np.einsum("nm,mij->nij", vectors, steering)))
         order = np.argsort(-np.abs(gains), 1)[:, :STRONGEST]
@@ -150,7 +170,10 @@ def make_room(folder: Path, rng: np.random.Generator, corners: np.ndarray, trace
 
 def folds(data: Measurements, seed: int) -> Iterator[tuple[str, Fold]]:
     """Yield what is held out."""
-    place, none = np.unique(data.tx, axis=0, return_inverse=True)[1].reshape(-1), np.zeros(0, np.int64)
+    place, none = (
+        np.unique(data.tx, axis=0, return_inverse=True)[1].reshape(-1),
+        np.zeros(0, np.int64),
+    )
 
     def hold_out(rows: np.ndarray) -> Fold:
         return Fold(np.flatnonzero(~rows), none, np.flatnonzero(rows))
@@ -169,7 +192,11 @@ def judge(name: str, data: Measurements, fold: Fold) -> dict[str, float | str]:
     start = time.process_time()
     method.fit(data, fold, FitContext(Path()))
     fitted = time.process_time()
-    mean, one, query_start = method.predict(batch).mean, data.batch(fold.test[:1]), time.process_time()
+    mean, one, query_start = (
+        method.predict(batch).mean,
+        data.batch(fold.test[:1]),
+        time.process_time(),
+    )
     for _ in range(10):
         method.predict(one)
     query_ms = (time.process_time() - query_start) / 10 * 1e3
@@ -199,7 +226,9 @@ def score(images: torch.Tensor, target: torch.Tensor) -> dict[str, float]:
 
 
 def main() -> None:
-    """Make rooms, fit, write a row a room, what is held out and method, and print the means over rooms."""
+    """Make rooms, fit, write a row a room, what is held out and method,
+    and print the means over rooms.
+    """
     folder, seed, *names = sys.argv[1:]
     torch.set_num_threads(1)
     rows = []

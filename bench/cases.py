@@ -1,11 +1,12 @@
 """Ours beside every plain method on 76 small cases: is it ever behind?
 
-python bench/cases.py FOLDER           # its files and cells; docs/results/cases.csv: half an hour of one core
-python bench/cases.py FOLDER draw.     # cases whose names begin so; `reuse=true` and others: as of compare
+python bench/cases.py FOLDER           # its files and cells; docs/results/cases.csv: half an hour
+of one core python bench/cases.py FOLDER draw.     # cases whose names begin so;
+`reuse=true` and others: as of compare
 
-Cells are those of `gsparc compare`: an interrupted run goes on. Cases of `../shared/data`, 56, are of others;
-those of `draw`, twenty, are drawn by seed from what stands here. Each is cut at random and in squares; ratios
-are of root mean squared errors, to the best plain method that serves a case.
+Cells are those of `gsparc compare`: an interrupted run goes on. Cases of `../shared/data`, 56, are
+of others; those of `draw`, twenty, are drawn by seed from what stands here. Each is cut at random
+and in squares; ratios are of root mean squared errors, to the best plain method that serves a case.
 """
 
 from __future__ import annotations
@@ -44,20 +45,34 @@ def measured() -> Iterator[Case]:
 
     city = read("real/powder-rss-462mhz")
     for station in (0, 2, 4, 6, 8, 10):
-        moving = {"tx_position": on_floor(city["mobile_position"]), "rssi_db": city["rssi_db"][:, station]}
+        moving = {
+            "tx_position": on_floor(city["mobile_position"]),
+            "rssi_db": city["rssi_db"][:, station],
+        }
         still = np.append(city["station_position"][station], 10.0)
         yield f"city_{station}", 300.0, moving | {"rx_position": still}
     for hall, station in ((1, 0), (1, 6), (2, 3), (2, 9)):
         npz = read(f"real/ble-hall-{hall}")
-        ends = {"tx_position": npz["mobile_position"], "rx_position": npz["station_position"][station]}
+        ends = {
+            "tx_position": npz["mobile_position"],
+            "rx_position": npz["station_position"][station],
+        }
         yield f"hall_{hall}_{station}", 4.0, ends | {"rssi_db": npz["rssi_db"][:, station]}
     plane = read("real/techtile-power-reci-rf-1")
-    yield "plane", 0.3, {name: plane[name][plane["rssi_db"] > -75] for name in ("rx_position", "rssi_db")}
+    yield (
+        "plane",
+        0.3,
+        {name: plane[name][plane["rssi_db"] > -75] for name in ("rx_position", "rssi_db")},
+    )
     for name, side in (("rss-lib1", 3.0), ("rss-tut3", 10.0), ("wifine-floor4", 5.0)):
         npz = read(f"locate/{name}")
         for most in (0, 5):  # access points, the most heard first
             level = npz["rss_dbm"][:, np.argsort(-np.isfinite(npz["rss_dbm"]).sum(0))[most]]
-            yield f"{name.replace('-', '_')}_{most}", side, {"rx_position": npz["position"], "rssi_db": level}
+            yield (
+                f"{name.replace('-', '_')}_{most}",
+                side,
+                {"rx_position": npz["position"], "rssi_db": level},
+            )
     garage = read("change/garage-rounds")
     first = garage["round"] == 1
     for beacon in (2, 11):
@@ -75,14 +90,20 @@ def measured() -> Iterator[Case]:
             }
             yield f"{run.lower()}_{antenna}", 0.3, ends | {"csi": tones["csi"][good, antenna]}
     every = {name: tones[name][rows] for name in ("tx_position", "csi", "mask")}
-    every |= {"station_position": tones["rx_antenna_position"], "frequency_hz": tones["frequency_hz"]}
+    every |= {
+        "station_position": tones["rx_antenna_position"],
+        "frequency_hz": tones["frequency_hz"],
+    }
     yield "exp006_all", 0.3, every
     robot = read("ofdm/wsr-los-a")
     for number in (0, 1):
         rows = robot["good"] & (robot["tx_index"] == number)
         rows &= np.isin(robot["run"], np.unique(robot["run"][rows])[:4])
         channel = (robot["root_sign"] * np.sqrt(robot["h2"]))[rows]
-        ends = {"rx_position": robot["rx_position"][rows], "tx_position": robot["tx_position"][number]}
+        ends = {
+            "rx_position": robot["rx_position"][rows],
+            "tx_position": robot["tx_position"][number],
+        }
         turned = packets(channel, robot["subcarrier_hz"], np.random.default_rng(number))
         yield f"robot_{number}", 0.3, ends | {"csi": turned, "frequency_hz": robot["subcarrier_hz"]}
 
@@ -109,12 +130,19 @@ def drawn(seed: int = 1) -> Iterator[Case]:
         place = np.c_[rng.uniform(0, (60, 40), (400, 2)), rng.integers(0, 3, 400) * 3.5 + 1.2]
         source = np.array([*rng.uniform(5, 35, 2), 4.7])
         level = -35 - 30 * np.log10(np.linalg.norm(place - source, axis=1)) + rng.normal(0, 2, 400)
-        level += waves(law, place[:, :2], 4.0, 3.0) - 15 * np.abs(np.round((place[:, 2] - source[2]) / 3.5))
+        level += waves(law, place[:, :2], 4.0, 3.0) - 15 * np.abs(
+            np.round((place[:, 2] - source[2]) / 3.5)
+        )
         level[level < -95] = np.nan
         yield f"draw.floors_{number}", 10.0, {"rx_position": place, "rssi_db": level}
-        place, station = rng.uniform(0, 1500, (400, 2)), np.c_[rng.uniform(0, 1500, (3, 2)), [25.0] * 3]
+        place, station = (
+            rng.uniform(0, 1500, (400, 2)),
+            np.c_[rng.uniform(0, 1500, (3, 2)), [25.0] * 3],
+        )
         each = enumerate(station)
-        level = np.stack([shadowed(place, at, np.random.default_rng([seed, number, i])) for i, at in each], 1)
+        level = np.stack(
+            [shadowed(place, at, np.random.default_rng([seed, number, i])) for i, at in each], 1
+        )
         level += rng.normal(0, 1.5, level.shape)
         moving = {"rx_position": on_floor(place), "station_position": station, "rssi_db": level}
         yield f"draw.cells_{number}", 200.0, moving
@@ -124,10 +152,13 @@ def drawn(seed: int = 1) -> Iterator[Case]:
         yield f"draw.river_{number}", 100.0, {"rx_position": on_floor(place), "rssi_db": level}
         tones = 5.5e9 + 625e3 * np.arange(-14, 15)
         place, channel = np.c_[rng.uniform(0, 0.6, (300, 2)), np.full(300, 1.0)], 0
-        images = np.c_[rng.uniform(-8, 8, (5, 2)), rng.uniform(0, 3, 5)]  # the transmitter is the first
+        # The transmitter is the first
+        images = np.c_[rng.uniform(-8, 8, (5, 2)), rng.uniform(0, 3, 5)]
         for amplitude, image in zip((1.0, 0.5, 0.4, 0.3, 0.3), images, strict=True):
             far = np.linalg.norm(place - image, axis=1)
-            channel = channel + amplitude * point_wave(torch.from_numpy(far)[:, None], tones).numpy()
+            channel = (
+                channel + amplitude * point_wave(torch.from_numpy(far)[:, None], tones).numpy()
+            )
         channel = packets(channel, tones, rng)
         noise = rng.normal(size=(*channel.shape, 2)) @ [1, 1j] * 0.02 * np.abs(channel).mean()
         ends = {"rx_position": place, "tx_position": images[0], "frequency_hz": tones}
@@ -145,7 +176,9 @@ def turns(rng: np.random.Generator, count: int, by: float) -> np.ndarray:
     return np.stack([np.cos(angle), np.sin(angle)], 1)
 
 
-def waves(rng: np.random.Generator, place: np.ndarray, deviation: float, length: float) -> np.ndarray:
+def waves(
+    rng: np.random.Generator, place: np.ndarray, deviation: float, length: float
+) -> np.ndarray:
     """Return a random field (n,) at places (n, 2)."""
     wave, phase = rng.normal(size=(2, 60)) / length, rng.uniform(0, 2 * np.pi, 60)
     return deviation * np.sqrt(2 / 60) * np.cos(place @ wave + phase).sum(1)
@@ -156,8 +189,12 @@ def thinned(arrays: Arrays) -> Arrays:
     count = len(arrays["csi"] if "csi" in arrays else arrays["rssi_db"])
     level = arrays.get("rssi_db", np.zeros(count)).reshape(count, -1)
     heard = np.flatnonzero(np.isfinite(level).any(1))
-    chosen = np.sort(np.random.default_rng(0).permutation(heard)[: ROWS if count != 3 * ROWS else count])
-    return {name: one[chosen] if np.shape(one)[:1] == (count,) else one for name, one in arrays.items()}
+    chosen = np.sort(
+        np.random.default_rng(0).permutation(heard)[: ROWS if count != 3 * ROWS else count]
+    )
+    return {
+        name: one[chosen] if np.shape(one)[:1] == (count,) else one for name, one in arrays.items()
+    }
 
 
 def main() -> None:
@@ -178,10 +215,16 @@ def main() -> None:
             squares.setdefault(side, []).append(name)
         config["splits"] = {"random": {"choose": ["split=random", "split.redraw=true"], "draws": 1}}
         for side, names in squares.items():
-            cut = {"choose": ["split=blocks", f"split.side_m={side}"], "draws": 1, "datasets": names}
+            cut = {
+                "choose": ["split=blocks", f"split.side_m={side}"],
+                "draws": 1,
+                "datasets": names,
+            }
             config["splits"][f"squares_{side:g}m"] = cut
         wanted = {*plain_methods(), "gsparc"}
-        config["methods"] = {name: method for name, method in config["methods"].items() if name in wanted}
+        config["methods"] = {
+            name: method for name, method in config["methods"].items() if name in wanted
+        }
         config["only"] = [f"{name}*" for name in words if "=" not in name]
         filled = run_jobs(plan_jobs(config, Path(folder) / "cells"), train_job, True, None)
     rows = average_cells(filled)
@@ -189,7 +232,9 @@ def main() -> None:
 
 
 def write_table(rows: pd.DataFrame, file: Path) -> None:
-    """Write ours beside the best plain method, a row a case, and print the mean and the largest ratio."""
+    """Write ours beside the best plain method, a row a case,
+    and print the mean and the largest ratio.
+    """
     cases = []
     for (dataset, split), those in rows.groupby(["dataset", "split"], sort=False):
         # A score is of squared errors [dB] but for powers, whose root mean squared error it is.
@@ -197,12 +242,17 @@ def write_table(rows: pd.DataFrame, file: Path) -> None:
         error = (-one.score_db).where(one.figure.str.startswith("rmse"), 10 ** (-one.score_db / 20))
         best = error.drop("gsparc").idxmin()
         ratio = error["gsparc"] / error[best]
-        cases.append((dataset, split, error["gsparc"], best, error[best], ratio, one.train_cpu_s["gsparc"]))
+        cases.append(
+            (dataset, split, error["gsparc"], best, error[best], ratio, one.train_cpu_s["gsparc"])
+        )
     table = pd.DataFrame(cases, columns=COLUMNS)
     table.to_csv(file, index=False, lineterminator="\n", float_format="%.4g")
     for at_random, those in table.groupby(table.split == "random"):
         worst = those.loc[those.ratio.idxmax()]
-        text = f"{len(those)} cases, ratio {those.ratio.mean():.3f}, {worst.ratio:.3f} at most ({worst.case})"
+        text = (
+            f"{len(those)} cases, ratio {those.ratio.mean():.3f}, {worst.ratio:.3f} at most "
+            f"({worst.case})"
+        )
         sys.stdout.write(f"{'random' if at_random else 'squares'}: {text}\n")
 
 

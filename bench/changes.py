@@ -31,7 +31,18 @@ from gsparc.models import checkpoint
 from gsparc.models.updated import map_level
 from gsparc.prediction.drift import Watch
 from gsparc.prediction.updating import versions_extra
-from gsparc.processes.changes import AWAY, ERRORS, KINDS, LEAST, NEAR, TINY, WHOLE, LaterRows, correct, learn
+from gsparc.processes.changes import (
+    AWAY,
+    ERRORS,
+    KINDS,
+    LEAST,
+    NEAR,
+    TINY,
+    WHOLE,
+    LaterRows,
+    correct,
+    learn,
+)
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import Sampling
 from gsparc.simulate.scenes.build import build_survey
@@ -62,7 +73,9 @@ def draw(count, seed, side=SIDE):
 
 
 def network(places, seed, later):
-    """Levels (n, T) of an office; later a quarter changed power, moved or failed, and another phone reads."""
+    """Levels (n, T) of an office; later a quarter changed power, moved or failed,
+    and another phone reads.
+    """
     rng = np.random.default_rng(seed)
     posts, shift = rng.uniform(0, SIDE, (STATIONS, 2)), np.zeros(STATIONS)
     fields = np.arange(STATIONS) + 1000 * seed
@@ -71,14 +84,22 @@ def network(places, seed, later):
         posts[4:7], fields[4:7] = rng.uniform(0, SIDE, (3, 2)), fields[4:7] + 500
         shift[7] = -60
     distance = np.linalg.norm(places[:, None, :2] - posts, axis=2)
-    level = -40 - 30 * np.log10(np.maximum(distance, 1)) + np.stack([field(places, s) for s in fields], 1)
+    level = (
+        -40
+        - 30 * np.log10(np.maximum(distance, 1))
+        + np.stack([field(places, s) for s in fields], 1)
+    )
     level += shift - 3 * later + np.random.default_rng(seed + 7 + later).normal(0, 2.5, level.shape)
     return np.where(level > -95, level, np.nan)
 
 
 def screened(places, stands=True):
     """Levels (n,) of a room; where `stands` (n,), a screen of 12 dB is before a disc of 4 m."""
-    return -60 + field(places, 1, 4.0) - 12 * (stands & (np.linalg.norm(places[:, :2] - 5, axis=1) < 4))
+    return (
+        -60
+        + field(places, 1, 4.0)
+        - 12 * (stands & (np.linalg.norm(places[:, :2] - 5, axis=1) < 4))
+    )
 
 
 def planned(places, town=1):
@@ -98,17 +119,21 @@ def judge(name, model, places, levels, told, alone=None):
     """
     at, which = np.unique(places, axis=0, return_inverse=True)
     which, static = which.reshape(-1), model.rssi(rx=places)
-    miss, order = np.ma.masked_invalid(levels - static), np.random.default_rng(0).permutation(len(at))
+    miss, order = (
+        np.ma.masked_invalid(levels - static),
+        np.random.default_rng(0).permutation(len(at)),
+    )
     for count in told:
         new = np.isin(which, order[:count])
         began = time.monotonic()
         model.update(rx=places[new], rssi=levels[new])
         seconds = time.monotonic() - began
         ways = {
-            "old map": static, "updated": model.rssi(rx=places),
+            "old map": static,
+            "updated": model.rssi(rx=places),
             "one constant each, of the places told": static + miss[new].mean(0).filled(0),
             "one constant each, of all later rows": static + miss.mean(0).filled(0),
-        }  # fmt: skip
+        }
         if alone is not None:
             trained = gsparc.fit(rx=places[new], rssi=levels[new], **alone)
             ways["trained on the places told"] = trained.rssi(rx=places)
@@ -125,8 +150,12 @@ def networks():
         unknown = np.full((STATIONS, 3), np.nan)
         fit = {"rx": before, "rssi": network(before, seed, False), "station_position": unknown}
         model = gsparc.fit(**fit, model="gp")
-        yield from judge(f"office {seed}, changed", model, later, network(later, seed, True), (5, 20))
-        yield from judge(f"office {seed}, as before", model, later, network(later, seed, False), (5, 20))
+        yield from judge(
+            f"office {seed}, changed", model, later, network(later, seed, True), (5, 20)
+        )
+        yield from judge(
+            f"office {seed}, as before", model, later, network(later, seed, False), (5, 20)
+        )
 
 
 def was_and_is(level, *places):
@@ -148,7 +177,9 @@ def traced(name, moved, effects, counts, apart_m, **facts):
     """
     facts |= {"name": name, "carrier_hz": 2.44e9, "bandwidth_hz": 0.0, "subcarriers": 1}
     before, asked, near = (
-        build_survey(SceneSettings(num_receivers=count, seed=seed, moved=later, **facts), Sampling())
+        build_survey(
+            SceneSettings(num_receivers=count, seed=seed, moved=later, **facts), Sampling()
+        )
         for count, seed, later in zip((300, *counts), (0, 11, 6), ([], moved, moved), strict=True)
     )
 
@@ -165,7 +196,11 @@ def traced(name, moved, effects, counts, apart_m, **facts):
 
 def cabinet():
     """A shoebox of 14 x 10 m, whose cabinet is moved."""
-    room = {"size_m": [14.0, 10.0, 3.0], "boxes_m": [[[8.0, 2.0, 0.0], [9.0, 4.0, 2.5]]], "reflection": -0.5}
+    room = {
+        "size_m": [14.0, 10.0, 3.0],
+        "boxes_m": [[[8.0, 2.0, 0.0], [9.0, 4.0, 2.5]]],
+        "reflection": -0.5,
+    }
     where = {"transmitter_m": [2.0, 5.0, 2.6], "area_m": [[0.3, 0.3], [13.7, 9.7]], "room": room}
     moved = [{"name": "box0", "by_m": [0.0, 4.0, 0.0]}]
     return traced("cabinet", moved, Effects(), (3000, 1000), 0.5, **where)
@@ -174,7 +209,10 @@ def cabinet():
 def building():
     """A town of 180 x 190 m with a mast on a roof, and a building of 37 x 23 x 20 m that is new."""
     where = {"file": str(OUT.parents[2] / "examples/town.osm"), "over": "ground", "open_sky": True}
-    mast, area = {"name": "roof", "position_m": [20, 45], "height_m": 3}, [[-90.0, -75.0], [90.0, 115.0]]
+    mast, area = (
+        {"name": "roof", "position_m": [20, 45], "height_m": 3},
+        [[-90.0, -75.0], [90.0, 115.0]],
+    )
     moved, less = [{"box_m": [[33, 74, 0], [70, 97, 20]]}], Effects(diffuse=False)
     return traced("town", moved, less, (700, 700), 5.0, transmitters=[mast], area_m=area, **where)
 
@@ -191,7 +229,9 @@ def space_time(before, heard, new, told, asked):
 
 
 def rooms():
-    """One transmitter, 300 rows with 1 dB of noise; then something is moved, and rows in and around tell."""
+    """One transmitter, 300 rows with 1 dB of noise; then something is moved,
+    and rows in and around tell.
+    """
     for name, post, (before, was, now), (near, _, values), (probes, static, truth) in (
         one() for one in ROOMS
     ):
@@ -201,30 +241,47 @@ def rooms():
         fixed = {"tx": post, "model": "gp"}
         model = gsparc.fit(rx=before, rssi=heard, **fixed)
         for count in (5, 10, 20, 50):
-            new, levels, ways = near[:count], values[:count], {"old map": model.rssi(rx=probes)[:, 0]}
+            new, levels, ways = (
+                near[:count],
+                values[:count],
+                {"old map": model.rssi(rx=probes)[:, 0]},
+            )
             for way, refit in (("updated", False), ("updated, refit=true", True)):
                 began = time.process_time()
                 model.update(rx=new, rssi=levels, refit=refit)
                 seconds = round(time.process_time() - began, 3)
                 ways[way] = model.rssi(rx=probes)[:, 0], seconds
                 model.undo()
-            sets = {"all": slice(None), "the right rows": ~right, "a window of 300": slice(count, None)}
+            sets = {
+                "all": slice(None),
+                "the right rows": ~right,
+                "a window of 300": slice(count, None),
+            }
             for way, rows in sets.items():
                 part = {"rx": np.r_[before[rows], new], "rssi": np.r_[heard[rows], levels]}
                 ways[f"retrained on {way}"] = gsparc.fit(**part, **fixed).rssi(rx=probes)[:, 0]
-            ways["retrained on the new rows"] = gsparc.fit(rx=new, rssi=levels, **fixed).rssi(rx=probes)[:, 0]
+            ways["retrained on the new rows"] = gsparc.fit(rx=new, rssi=levels, **fixed).rssi(
+                rx=probes
+            )[:, 0]
             ways["space and time"] = space_time(before, heard, new, levels, probes)
             for way, result in ways.items():
                 answer, seconds = result if isinstance(result, tuple) else (result, "")
                 for part, where in (("where it changed", changed), ("elsewhere", ~changed)):
-                    yield f"{name}, {part}", f"{count} rows", way, rmse(answer[where], truth[where]), seconds
+                    yield (
+                        f"{name}, {part}",
+                        f"{count} rows",
+                        way,
+                        rmse(answer[where], truth[where]),
+                        seconds,
+                    )
 
 
 def seconds():
     """One row, and 50, told to a model of 5,000 rows with 5,000 kept: the least of ten each."""
     before, new = draw(5000, 0, 20.0), draw(6000, 6, 20.0)
     level, later = (
-        -60 + field(at, 1, 4.0) + np.random.default_rng(2).normal(size=len(at)) for at in (before, new)
+        -60 + field(at, 1, 4.0) + np.random.default_rng(2).normal(size=len(at))
+        for at in (before, new)
     )
     model = gsparc.fit(rx=before, rssi=level, tx=[9.0, 9.0, 2.6], model="gp")
     model.update(rx=new[:5000], rssi=later[:5000], window=5000)
@@ -234,11 +291,19 @@ def seconds():
             rows, began = slice(5000 + count * turn, 5000 + count * (turn + 1)), time.process_time()
             model.update(rx=new[rows], rssi=later[rows], window=5000)
             spent.append(1e3 * (time.process_time() - began))
-        yield "an update, 5,000 rows kept", f"{count} rows", "least of ten [ms]", round(min(spent), 1), ""
+        yield (
+            "an update, 5,000 rows kept",
+            f"{count} rows",
+            ("least of ten [ms]"),
+            round(min(spent), 1),
+            "",
+        )
 
 
 def readings(kind, seed, count):
-    """Rows of one station as they miss a map, whose error is .7 dB and noise 2 dB; changed from BEGINS on."""
+    """Rows of one station as they miss a map, whose error is .7 dB and noise 2 dB;
+    changed from BEGINS on.
+    """
     rng = np.random.default_rng(seed)
     places = np.c_[rng.uniform(-10, 10, (count, 2)), np.zeros(count)]
     later, level = np.arange(count) >= BEGINS, 1.5 * field(places, seed + 1, 5.0)
@@ -271,7 +336,9 @@ def detections():
 
 
 def measured(file, epoch):
-    """Months of a library, rounds of a garage: the first learns, later ones tell of 5 places, a fifth."""
+    """Months of a library, rounds of a garage: the first learns, later ones tell of 5 places,
+    a fifth.
+    """
     data = np.load(MEASURED / file)
     places, levels, of = data["position"].astype(float), data["rss_dbm"].astype(float), data[epoch]
     places = np.c_[places, np.full(len(places), 1.5)][:, :3]
@@ -293,13 +360,17 @@ def measured(file, epoch):
 
 
 def campaigns():
-    """Powers of a robot at every fourth antenna of a ceiling: a campaign learns, the next one tells."""
+    """Powers of a robot at every fourth antenna of a ceiling: a campaign learns,
+    the next one tells.
+    """
     data = np.load(MEASURED.parent / "real/techtile-csi-920mhz.npz")
     levels = 20 * np.log10(np.abs(np.where(data["mask"], data["csi"], np.nan))[:, ::4])
     places, later = data["tx_position"], data["run"] == "EXP006"
     fixed = {"station_position": data["rx_antenna_position"][::4], "model": "gp"}
     model = gsparc.fit(rx=places[~later], rssi=levels[~later], **fixed)
-    yield from judge("EXP005 then EXP006", model, places[later], levels[later], (5, 20, 50, 119), fixed)
+    yield from judge(
+        "EXP005 then EXP006", model, places[later], levels[later], (5, 20, 50, 119), fixed
+    )
 
 
 def judge_maps(axis, cases):
@@ -307,13 +378,15 @@ def judge_maps(axis, cases):
 
     Args:
         axis: (n,) centres of squares, both ways [m].
-        cases: of each town the rows that are known, places and levels (Q, T) that are asked, names of
-            stations, and levels (n * n, T) of each map.
+        cases: of each town the rows that are known, places and levels (Q, T) that are asked, names
+            of stations, and levels (n * n, T) of each map.
     """
     squares, errors, spent = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2), [], 0.0
     step = axis[1] - axis[0]
     how = {"width": len(axis), "height": len(axis), "dtype": "float64", "driver": "GTiff"}
-    how["transform"] = rasterio.transform.from_origin(axis[0] - step / 2, axis[-1] + step / 2, step, step)
+    how["transform"] = rasterio.transform.from_origin(
+        axis[0] - step / 2, axis[-1] + step / 2, step, step
+    )
     for known, asked, truth, names, maps in cases:
         row = {"no map": rmse(gsparc.fit(**known).rssi(rx=asked), truth)}
         for name, levels in maps.items():
@@ -335,7 +408,9 @@ def judge_maps(axis, cases):
 
 
 def priors():
-    """Towns whose planned map misses shadowing, has 6 dB too little, lies 30 m off, or is another town's."""
+    """Towns whose planned map misses shadowing, has 6 dB too little, lies 30 m off,
+    or is another town's.
+    """
     axis = np.arange(5.0, 700, 10)
     squares = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
 
@@ -345,10 +420,18 @@ def priors():
         level += np.random.default_rng(town).normal(0, 1, len(places))
         survey = {"rx": places[:count], "tx": [0.0, 0, 20], "rssi": level[:count]}
         maps = {
-            "misses shadowing": planned(squares, town), "6 dB too low": planned(squares, town) - 6,
-            "30 m off": planned(squares - [30, 0], town), "another town's": planned(squares, town + 50),
-        }  # fmt: skip
-        return survey, places[count:], level[count:, None], [""], {n: one[:, None] for n, one in maps.items()}
+            "misses shadowing": planned(squares, town),
+            "6 dB too low": planned(squares, town) - 6,
+            "30 m off": planned(squares - [30, 0], town),
+            "another town's": planned(squares, town + 50),
+        }
+        return (
+            survey,
+            places[count:],
+            level[count:, None],
+            [""],
+            {n: one[:, None] for n, one in maps.items()},
+        )
 
     for count in (5, 10, 20, 50, 100):
         for name, *figures in judge_maps(axis, (case(town, count) for town in range(1, 7))):
@@ -356,13 +439,17 @@ def priors():
 
 
 def cells():
-    """Networks with a map of each cell, that misses shadowing, has 6 dB too little, or is another town's."""
+    """Networks with a map of each cell, that misses shadowing, has 6 dB too little,
+    or is another town's.
+    """
     axis = np.arange(25.0, simulated.SIDE_M, 50)
     squares = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2)
 
     def town(seed, shadows):
         asked = np.r_[squares, np.random.default_rng(seed).uniform(0, simulated.SIDE_M, (250, 2))]
-        with patch.multiple(simulated, **{one: shadows * getattr(simulated, one) for one in SHADOWING}):
+        with patch.multiple(
+            simulated, **{one: shadows * getattr(simulated, one) for one in SHADOWING}
+        ):
             return simulated.draw_network(seed, 0, 300, asked)
 
     def case(seed, count):
@@ -371,9 +458,19 @@ def cells():
         heard = np.random.default_rng(seed).permutation(len(one.moment))[: count // LISTED]
         rows = np.isin(np.nonzero(one.listed(LISTED))[0], heard)
         known |= {name: known[name][rows] for name in ("rx_position", "station", "rssi_db")}
-        maps = {"misses shadowing": flat.truth, "6 dB too low": flat.truth - 6, "another town's": other.truth}
+        maps = {
+            "misses shadowing": flat.truth,
+            "6 dB too low": flat.truth - 6,
+            "another town's": other.truth,
+        }
         maps = {name: level[: len(squares)] for name, level in maps.items()}
-        return known, one.asked[len(squares) :], one.truth[len(squares) :], known["station_name"], maps
+        return (
+            known,
+            one.asked[len(squares) :],
+            one.truth[len(squares) :],
+            known["station_name"],
+            maps,
+        )
 
     for count in (48, 198, 996):
         for name, *figures in judge_maps(axis, (case(seed, count) for seed in range(1, 5))):
@@ -388,7 +485,9 @@ def world():
     before, noise = draw(300, 0, 20.0), np.random.default_rng(2)
 
     def measure(number, places):
-        return screened(places, np.asarray(number) // 10_000 % 2 == 1) + noise.normal(size=len(places))
+        return screened(places, np.asarray(number) // 10_000 % 2 == 1) + noise.normal(
+            size=len(places)
+        )
 
     return gsparc.fit(rx=before, rssi=measure(0, before), tx=[9.0, 9.0, 2.6], model="gp"), measure
 
@@ -399,19 +498,26 @@ def matern(distance, length):
 
 
 def solve(belief, rows, level, doubt, apart, among, middle, seen):
-    """Level [dB] at a place, at distances `apart` (n,) and `among` (n, n) [m]: one plain solve a kind."""
+    """Level [dB] at a place, at distances `apart` (n,) and `among` (n, n) [m]:
+    one plain solve a kind.
+    """
     weight, added = (np.asarray(part) for part in belief.of(0))
     mask, result, near = weight >= LEAST, 0.0, matern(apart.min(), belief.extent * AWAY)
     for share, kind in zip(weight, KINDS, strict=True):
         if share < LEAST:
             continue
         covariances = [
-            kind.keeps * np.sqrt(variance * rows.doubt.numpy()) * matern(distance, belief.extent * ERRORS)
-            + kind.offset**2 + kind.local**2 * matern(distance, belief.extent * kind.size)
+            kind.keeps
+            * np.sqrt(variance * rows.doubt.numpy())
+            * matern(distance, belief.extent * ERRORS)
+            + kind.offset**2
+            + kind.local**2 * matern(distance, belief.extent * kind.size)
             for variance, distance in ((doubt, apart), (rows.doubt.numpy()[:, None], among))
-        ]  # fmt: skip
+        ]
         noise = added + (rows.noise + rows.faded).numpy() + TINY
-        values = rows.missed.numpy() + (1 - kind.keeps) * rows.level.numpy() - (1 - kind.keeps) * middle
+        values = (
+            rows.missed.numpy() + (1 - kind.keeps) * rows.level.numpy() - (1 - kind.keeps) * middle
+        )
         mean = covariances[0] @ np.linalg.solve(covariances[1] + np.diag(noise), values)
         away = 0.0 if kind.keeps else near + (1 - near) * seen
         mean = (kind.keeps + away) * mean + (1 - away) * level + away * middle
@@ -423,7 +529,10 @@ def updates():
     """A row at a time, many of them: differences to fresh solves, memory and seconds."""
     model, measure = world()
     places, probes = draw(UPDATES, 6, 20.0), torch.from_numpy(draw(20, 11, 20.0))
-    levels, query = measure(np.arange(UPDATES), places), probes - torch.from_numpy(model.site.origin)
+    levels, query = (
+        measure(np.arange(UPDATES), places),
+        probes - torch.from_numpy(model.site.origin),
+    )
     before = map_level(
         model.method, model.predict_query(Query.from_places(model.site, query.float())), model.site
     )
@@ -434,8 +543,13 @@ def updates():
         seconds.append(time.process_time() - began)
         if number % EACH != EACH - 1:
             continue
-        rows, extent = model.versions[-1].changes.stations[0], model.versions[-1].changes.belief.extent
-        means = correct(model.versions[-1].changes.belief, 0, rows, query, before.mean, before.doubt).mean
+        rows, extent = (
+            model.versions[-1].changes.stations[0],
+            model.versions[-1].changes.belief.extent,
+        )
+        means = correct(
+            model.versions[-1].changes.belief, 0, rows, query, before.mean, before.doubt
+        ).mean
         belief, distances = learn({0: rows}, extent), torch.cdist(query, rows.places).numpy()
         seen = min(np.linalg.norm(np.ptp(rows.places.numpy(), axis=0)) / extent, 1.0) ** WHOLE
         for count in worst if number % (5 * EACH) == 5 * EACH - 1 else (NEAR,):
@@ -444,22 +558,40 @@ def updates():
                 part = rows[torch.from_numpy(near)]
                 among = torch.cdist(part.places, part.places).numpy()
                 fresh = solve(
-                    belief, part, float(before.mean[one]), float(before.doubt[one]), distance[near], among,
-                    rows.middle.item(), seen,
-                )  # fmt: skip
+                    belief,
+                    part,
+                    float(before.mean[one]),
+                    float(before.doubt[one]),
+                    distance[near],
+                    among,
+                    rows.middle.item(),
+                    seen,
+                )
                 worst[count] = max(worst[count], abs(fresh - float(means[one])))
-        memory = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
+        memory = (
+            int(Path("/proc/self/statm").read_text().split()[1])
+            * os.sysconf("SC_PAGE_SIZE")
+            / 2**20
+        )
         few.append(memory)
     name, amount = "a row at a time, 1,000 kept", f"{UPDATES} updates"
     figures = {
         "from a fresh solve of the 64 nearest rows, at most [dB]": worst[NEAR],
         "from a fresh solve of all rows kept, at most [dB]": worst[1000],
-        "memory after 1,000 updates [MiB]": few[0], "memory at the end [MiB]": few[-1],
-        "alarms, of 9 changes": alarms, "an update, median [ms]": 1e3 * np.median(seconds),
+        "memory after 1,000 updates [MiB]": few[0],
+        "memory at the end [MiB]": few[-1],
+        "alarms, of 9 changes": alarms,
+        "an update, median [ms]": 1e3 * np.median(seconds),
         "of the last 1,000, median [ms]": 1e3 * np.median(seconds[-EACH:]),
-    }  # fmt: skip
+    }
     for way, figure in figures.items():
-        yield name, amount, way, float(f"{figure:.3g}"), round(sum(seconds)) if way.startswith("an") else ""
+        yield (
+            name,
+            amount,
+            way,
+            float(f"{figure:.3g}"),
+            round(sum(seconds)) if way.startswith("an") else "",
+        )
     states = []
     for turn in range(10):
         states.append(model.predict(rx=probes.numpy()))
@@ -473,7 +605,9 @@ def updates():
 
 
 def kills():
-    """A process that updates a file, killed at random moments: the file holds the state before, or after."""
+    """A process that updates a file, killed at random moments: the file holds the state before,
+    or after.
+    """
     model, measure = world()
     places, probes, rng = draw(2000, 6, 20.0), draw(20, 11, 20.0), np.random.default_rng(0)
     levels, whole, losses, writes = measure(np.arange(2000), places), 0, 0, 0
@@ -500,24 +634,33 @@ def kills():
                 maps.append(model.rssi(rx=probes))
             writes, losses = len(after.rows), losses + (len(after.rows) < done)
             whole += (
-                len(after.rows) in (done, done + 1) and (after.rssi(rx=probes) == maps[len(after.rows)]).all()
+                len(after.rows) in (done, done + 1)
+                and (after.rssi(rx=probes) == maps[len(after.rows)]).all()
             )
         leftovers = len(list(Path(folder).iterdir())) - 1
     figures = {
         "the state before, or after, bit for bit": int(whole),
-        "updates lost that were said to be stored": losses, "partial files left": leftovers,
-    }  # fmt: skip
+        "updates lost that were said to be stored": losses,
+        "partial files left": leftovers,
+    }
     for way, figure in figures.items():
         yield "killed at random", f"{KILLS} kills, {writes} writes", way, figure, ""
 
 
 ROOMS = disc, cabinet, building
 PARTS = {
-    "networks": networks, "rooms": rooms, "detections": detections, "priors": priors, "cells": cells,
-    "campaigns": campaigns, "seconds": seconds, "updates": updates, "kills": kills,
+    "networks": networks,
+    "rooms": rooms,
+    "detections": detections,
+    "priors": priors,
+    "cells": cells,
+    "campaigns": campaigns,
+    "seconds": seconds,
+    "updates": updates,
+    "kills": kills,
     "months": lambda: measured("library-months.npz", "month"),
     "rounds": lambda: measured("garage-rounds.npz", "round"),
-}  # fmt: skip
+}
 
 if __name__ == "__main__":
     logging.disable(logging.WARNING)

@@ -4,9 +4,9 @@ python bench/scale.py town 1000 10000 100000 1000000 >> docs/results/scale/power
 python bench/scale.py city 1000 10000 100000 1000000 >> docs/results/scale/powers.csv
 python bench/scale.py draw docs/results/scale docs/images
 
-Methods may be named behind the numbers. Each is fitted in a process of its own. Seconds are of the processor,
-user and system, beside those of the wall, which say little on a machine that others use: its load stands
-beside them.
+Methods may be named behind the numbers. Each is fitted in a process of its own. Seconds are of the
+processor, user and system, beside those of the wall, which say little on a machine that others use:
+its load stands beside them.
 """
 
 from __future__ import annotations
@@ -91,7 +91,9 @@ def measured(source: str, name: str, data: Measurements, fold: Fold) -> None:
     spread = standard_error(squared) / (2 * rmse)
     values = (cpu, wall, query, rmse, spread, before, peak_gb(), private.most, os.getloadavg()[0])
     count = len(fold.train) + len(fold.val)
-    csv.writer(sys.stdout).writerow((source, name, method.label, count, *(f"{v:.4g}" for v in values)))
+    csv.writer(sys.stdout).writerow(
+        (source, name, method.label, count, *(f"{v:.4g}" for v in values))
+    )
     sys.stdout.flush()
 
 
@@ -129,7 +131,12 @@ def main(source: str, *rest: str) -> None:
     for count in (int(word) for word in rest if word.isdigit()):
         data, rows = {"town": town, "city": city}[source](count), np.arange(count + TESTED)
         # Validation rows first, test rows last, which are the same whatever the count.
-        each(source, methods, data, Fold(rows[count // 10 : count], rows[: count // 10], rows[count:]))
+        each(
+            source,
+            methods,
+            data,
+            Fold(rows[count // 10 : count], rows[: count // 10], rows[count:]),
+        )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Lightning callbacks: densify and prune, bounds, opacity reset, checkpoint, cost ledger, pictures."""
+"""Lightning callbacks: densify and prune, bounds, opacity reset, checkpoint, cost ledger,
+pictures.
+"""
 
 from gsparc.callbacks.bounds import Bounds
 from gsparc.callbacks.checkpoint import Checkpoint
@@ -8,4 +10,12 @@ from gsparc.callbacks.pictures import Pictures
 from gsparc.callbacks.progress import StepProgress
 from gsparc.callbacks.reset import OpacityReset
 
-__all__ = ["Bounds", "Checkpoint", "CostLedger", "Densify", "OpacityReset", "Pictures", "StepProgress"]
+__all__ = [
+    "Bounds",
+    "Checkpoint",
+    "CostLedger",
+    "Densify",
+    "OpacityReset",
+    "Pictures",
+    "StepProgress",
+]

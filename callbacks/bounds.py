@@ -13,7 +13,8 @@ from gsparc.base.limits import Checked, number, setting
 
 @dataclass(eq=False)
 class Bounds(Checked, L.Callback):
-    """After each step, moves centres that left the scene box enlarged by `margin` back to its faces.
+    """After each step, moves centres that left the scene box enlarged
+    by `margin` back to its faces.
 
     >>> Bounds(margin=4.0).margin
     4.0

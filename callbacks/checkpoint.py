@@ -14,7 +14,8 @@ from gsparc.field.schedule import INTERVAL, to_steps
 
 @dataclass(eq=False)
 class Checkpoint(Checked, L.callbacks.Checkpoint):  # Lightning calls it after all other callbacks
-    """Write the state every `interval` steps, or share of all steps; after the last step it always is.
+    """Write the state every `interval` steps, or share of all steps;
+    after the last step it always is.
 
     >>> Checkpoint(interval=500).interval  # steps; 0.25 is a quarter of them
     500
@@ -29,7 +30,11 @@ class Checkpoint(Checked, L.callbacks.Checkpoint):  # Lightning calls it after a
         """Write when the schedule says so."""
         step = module.global_step
         # After the last step the state is written in any case, and not here.
-        due = step and step % to_steps(self.interval, module.total_steps) == 0 and step < module.total_steps
+        due = (
+            step
+            and step % to_steps(self.interval, module.total_steps) == 0
+            and step < module.total_steps
+        )
         if due and step_is_complete(trainer):
             trainer.save_checkpoint(module.run_dir / "last.ckpt")
 

@@ -22,7 +22,8 @@ from gsparc.training.tracking import log_event
 log = logging.getLogger(__name__)
 
 LEAST = 1e-7  # of an opacity, and of what lacks it to 1: logits of both are finite in float32
-MOST_CHANGE = 1e-3  # root mean square, that an edit may make of spectra whose emissions were solved for
+# Root mean square, that an edit may make of spectra whose emissions were solved for
+MOST_CHANGE = 1e-3
 
 
 @dataclass(eq=False)
@@ -37,17 +38,19 @@ class Densify(Checked, L.Callback):
     gsparc.base.limits.SettingError: children=1: a whole number of at least 2 is needed
 
     Args:
-        start, stop, interval: first step, last step and spacing of the edits; below 1 a share of all steps.
+        start, stop, interval: first step, last step and spacing of the edits; below 1 a share of
+            all steps.
         grad_threshold: mean screen-space gradient norm [loss per px] above which a Gaussian is
             under-reconstructed; read per sample before summing.
         size_share: Gaussians up to this share of the scene radius are cloned, larger ones split.
         children: number N of children of a split; their scale is the parent's / (`shrink` N).
         shrink: see `children`.
         min_opacity: prune below this opacity.
-        max_radius: prune above this footprint radius [px], from step `radius_from` on; null never does.
+        max_radius: prune above this footprint radius [px], from step `radius_from` on; null never
+            does.
         radius_from: first step that prunes by radius, or its share of all steps.
-        max_size_share: prune where the largest standard deviation is above this share of the scene's
-            diagonal; null never does.
+        max_size_share: prune where the largest standard deviation is above this share of the
+            scene's diagonal; null never does.
         max_gaussians: never more than this many.
         min_gaussians: pruning stops at this many, the most opaque stay.
         part: what tells it from others of one training; "" of the only one.
@@ -69,8 +72,10 @@ class Densify(Checked, L.Callback):
     min_gaussians: int = setting(16, whole(0))
     part: str = ""
     statistics: dict[str, Tensor] = field(default_factory=dict, init=False, repr=False)
-    _ended: bool = field(default=False, init=False, repr=False)  # an edit would have changed what is rendered
-    _is_full: bool = field(default=False, init=False, repr=False)  # the last edit had more to add than room
+    # An edit would have changed what is rendered
+    _ended: bool = field(default=False, init=False, repr=False)
+    # The last edit had more to add than room
+    _is_full: bool = field(default=False, init=False, repr=False)
     _full_is_logged: bool = field(default=False, init=False, repr=False)
 
     @property
@@ -87,7 +92,9 @@ class Densify(Checked, L.Callback):
         """Accumulate positional gradients and radii of the Gaussians that were seen."""
         if module.rendered is None or module.global_step >= to_steps(self.stop, module.total_steps):
             return
-        raster = module.rendered.raster or module.model.raster_of_weights(module.rendered, module.batch.rx)
+        raster = module.rendered.raster or module.model.raster_of_weights(
+            module.rendered, module.batch.rx
+        )
         if raster is None:
             return
         if not self.statistics or len(self.statistics["seen"]) != len(module.model.gaussians):
@@ -103,13 +110,20 @@ class Densify(Checked, L.Callback):
                 sums = torch.stack([(gradient.norm(dim=-1) * visible).sum(0), visible.sum(0)])
                 result, seen = process_sum(sums)
             else:  # of one pose the gradient is the sum over rows, and every process sees the same
-                result, seen = (process_sum(gradient.clone()).norm(dim=-1) * visible).sum(0), visible.sum(0)
+                result, seen = (
+                    (process_sum(gradient.clone()).norm(dim=-1) * visible).sum(0),
+                    visible.sum(0),
+                )
             self.statistics["gradient"] += result
             self.statistics["seen"] += seen
             radius = (raster.radii * visible).amax(0) if len(visible) else self.statistics["radius"]
-            self.statistics["radius"] = process_max(torch.maximum(self.statistics["radius"], radius.float()))
+            self.statistics["radius"] = process_max(
+                torch.maximum(self.statistics["radius"], radius.float())
+            )
 
-    def on_train_batch_start(self, trainer: L.Trainer, module: Any, batch: Any = None, *unused: Any) -> None:
+    def on_train_batch_start(
+        self, trainer: L.Trainer, module: Any, batch: Any = None, *unused: Any
+    ) -> None:
         """Edit the field when the schedule says so, after the validation of the step before."""
         if not self.statistics or self._ended:
             return
@@ -126,7 +140,10 @@ class Densify(Checked, L.Callback):
             solved = solve_readout(model, planned, batch) if module.solved else None
             change = 0.0 if solved is None else float(process_sum(solved.change)) ** 0.5
             if change > MOST_CHANGE:
-                text = "step %d: no Gaussians added from here on: spectra would change by %.1e, more than %g"
+                text = (
+                    "step %d: no Gaussians added from here on: spectra would change by %.1e, "
+                    "more than %g"
+                )
                 log.info(text, step, change, MOST_CHANGE)
                 self._ended = True
                 return
@@ -142,15 +159,19 @@ class Densify(Checked, L.Callback):
             self._full_is_logged = True
 
     def plan(
-        self, model: GaussianModel, generator: torch.Generator, in_place: bool = False, by_radius: bool = True
+        self,
+        model: GaussianModel,
+        generator: torch.Generator,
+        in_place: bool = False,
+        by_radius: bool = True,
     ) -> edit.Edit:
         """Decide what to clone, split and prune from the statistics gathered so far.
 
         Args:
             model: the field.
             generator: of the places of children.
-            in_place: children stay where the parent was, as large, and let through together what it did, so
-                that the field renders as before: for emissions that were solved for it.
+            in_place: children stay where the parent was, as large, and let through together what it
+                did, so that the field renders as before: for emissions that were solved for it.
             by_radius: whether large footprints are removed.
         """
         gaussians = model.gaussians
@@ -174,7 +195,9 @@ class Densify(Checked, L.Callback):
         wanted = under_reconstructed & ~prune
         chosen = self._choose_within_room(wanted, mean_gradient, cost, room)
         self._is_full = bool((wanted & ~chosen).any())
-        clone, split = (chosen & ~large, chosen & large) if not in_place else (chosen & False, chosen)
+        clone, split = (
+            (chosen & ~large, chosen & large) if not in_place else (chosen & False, chosen)
+        )
         clones = clone.nonzero().squeeze(1)
         splits = split.nonzero().squeeze(1).repeat_interleave(self.children)
         parents = torch.cat([clones, splits])
@@ -182,9 +205,12 @@ class Densify(Checked, L.Callback):
             # N layers of opacity b let through (1 - b)^N, which is to be 1 - a of the parent.
             opacities = -torch.expm1(torch.log1p(-gaussians.opacities[splits]) / self.children)
             return edit.Edit(
-                ~(prune | split), parents, {"gaussians.opacity_logits": torch.logit(opacities, LEAST)}
+                ~(prune | split),
+                parents,
+                {"gaussians.opacity_logits": torch.logit(opacities, LEAST)},
             )
-        # Two children are 1 / 1.6 of their parent, as in B. Kerbl et al., 3D Gaussian splatting (2023).
+        # Two children are 1 / 1.6 of their parent, as in B. Kerbl et al.,
+        # 3D Gaussian splatting (2023).
         smaller = gaussians.log_scales[splits] - math.log(self.shrink * self.children)
         scales = torch.cat([gaussians.log_scales[clones], smaller])
         spread = _sample_inside(gaussians.scales[splits], gaussians.quats[splits], generator)
@@ -202,7 +228,9 @@ class Densify(Checked, L.Callback):
         return prune
 
     @staticmethod
-    def _choose_within_room(under_reconstructed: Tensor, gradient: Tensor, cost: Tensor, room: int) -> Tensor:
+    def _choose_within_room(
+        under_reconstructed: Tensor, gradient: Tensor, cost: Tensor, room: int
+    ) -> Tensor:
         rank = torch.where(under_reconstructed, gradient, -torch.ones_like(gradient))
         # Stable: where gradients are equal, a resumed run chooses the same.
         order = rank.argsort(descending=True, stable=True)
@@ -226,8 +254,12 @@ def _log_edit(trainer: L.Trainer, module: Any, planned: edit.Edit, before: int, 
     if gone or len(planned.parents):
         log.info(
             "step %d: %d Gaussians removed or split, %d added: %d -> %d",
-            step, gone, len(planned.parents), before, after,
-        )  # fmt: skip
+            step,
+            gone,
+            len(planned.parents),
+            before,
+            after,
+        )
         log_event(trainer, module, {"densify/removed": gone, "densify/added": len(planned.parents)})
 
 

@@ -15,7 +15,8 @@ from gsparc.training import curve
 class CostLedger(L.Callback):
     """A stopwatch that runs only while the model learns, and the learning curve against it.
 
-    `learning_curve.csv` in the run directory has a row per validation, the first before the first step.
+    `learning_curve.csv` in the run directory has a row per validation,
+    the first before the first step.
 
     >>> ledger = CostLedger()
     >>> with ledger.paused():  # for work that is not training
@@ -53,7 +54,9 @@ class CostLedger(L.Callback):
         return self.seconds + running
 
     def on_train_start(self, trainer: L.Trainer, module: Any) -> None:
-        """Start the watch; the curve of an interrupted run ends with the checkpoint that it goes on from."""
+        """Start the watch; the curve of an interrupted run ends with the checkpoint
+        that it goes on from.
+        """
         if trainer.is_global_zero and trainer.global_step:
             # Rows after the checkpoint are of steps that are taken again.
             self._rows = [row for row in self._rows if int(row["step"]) <= trainer.global_step]
@@ -74,7 +77,8 @@ class CostLedger(L.Callback):
 
     def on_validation_end(self, trainer: L.Trainer, module: Any) -> None:
         """Write a row of the learning curve and go on."""
-        # `trainer.validate` by itself is no training: neither a row of the curve nor a running watch.
+        # `trainer.validate` by itself is no training:
+        # neither a row of the curve nor a running watch.
         fitting = trainer.state.fn == "fit"
         if trainer.is_global_zero and fitting and module.figures:
             self._log_seconds(trainer, module)
@@ -87,10 +91,14 @@ class CostLedger(L.Callback):
         figures = {name: value for name, value in module.figures.items() if name in curve.FIGURES}
         # What was solved before the first step is part of what an accuracy costs.
         row = curve.curve_row(
-            module.prepared_seconds + self.seconds, f"step {step}" if step else module.start,
-            module.figures["val/error"], step, num_gaussians=module.count,
-            **figures, **({} if loss is None else {"train/task_loss": float(loss)}),
-        )  # fmt: skip
+            module.prepared_seconds + self.seconds,
+            f"step {step}" if step else module.start,
+            module.figures["val/error"],
+            step,
+            num_gaussians=module.count,
+            **figures,
+            **({} if loss is None else {"train/task_loss": float(loss)}),
+        )
         self._rows.append(row)
         curve.write_curve(module.run_dir, self._rows)
         curve.log_row(trainer.loggers, row)

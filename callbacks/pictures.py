@@ -59,6 +59,8 @@ class Pictures(Checked, L.Callback):
             path = module.run_dir / "pictures" / f"step_{step:06d}.png"
             true, predictions = batch.target.cpu().numpy(), {"predicted": predicted.cpu().numpy()}
             unknown = np.full(len(rows), np.nan)
-            examples = Examples(rows, np.array(module.site.grid.edges()), true, unknown, predictions)
+            examples = Examples(
+                rows, np.array(module.site.grid.edges()), true, unknown, predictions
+            )
             save(draw_spectra(examples, title), path, 100)
             log_picture(trainer.loggers, "predictions", path, step)

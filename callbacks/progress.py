@@ -24,8 +24,8 @@ CHANGED = 1.3  # ratio of two estimates that is worth another line
 class StepProgress(L.Callback):
     """A rich progress bar over optimiser steps (epochs mean little when data are few).
 
-    A line says after some steps how long all take here, where that is over a minute, and again at quarters
-    of the way where they have become slower or faster.
+    A line says after some steps how long all take here, where that is over a minute, and again at
+    quarters of the way where they have become slower or faster.
     """
 
     def __init__(self) -> None:
@@ -46,7 +46,9 @@ class StepProgress(L.Callback):
         self._bar.start()
         self._began = self._told_s = None
         stage = "again, on all rows " if module.run_dir.name == "refit" else ""
-        self._bar.add_task(stage, total=trainer.max_steps, completed=trainer.global_step, figures="")
+        self._bar.add_task(
+            stage, total=trainer.max_steps, completed=trainer.global_step, figures=""
+        )
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         """Advance; metrics are read every 20 steps: reading waits for the device."""
@@ -64,10 +66,14 @@ class StepProgress(L.Callback):
             if other and (rest_s := each * (trainer.max_steps - step)) > LONG_S:
                 self._told_s = each
                 pace = f"{trainer.max_steps:,} steps, {1000 * each:.0f} ms each here"
-                self._bar.console.print(f"{pace}: about {rest_s / 60:.0f} min to go", highlight=False)
+                self._bar.console.print(
+                    f"{pace}: about {rest_s / 60:.0f} min to go", highlight=False
+                )
         if step % 20 == 0 or step == trainer.max_steps:
             result = {form: trainer.callback_metrics.get(key) for key, form in SHOWN.items()}
-            figures = [form.format(float(value)) for form, value in result.items() if value is not None]
+            figures = [
+                form.format(float(value)) for form, value in result.items() if value is not None
+            ]
             figures += [] if module.count is None else [f"{module.count} Gaussians"]
             self._bar.update(task, figures=", ".join(figures))
 

@@ -21,9 +21,9 @@ log = logging.getLogger(__name__)
 class OpacityReset(Checked, L.Callback):
     """sigma_i <- min(sigma_i, ceiling) every `interval` steps until `stop`; Adam's moments follow.
 
-    Validation falls by several decibels and takes about an interval to recover: where fewer steps are left,
-    there is no reset, nor in a training of fewer than `least_steps`, nor after a start in closed form, whose
-    emissions were solved for the opacities as they are.
+    Validation falls by several decibels and takes about an interval to recover: where fewer steps
+    are left, there is no reset, nor in a training of fewer than `least_steps`, nor after a start in
+    closed form, whose emissions were solved for the opacities as they are.
 
     >>> OpacityReset(ceiling=1.5)
     Traceback (most recent call last):

@@ -1,4 +1,5 @@
-"""GSpaRC: Gaussian splatting for radio. See ARCHITECTURE.md for a map; `gsparc.ops` is the folder `ops/`.
+"""GSpaRC: Gaussian splatting for radio. See ARCHITECTURE.md for a map;
+`gsparc.ops` is the folder `ops/`.
 
 >>> import gsparc
 >>> predictor = gsparc.load("model.ckpt")  # or gsparc.fit(rx=..., tx=..., rssi=...)
@@ -17,8 +18,9 @@ if TYPE_CHECKING:
     from gsparc.prediction.operating_point import load as load
     from gsparc.prediction.predictor import Predictor as Predictor
 
-# Torch's threads would otherwise spin for one another and against our kernels' own: up to twice slower, and
-# twenty times beside another busy process. It works where gsparc is imported before torch.
+# Torch's threads would otherwise spin for one another and against our kernels' own: up to twice
+# slower, and twenty times beside another busy process.
+# It works where gsparc is imported before torch.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 # Looked up on first use: `import gsparc` costs nothing.

@@ -12,14 +12,17 @@ READER_LEFT = 141  # a shell's status of a process that wrote to a closed pipe
 
 
 def main() -> None:
-    """Run the command named first; without one, list them. Exit status 0 only when the job was done."""
+    """Run the command named first; without one, list them.
+    Exit status 0 only when the job was done.
+    """
     try:
         try:
             _run()
         finally:
             sys.stdout.flush()
     except BrokenPipeError:  # `| head` has its lines
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the interpreter flushes once more
+        # The interpreter flushes once more
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(READER_LEFT)
     except KeyboardInterrupt:  # while modules are loaded: cli.run says the others
         sys.stderr.write("error: interrupted\n")

@@ -1,11 +1,12 @@
 """The rasterizer: plain-PyTorch reference, C++ and CUDA kernels, one interface.
 
-`rasterize` = `make_plan` (footprints, visibility, depth order) + `composite` (linear in the features);
-`mean_weights` is its weights-only twin, `freeze` turns a static receiver's plan into a sparse matrix.
+`rasterize` = `make_plan` (footprints, visibility, depth order) + `composite` (linear in the
+features); `mean_weights` is its weights-only twin,
+`freeze` turns a static receiver's plan into a sparse matrix.
 
 >>> import torch
->>> scene = torch.tensor([[4.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.full((1, 3), 0.5)
->>> scene += (torch.tensor([0.8]),)  # mean [m], rotation, scales [m] and opacity of one Gaussian
+>>> mean, rotation = torch.tensor([[4.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]])
+>>> scene = mean, rotation, torch.full((1, 3), 0.5), torch.tensor([0.8])  # scales [m], opacity
 >>> plan = make_plan(*scene, Pose.identity(torch.zeros(3)), SphereGrid.hemisphere(9, 36))
 >>> composite(plan, *scene, torch.ones(1, 2)).image.shape  # of two channels
 torch.Size([1, 2, 9, 36])
@@ -16,7 +17,9 @@ torch.Size([2, 9, 36])
 """
 
 if __name__ != "gsparc.ops":
-    raise ImportError(f"this package is installed as gsparc.ops; import that instead of {__name__!r}")
+    raise ImportError(
+        f"this package is installed as gsparc.ops; import that instead of {__name__!r}"
+    )
 
 from gsparc.ops.backends import BackendUnavailable
 from gsparc.ops.frozen import FrozenPlan, StalePlan

@@ -1,4 +1,5 @@
-"""The compiled kernels; see csrc/bindings.cpp. Tensors are passed as addresses, 0 for an absent one."""
+"""The compiled kernels; see csrc/bindings.cpp. Tensors are passed as addresses, 0 for an absent
+one."""
 
 from typing import Any
 

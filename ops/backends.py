@@ -48,7 +48,8 @@ def _load_cpu() -> ModuleType:
         from gsparc.ops import native
     except ImportError as error:
         raise BackendUnavailable(
-            f"the CPU kernels are not built ({error}); install gsparc with a C++17 compiler at hand, "
+            f"the CPU kernels are not built ({error}); install gsparc with a C++17 compiler at "
+            "hand, "
             "or pass backend='reference' for small scenes"
         ) from error
     return native

@@ -20,7 +20,9 @@ libraries: dict[str, Any] = {}
 
 @cache
 def kernels() -> Any:
-    """Return the compiled CPU kernels with the constants of csrc/layout.h; None where none were built."""
+    """Return the compiled CPU kernels with the constants of csrc/layout.h;
+    None where none were built.
+    """
     try:
         from gsparc.ops import _native
     except ImportError:
@@ -35,7 +37,9 @@ class _Settings(ctypes.Structure):
     """`KernelSettings<double>` of csrc/layout.h."""
 
     # In the order of `KernelSettings`, which is that of the structure in C.
-    _fields_ = tuple((name, _C_TYPES[kind]) for name, kind in get_type_hints(KernelSettings).items())
+    _fields_ = tuple(
+        (name, _C_TYPES[kind]) for name, kind in get_type_hints(KernelSettings).items()
+    )
 
 
 class Call(ctypes.Structure):
@@ -64,7 +68,9 @@ def make_call(
     numbers: Sequence[float] = (),
     settings: KernelSettings | None = None,
 ) -> Call:
-    """Return a call in the precision and on the device of `like`; the caller keeps the tensors alive."""
+    """Return a call in the precision and on the device of `like`;
+    the caller keeps the tensors alive.
+    """
     # Tensors on the CPU are on device -1.
     call = Call(like.dtype == torch.float64, torch.get_num_threads(), max(like.get_device(), 0))
     call.sizes[: len(sizes)] = sizes
@@ -72,7 +78,8 @@ def make_call(
         call.numbers[: len(numbers)] = numbers
     # An absent tensor is a null pointer.
     addresses = [0 if t is None else t.data_ptr() for t in tensors]
-    struct.pack_into(f"{len(addresses)}Q", call, Call.tensors.offset, *addresses)  # ctypes takes far longer
+    # Ctypes takes far longer
+    struct.pack_into(f"{len(addresses)}Q", call, Call.tensors.offset, *addresses)
     if settings is not None:
         call.settings = _to_c_settings(settings)
     return call
@@ -81,8 +88,8 @@ def make_call(
 def launch(name: str, like: Tensor, *tensors: Tensor | None, **numbers: Any) -> int:
     """Return the result of the kernel `name` on the device of `like`. `numbers` as `make_call`.
 
-    Sizes, numbers and tensors are in the order in which the kernel reads them; tensors are contiguous. On
-    a GPU the kernel has scratch memory and runs on torch's current stream.
+    Sizes, numbers and tensors are in the order in which the kernel reads them; tensors are
+    contiguous. On a GPU the kernel has scratch memory and runs on torch's current stream.
     """
     call = make_call(like, *tensors, **numbers)
     if not like.is_cuda and "cpu" not in libraries:

@@ -1,11 +1,12 @@
 """The `cuda` backend: the operators on CUDA tensors by the CUDA kernels, and frozen views.
 
-A plan's buffers have the shapes of the CPU's, with contents of their own: records, boxes and entries go by
-Gaussian instead of by rank, the last of the strip starts is the number of entries, and the entries hold the
-tiles' starts (P tiles + 1), then for each entry its Gaussian and its slot.
+A plan's buffers have the shapes of the CPU's, with contents of their own: records, boxes and
+entries go by Gaussian instead of by rank, the last of the strip starts is the number of entries,
+and the entries hold the tiles' starts (P tiles + 1), then for each entry its Gaussian and its slot.
 
-Inside a captured CUDA graph nothing may synchronise, so a plan has room for as many entries as earlier plans
-of this size needed, plus headroom; if it needs more, its images and gradients are NaN.
+Inside a captured CUDA graph nothing may synchronise, so a plan has room for as many entries as
+earlier plans of this size needed, plus headroom; if it needs more,
+its images and gradients are NaN.
 """
 
 from __future__ import annotations
@@ -41,7 +42,9 @@ _capacities: dict[tuple, int] = {}
 
 
 def load() -> None:
-    """Build or find the kernels and let them serve CUDA tensors (cuda_library.LibraryUnavailable)."""
+    """Build or find the kernels and let them serve CUDA tensors
+    (cuda_library.LibraryUnavailable).
+    """
     if "cuda" not in calls.libraries:
         calls.libraries["cuda"] = cuda_library.load()
 
@@ -63,7 +66,9 @@ def _is_capturing(tensor: Tensor) -> bool:
 
 @cache
 def _sincos(device: torch.device, dtype: torch.dtype, settings: KernelSettings) -> Tensor:
-    """Sines and cosines of the grid's rows and columns, kept for good: captured graphs hold their address."""
+    """Sines and cosines of the grid's rows and columns, kept for good:
+    captured graphs hold their address.
+    """
     library = calls.libraries[device.type]
     call = calls.make_call(torch.empty(0, dtype=dtype), settings=settings)
     numbers = torch.empty(library.run("tables", call), dtype=dtype)
@@ -86,7 +91,12 @@ def run_on_plan(
     entries, capacity = None, 0
     if buffers.entries.numel():
         entries, capacity = buffers.entries, entry_capacity(plan)
-    view = (_sincos(means.device, means.dtype, plan.settings), *buffers[:5], buffers.starts[-1:], entries)
+    view = (
+        _sincos(means.device, means.dtype, plan.settings),
+        *buffers[:5],
+        buffers.starts[-1:],
+        entries,
+    )
     inputs = contiguous((*gaussians, plan.pose.position, plan.pose.rotation, *tensors))
     counts = (plan.num_poses, len(means), capacity, *sizes)
     calls.launch(name, means, *view, *inputs, sizes=counts, settings=plan.settings)
@@ -110,7 +120,9 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
     key = (count, n, plan.settings)
     if _is_capturing(means):
         if key not in _capacities:
-            raise RuntimeError("plan once before capturing: a graph cannot ask how many entries are needed")
+            raise RuntimeError(
+                "plan once before capturing: a graph cannot ask how many entries are needed"
+            )
         capacity = _capacity_with_headroom(_capacities[key])
     else:
         status, capacity = verdict.tolist()
@@ -193,7 +205,9 @@ def _weights_backward(out: Any, plan: Plan, gaussians: Gaussians, *slopes: Tenso
 
 
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """Return the order (V,) of visible Gaussians; tiles' starts and ends, entries' ranks and 32 weights."""
+    """Return the order (V,) of visible Gaussians; tiles' starts and ends,
+    entries' ranks and 32 weights.
+    """
     means, buffers, capacity = gaussians.means, plan.buffers, entry_capacity(plan)
     pixels = _native.TILE_WIDTH * _native.TILE_HEIGHT
     # A frozen entry is a block of weights, one for each pixel of its tile.
@@ -212,9 +226,15 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
 
 
 def draw_frozen(
-    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, visible_only: bool
+    grid: SphereGrid,
+    buffers: tuple[Tensor, ...],
+    features: Tensor,
+    order: Tensor,
+    visible_only: bool,
 ) -> Tensor:
-    """Return images (B C, H, W) of features (B, N, C), or (`visible_only`) those in `order`, (B, V, C)."""
+    """Return images (B C, H, W) of features (B, N, C), or (`visible_only`) those in `order`,
+    (B, V, C).
+    """
     columns = validation.seen_features(features, order, visible_only).contiguous()
     image = columns.new_empty(columns.shape[1], grid.height, grid.width)
     if image.numel():

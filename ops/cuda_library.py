@@ -20,7 +20,15 @@ import torch
 from gsparc.ops.calls import Call
 
 SOURCES = Path(__file__).parent / "csrc"
-FLAGS = ("-std=c++17", "-O3", "-fmad=false", "--expt-relaxed-constexpr", "-Xcompiler=-fPIC", "-shared", "-t0")
+FLAGS = (
+    "-std=c++17",
+    "-O3",
+    "-fmad=false",
+    "--expt-relaxed-constexpr",
+    "-Xcompiler=-fPIC",
+    "-shared",
+    "-t0",
+)
 LOG = logging.getLogger(__name__)
 
 
@@ -54,16 +62,20 @@ class Library:
         return result
 
     def check(self) -> None:
-        """Ask the driver whether it can run these kernels on the current GPU (LibraryUnavailable)."""
+        """Ask the driver whether it can run these kernels
+        on the current GPU (LibraryUnavailable).
+        """
         call = Call(device=torch.cuda.current_device())
         try:
             self.run("check", call)
         except RuntimeError as error:
             built, driver = (
-                f"{version // 1000}.{version % 1000 // 10}" for version in (call.built_for, call.driver)
+                f"{version // 1000}.{version % 1000 // 10}"
+                for version in (call.built_for, call.driver)
             )
             raise LibraryUnavailable(
-                f"{error}; the kernels were built with CUDA {built} and the driver is of CUDA {driver}: "
+                f"{error}; the kernels were built with CUDA {built} and the driver is of CUDA "
+                f"{driver}: "
                 "update the driver, or set CUDA_HOME to a toolkit no newer than it"
             ) from error
 
@@ -89,7 +101,10 @@ def load() -> Library:
 def missing_device() -> str | None:
     """Say why this process cannot use a GPU, or None."""
     if torch.version.cuda is None:
-        return f"this PyTorch ({torch.__version__}) was built without CUDA; install a CUDA build of torch"
+        return (
+            f"this PyTorch ({torch.__version__}) was built without CUDA; install a CUDA build "
+            "of torch"
+        )
     if torch.cuda.is_available():
         return None
     try:
@@ -102,7 +117,9 @@ def missing_device() -> str | None:
 def architectures() -> list[str]:
     """Compute capabilities of all GPUs here, as in `sm_90` without the prefix."""
     devices = range(torch.cuda.device_count())
-    return sorted({"{}{}".format(*torch.cuda.get_device_capability(device)) for device in devices}, key=int)
+    return sorted(
+        {"{}{}".format(*torch.cuda.get_device_capability(device)) for device in devices}, key=int
+    )
 
 
 def compiler() -> str | None:
@@ -123,7 +140,9 @@ def library_path(*architectures: str) -> Path:
 def hash_sources(*also: str) -> str:
     """Return the hash of the sources and of `also`, such as compiler flags."""
     digest = hashlib.sha256(repr(also).encode())
-    for source in sorted([*SOURCES.glob("*.h"), *SOURCES.glob("projection/*"), *SOURCES.glob("cuda/*")]):
+    for source in sorted(
+        [*SOURCES.glob("*.h"), *SOURCES.glob("projection/*"), *SOURCES.glob("cuda/*")]
+    ):
         digest.update(source.name.encode() + source.read_bytes())
     return digest.hexdigest()[:16]
 
@@ -138,11 +157,14 @@ def build(path: Path, *architectures: str) -> None:
     nvcc = compiler()
     if nvcc is None:
         raise LibraryUnavailable(
-            "the CUDA kernels are not built and there is no nvcc to build them; install the CUDA toolkit or "
+            "the CUDA kernels are not built and there is no nvcc to build them; install the CUDA "
+            "toolkit or "
             "set CUDA_HOME"
         )
     targets = [arch_option(nvcc, arch) for arch in architectures]
-    LOG.info("building the CUDA kernels for sm_%s (about a minute, once)", ", sm_".join(architectures))
+    LOG.info(
+        "building the CUDA kernels for sm_%s (about a minute, once)", ", sm_".join(architectures)
+    )
     started = time.perf_counter()
     compile_to(path, [nvcc, *FLAGS, *targets, f"-I{SOURCES}", *cuda_sources()])
     LOG.info("built in %.0f s: %s", time.perf_counter() - started, path)
@@ -150,7 +172,9 @@ def build(path: Path, *architectures: str) -> None:
 
 def arch_option(nvcc: str, arch: str) -> str:
     """Return nvcc's option for a GPU: native code, or PTX for one newer than nvcc."""
-    listed = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True, check=False).stdout
+    listed = subprocess.run(
+        [nvcc, "--list-gpu-arch"], capture_output=True, text=True, check=False
+    ).stdout
     archs = sorted({int(number) for number in re.findall(r"compute_(\d+)\b", listed)})
     if not archs or int(arch) in archs:
         return f"-gencode=arch=compute_{arch},code=sm_{arch}"
@@ -174,13 +198,16 @@ def compile_to(path: Path, command: list[str]) -> None:
         ) from error
     # Processes may build at the same time: each writes its own file, and any of them is good.
     unfinished = path.with_suffix(f".{os.getpid()}")
-    process = subprocess.run([*command, "-o", str(unfinished)], capture_output=True, text=True, check=False)
+    process = subprocess.run(
+        [*command, "-o", str(unfinished)], capture_output=True, text=True, check=False
+    )
     if process.returncode:
         unfinished.unlink(missing_ok=True)
         lines = (process.stderr or process.stdout).strip().splitlines()
         # Compilers print much around the one line that names the error.
         first = next(
-            (line for line in lines if "error" in line or "fatal" in line), lines[0] if lines else ""
+            (line for line in lines if "error" in line or "fatal" in line),
+            lines[0] if lines else "",
         )
         raise LibraryUnavailable(f"the CUDA kernels do not compile with {command[0]}: {first}")
     unfinished.replace(path)

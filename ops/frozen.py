@@ -1,4 +1,6 @@
-"""A static receiver at inference: compositing weights as one sparse matrix applied to the features."""
+"""A static receiver at inference: compositing weights
+as one sparse matrix applied to the features.
+"""
 
 from __future__ import annotations
 
@@ -36,34 +38,43 @@ class FrozenPlan:
 
     @torch.no_grad()
     def render(self, features: Tensor, version: int) -> Tensor:
-        """Return the image (C, H, W) of features (N, C), or (B, C, H, W) of (B, N, C); not differentiable.
+        """Return the image (C, H, W) of features (N, C), or (B, C, H, W) of (B, N, C);
+        not differentiable.
 
         Raises:
-            StalePlan: if `version`, the field's counter now, is not the one this view was made from.
-            RuntimeError: under `torch.func` and in forward mode, where a constant would be no answer.
-            ValueError, TypeError: features of another number, dtype or device, or (on the CPU) not finite.
+            StalePlan: if `version`, the field's counter now, is not the one this view was made
+                from.
+            RuntimeError: under `torch.func` and in forward mode, where a constant would be no
+                answer.
+            ValueError, TypeError: features of another number, dtype or device, or (on the CPU) not
+                finite.
         """
         # The field's own counter: that of a tensor misses writes through `.data`.
         if version != self.version:
             raise StalePlan(
-                f"this view was frozen at version {self.version}, the field is at {version}: freeze again"
+                f"this view was frozen at version {self.version}, the field is at {version}: "
+                "freeze again"
             )
         return self._render(features, visible_only=False)
 
     @torch.no_grad()
     def render_visible(self, seen: Tensor) -> Tensor:
-        """Render as `render` does, features (V, C) or (B, V, C) of the Gaussians in `order` alone."""
+        """Render as `render` does, features (V, C) or (B, V, C)
+        of the Gaussians in `order` alone.
+        """
         if seen.dim() not in (2, 3) or seen.shape[-2] != len(self.order):
             count = len(self.order)
             raise ValueError(
-                f"features must be ({count}, C) or (B, {count}, C) of those seen, got {tuple(seen.shape)}"
+                f"features must be ({count}, C) or (B, {count}, C) of those seen, got "
+                f"{tuple(seen.shape)}"
             )
         return self._render(seen, visible_only=True)
 
     def _render(self, features: Tensor, *, visible_only: bool) -> Tensor:
         if needs_reference(features):
             raise RuntimeError(
-                "a frozen view has no derivatives and cannot be mapped: composite the plan it was made from"
+                "a frozen view has no derivatives and cannot be mapped: composite the plan it "
+                "was made from"
             )
         # The weights are the last of every backend's buffers.
         if features.dtype != self.buffers[-1].dtype:

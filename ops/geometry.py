@@ -35,7 +35,8 @@ class Pose:
 
     Attributes:
         position: (3,) or (P, 3) [m], world frame.
-        rotation: (3, 3) or (P, 3, 3), local to world; columns are the local axes seen from the world.
+        rotation: (3, 3) or (P, 3, 3), local to world; columns are the local axes seen from the
+            world.
     """
 
     position: Tensor
@@ -73,7 +74,9 @@ class Pose:
     def local(self, points: Tensor) -> Tensor:
         """Return world points (N, 3) [m] in the receiver frame: (N, 3), or (P, N, 3) for P poses.
 
-        >>> left = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # turned by 90 degrees
+        Turned by 90 degrees:
+
+        >>> left = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         >>> Pose(torch.tensor([1.0, 0.0, 0.0]), left).local(torch.tensor([[1.0, 2.0, 0.0]]))
         tensor([[2., 0., 0.]])
         """
@@ -112,7 +115,8 @@ class SphereGrid:
         elevation_step, azimuth_step: spacing of the centres, positive [rad].
 
     Raises:
-        ValueError: no pixel, angles that are not finite, rows beyond a pole, columns beyond the circle.
+        ValueError: no pixel, angles that are not finite, rows beyond a pole, columns beyond the
+            circle.
     """
 
     height: int
@@ -137,7 +141,8 @@ class SphereGrid:
         last = self.first_elevation + (self.height - 1) * self.elevation_step
         if self.first_elevation < -math.pi / 2 - 1e-6 or last > math.pi / 2 + 1e-6:
             raise ValueError(
-                f"elevations run from {self.first_elevation:g} to {last:g} rad; a sphere ends at +-pi/2"
+                f"elevations run from {self.first_elevation:g} to {last:g} rad; a sphere ends at "
+                "+-pi/2"
             )
 
     @property
@@ -148,12 +153,16 @@ class SphereGrid:
 
     @property
     def per_turn(self) -> float:
-        """Columns in a full circle: the width where they close it, if only nearly; as in csrc/pixels.h."""
+        """Columns in a full circle: the width where they close it, if only nearly;
+        as in csrc/pixels.h.
+        """
         return float(self.width) if self.periodic else 2 * math.pi / self.azimuth_step
 
     def elevations(self) -> Tensor:
         """Return row centres (H,) float64 [rad]."""
-        return self.first_elevation + self.elevation_step * torch.arange(self.height, dtype=torch.float64)
+        return self.first_elevation + self.elevation_step * torch.arange(
+            self.height, dtype=torch.float64
+        )
 
     def azimuths(self) -> Tensor:
         """Return column centres (W,) float64 [rad].
@@ -161,7 +170,9 @@ class SphereGrid:
         >>> SphereGrid.hemisphere(2, 4).azimuths().rad2deg()
         tensor([  0.,  90., 180., 270.], dtype=torch.float64)
         """
-        return self.first_azimuth + self.azimuth_step * torch.arange(self.width, dtype=torch.float64)
+        return self.first_azimuth + self.azimuth_step * torch.arange(
+            self.width, dtype=torch.float64
+        )
 
     def directions(self, dtype: torch.dtype = torch.float64) -> Tensor:
         """Return unit vectors of the pixel centres (H, W, 3), receiver frame.
@@ -171,7 +182,9 @@ class SphereGrid:
         """
         elevation, azimuth = self.elevations()[:, None], self.azimuths()[None, :]
         level, upright = elevation.cos(), elevation.sin().expand(self.height, self.width)
-        return torch.stack([level * azimuth.cos(), level * azimuth.sin(), upright], dim=-1).to(dtype)
+        return torch.stack([level * azimuth.cos(), level * azimuth.sin(), upright], dim=-1).to(
+            dtype
+        )
 
     def solid_angles(self) -> Tensor:
         """Return the solid angle of each pixel (H, W) float64 [sr]; cells are cut off at the poles.
@@ -182,22 +195,29 @@ class SphereGrid:
         elevation, half = self.elevations(), self.elevation_step / 2
         upper = (elevation + half).clamp(-math.pi / 2, math.pi / 2).sin()
         lower = (elevation - half).clamp(-math.pi / 2, math.pi / 2).sin()
-        # The integral of cos(elevation) over a cell is a difference of sines, without approximation.
+        # The integral of cos(elevation) over a cell is a difference of sines,
+        # without approximation.
         return ((upper - lower) * self.azimuth_step)[:, None].expand(self.height, self.width)
 
     def edges(self) -> tuple[float, float, float, float]:
-        """Return least and largest azimuth, least and largest elevation of the pixels' edges [degrees].
+        """Return least and largest azimuth, least and largest elevation
+        of the pixels' edges [degrees].
 
         >>> tuple(round(edge, 3) for edge in SphereGrid.hemisphere(90, 360).edges())
         (-0.5, 359.5, -0.5, 89.5)
         """
         across, up = math.degrees(self.azimuth_step), math.degrees(self.elevation_step)
-        left, low = math.degrees(self.first_azimuth) - across / 2, math.degrees(self.first_elevation) - up / 2
+        left, low = (
+            math.degrees(self.first_azimuth) - across / 2,
+            math.degrees(self.first_elevation) - up / 2,
+        )
         return left, left + self.width * across, low, low + self.height * up
 
     @staticmethod
     def hemisphere(height: int = 90, width: int = 360) -> SphereGrid:
-        """Return the RFID release's grid: row i is i steps above the horizon, column j is at j of azimuth."""
+        """Return the RFID release's grid: row i is i steps above the horizon,
+        column j is at j of azimuth.
+        """
         return SphereGrid(height, width, 0.0, 0.0, math.pi / 2 / height, 2 * math.pi / width)
 
     @staticmethod

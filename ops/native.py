@@ -32,7 +32,9 @@ def run_on_plan(
     """Call a kernel that begins with `ViewArgs` of csrc/layout.h, then `tensors`."""
     inputs = contiguous((*gaussians, plan.pose.position, plan.pose.rotation, *tensors))
     counts = (plan.num_poses, plan.num_gaussians, *sizes)
-    return calls.launch(name, gaussians.means, *plan.buffers, *inputs, sizes=counts, settings=plan.settings)
+    return calls.launch(
+        name, gaussians.means, *plan.buffers, *inputs, sizes=counts, settings=plan.settings
+    )
 
 
 @register_kernel("plan", "cpu")
@@ -41,7 +43,9 @@ def _plan(plan: Plan, gaussians: Gaussians, ids: Tensor | None) -> Plan:
     call = partial(calls.launch, sizes=(plan.num_poses, len(means)), settings=plan.settings)
     inputs = contiguous((*gaussians, pose.position, pose.rotation, ids))
     # In two passes: how many entries there are is known when all footprints have been placed.
-    status = call("plan", means, *inputs, *plan.buffers[:-1], plan.means2d, plan.radii, plan.visible)
+    status = call(
+        "plan", means, *inputs, *plan.buffers[:-1], plan.means2d, plan.radii, plan.visible
+    )
     validation.raise_for_status(status, pose)
     entries = int(plan.buffers.starts.numpy()[-1])  # torch's own element takes ten times as long
     check_memory(entries, 4)
@@ -87,7 +91,9 @@ def _weights_backward(out: Any, plan: Plan, gaussians: Gaussians, *slopes: Tenso
 
 
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """Return the order (V,) of visible Gaussians, and weights alpha T as blocks of pixels; see frozen.h."""
+    """Return the order (V,) of visible Gaussians, and weights alpha T as blocks of pixels;
+    see frozen.h.
+    """
     rows, grid, run = _native.STRIP_ROWS, plan.grid, partial(run_on_plan, "freeze", plan, gaussians)
     counts = torch.zeros(
         count_strips(grid.height) * grid.width + 1, dtype=torch.int64
@@ -105,9 +111,14 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
 
 
 def draw_frozen(
-    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, visible_only: bool
+    grid: SphereGrid,
+    buffers: tuple[Tensor, ...],
+    features: Tensor,
+    order: Tensor,
+    visible_only: bool,
 ) -> Tensor:
-    """Return images (B C, H, W) of features (B, N, C), or (`visible_only`) those in `order`, (B, V, C).
+    """Return images (B C, H, W) of features (B, N, C), or (`visible_only`) those in `order`,
+    (B, V, C).
 
     Raises:
         ValueError: features that are not finite, or not as many as `order` speaks of.

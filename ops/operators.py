@@ -1,7 +1,7 @@
 """What kernels compute on a plan: shapes and gradients stated once, filled on each device.
 
-An operator makes its empty outputs and has them filled by the function that `kernel` marks for its name and
-the device; `call_differentiable` joins it with its gradient, another operator.
+An operator makes its empty outputs and has them filled by the function that `kernel` marks for its
+name and the device; `call_differentiable` joins it with its gradient, another operator.
 """
 
 from __future__ import annotations
@@ -21,7 +21,9 @@ KERNELS: dict[str, dict[str, Callable[..., Any]]] = {"cpu": {}, "cuda": {}}
 """What computes an operator, by type of device and name; see `kernel`."""
 
 MEMORY_BOUND = 8 * 2**30
-"""Bytes that one call may need for entries and gradient slots [B]; more is refused before it is allocated."""
+"""Bytes that one call may need for entries and gradient slots [B];
+more is refused before it is allocated.
+"""
 
 
 class Buffers(NamedTuple):
@@ -52,8 +54,8 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 def register_kernel(name: str, device: str) -> Callable[[_Function], _Function]:
     """Mark what computes operator `name` on a type of device.
 
-    It receives the operator's empty outputs, then its arguments, from `run_kernel`. It fills the outputs, or
-    returns others in their place.
+    It receives the operator's empty outputs, then its arguments, from `run_kernel`. It fills the
+    outputs, or returns others in their place.
     """
 
     def mark(function: _Function) -> _Function:
@@ -64,7 +66,9 @@ def register_kernel(name: str, device: str) -> Callable[[_Function], _Function]:
 
 
 def run_kernel(name: str, like: Tensor, out: Any, *values: Any) -> Any:
-    """Fill the empty outputs `out` of operator `name` on the device of `like`, given its arguments."""
+    """Fill the empty outputs `out` of operator `name` on the device of `like`,
+    given its arguments.
+    """
     if like.is_meta:
         return out  # shapes alone
     result = KERNELS[like.device.type][name](out, *values)
@@ -113,8 +117,8 @@ def call_differentiable(
 ) -> Any:
     """Call `operator(fixed, *tensors)`; `gradient(fixed, *slopes, *tensors)` is its derivative.
 
-    A slope is None where nothing depends on that output; at least one is given. Where the gradient reads the
-    outputs they stand behind the slopes, and nobody may write into them.
+    A slope is None where nothing depends on that output; at least one is given. Where the gradient
+    reads the outputs they stand behind the slopes, and nobody may write into them.
     """
     if torch.is_grad_enabled():
         return _Operator.apply(operator, gradient, reads_outputs, fixed, *tensors)
@@ -137,7 +141,9 @@ def contiguous(tensors: Iterable[Tensor | None]) -> list[Tensor | None]:
     return [t if t is None or t.is_contiguous() else t.detach().contiguous() for t in tensors]
 
 
-def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics) -> Plan:
+def make_plan(
+    gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics
+) -> Plan:
     """Project, cull, order and bin."""
     means, poses, n = gaussians.means, len(pose), len(gaussians.means)
     buffers = Buffers(
@@ -159,7 +165,9 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
     return run_kernel("plan", means, empty, gaussians, ids)
 
 
-def _composite(plan: Plan, means2d: Tensor, features: Tensor, *parts: Tensor) -> tuple[Tensor, Tensor]:
+def _composite(
+    plan: Plan, means2d: Tensor, features: Tensor, *parts: Tensor
+) -> tuple[Tensor, Tensor]:
     samples, _, channels = features.shape
     size = plan.grid.height, plan.grid.width
     out = features.new_empty(samples, channels, *size), features.new_empty(plan.num_poses, *size)
@@ -178,8 +186,15 @@ def composite_gradient(
 ) -> tuple[Tensor | None, ...]:
     """Return gradients of means2d, features and `parts`, given those of image and transmittance."""
     # Kernels always read a slope of the image, one of the transmittance where there is one.
-    gaussians, slope = Gaussians(*parts), torch.zeros_like(image) if grad_image is None else grad_image
-    out = empty_like(gaussians), features.new_empty(features.shape), means2d.new_empty(means2d.shape)
+    gaussians, slope = (
+        Gaussians(*parts),
+        torch.zeros_like(image) if grad_image is None else grad_image,
+    )
+    out = (
+        empty_like(gaussians),
+        features.new_empty(features.shape),
+        means2d.new_empty(means2d.shape),
+    )
     values = slope, grad_transmittance, image, transmittance, features
     grads, grad_features, grad_means2d = run_kernel(
         "composite_backward", image, out, plan, gaussians, *values
@@ -187,8 +202,12 @@ def composite_gradient(
     return grad_means2d, grad_features, *grads
 
 
-def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
-    """Return image (B, C, H, W), transmittance (P, H, W) of (B, N, C); `means2d` only gets a gradient."""
+def composite(
+    plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return image (B, C, H, W), transmittance (P, H, W) of (B, N, C);
+    `means2d` only gets a gradient.
+    """
     inputs = means2d, features, *gaussians
     return call_differentiable(_composite, composite_gradient, plan, *inputs, reads_outputs=True)
 
@@ -205,7 +224,9 @@ def _weights_gradient(
     gaussians, size = Gaussians(*parts), (plan.num_poses, plan.num_gaussians)
     # The kernel reads both slopes: one that nothing depends on is 0.
     slopes = [gaussians.means.new_zeros(size) if s is None else s for s in (grad_seen, grad_total)]
-    return run_kernel("weights_backward", gaussians.means, empty_like(gaussians), plan, gaussians, *slopes)
+    return run_kernel(
+        "weights_backward", gaussians.means, empty_like(gaussians), plan, gaussians, *slopes
+    )
 
 
 def mean_weights(plan: Plan, gaussians: Gaussians) -> Weights:
@@ -218,6 +239,8 @@ def check_memory(entries: int, bytes_each: int) -> None:
     """Raise MemoryError, in one line, where entries would need more than `MEMORY_BOUND`."""
     if entries * bytes_each > MEMORY_BOUND:
         raise MemoryError(
-            f"{entries} footprint entries need {entries * bytes_each / 2**30:.1f} GiB, the bound is "
-            f"{MEMORY_BOUND / 2**30:.0f} GiB: use fewer or smaller Gaussians, or fewer poses at a time"
+            f"{entries} footprint entries need {entries * bytes_each / 2**30:.1f} GiB, the bound "
+            "is "
+            f"{MEMORY_BOUND / 2**30:.0f} GiB: use fewer or smaller Gaussians, or fewer poses at "
+            "a time"
         )

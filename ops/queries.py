@@ -1,4 +1,6 @@
-"""Single places answered in one call: an array's spectrum, and weights of the nearest rows of a process."""
+"""Single places answered in one call: an array's spectrum,
+and weights of the nearest rows of a process.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,9 @@ from gsparc.ops.transforms import is_differentiated
 
 
 def has_query_kernel(*tensors: Tensor) -> bool:
-    """Tell whether the kernels answer: CPU tensors that neither autograd nor `torch.func` follows."""
+    """Tell whether the kernels answer: CPU tensors
+    that neither autograd nor `torch.func` follows.
+    """
     plain = all(part.device.type == "cpu" for part in tensors) and not is_differentiated(*tensors)
     return plain and calls.kernels() is not None
 
@@ -25,16 +29,17 @@ def array_spectrum(
     square: Tensor,
     numbers: tuple[float, float, float, float],
 ) -> tuple[Tensor, Tensor]:
-    """Return spectra (B, H, W) in [0, 1] of an array, and unknown shares (B,), at (B, D) [m]; all float32.
+    """Return spectra (B, H, W) in [0, 1] of an array, and unknown shares (B,), at (B, D) [m];
+    all float32.
 
     Args:
         places: where the moving end is.
         features: anchors (E, D) [m], and whitening (E, F) of their correlations.
-        read_out: features to real and imaginary parts of array vectors, and an unused pair: (F, 2 M + 2),
-            and what is added to them (2 M + 2,).
-        tables: pairs of elements to lag numbers (2 M M, L); for pixels that stay half a turn on, lag numbers
-            to harmonics of each row (l, H K) and these to pixels (K, columns); the same for those that flip,
-            or nothing.
+        read_out: features to real and imaginary parts of array vectors, and an unused pair: (F, 2 M
+            + 2), and what is added to them (2 M + 2,).
+        tables: pairs of elements to lag numbers (2 M M, L); for pixels that stay half a turn on,
+            lag numbers to harmonics of each row (l, H K) and these to pixels (K, columns); the same
+            for those that flip, or nothing.
         square: (H, W) of the background that an unknown share shows.
         numbers: share and length [m] of a Matern-5/2, share and length of a Matern-3/2.
     """
@@ -47,10 +52,24 @@ def array_spectrum(
     absent = (None,) * (4 - len(rest))
     inputs = contiguous((places, *features, *read_out, pairs, *rest))
     calls.launch(
-        "array_spectrum", places, *inputs, *absent, square, image, unknown, numbers=numbers,
-        sizes=(*places.shape, *features[1].shape, read_out[1].numel() // 2 - 1, height, columns,
-               *sizes[0], *sizes[1]),
-    )  # fmt: skip
+        "array_spectrum",
+        places,
+        *inputs,
+        *absent,
+        square,
+        image,
+        unknown,
+        numbers=numbers,
+        sizes=(
+            *places.shape,
+            *features[1].shape,
+            read_out[1].numel() // 2 - 1,
+            height,
+            columns,
+            *sizes[0],
+            *sizes[1],
+        ),
+    )
     return image, unknown
 
 
@@ -62,7 +81,8 @@ def nearest_weights(
     lengths: Sequence[float],
     shares: Sequence[float],
 ) -> tuple[Tensor, Tensor] | None:
-    """Return weights (B, k) of near rows in a process's mean, and what they take off its variance 1 (B,).
+    """Return weights (B, k) of near rows in a process's mean,
+    and what they take off its variance 1 (B,).
 
     None where a covariance has no Cholesky factor.
 
@@ -78,6 +98,8 @@ def nearest_weights(
     inputs = contiguous((queries, places, noise, rows))
     sizes = (*queries.shape, rows.shape[1])
     numbers = (*two, float(len(lengths)))
-    failed = calls.launch("nearest_weights", queries, *inputs, weights, gains, sizes=sizes, numbers=numbers)
+    failed = calls.launch(
+        "nearest_weights", queries, *inputs, weights, gains, sizes=sizes, numbers=numbers
+    )
     # -1 where every covariance has a factor.
     return None if failed >= 0 else (weights, gains)

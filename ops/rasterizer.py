@@ -69,9 +69,12 @@ def _make_plan(
     validation.check_transforms(gaussians, pose, pose_trained)
     chosen = backends.choose_backend(backend, gaussians.means.device)
     with torch.no_grad() if torch.is_grad_enabled() else nullcontext(), no_transforms():
-        # Order and visibility are choices without a derivative: neither autograd nor `torch.func` sees them.
+        # Order and visibility are choices without a derivative:
+        # neither autograd nor `torch.func` sees them.
         still = Gaussians._make(map(detach, gaussians))
-        poses = validation.check_poses(Pose(detach(pose.position), detach(pose.rotation)), still.means)
+        poses = validation.check_poses(
+            Pose(detach(pose.position), detach(pose.rotation)), still.means
+        )
         plan = chosen.make_plan(still, detach(ids), poses, grid, optics)
     return replace(plan, pose_trained=True) if pose_trained else plan
 
@@ -82,18 +85,22 @@ def _check_against_plan(plan: Plan, *parameters: Tensor) -> Gaussians:
     validation.check_transforms(gaussians, plan.pose, plan.pose_trained)
     if plan.num_gaussians != len(gaussians.means):
         raise ValueError(
-            f"this plan holds {plan.num_gaussians} Gaussians, got {len(gaussians.means)}; plan again"
+            f"this plan holds {plan.num_gaussians} Gaussians, got {len(gaussians.means)}; plan "
+            "again"
         )
     return gaussians
 
 
 def _needs_gradient(plan: Plan, *tensors: Tensor) -> bool:
-    """Whether gradients of the tensors are asked for (RuntimeError where the plan does not allow it)."""
+    """Whether gradients of the tensors are asked for (RuntimeError
+    where the plan does not allow it).
+    """
     requires_grad = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
     # Tensors of inference mode can never become part of a graph.
     if requires_grad and plan.means2d.is_inference():
         raise RuntimeError(
-            "this plan was made in torch.inference_mode, so nothing can be trained over it: plan outside, "
+            "this plan was made in torch.inference_mode, so nothing can be trained over it: plan "
+            "outside, "
             "or under torch.no_grad"
         )
     return requires_grad
@@ -107,10 +114,12 @@ def composite(
     opacities: Tensor,
     features: Tensor,
 ) -> Raster:
-    """Blend features front to back over a plan made from the same Gaussians; differentiable in every tensor.
+    """Blend features front to back over a plan made from the same Gaussians;
+    differentiable in every tensor.
 
-    Under `torch.func` (`jvp`, `jacrev`, `hessian`) and in forward mode plain PyTorch computes it, slowly.
-    `features` is (N, C) or (B, N, C), real. With one pose the weights are formed once for all B C channels.
+    Under `torch.func` (`jvp`, `jacrev`, `hessian`) and in forward mode plain PyTorch computes it,
+    slowly. `features` is (N, C) or (B, N, C), real.
+    With one pose the weights are formed once for all B C channels.
 
     Raises:
         ValueError, TypeError: shapes, dtypes or devices disagree, or the plan is of another number.
@@ -122,7 +131,8 @@ def composite(
     # Kernels have first derivatives in reverse mode alone.
     plain = needs_reference(*gaussians, features)
     trained = _needs_gradient(plan, *gaussians, features) and not plain
-    # A leaf of its own: after `backward` its `.grad` is the screen-space gradient that densification reads.
+    # A leaf of its own: after `backward` its `.grad` is the screen-space gradient
+    # that densification reads.
     means2d = plan.means2d.clone().requires_grad_() if trained else plan.means2d
     backend = reference_by_rows if plain else backends.backend_named(plan.backend)
     image, transmittance = backend.composite(plan, gaussians, values, means2d)
@@ -156,7 +166,10 @@ def rasterize(
     >>> raster = rasterize(means, quats, scales, opacities, features, pose, grid)
     >>> raster.image.shape, raster.transmittance.shape
     (torch.Size([1, 1, 9, 36]), torch.Size([1, 9, 36]))
-    >>> bool(torch.allclose(raster.image[0], 1 - raster.transmittance, atol=1e-6))  # one feature, of 1
+
+    One feature, of 1:
+
+    >>> bool(torch.allclose(raster.image[0], 1 - raster.transmittance, atol=1e-6))
     True
     """
     gaussians = validation.check_gaussians(means, quats, scales, opacities, ids)
@@ -172,7 +185,8 @@ def mean_weights(
     scales: Tensor,
     opacities: Tensor,
 ) -> Weights:
-    """Return each Gaussian's visible weight for each pose, by a plan of the same ones; differentiable.
+    """Return each Gaussian's visible weight for each pose, by a plan of the same ones;
+    differentiable.
 
     Raises:
         ValueError, TypeError, RuntimeError: as `composite`.
@@ -180,7 +194,9 @@ def mean_weights(
     gaussians = _check_against_plan(plan, means, quats, scales, opacities)
     # Called for its refusal of plans that were made in inference mode.
     _needs_gradient(plan, *gaussians)
-    backend = reference_by_rows if needs_reference(*gaussians) else backends.backend_named(plan.backend)
+    backend = (
+        reference_by_rows if needs_reference(*gaussians) else backends.backend_named(plan.backend)
+    )
     return backend.mean_weights(plan, gaussians)
 
 
@@ -196,8 +212,8 @@ def freeze(
 ) -> FrozenPlan:
     """Store one static receiver's weights as a sparse pixel x Gaussian matrix, valid for `version`.
 
-    `version` is the field's own counter, raised whenever its geometry or opacity changes; a tensor's hidden
-    counter misses writes through `.data`.
+    `version` is the field's own counter, raised whenever its geometry or opacity changes; a
+    tensor's hidden counter misses writes through `.data`.
 
     Raises:
         ValueError: a plan of more than one pose.
@@ -208,6 +224,8 @@ def freeze(
     gaussians = _check_against_plan(plan, means, quats, scales, opacities)
     # To `torch.func` a frozen view would be a constant, its derivative 0 without a word.
     if needs_reference(*gaussians):
-        raise RuntimeError("a frozen view has no derivatives: composite the plan instead of freezing it")
+        raise RuntimeError(
+            "a frozen view has no derivatives: composite the plan instead of freezing it"
+        )
     order, buffers = backends.backend_named(plan.backend).freeze(plan, gaussians)
     return FrozenPlan(plan.grid, plan.backend, version, order, buffers)

@@ -1,6 +1,7 @@
 """The `reference` backend: plans and composites with dense tensors and autograd.
 
-Half precision of `torch.autocast` is switched off here; a backward pass must itself be outside of it.
+Half precision of `torch.autocast` is switched off here;
+a backward pass must itself be outside of it.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from gsparc.ops.transforms import full_precision
 
 
 @full_precision
-def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics) -> Plan:
+def make_plan(
+    gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: SphereGrid, optics: Optics
+) -> Plan:
     """Find depth order and radii; compositing evaluates the footprints again, differentiably."""
     validation.check_finite(gaussians, pose)
     means, quats, scales, opacities = gaussians
@@ -45,7 +48,9 @@ def make_plan(gaussians: Gaussians, ids: Tensor | None, pose: Pose, grid: Sphere
 
 
 @full_precision
-def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
+def composite(
+    plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor
+) -> tuple[Tensor, Tensor]:
     """Return the image (B, C, H, W) and transmittance (P, H, W) of features (B, N, C)."""
     per_pose = features.unsqueeze(0) if plan.num_poses == 1 else features.unsqueeze(1)
     images, transmittances = [], []
@@ -85,7 +90,9 @@ def mean_weights(plan: Plan, gaussians: Gaussians) -> Weights:
 
 @full_precision
 def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """Return the depth order (N,) of the only pose, and the weights alpha T (N, H W) in that order."""
+    """Return the depth order (N,) of the only pose, and the weights alpha T (N, H W)
+    in that order.
+    """
     # No shift of centres: a view is frozen for inference.
     no_shift = torch.zeros_like(plan.means2d)
     weights, _, _ = _weights(plan, 0, gaussians, no_shift)
@@ -94,9 +101,15 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
 
 @full_precision
 def draw_frozen(
-    grid: SphereGrid, buffers: tuple[Tensor, ...], features: Tensor, order: Tensor, visible_only: bool
+    grid: SphereGrid,
+    buffers: tuple[Tensor, ...],
+    features: Tensor,
+    order: Tensor,
+    visible_only: bool,
 ) -> Tensor:
-    """Return images (B C, H, W) of features (B, N, C), or (`visible_only`) those in `order`, (B, V, C)."""
+    """Return images (B C, H, W) of features (B, N, C), or (`visible_only`) those in `order`,
+    (B, V, C).
+    """
     columns = validation.seen_features(features, order, visible_only)
     return (columns.mT @ buffers[0]).unflatten(-1, (grid.height, grid.width))
 
@@ -111,11 +124,17 @@ def _zero_of(*tensors: Tensor) -> Tensor:
     return torch.stack([t[:0].sum() for t in tensors]).sum()
 
 
-def _weights(plan: Plan, index: int, gaussians: Gaussians, means2d: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """For a pose and the Gaussians in depth order: alpha T (N, H W), alpha (N, H W), transmittance (H W,)."""
+def _weights(
+    plan: Plan, index: int, gaussians: Gaussians, means2d: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """For a pose and the Gaussians in depth order: alpha T (N, H W), alpha (N, H W),
+    transmittance (H W,).
+    """
     order = plan.buffers[0][index]
     near = Gaussians._make(t[order] for t in gaussians)
-    seen = reference.project(near.means, near.quats, near.scales, plan.pose[index], plan.grid, plan.optics)
+    seen = reference.project(
+        near.means, near.quats, near.scales, plan.pose[index], plan.grid, plan.optics
+    )
     # Zero in value, with the slope of the centres on the screen.
     shift = (means2d[index] - means2d[index].detach())[order]
     shapes = reference.footprints(seen, plan.grid, plan.optics, shift)

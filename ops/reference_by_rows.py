@@ -19,9 +19,16 @@ from gsparc.ops.results import Plan, Weights, visible_share
 ELEMENTS = 2**22  # of a tensor Gaussians x pixels
 
 
-def composite(plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor) -> tuple[Tensor, Tensor]:
-    """Return image (B, C, H, W), transmittance (P, H, W) of features (B, N, C), by any backend's plan."""
-    parts = [reference_backend.composite(part, gaussians, features, means2d) for part in _split_rows(plan)]
+def composite(
+    plan: Plan, gaussians: Gaussians, features: Tensor, means2d: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return image (B, C, H, W), transmittance (P, H, W) of features (B, N, C),
+    by any backend's plan.
+    """
+    parts = [
+        reference_backend.composite(part, gaussians, features, means2d)
+        for part in _split_rows(plan)
+    ]
     images, transmittances = zip(*parts, strict=True)
     return torch.cat(images, -2), torch.cat(transmittances, -2)
 
@@ -41,5 +48,7 @@ def _split_rows(plan: Plan) -> Iterator[Plan]:
     for first in range(0, grid.height, count):
         rows = min(count, grid.height - first)
         start = grid.first_elevation + first * grid.elevation_step
-        part = SphereGrid(rows, grid.width, start, grid.first_azimuth, grid.elevation_step, grid.azimuth_step)
+        part = SphereGrid(
+            rows, grid.width, start, grid.first_azimuth, grid.elevation_step, grid.azimuth_step
+        )
         yield replace(plan, backend="reference", grid=part, buffers=(order,))

@@ -25,7 +25,8 @@ class Plan:
         means2d: (P, N, 2) (column, row) [px].
         radii: (P, N) [px], 0 where culled.
         visible: (P, N) bool.
-        buffers: the backend's own tensors: `operators.Buffers`, or of the reference the depth order alone.
+        buffers: the backend's own tensors: `operators.Buffers`, or of the reference the depth order
+            alone.
         pose_trained: whether the poses it was given require gradients, of which there are none.
     """
 
@@ -59,17 +60,19 @@ class Plan:
 class Raster:
     """A rendered batch of B samples seen from P poses (P = 1 when the pose is shared, else P = B).
 
-    Image and transmittance are differentiable. Radii, visible and means2d belong to the plan: constants,
-    whose derivative by a Gaussian is 0 in every mode.
+    Image and transmittance are differentiable. Radii, visible and means2d belong to the plan:
+    constants, whose derivative by a Gaussian is 0 in every mode.
 
     Attributes:
-        image: (B, C, H, W), sum over Gaussians of transmittance before it, times alpha, times feature.
+        image: (B, C, H, W), sum over Gaussians of transmittance before it, times alpha, times
+            feature.
         transmittance: (P, H, W), what is left behind all Gaussians.
         radii: (P, N) [px], long half axis of the footprint at the cut-off; 0 where culled.
         visible: (P, N) bool, whether the footprint at the cut-off may reach a pixel of the grid.
-        means2d: (P, N, 2) (column, row) [px]. After `backward` its `.grad` holds, per pose, the derivative by
-            a shift of the footprint alone, before the chain into `means`. For `tangent` a pixel of
-            that gradient is one elevation step in both directions, so that it does not fade at the zenith.
+        means2d: (P, N, 2) (column, row) [px]. After `backward` its `.grad` holds, per pose, the
+            derivative by a shift of the footprint alone, before the chain into `means`. For
+            `tangent` a pixel of that gradient is one elevation step in both directions,
+            so that it does not fade at the zenith.
     """
 
     image: Tensor
@@ -85,8 +88,9 @@ class Weights:
 
     Attributes:
         mean: (P, N), mean over pixels of alpha times transmittance.
-        share: (P, N) in [0, 1], sum of alpha times transmittance over sum of alpha: the visible part of the
-            footprint; 0 where there is no footprint. Below `FAINTEST` it has a value and no gradient.
+        share: (P, N) in [0, 1], sum of alpha times transmittance over sum of alpha: the visible
+            part of the footprint; 0 where there is no footprint.
+            Below `FAINTEST` it has a value and no gradient.
     """
 
     mean: Tensor

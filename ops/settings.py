@@ -15,19 +15,28 @@ FARTHEST = 1e6
 SKEW = 2e-3
 """How far the products of the columns of a pose's rotation may be from those of a rotation."""
 
-# Seen from .01 m, 1e5 m span 6e8 px of a degree: their determinant, 1e35 px^4, is below float32's 3.4e38.
+# Seen from .01 m, 1e5 m span 6e8 px of a degree: their determinant, 1e35 px^4,
+# is below float32's 3.4e38.
 WIDEST = 1e5
-"""Largest standard deviation of a Gaussian [m]; at the near cut its determinant in px still is a float32."""
+"""Largest standard deviation of a Gaussian [m];
+at the near cut its determinant in px still is a float32.
+"""
 
 SHORTEST_QUATERNION = 1e-18
-"""A quaternion whose longest component is not longer than this does not turn, in either precision."""
+"""A quaternion whose longest component is not longer than this does not turn,
+in either precision.
+"""
 
 # .99 as in Kerbl et al. 2023: behind a layer of alpha = 1 the gradient would be divided by 0.
 ALPHA_MAX = 0.99
-"""Largest opacity of one layer at one pixel; a clamped layer passes no gradient to geometry or opacity."""
+"""Largest opacity of one layer at one pixel;
+a clamped layer passes no gradient to geometry or opacity.
+"""
 
 FAINTEST = 1e-30
-"""A Gaussian whose alphas add up to less has a visible share without a gradient: 1 / sum is no float32."""
+"""A Gaussian whose alphas add up to less has a visible share without a gradient:
+1 / sum is no float32.
+"""
 
 
 @dataclass(frozen=True)
@@ -42,9 +51,9 @@ class Cutoff:
     Attributes:
         alpha: it counts where its layer opacity is at least this; 1/255 is right for images.
         transmittance: it counts where the light that reaches it is at least this.
-        relative: compare `alpha` with the footprint itself, whose peak is 1, instead of with the opacity
-            times the footprint. Right for CSI, where an absolute threshold would cut 39 % off a footprint
-            of opacity 0.01.
+        relative: compare `alpha` with the footprint itself, whose peak is 1, instead of with the
+            opacity times the footprint. Right for CSI, where an absolute threshold would cut 39 %
+            off a footprint of opacity 0.01.
     """
 
     # A grey level of 8 bits, and a transmittance of 1e-4: the thresholds of Kerbl et al. 2023.
@@ -55,7 +64,8 @@ class Cutoff:
     def __post_init__(self) -> None:
         if not 0.0 < self.alpha < 1.0 or not 0.0 <= self.transmittance < 1.0:
             raise ValueError(
-                f"cut-offs lie in (0, 1), got alpha {self.alpha}, transmittance {self.transmittance}"
+                f"cut-offs lie in (0, 1), got alpha {self.alpha}, transmittance "
+                f"{self.transmittance}"
             )
 
 
@@ -68,11 +78,14 @@ class Optics:
     """How Gaussians become footprints.
 
     Attributes:
-        projection: `tangent` evaluates the footprint on the plane touching the sphere at the Gaussian's own
-            direction (no pole); `equirect` linearises azimuth and elevation there (the paper; inexact near
-            the pole, where it replaces cos(elevation) by sqrt(cos^2 + step^2)).
-        low_pass: variance added to every footprint [px^2]; a pixel of `tangent` is one elevation step.
-        compensate: scale the opacity by sqrt(det before / det after the low-pass), which keeps the energy.
+        projection: `tangent` evaluates the footprint on the plane touching the sphere at the
+            Gaussian's own direction (no pole); `equirect` linearises azimuth and elevation there
+            (the paper; inexact near the pole, where it replaces cos(elevation) by sqrt(cos^2 +
+            step^2)).
+        low_pass: variance added to every footprint [px^2]; a pixel of `tangent` is one elevation
+            step.
+        compensate: scale the opacity by sqrt(det before / det after the low-pass), which keeps the
+            energy.
         near: Gaussians nearer than this are absent; they fade in up to twice this distance [m].
         cutoff: when a Gaussian stops counting.
     """
@@ -85,13 +98,19 @@ class Optics:
 
     def __post_init__(self) -> None:
         if self.projection not in PROJECTIONS:
-            raise ValueError(f"projection is {' or '.join(map(repr, PROJECTIONS))}, got {self.projection!r}")
+            raise ValueError(
+                f"projection is {' or '.join(map(repr, PROJECTIONS))}, got {self.projection!r}"
+            )
         if not self.low_pass >= 0.0 or not self.near > 0.0:
-            raise ValueError(f"low_pass >= 0 and near > 0 are needed, got {self.low_pass} and {self.near}")
+            raise ValueError(
+                f"low_pass >= 0 and near > 0 are needed, got {self.low_pass} and {self.near}"
+            )
 
 
 class KernelSettings(NamedTuple):
-    """Grid, optics and thresholds as the kernels take them; the struct of that name in csrc/layout.h."""
+    """Grid, optics and thresholds as the kernels take them;
+    the struct of that name in csrc/layout.h.
+    """
 
     height: int
     width: int

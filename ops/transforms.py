@@ -1,4 +1,6 @@
-"""What torch does to a tensor that reaches the rasterizer: tangents, vmap, nesting, half precision."""
+"""What torch does to a tensor that reaches the rasterizer: tangents, vmap, nesting,
+half precision.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def full_precision(function: _Function) -> _Function:
-    """Keep `function` in the precision of its tensors, as the kernels are, under `torch.autocast` too."""
+    """Keep `function` in the precision of its tensors, as the kernels are,
+    under `torch.autocast` too.
+    """
     # Autocast would render in half precision: 5 % off, and sound rotations refused.
     exact = torch.autocast("cpu", enabled=False)(torch.autocast("cuda", enabled=False)(function))
     return cast(_Function, exact)
@@ -28,7 +32,9 @@ def forward_mode_is_active() -> bool:
 
 
 def carries_tangent(*values: Any) -> bool:
-    """Tell whether a tensor among `values` is differentiated in forward mode, as by `torch.func.jvp`."""
+    """Tell whether a tensor among `values` is differentiated in forward mode,
+    as by `torch.func.jvp`.
+    """
     if not forward_mode_is_active():
         return False
     tensors = (v for v in values if isinstance(v, Tensor) and v.is_floating_point())
@@ -48,7 +54,9 @@ def has_vmap_axis(*values: Any) -> bool:
 
 
 def unwrap(value: Tensor, axis: int) -> tuple[Tensor, int]:
-    """Return the numbers behind a tensor, hidden axes included, and where its axis `axis` is among them."""
+    """Return the numbers behind a tensor, hidden axes included,
+    and where its axis `axis` is among them.
+    """
     while _functorch.is_functorch_wrapped_tensor(value):
         hidden = _functorch.maybe_get_bdim(value)
         # A hidden axis at or before it moves it back by one.
@@ -63,13 +71,17 @@ def transform_is_active() -> bool:
 
 
 def needs_reference(*values: Any) -> bool:
-    """Tell whether plain PyTorch must compute what a kernel has no derivative of, or no answer to."""
+    """Tell whether plain PyTorch must compute what a kernel has no derivative of,
+    or no answer to.
+    """
     return transform_is_active() or carries_tangent(*values)
 
 
 def is_differentiated(*values: Tensor | None) -> bool:
     """Tell whether autograd, in either mode, or `torch.func` follows any of these."""
-    recorded = torch.is_grad_enabled() and any(value is not None and value.requires_grad for value in values)
+    recorded = torch.is_grad_enabled() and any(
+        value is not None and value.requires_grad for value in values
+    )
     return recorded or needs_reference(*values)
 
 
@@ -79,11 +91,15 @@ def no_transforms() -> AbstractContextManager[Any]:
 
 
 def detach(value: Tensor | None) -> Any:
-    """Return the numbers behind a tensor or None, for choices without a derivative, in `no_transforms`."""
+    """Return the numbers behind a tensor or None, for choices without a derivative,
+    in `no_transforms`.
+    """
     return None if value is None else unwrap(value, 0)[0].detach()
 
 
 def to_numpy(value: Tensor) -> np.ndarray:
-    """Return the numbers of a tensor without what follows them, for choices that have no derivative."""
+    """Return the numbers of a tensor without what follows them,
+    for choices that have no derivative.
+    """
     with no_transforms():
         return detach(value).cpu().numpy()

@@ -1,6 +1,7 @@
 """Small invented campaigns, and the real subset where it is present.
 
-What is large is imported where it is needed: pytest-xdist starts its workers after it has read this file.
+What is large is imported where it is needed:
+pytest-xdist starts its workers after it has read this file.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ def pytest_collection_finish():
 
 
 def pytest_terminal_summary(terminalreporter):
-    """Skipped tests by their reasons, in one line; measured data that are not there are one reason."""
+    """Skipped tests by their reasons, in one line;
+    measured data that are not there are one reason.
+    """
     own = r"^Skipped: |(?<=measured data not beside this checkout).*"
     skipped = [report.longrepr[2] for report in terminalreporter.stats.get("skipped", [])]
     reasons = Counter(re.sub(own, "", why) for why in skipped)
@@ -48,7 +51,8 @@ def _short_trainings_end_at_once(tmp_path_factory):
     from threadpoolctl import threadpool_limits
 
     threadpool_limits(1, "blas")  # as every command has it
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a script's job in the background ignores it
+    # A script's job in the background ignores it
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     if kernels := os.environ.get("GSPARC_TEST_KERNELS"):
         from gsparc.ops import _native
 
@@ -78,7 +82,9 @@ def folds() -> Callable[..., Split]:
 
 @pytest.fixture
 def elsewhere():
-    """`elsewhere("joblib")`, `elsewhere("ray", nodes=2)`: other processes do pieces of work until the end."""
+    """`elsewhere("joblib")`, `elsewhere("ray", nodes=2)`:
+    other processes do pieces of work until the end.
+    """
     import torch
 
     from gsparc.base import executor
@@ -123,7 +129,8 @@ def browser():
     for switch in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"):
         options.add_argument(switch)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    service = webdriver.ChromeService(executable_path=driver)  # never looked for or fetched elsewhere
+    # Never looked for or fetched elsewhere
+    service = webdriver.ChromeService(executable_path=driver)
     running = webdriver.Chrome(options=options, service=service)
     yield running
     running.quit()

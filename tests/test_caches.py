@@ -15,16 +15,34 @@ from gsparc.runs.ledger import measurements_hash
 
 ONE = np.ones(3)
 FACTS = {
-    "name": "other", "kind": "rssi", "static_end": "tx", "grid": SphereGrid.hemisphere(4, 8),
-    "array": np.eye(3), "carrier_hz": 2.4e9, "subcarriers_hz": ONE, "origin": 7 * ONE,
-    "box": np.array([-ONE, 3 * ONE]), "sha256": "0" * 64, "normalisation": "minmax", "target_scale": 3.0,
-    "stand_in": "another", "convergence_error": 0.5, "static_position": 9 * ONE,
-    "rx_rotation": -np.eye(3), "uplink_array": np.eye(3), "uplink_hz": ONE, "antennas": np.arange(2),
-    "stations": Stations(np.zeros((2, 3)), ("one", "two")), "georeference": Georeference(52.0, 13.0),
-    "moving_box": np.array([-ONE, 2 * ONE]), "level_unit": "dBm", "unit": "mW",
-    "unknown_factor": "phase", "phase_reference": "carrier",
+    "name": "other",
+    "kind": "rssi",
+    "static_end": "tx",
+    "grid": SphereGrid.hemisphere(4, 8),
+    "array": np.eye(3),
+    "carrier_hz": 2.4e9,
+    "subcarriers_hz": ONE,
+    "origin": 7 * ONE,
+    "box": np.array([-ONE, 3 * ONE]),
+    "sha256": "0" * 64,
+    "normalisation": "minmax",
+    "target_scale": 3.0,
+    "stand_in": "another",
+    "convergence_error": 0.5,
+    "static_position": 9 * ONE,
+    "rx_rotation": -np.eye(3),
+    "uplink_array": np.eye(3),
+    "uplink_hz": ONE,
+    "antennas": np.arange(2),
+    "stations": Stations(np.zeros((2, 3)), ("one", "two")),
+    "georeference": Georeference(52.0, 13.0),
+    "moving_box": np.array([-ONE, 2 * ONE]),
+    "level_unit": "dBm",
+    "unit": "mW",
+    "unknown_factor": "phase",
+    "phase_reference": "carrier",
     "device_names": ("one", "two"),
-}  # fmt: skip
+}
 
 
 class Asked(Exception):
@@ -48,7 +66,9 @@ def _keys(data, monkeypatch) -> dict[str, str]:
 
 
 def test_every_fact_of_a_site_changes_the_keys_of_all_caches(campaign, monkeypatch):
-    """Of another `grid_deg` or `normalisation` a comparison showed the kept 32.4169 dB for 32.3799."""
+    """Of another `grid_deg` or `normalisation` a comparison showed the kept 32.4169 dB for
+    32.3799.
+    """
     facts = {one.name for one in fields(Site) if one.compare}  # the others are what a fit found
     assert set(FACTS) == facts, "a new fact of a site is to be named here"
     data = campaign("spectrum", 20)

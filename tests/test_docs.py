@@ -21,7 +21,8 @@ from gsparc.simulate.scenes.shipped import list_shipped_scenes
 
 MAP = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
 SITE = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
-MEASURED = sorted((ROOT / "docs" / "results").glob("*.md"))  # their commands take long: read, not run
+# Their commands take long: read, not run
+MEASURED = sorted((ROOT / "docs" / "results").glob("*.md"))
 PER_PAGE = pytest.mark.parametrize(
     "page", [*PAGES, *MEASURED], ids=lambda page: f"{page.parent.name}/{page.name}"
 )
@@ -29,7 +30,15 @@ TODAY = pytest.mark.parametrize(
     "page", [*PRESENT, *MEASURED], ids=lambda page: f"{page.parent.name}/{page.name}"
 )
 README_LINES = 100
-GONE = ("vsgp", "directed", "model=bearings", "committee", "budget_s", "budget_clock", "trainer.val_every")
+GONE = (
+    "vsgp",
+    "directed",
+    "model=bearings",
+    "committee",
+    "budget_s",
+    "budget_clock",
+    "trainer.val_every",
+)
 
 
 def test_a_tutorial_imported_a_name_that_was_gone():
@@ -40,14 +49,20 @@ def test_a_tutorial_imported_a_name_that_was_gone():
         for cell in json.loads(file.read_text(encoding="utf-8"))["cells"]
         if cell["cell_type"] == "code"
     ]
-    lines = re.findall(r"^from (gsparc[\w.]*) import ([\w, ]+)$", "\n".join(cells), flags=re.MULTILINE)
+    lines = re.findall(
+        r"^from (gsparc[\w.]*) import ([\w, ]+)$", "\n".join(cells), flags=re.MULTILINE
+    )
     assert lines
-    gone = [f"{home}.{n}" for home, names in lines for n in names.split(", ") if not can_import(home, n)]
+    gone = [
+        f"{home}.{n}" for home, names in lines for n in names.split(", ") if not can_import(home, n)
+    ]
     assert not gone
 
 
 def test_pages_show_their_files_as_they_are(monkeypatch):
-    """`python docs/site/shown.py` writes tables and code between marks: a clone shows what the site shows."""
+    """`python docs/site/shown.py` writes tables and code between marks:
+    a clone shows what the site shows.
+    """
     monkeypatch.syspath_prepend(ROOT / "docs" / "site")
     from shown import MARKED, PAGES, shown
 
@@ -75,7 +90,9 @@ def test_every_package_is_on_the_map():
     packages |= {f"{folder}/" for folder in ("conf", "callbacks", "ops", "bench", "tests")}
     assert not packages - named
     assert not {name for name in named if not (ROOT / name).exists()}
-    groups = {folder.name for folder in (ROOT / "conf").iterdir() if folder.is_dir()} - {"__pycache__"}
+    groups = {folder.name for folder in (ROOT / "conf").iterdir() if folder.is_dir()} - {
+        "__pycache__"
+    }
     assert not groups - set(re.findall(r"(\w+)/", MAP))
 
 
@@ -86,7 +103,10 @@ def test_the_walk_is_through_functions_that_are_there():
         assert len(steps) > 5 and int(steps[-1][0]) == 12
         for _, file, name in steps:
             text = (ROOT / "gsparc" / file).read_text(encoding="utf-8")
-            assert all(re.search(rf"(?:def|class) {part}\b", text) for part in name.split(".")), (file, name)
+            assert all(re.search(rf"(?:def|class) {part}\b", text) for part in name.split(".")), (
+                file,
+                name,
+            )
 
 
 @PER_PAGE
@@ -94,7 +114,9 @@ def test_what_a_page_names_is_there(page):
     """Files that it links, names or shows, headings of other pages, and tests."""
     text = page.read_text(encoding="utf-8")
     links = [link for link in re.findall(r"\]\(([^)\s]+)\)", text) if "://" not in link]
-    files, anchors = zip(*(link.partition("#")[::2] for link in links), strict=True) if links else ((), ())
+    files, anchors = (
+        zip(*(link.partition("#")[::2] for link in links), strict=True) if links else ((), ())
+    )
     missing = [file for file in files if not (page.parent / file).exists()]
     shown_tables = re.findall(r"<!-- table: (\S+) -->", text)
     missing += [path for path in shown_tables if not (ROOT / path).exists()]
@@ -109,7 +131,11 @@ def test_what_a_page_names_is_there(page):
         if anchor and anchor not in headings(page.parent / file if file else page):
             missing.append(f"{file}#{anchor}")
     for file, name in re.findall(r"`([\w/]*test_\w+\.py)::(\w+)`", text):
-        found = [path for path in (ROOT / "tests").rglob(Path(file).name) if path.as_posix().endswith(file)]
+        found = [
+            path
+            for path in (ROOT / "tests").rglob(Path(file).name)
+            if path.as_posix().endswith(file)
+        ]
         if not any(f"def {name}(" in path.read_text(encoding="utf-8") for path in found):
             missing.append(f"{file}::{name}")
     assert not missing
@@ -129,28 +155,38 @@ def test_commands_compose():
     """Commands, settings and choices that the documents name exist."""
     given, alike = commands(), defaultdict(dict)
     assert len(given) > 30
-    for name, *overrides in given:  # those of the same choices at once: they differ in settings alone
+    # Those of the same choices at once: they differ in settings alone
+    for name, *overrides in given:
         chosen = {
-            word for word in overrides if word[0] in "~+" or (ROOT / "conf" / word.split("=")[0]).is_dir()
+            word
+            for word in overrides
+            if word[0] in "~+" or (ROOT / "conf" / word.split("=")[0]).is_dir()
         }
         alike[name, frozenset(chosen)] |= dict.fromkeys(overrides)
     offer_scenes()
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         for (name, _), overrides in alike.items():
-            if "search=optuna" in overrides and find_spec("hydra_plugins.hydra_optuna_sweeper") is None:
+            if (
+                "search=optuna" in overrides
+                and find_spec("hydra_plugins.hydra_optuna_sweeper") is None
+            ):
                 continue  # an extra that is not installed here
             assert compose(name, list(overrides)), (name, *overrides)
 
 
 @TODAY
 def test_choices_and_names_are_of_today(page):
-    """And whoever installed a wheel is not stopped at a file of the clone: most pages said `train.py`."""
+    """And whoever installed a wheel is not stopped at a file of the clone:
+    most pages said `train.py`.
+    """
     code = "\n".join(said(page))
     for group in ("model", "dataset", "split", "trainer", "callbacks", "experiment", "scene"):
         chosen = re.findall(rf"(?<![\w.]){group}=([a-z][\w/]*)", code)
         offered = ("help", *list_shipped_scenes()) if group == "scene" else ()
         written = [name for name in chosen if name not in offered]
-        assert not [name for name in written if not (ROOT / "conf" / group / f"{name}.yaml").exists()], group
+        assert not [
+            name for name in written if not (ROOT / "conf" / group / f"{name}.yaml").exists()
+        ], group
     assert not [name for name in GONE if re.search(rf"(?<![\w.]){re.escape(name)}\b", code)]
     assert "gsparc.commands" not in code, "name the command"
     if page.parent.name == "docs":
@@ -168,13 +204,19 @@ def test_the_readme_is_short():
 
 
 def test_every_method_is_listed():
-    """Each name of the registry is a row or an entry of the page of methods, or of the page of training."""
-    text = "".join((ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("peers.md", "train.md"))
+    """Each name of the registry is a row or an entry of the page of methods,
+    or of the page of training.
+    """
+    text = "".join(
+        (ROOT / "docs" / name).read_text(encoding="utf-8") for name in ("peers.md", "train.md")
+    )
     assert not {name for name in built_in_methods() if f"`{name}`" not in text}
 
 
 def test_every_regression_test_of_the_hard_cases_is_there():
-    """`docs/results/hard-cases-bugs.csv` names them; nothing on it may be lost when tests are renamed."""
+    """`docs/results/hard-cases-bugs.csv` names them;
+    nothing on it may be lost when tests are renamed.
+    """
     table = pd.read_csv(ROOT / "docs" / "results" / "hard-cases-bugs.csv", keep_default_na=False)
     named = [name.partition("::") for names in table["regression test"] for name in names.split()]
     assert len(named) > 150

@@ -15,10 +15,13 @@ import gsparc
 RNG = np.random.default_rng(0)
 PLACES = np.c_[RNG.uniform(0, 9, (60, 2)), np.full(60, 1.5)]
 ENDS = np.array([[4.0, 4.0, 2.6], [9.0, 9.0, 2.6]])
-POWERS = -30 - 25 * np.log10(np.linalg.norm(PLACES[:, None] - ENDS, axis=2)) + RNG.normal(size=(60, 2))
+POWERS = (
+    -30 - 25 * np.log10(np.linalg.norm(PLACES[:, None] - ENDS, axis=2)) + RNG.normal(size=(60, 2))
+)
 ROOT = Path(__file__).parents[1]
 DESCRIBED = ast.Module, ast.ClassDef, ast.FunctionDef
-OTHERS = {"yield", "vjp", "jacrev", "jacfwd", "tx_x_mm"}  # of Python, of torch.func, and of a user's table
+# Of Python, of torch.func, and of a user's table
+OTHERS = {"yield", "vjp", "jacrev", "jacfwd", "tx_x_mm"}
 PACKAGES = {"gsparc": "gsparc", "ops": "gsparc.ops", "callbacks": "gsparc.callbacks"}  # by folder
 # They ask for Sionna's solver, or for a cloud of a trained field.
 ELSEWHERE = ("gsparc.apps.view.ply",)
@@ -30,7 +33,9 @@ def with_examples() -> dict[str, int]:
     for folder, package in PACKAGES.items():
         for file in sorted((ROOT / folder).rglob("*.py")):
             name = ".".join([package, *file.relative_to(ROOT / folder).with_suffix("").parts])
-            counts[name.removesuffix(".__init__")] = len(re.findall(r"^\s*>>> ", file.read_text(), re.M))
+            counts[name.removesuffix(".__init__")] = len(
+                re.findall(r"^\s*>>> ", file.read_text(), re.M)
+            )
     return {name: count for name, count in counts.items() if count and name not in ELSEWHERE}
 
 
@@ -42,8 +47,14 @@ def checkpoints(tmp_path_factory):
     """A folder with the files that the examples load."""
     folder = tmp_path_factory.mktemp("examples")
     gsparc.fit(rx=PLACES, tx=ENDS[0], rssi=POWERS[:, 0], model="gp", save=folder / "model.ckpt")
-    degrees = {"latitude": 40.765 + PLACES[:, 1] * 1e-5, "longitude": -111.835 + PLACES[:, 0] * 1e-5}
-    ends = {"station_latitude": 40.765 + ENDS[:, 1] * 1e-5, "station_longitude": -111.835 + ENDS[:, 0] * 1e-5}
+    degrees = {
+        "latitude": 40.765 + PLACES[:, 1] * 1e-5,
+        "longitude": -111.835 + PLACES[:, 0] * 1e-5,
+    }
+    ends = {
+        "station_latitude": 40.765 + ENDS[:, 1] * 1e-5,
+        "station_longitude": -111.835 + ENDS[:, 0] * 1e-5,
+    }
     names = {"station_name": np.array(["roof-2", "roof-3"])}
     gsparc.fit(**degrees, **ends, **names, rssi=POWERS, model="gp", save=folder / "city.ckpt")
     return folder
@@ -59,9 +70,14 @@ def words_of_code(tree: ast.AST) -> set[str]:
     words = []
     for node in ast.walk(tree):
         words += [
-            getattr(node, part, None) or "" for part in ("name", "arg", "id", "attr", "module", "asname")
+            getattr(node, part, None) or ""
+            for part in ("name", "arg", "id", "attr", "module", "asname")
         ]
-        if isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in described:
+        if (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and id(node) not in described
+        ):
             words.append(node.value)
     return set(re.findall(r"[A-Za-z_]\w*", " ".join(words)))
 
@@ -72,14 +88,24 @@ def test_docstrings_named_functions_that_are_gone():
     files = [file for folder in PACKAGES for file in sorted((ROOT / folder).rglob("*.py"))]
     trees = {file: ast.parse(file.read_text()) for file in files}
     known = {file.stem for file in files}.union(*map(words_of_code, trees.values()))
-    for kind in ("conf/**/*.yaml", "gsparc/**/*.yaml", "gsparc/**/*.csv", "ops/**/*.h", "docs/**/*.md"):
+    for kind in (
+        "conf/**/*.yaml",
+        "gsparc/**/*.yaml",
+        "gsparc/**/*.csv",
+        "ops/**/*.h",
+        "docs/**/*.md",
+    ):
         known.update(*(re.findall(r"[A-Za-z_]\w*", file.read_text()) for file in ROOT.glob(kind)))
     gone = []
     for file, tree in trees.items():
         for node in (one for one in ast.walk(tree) if isinstance(one, DESCRIBED)):
-            said = re.findall(r"`((?:[A-Za-z_]+\.)*[A-Za-z_]+)(?:\(\))?`", ast.get_docstring(node) or "")
+            said = re.findall(
+                r"`((?:[A-Za-z_]+\.)*[A-Za-z_]+)(?:\(\))?`", ast.get_docstring(node) or ""
+            )
             ours = {name for name in said if not name.startswith("sionna.")} - OTHERS
-            gone += [f"{file.name}: {name}" for name in ours if not known.issuperset(name.split("."))]
+            gone += [
+                f"{file.name}: {name}" for name in ours if not known.issuperset(name.split("."))
+            ]
     assert not gone
 
 

@@ -1,4 +1,6 @@
-"""Rooms import what a list allows, and no circle; ops register once. That nobody prints: ruff (T20)."""
+"""Rooms import what a list allows, and no circle; ops register once. That nobody prints:
+ruff (T20).
+"""
 
 import ast
 import importlib
@@ -31,8 +33,7 @@ ARROWS = {
     "models": "base conf data datasets field ops physics processes simulate tables training",
     "prediction": "base data datasets field models ops physics processes tables training",
     "evaluation": "base conf data models physics prediction processes tables training",
-    "runs": "base data datasets evaluation models physics prediction simulate tables "
-    "training",
+    "runs": "base data datasets evaluation models physics prediction simulate tables training",
     "pictures": "base data evaluation field models physics prediction processes runs simulate "
     "tables training",
     "callbacks": "base evaluation field pictures processes training",
@@ -47,7 +48,8 @@ ARROWS = {
 }
 ROOMS = tuple(ARROWS)
 LARGEST = ("models", "tables", "commands")
-GROUPS = ("gsparc.models", "gsparc.datasets")  # of entry points: what plugins bring, by these very words
+# Of entry points: what plugins bring, by these very words
+GROUPS = ("gsparc.models", "gsparc.datasets")
 
 
 def inside(room: str) -> str:
@@ -62,7 +64,9 @@ FILES = [
 
 
 def imported(tree: ast.Module):
-    """Modules and names, also those within functions; of expressions, nine tenths, nothing is asked."""
+    """Modules and names, also those within functions; of expressions, nine tenths,
+    nothing is asked.
+    """
     todo: list[ast.AST] = [tree]
     for node in todo:
         for part in ("body", "orelse", "finalbody", "handlers", "cases"):
@@ -77,7 +81,9 @@ def imported(tree: ast.Module):
 
 
 def named(text: str):
-    """Modules and classes in strings: of `import_module`, `_target_`, registries and tables of lazy names."""
+    """Modules and classes in strings: of `import_module`, `_target_`,
+    registries and tables of lazy names.
+    """
     found = re.findall(r"""["'](?:pkg://)?(gsparc(?:\.\w+)+)["']""", text)
     yield from (name for name in found if name not in GROUPS)
 
@@ -118,7 +124,8 @@ def test_rooms_import_what_the_list_allows_and_nothing_else():
     new = {pair: files for pair, files in found.items() if pair not in allowed}
     assert not new, f"arrows that are not on the list: {new}"
     assert not allowed - set(found), f"on the list, and nobody needs them: {allowed - set(found)}"
-    TopologicalSorter({room: others.split() for room, others in ARROWS.items()}).prepare()  # no circle
+    # No circle
+    TopologicalSorter({room: others.split() for room, others in ARROWS.items()}).prepare()
 
 
 def test_the_map_left_out_imports_that_the_list_allows():
@@ -127,7 +134,9 @@ def test_the_map_left_out_imports_that_the_list_allows():
     rows = [line.strip("| ").split(" | ") for line in lines if line.startswith("| `")]
     uses = {row[0].strip("`/").removeprefix("gsparc/").replace("/", "."): row[-1] for row in rows}
     assert not {*ROOMS} - {*uses}
-    said = {room: re.sub(r" \([^)]*\)", "", uses[room]).replace("/", ".").split(", ") for room in ROOMS}
+    said = {
+        room: re.sub(r" \([^)]*\)", "", uses[room]).replace("/", ".").split(", ") for room in ROOMS
+    }
     assert {room: {*names} & {*ROOMS} for room, names in said.items()} == {
         room: {*others.split()} for room, others in ARROWS.items()
     }
@@ -141,7 +150,9 @@ def test_no_file_needs_itself(room):
     for module, file in files.items():
         found = {_of(name, files) for name in needed(file)}
         used[module] = found - {module, None}
-    assert len(list(TopologicalSorter(used).static_order())) >= len([one for one in used if used[one]])
+    assert len(list(TopologicalSorter(used).static_order())) >= len(
+        [one for one in used if used[one]]
+    )
 
 
 def module_of(file: Path) -> str:
@@ -156,13 +167,17 @@ def _of(name: str, files: dict[str, Path]) -> str | None:
 
 
 def test_the_core_does_without_the_apps():
-    """What is done with predictions is known to the commands alone, also in functions and strings."""
+    """What is done with predictions is known to the commands alone,
+    also in functions and strings.
+    """
     above = [ROOT / "gsparc" / name for name in ("apps", "commands")]
     rooms = [ROOT / name for name in ("gsparc", "ops", "callbacks", "bench", "hydra_plugins")]
     core = [file for room in rooms for file in room.rglob("*.py") if not {*above} & {*file.parents}]
     assert len(core) > 300
     wrong = {file for file in core for name in _needs(file) if _is_app(name)}
-    wrong |= {file for file in (ROOT / "conf").rglob("*.yaml") if "gsparc.apps" in file.read_text("utf-8")}
+    wrong |= {
+        file for file in (ROOT / "conf").rglob("*.yaml") if "gsparc.apps" in file.read_text("utf-8")
+    }
     assert not wrong
 
 
@@ -221,10 +236,16 @@ def _top(tree: ast.Module) -> ast.Module:
 def test_imports_have_full_names():
     for room, file in FILES:
         names = set(_imports(file))
-        bare = {name for name in names if name.split(".")[0] in ("ops", "callbacks", "conf", "tests")}
+        bare = {
+            name for name in names if name.split(".")[0] in ("ops", "callbacks", "conf", "tests")
+        }
         assert not bare, f"{file}: {bare}: import gsparc.NAME"
         if room == "ops":
-            assert not {name.split(".")[0] for name in names} & {"lightning", "hydra", "omegaconf"}, file
+            assert not {name.split(".")[0] for name in names} & {
+                "lightning",
+                "hydra",
+                "omegaconf",
+            }, file
 
 
 def test_nothing_happens_at_import():
@@ -235,17 +256,24 @@ def test_nothing_happens_at_import():
                 called = ast.unparse(node.value.func)
                 # Declaring an operator's derivative is part of declaring the operator.
                 declares = ".register_" in called
-                # The one exception: how torch's threads wait is settled when torch is first imported.
-                waits = file == ROOT / "gsparc" / "__init__.py" and called == "os.environ.setdefault"
+                # The one exception: how torch's threads wait is settled when torch is first
+                # imported.
+                waits = (
+                    file == ROOT / "gsparc" / "__init__.py" and called == "os.environ.setdefault"
+                )
                 assert declares or waits, f"{file}:{node.lineno} calls {called} at import"
 
 
-@pytest.mark.parametrize(("said", "found"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")])
+@pytest.mark.parametrize(
+    ("said", "found"), [({}, "passive"), ({"OMP_WAIT_POLICY": "active"}, "active")]
+)
 def test_importing_the_package_is_free_and_keeps_torch_threads_from_spinning(said, found):
     """At 62,000 Gaussians on two cores spinning doubled a query; who wants it can say so."""
     code = "import os, sys, gsparc; print(os.environ['OMP_WAIT_POLICY'], 'torch' in sys.modules)"
     clean = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-    done = subprocess.run([sys.executable, "-c", code], env=clean | said, capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=clean | said, capture_output=True, text=True
+    )
     assert done.stdout.split() == [found, "False"], done.stderr
 
 
@@ -258,7 +286,9 @@ def test_the_bare_names_refuse_to_be_imported(monkeypatch):
 
 @pytest.mark.slow
 def test_a_wheel_installed_elsewhere_trains(tmp_path):
-    """Built, installed without the source tree, a compiler or data in sight, run as a user would."""
+    """Built, installed without the source tree, a compiler or data in sight,
+    run as a user would.
+    """
     pytest.importorskip("auditwheel", reason="auditwheel is not installed")
     wheels, home = tmp_path / "wheels", tmp_path / "home"
     home.mkdir()
@@ -268,16 +298,27 @@ def test_a_wheel_installed_elsewhere_trains(tmp_path):
     quick.chmod(0o755)
     given = f"-Ccmake.define.CMAKE_CXX_COMPILER_LAUNCHER={quick} -Ccmake.define.GSPARC_PORTABLE=ON"
     portable = f"-Cbuild-dir={tmp_path / 'build'} -Ccmake.build-type=Debug {given}"
-    make = ["make", "-o", "setup", "wheel", f"VENV={sys.prefix}", f"WHEEL={portable}", f"DIST={wheels}"]
+    make = [
+        "make",
+        "-o",
+        "setup",
+        "wheel",
+        f"VENV={sys.prefix}",
+        f"WHEEL={portable}",
+        f"DIST={wheels}",
+    ]
     made = subprocess.run(make, capture_output=True, text=True, cwd=ROOT)
     assert made.returncode == 0, made.stderr
     (wheel,) = wheels.glob("*.whl")
     assert "manylinux" in wheel.name
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True)
+    subprocess.run(
+        [sys.executable, "-m", "venv", "--without-pip", str(tmp_path / "venv")], check=True
+    )
     python = str(tmp_path / "venv" / "bin" / "python")
     (site,) = (tmp_path / "venv").glob("lib/python*/site-packages")
     subprocess.run([*pip, "install", "--no-deps", "--target", str(site), str(wheel)], check=True)
-    # A path in a .pth file brings this environment's packages without its .pth files (an editable gsparc).
+    # A path in a .pth file brings this environment's packages without its .pth files (an editable
+    # gsparc).
     torch = importlib.util.find_spec("torch")
     places = (sysconfig.get_path("purelib"), Path(torch.origin).parents[1])
     (site / "dependencies.pth").write_text("".join(f"{place}\n" for place in places))
@@ -286,7 +327,9 @@ def test_a_wheel_installed_elsewhere_trains(tmp_path):
     environment = {"HOME": str(home), "PATH": str(nothing), "OMP_NUM_THREADS": "1"}
 
     def say(*words: str) -> str:
-        done = subprocess.run([python, *words], cwd=home, env=environment, capture_output=True, text=True)
+        done = subprocess.run(
+            [python, *words], cwd=home, env=environment, capture_output=True, text=True
+        )
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 

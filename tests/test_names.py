@@ -38,8 +38,15 @@ def test_every_setting_has_a_comment(file: Path):
 
 
 def test_a_run_writes_no_name_that_no_table_explains(tmp_path: Path):
-    """`model/class` and `locate_ms` stood in no page; others: `test_a_command_of_a_page_ends_well`."""
-    given = ["dataset=own", f"dataset.file={powers(tmp_path / 'own.npz', 60)}", "model=gp", "threads=1"]
+    """`model/class` and `locate_ms` stood in no page; others:
+    `test_a_command_of_a_page_ends_well`.
+    """
+    given = [
+        "dataset=own",
+        f"dataset.file={powers(tmp_path / 'own.npz', 60)}",
+        "model=gp",
+        "threads=1",
+    ]
     train(compose(*given, "baselines=[nearest]", "logger=none"), tmp_path / "run")
     assert find_unexplained(tmp_path / "run") == []
 
@@ -47,5 +54,9 @@ def test_a_run_writes_no_name_that_no_table_explains(tmp_path: Path):
 @pytest.mark.parametrize("name", gsparc.__all__)
 def test_whatever_is_public_says_what_it_is(name: str):
     public = getattr(gsparc, name)
-    members = [(k, v) for k, v in inspect.getmembers(public) if k[0] != "_" and inspect.isclass(public)]
-    assert not [k for k, v in members if (callable(v) or isinstance(v, property)) and not inspect.getdoc(v)]
+    members = [
+        (k, v) for k, v in inspect.getmembers(public) if k[0] != "_" and inspect.isclass(public)
+    ]
+    assert not [
+        k for k, v in members if (callable(v) or isinstance(v, property)) and not inspect.getdoc(v)
+    ]

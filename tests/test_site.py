@@ -1,4 +1,6 @@
-"""The documentation site: tutorials run, the build is strict, links lead somewhere, nothing is fetched."""
+"""The documentation site: tutorials run, the build is strict, links lead somewhere,
+nothing is fetched.
+"""
 
 import csv
 import os
@@ -59,7 +61,9 @@ def _build(folder: Path) -> None:
     for needed in ("mkdocs", "mkdocs_jupyter", "mkdocstrings", "material", "nbclient", "ipykernel"):
         pytest.importorskip(needed, reason="the site needs the extra docs: make docs")
     subprocess.run(["make", "named"], check=True, **RUN)
-    done = subprocess.run([sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(folder)], **RUN)
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(folder)], **RUN
+    )
     assert done.returncode == 0, done.stdout + done.stderr
 
 
@@ -100,7 +104,9 @@ def test_no_cell_of_a_table_is_cut(helpers, path):
     """`mean |e|²` was three cells, of which the site showed "mean" and "e"."""
     from cells import table
 
-    markdown = pytest.importorskip("markdown", reason="the site needs the extra docs: make docs").markdown
+    markdown = pytest.importorskip(
+        "markdown", reason="the site needs the extra docs: make docs"
+    ).markdown
     with (ROOT / path).open(encoding="utf-8", newline="") as file:
         written = [[text.replace("`", "").strip() for text in row] for row in csv.reader(file)]
     assert Cells(markdown(table(ROOT / path), extensions=["tables"])).rows == written
@@ -110,7 +116,9 @@ def test_every_setting_is_on_the_site(helpers):
     """Some were in no page; what files leave to their class is there with its meaning."""
     from settings import CONF, list_files, list_settings
 
-    found = {file.relative_to(CONF).as_posix(): list_settings(file) for file in CONF.rglob("*.yaml")}
+    found = {
+        file.relative_to(CONF).as_posix(): list_settings(file) for file in CONF.rglob("*.yaml")
+    }
     assert not [(file, row) for file, rows in found.items() for row in rows if not row[2]]
     names = {file: {name: default for name, default, _ in rows} for file, rows in found.items()}
     assert names["paper/gsparc.yaml"]["model.attenuation.learn_gain"] == "false"
@@ -128,19 +136,26 @@ def test_every_setting_is_on_the_site(helpers):
 @pytest.mark.timeout(1800)
 def test_names_are_those_that_users_import(site):
     """`SphereGrid` also stood under `gsparc.ops.native`, and `gsparc.fit` nowhere."""
-    lines = zlib.decompress((site / "objects.inv").read_bytes().split(b"\n", 4)[4]).decode().splitlines()
+    lines = (
+        zlib.decompress((site / "objects.inv").read_bytes().split(b"\n", 4)[4])
+        .decode()
+        .splitlines()
+    )
     names = {line.split()[0] for line in lines if line.split()[1] in ("py:class", "py:function")}
     assert {f"gsparc.{name}" for name in gsparc.__all__} <= names
     for module, _, name in (name.rpartition(".") for name in names):
         room = import_module(module)
-        assert name in getattr(room, "__all__", ()) or getattr(room, name).__module__ == module, module
+        assert name in getattr(room, "__all__", ()) or getattr(room, name).__module__ == module, (
+            module
+        )
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(1800)
 def test_tutorials_run():
     pytest.importorskip("nbclient", reason="tutorials need the extra docs: make docs")
-    done = subprocess.run([sys.executable, "docs/site/notebooks.py"], **RUN)  # which limits each cell
+    # Which limits each cell
+    done = subprocess.run([sys.executable, "docs/site/notebooks.py"], **RUN)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "5 notebooks: " in done.stderr
 
@@ -170,6 +185,9 @@ def test_pages_are_searched_from_a_folder(site, browser, page):
     entry.send_keys("rasterize")
     until, found = time.monotonic() + 30, ""
     while "Rasterizer" not in found:  # items stand in the page before they are shown
-        assert time.monotonic() < until, [found, *(line["message"] for line in browser.get_log("browser"))]
+        assert time.monotonic() < until, [
+            found,
+            *(line["message"] for line in browser.get_log("browser")),
+        ]
         time.sleep(0.2)
         found = browser.find_element("css selector", ".md-search-result__list").text

@@ -1,4 +1,6 @@
-"""Draw a new place and a left-out carrier of a room (with `freq.txt`): `python docs/images/bands.py ROOM`."""
+"""Draw a new place and a left-out carrier of a room (with `freq.txt`):
+`python docs/images/bands.py ROOM`.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def fit(data: Measurements, fold: Fold) -> dict[str, Method]:
     return fits
 
 
-def draw_images(axes: np.ndarray, data: Measurements, row: int, fits: dict[str, Method], title: str) -> None:
+def draw_images(
+    axes: np.ndarray, data: Measurements, row: int, fits: dict[str, Method], title: str
+) -> None:
     """Draw what was measured in a row, and what methods predict, with their errors."""
     batch = data.batch(np.array([row]))
     images = {"measured": batch.target[0]}
@@ -50,7 +54,14 @@ def draw_images(axes: np.ndarray, data: Measurements, row: int, fits: dict[str, 
     for axis, name in zip(axes, ("measured", *METHODS), strict=True):
         axis.set_xticks([]), axis.set_yticks([])
         if name not in images:
-            axis.text(0.5, 0.5, "knows no such carrier", ha="center", va="center", transform=axis.transAxes)
+            axis.text(
+                0.5,
+                0.5,
+                "knows no such carrier",
+                ha="center",
+                va="center",
+                transform=axis.transAxes,
+            )
             continue
         error = float((images[name] - batch.target[0]).square().mean())
         axis.imshow(images[name], vmin=0, vmax=1, cmap="viridis", aspect="auto", origin="lower")
@@ -65,7 +76,9 @@ def draw_plan(axis: plt.Axes, data: Measurements, fold: Fold, field: CarrierFiel
             axis.axvline(offset, color="C3", lw=1)
         elif abs(normal[1]) > 0.5:
             axis.axhline(offset, color="C3", lw=1)
-    axis.plot(*np.unique(data.tx[fold.train], axis=0)[:, :2].T, ".", color="C0", label="measured places")
+    axis.plot(
+        *np.unique(data.tx[fold.train], axis=0)[:, :2].T, ".", color="C0", label="measured places"
+    )
     new = np.unique(data.tx[fold.test], axis=0)
     axis.plot(*new[:, :2].T, "x", color="C1", label="new places")
     axis.plot(*receiver[:2], "^", color="k", label="receiver")
@@ -97,7 +110,11 @@ def main(room: str) -> None:
         draw_images(line, data, row, fits, f"new place, {shown[station]}: measured")
     cut = split_for({"name": "carriers", "seed": 0, "leave_out": 2}, data).folds[0]
     draw_images(
-        axes[3], data, cut.test[0], fit(data, cut), f"left-out {shown[data.station[cut.test[0]]]}: measured"
+        axes[3],
+        data,
+        cut.test[0],
+        fit(data, cut),
+        f"left-out {shown[data.station[cut.test[0]]]}: measured",
     )
     draw_plan(figure.add_subplot(grid[4, 1:4]), data, fold, fits["gsparc"])
     figure.savefig(OUT, dpi=90)

@@ -1,4 +1,5 @@
-"""The picture of docs/changes.md: a room whose screen is noticed and learned, and a town's map from before.
+"""The picture of docs/changes.md: a room whose screen is noticed and learned,
+and a town's map from before.
 
 python docs/images/changes.py
 """
@@ -33,7 +34,9 @@ def room():
     noise = np.random.default_rng(2)
     before, near, asked = draw(300, 0, SIDE), draw(4000, 6, SIDE), grid(0, SIDE)
     near = near[np.linalg.norm(near[:, :2] - 5, axis=1) < 6][:50]
-    model = gsparc.fit(rx=before, rssi=screened(before, False) + noise.normal(size=300), tx=POST, model="gp")
+    model = gsparc.fit(
+        rx=before, rssi=screened(before, False) + noise.normal(size=300), tx=POST, model="gp"
+    )
     yield "true later: a screen in a disc", screened(asked), None, None
     yield "the map before", model.rssi(rx=asked)[:, 0], None, None
     told = screened(near, True) + noise.normal(size=50)
@@ -48,15 +51,25 @@ def room():
 
 def town():
     """The same of the second line."""
-    asked, squares, rows = grid(50, 650), grid(5, 695, 70), draw(20, 103, TOWN) + np.array([50, 50, 0])
+    asked, squares, rows = (
+        grid(50, 650),
+        grid(5, 695, 70),
+        draw(20, 103, TOWN) + np.array([50, 50, 0]),
+    )
     truth = lambda places: planned(places) + 0.75 * field(places, 21, 30.0)  # noqa: E731
-    known = {"rx": rows, "tx": [0.0, 0, 20], "rssi": truth(rows) + np.random.default_rng(1).normal(0, 1, 20)}
+    known = {
+        "rx": rows,
+        "tx": [0.0, 0, 20],
+        "rssi": truth(rows) + np.random.default_rng(1).normal(0, 1, 20),
+    }
     yield "true", truth(asked), None, None
     yield "learned from 20 rows", gsparc.fit(**known).rssi(rx=asked)[:, 0], rows, None
     for name, which in (("and a planned map", 1), ("and another town's map: left out", 51)):
         with tempfile.TemporaryDirectory() as folder:
             file = Path(folder) / "map.npz"
-            np.savez(file, rx_position=squares, tx_position=known["tx"], rssi_db=planned(squares, which))
+            np.savez(
+                file, rx_position=squares, tx_position=known["tx"], rssi_db=planned(squares, which)
+            )
             found = gsparc.fit(**known, settings={"prior": file})
         yield name, found.rssi(rx=asked)[:, 0], rows, None
 
@@ -65,13 +78,19 @@ def main():
     """Write `changes.png`."""
     logging.disable(logging.WARNING)
     figure, axes = plt.subplots(2, 4, figsize=(12, 6.2), layout="constrained")
-    for line, panels, low, side in ((axes[0], [*room()], 0.0, SIDE), (axes[1], [*town()], 50.0, TOWN)):
+    for line, panels, low, side in (
+        (axes[0], [*room()], 0.0, SIDE),
+        (axes[1], [*town()], 50.0, TOWN),
+    ):
         truth = panels[0][1]
         for axis, (title, level, rows, alarm) in zip(line, panels, strict=True):
             image = axis.imshow(
-                level.reshape(61, 61), origin="lower", extent=(low, low + side) * 2,
-                vmin=truth.min(), vmax=truth.max(),
-            )  # fmt: skip
+                level.reshape(61, 61),
+                origin="lower",
+                extent=(low, low + side) * 2,
+                vmin=truth.min(),
+                vmax=truth.max(),
+            )
             error = np.sqrt(np.mean((level - truth) ** 2))
             axis.set_title(title if level is truth else f"{title}\nrmse {error:.1f} dB", fontsize=9)
             if rows is not None:

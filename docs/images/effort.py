@@ -1,4 +1,5 @@
-"""Draws `effort.png`: error over seconds of training by `effort`, of `docs/results/fronts/effort.csv`.
+"""Draws `effort.png`: error over seconds of training by `effort`,
+of `docs/results/fronts/effort.csv`.
 
 python docs/images/effort.py
 
@@ -31,8 +32,13 @@ def main() -> None:
         middle, least = sum(error) / len(error), float(own[0]["noise"])
         # A range that is not less than the noise: a flat front is to look flat.
         half = max(max(error) - min(error), 2 * least) * 0.7
-        axis.set(title=name, xlabel="training, seconds of one processor", ylabel=own[0]["unit"],
-                 ylim=(middle - half, middle + half), xlim=(0, 1.15 * max(seconds)))  # fmt: skip
+        axis.set(
+            title=name,
+            xlabel="training, seconds of one processor",
+            ylabel=own[0]["unit"],
+            ylim=(middle - half, middle + half),
+            xlim=(0, 1.15 * max(seconds)),
+        )
     save(figure, HERE / "effort.png")
 
 

@@ -16,7 +16,9 @@ def table(path: Path) -> str:
 
 
 def in_cells(rows: Sequence[Sequence[str]]) -> str:
-    """Return rows, the first of heads, as a table that shows what is written, and code between backticks."""
+    """Return rows, the first of heads, as a table that shows what is written,
+    and code between backticks.
+    """
     head, *others = ([cell(text) for text in row] for row in rows)
     return "\n".join(f"| {' | '.join(row)} |" for row in (head, ["---"] * len(head), *others))
 
@@ -24,7 +26,9 @@ def in_cells(rows: Sequence[Sequence[str]]) -> str:
 def cell(text: str) -> str:
     """Return a text without what would end its cell, or be taken for Markdown outside of code."""
     parts = re.split(r"(`[^`]*`)", " ".join(text.split()))
-    return "".join(part if part[:1] == "`" else re.sub(r"[|*_\[\]<&\\]", _entity, part) for part in parts)
+    return "".join(
+        part if part[:1] == "`" else re.sub(r"[|*_\[\]<&\\]", _entity, part) for part in parts
+    )
 
 
 def _entity(found: re.Match[str]) -> str:

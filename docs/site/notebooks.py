@@ -13,7 +13,8 @@ import nbformat
 from nbclient import NotebookClient
 
 ROOT = Path(__file__).parents[2]
-DONE = ROOT / "build" / "executed" / "tutorials"  # pages.py takes the notebooks from here where they are
+# pages.py takes the notebooks from here where they are
+DONE = ROOT / "build" / "executed" / "tutorials"
 LIMIT_S = 900  # of a cell by the clock, which a busy machine stretches
 
 log = logging.getLogger(__name__)
@@ -41,7 +42,11 @@ def run(file: Path) -> float:
 
 def main(names: list[str]) -> float:
     """Run the named tutorials, or all; returns the seconds in all."""
-    found = [f for f in sorted((ROOT / "docs" / "tutorials").glob("*.ipynb")) if not names or f.stem in names]
+    found = [
+        f
+        for f in sorted((ROOT / "docs" / "tutorials").glob("*.ipynb"))
+        if not names or f.stem in names
+    ]
     total = 0.0
     for file in found:
         seconds = run(file)
@@ -52,6 +57,7 @@ def main(names: list[str]) -> float:
 
 
 if __name__ == "__main__":
-    os.environ["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"  # of `gsparc` in cells
+    # Of `gsparc` in cells
+    os.environ["PATH"] = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     main(sys.argv[1:])

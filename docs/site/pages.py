@@ -1,4 +1,6 @@
-"""What the site takes from elsewhere: pages beside the README, and notebooks as they were executed."""
+"""What the site takes from elsewhere: pages beside the README,
+and notebooks as they were executed.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, **unused: Any) -> str:
-    """Links to the README lead to the start page, those to taken pages to these; tables are shown."""
+    """Links to the README lead to the start page, those to taken pages to these;
+    tables are shown.
+    """
     markdown = TABLE.sub(lambda found: table(ROOT / found[1]), markdown)
     if SETTINGS in markdown:
         markdown = markdown.replace(SETTINGS, settings.list_files())
@@ -52,7 +56,9 @@ def on_env(env: Any, config: Any, **unused: Any) -> Any:
 
 
 def on_post_page(output: str, page: Any, config: Any) -> str:
-    """Links of notebooks lead to pages; the theme's search takes its script from here, not from a network."""
+    """Links of notebooks lead to pages; the theme's search takes its script from here,
+    not from a network.
+    """
     if page.file.src_uri.endswith(".ipynb"):
         output = re.sub(r'href="(?!\w+:)([^"#]+)\.md(#[^"]*)?"', r'href="\1.html\2"', output)
         name = page.file.src_uri.rpartition("/")[2]

@@ -24,7 +24,9 @@ Row = tuple[str, str, str]
 def list_files() -> str:
     """Return all files with their settings in Markdown: commands first, then groups by name."""
     texts = []
-    files = sorted(CONF.rglob("*.yaml"), key=lambda file: (file.parent != CONF, file.relative_to(CONF).parts))
+    files = sorted(
+        CONF.rglob("*.yaml"), key=lambda file: (file.parent != CONF, file.relative_to(CONF).parts)
+    )
     for group in dict.fromkeys(map(_group, files)):
         texts.append(f"## {group or 'Commands'}")
         for file in (file for file in files if _group(file) == group):
@@ -32,7 +34,9 @@ def list_files() -> str:
             title = f"{group}={path.relative_to(group)}" if group else f"gsparc {path}"
             texts += [f"### `{title}`", _first_lines(file)]
             if rows := list_settings(file):
-                coded = [(f"`{name}`", default and f"`{default}`", text) for name, default, text in rows]
+                coded = [
+                    (f"`{name}`", default and f"`{default}`", text) for name, default, text in rows
+                ]
                 texts.append(in_cells([("setting", "default", "what it is"), *coded]))
     return "\n\n".join(texts)
 
@@ -82,7 +86,9 @@ def _of_class(node: Mapping[str, Any], prefix: str, given: Mapping[str, Any]) ->
 
 
 def _described(kind: type) -> dict[str, str]:
-    """Return what docstrings of a class, its bases and whose settings it hands on say of each argument."""
+    """Return what docstrings of a class, its bases and whose settings it hands on say
+    of each argument.
+    """
     found: dict[str, str] = {}
     for one in reversed(kind.__mro__):
         if "hands_on" in vars(one):
@@ -91,7 +97,9 @@ def _described(kind: type) -> dict[str, str]:
             for section in re.findall(
                 r"^(?:Args|Attributes):\n((?:    .*\n?|\n)+)", inspect.cleandoc(text or ""), re.M
             ):
-                for names, meaning in re.findall(r"^    ([\w, ]+): (.+(?:\n     .+)*)", section, re.M):
+                for names, meaning in re.findall(
+                    r"^    ([\w, ]+): (.+(?:\n     .+)*)", section, re.M
+                ):
                     own = dict.fromkeys(re.split(", *", names), " ".join(meaning.split()))
                     named = re.match(r"see `(\w+)`", meaning)
                     other = vars(sys.modules[one.__module__]).get(named[1]) if named else None
@@ -109,7 +117,9 @@ def _default(value: yaml.Node, lines: list[str]) -> str:
 
 
 def _comment(key: yaml.Node, value: yaml.Node, lines: list[str]) -> str:
-    """Return what stands beside a setting and goes on beneath, far to the right; else what is above it."""
+    """Return what stands beside a setting and goes on beneath, far to the right;
+    else what is above it.
+    """
     row, column = key.start_mark.line, key.start_mark.column
     alone = value.end_mark.line == row
     beside = re.search(

@@ -1,7 +1,8 @@
-"""Files that pages show between marks, a CSV file as a table, others as code: python docs/site/shown.py
+"""Files that pages show between marks, a CSV file as a table, others as code:
+python docs/site/shown.py
 
-A page holds `<!-- PATH: begin -->` and `<!-- PATH: end -->`, PATH from the root: a clone shows what the site
-shows.
+A page holds `<!-- PATH: begin -->` and `<!-- PATH: end -->`, PATH from the root: a clone shows what
+the site shows.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ LANGUAGES = {".py": " { .python }", ".toml": "toml"}  # of a fence
 
 
 def shown(page: str) -> str:
-    """Return a page with what its marked files hold now; KeyError of one that is neither table nor code."""
+    """Return a page with what its marked files hold now;
+    KeyError of one that is neither table nor code.
+    """
     return MARKED.sub(lambda found: _block(found["path"]), page)
 
 

@@ -1,4 +1,6 @@
-"""An exported field by ctypes: `Field("FOLDER/field.gsparc", "FOLDER/build/libgsparc_field.so")`."""
+"""An exported field by ctypes:
+`Field("FOLDER/field.gsparc", "FOLDER/build/libgsparc_field.so")`.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +17,15 @@ class Facts(ctypes.Structure):
     """`gsparc_facts` of gsparc_field.h."""
 
     _fields_ = (
-        ("kind", ctypes.c_int32), ("axes", ctypes.c_int32), ("shape", ctypes.c_int32 * 2),
-        ("values", ctypes.c_int64), ("scratch", ctypes.c_int64), ("origin", ctypes.c_double * 3),
-        ("error", ctypes.c_double), ("worst", ctypes.c_double),
-    )  # fmt: skip
+        ("kind", ctypes.c_int32),
+        ("axes", ctypes.c_int32),
+        ("shape", ctypes.c_int32 * 2),
+        ("values", ctypes.c_int64),
+        ("scratch", ctypes.c_int64),
+        ("origin", ctypes.c_double * 3),
+        ("error", ctypes.c_double),
+        ("worst", ctypes.c_double),
+    )
 
 
 class Field:
@@ -26,7 +33,8 @@ class Field:
 
     def __init__(self, path: str | Path, library: str | Path) -> None:
         self._c = ctypes.CDLL(str(library))
-        # Pointers must be said to be pointers: an int, ctypes' default, cuts off their upper 32 bits.
+        # Pointers must be said to be pointers: an int, ctypes' default,
+        # cuts off their upper 32 bits.
         self._c.gsparc_load.restype = self._c.gsparc_free.restype = ctypes.c_void_p
         self._c.gsparc_about.restype = Facts
         for call, count in (("about", 1), ("free", 1), ("query", 6)):
@@ -41,7 +49,9 @@ class Field:
         self._scratch = -(-self._memory.ctypes.data // LINE) * LINE
 
     def __call__(self, place: np.ndarray) -> tuple[np.ndarray, float, float]:
-        """The answer at (3,) [m], or (6,) of both ends; its variance, and the share that is unknown."""
+        """The answer at (3,) [m], or (6,) of both ends; its variance,
+        and the share that is unknown.
+        """
         facts = self.facts
         # In float64, since float32 of UTM metres moves in steps of half a metre.
         local = np.asarray(place, np.float64) - np.tile(facts.origin[:], facts.axes // 3)

@@ -61,8 +61,12 @@ class GPyTorch(Interpolator):
             adam.step()
         self.weights = {name: value.detach().clone() for name, value in model.named_parameters()}
         self._ready = model.eval()
-        lengths = ", ".join(f"{v:.3g}" for v in model.kernel.base_kernel.lengthscale.flatten().tolist())
-        return (f"gpytorch: lengths {lengths} m along the axes, {time.perf_counter() - began:.1f} s",)
+        lengths = ", ".join(
+            f"{v:.3g}" for v in model.kernel.base_kernel.lengthscale.flatten().tolist()
+        )
+        return (
+            f"gpytorch: lengths {lengths} m along the axes, {time.perf_counter() - began:.1f} s",
+        )
 
     def _model(self) -> _Exact:
         return _Exact(self.x, self.y, gpytorch.likelihoods.GaussianLikelihood()).double()
@@ -70,13 +74,17 @@ class GPyTorch(Interpolator):
     def _relearn(self, state: dict[str, Any]) -> None:
         super()._relearn(state)
         self._ready = self._model().eval()
-        self._ready.load_state_dict(self.weights, strict=False)  # bounds are infinite, and not stored
+        # Bounds are infinite, and not stored
+        self._ready.load_state_dict(self.weights, strict=False)
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
         with torch.no_grad(), gpytorch.settings.fast_pred_var():
             asked = torch.from_numpy(queries).expand(len(self.y), -1, -1)
             found = self._ready(asked)
             # Of the prior's variance: 0 at measured places, 1 where nothing is known.
-            scores, spread = found.mean.T * self.unit, found.variance.mean(0) / self._ready.kernel.outputscale
+            scores, spread = (
+                found.mean.T * self.unit,
+                found.variance.mean(0) / self._ready.kernel.outputscale,
+            )
         mean = self._to_targets(self.mean + scores.float() @ self.axes)
         return Prediction(mean, unknown=spread.clamp(0, 1).float())

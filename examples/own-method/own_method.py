@@ -24,17 +24,22 @@ class NearestK(Interpolator):
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
         """From places (n, 3) [m] and targets (n, ...); returns remarks, a line each."""
         self.places = torch.from_numpy(positions)
-        self.rows = torch.from_numpy(self.target.to_real(targets))  # (n, D) float32; powers in decibels
+        # (n, D) float32; powers in decibels
+        self.rows = torch.from_numpy(self.target.to_real(targets))
         return ()
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        """At places (B, 3) [m]; `variance=` (squared error) and `unknown=` (0 to 1), (B,), are optional."""
+        """At places (B, 3) [m]; `variance=` (squared error) and `unknown=` (0 to 1), (B,),
+        are optional.
+        """
         near = cKDTree(self.places.numpy()).query(queries, k=range(1, self.k + 1))[1]
         return Prediction(self._to_targets(self.rows[near].float().mean(1)))
 
 
 class Corridor(DataModule):
-    """Powers along a corridor; `dataset=corridor dataset.count=200`. Read your own file here instead."""
+    """Powers along a corridor; `dataset=corridor dataset.count=200`.
+    Read your own file here instead.
+    """
 
     def __init__(self, count: int = 200, name: str = "corridor", batch_size: int = 16) -> None:
         super().__init__(name, batch_size)

@@ -52,7 +52,9 @@ class Run:
 
 
 def play(answer, centre: np.ndarray, seconds: float, period_s: float = PERIOD_S) -> Run:
-    """Ask for a place each period; a tick that passes while an answer is computed is missed, not made up."""
+    """Ask for a place each period; a tick that passes while an answer is computed is missed,
+    not made up.
+    """
     ticks, latency, missed, tick = int(seconds / period_s), [], 0, 0
     # 10 ms ahead, so that the first tick is not late by what comes before the loop.
     start = time.perf_counter() + 0.01

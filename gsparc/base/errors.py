@@ -53,12 +53,16 @@ def group_warnings(warnings: Sequence[str]) -> list[str]:
 def name_row_ranges(rows: Sequence[str], count: int = 5) -> str:
     """Name rows (`line 2`, `row 7`), neighbours as `lines 2 to 20`, in at most `count` pieces."""
     numbers = [int(last) if (last := name.rpartition(" ")[2]).isdigit() else -9 for name in rows]
-    starts = [i for i in range(len(rows)) if i == 0 or numbers[i] != numbers[i - 1] + 1 or numbers[i] < 0]
+    starts = [
+        i for i in range(len(rows)) if i == 0 or numbers[i] != numbers[i - 1] + 1 or numbers[i] < 0
+    ]
     pieces = []
     for first, after in zip(starts, [*starts[1:], len(rows)], strict=True):
         what, number = rows[first].rpartition(" ")[::2]
         one = after - first == 1
-        pieces.append(rows[first] if one else f"{what}s {number} to {rows[after - 1].rpartition(' ')[2]}")
+        pieces.append(
+            rows[first] if one else f"{what}s {number} to {rows[after - 1].rpartition(' ')[2]}"
+        )
     return list_first(pieces, count)
 
 
@@ -75,12 +79,16 @@ def absent(path: Path) -> str:
     'nothing.npz: no such file'
     """
     if path.is_dir():
-        return f"{path}: a folder, which dataset=rfid (argos, ...) dataset.root={path} reads; no file"
+        return (
+            f"{path}: a folder, which dataset=rfid (argos, ...) dataset.root={path} reads; no file"
+        )
     return f"{path}: no such file"
 
 
 def explain_error(error: BaseException) -> str:
-    """Say what another library calls wrong, on one line, without what only a programmer could do about it."""
+    """Say what another library calls wrong, on one line,
+    without what only a programmer could do about it.
+    """
     if isinstance(error, RecursionError):
         return "brackets within brackets, too many"
     text = " ".join(str(error).split()).partition("; use sys.set_int_max_str_digits")[0]
@@ -88,11 +96,15 @@ def explain_error(error: BaseException) -> str:
 
 
 class Caution(str):
-    """A remark of a reader that something may be wrong: `gsparc check` and runs print it as a warning."""
+    """A remark of a reader that something may be wrong:
+    `gsparc check` and runs print it as a warning.
+    """
 
 
 class Severe(Caution):
-    """A caution about what may change all figures, a unit or a convention: runs say it again at their end."""
+    """A caution about what may change all figures, a unit or a convention:
+    runs say it again at their end.
+    """
 
 
 class DataError(ValueError):
@@ -112,15 +124,20 @@ class DataError(ValueError):
 
 @contextmanager
 def readable(
-    where: str | Path, fault: str, errors: type[Exception] | tuple[type[Exception], ...], if_absent: str = ""
+    where: str | Path,
+    fault: str,
+    errors: type[Exception] | tuple[type[Exception], ...],
+    if_absent: str = "",
 ) -> Iterator[None]:
-    """Raise `DataError` in place of what other libraries raise in the block: WHERE: FAULT (what they say).
+    """Raise `DataError` in place of what other libraries raise in the block: WHERE:
+    FAULT (what they say).
 
     Args:
         where: file, and part of it.
         fault: in words.
         errors: that are so turned; a `DataError` is left as it is.
-        if_absent: said of a file that is not there, alone; empty: nothing else than of other errors.
+        if_absent: said of a file that is not there, alone; empty: nothing else than of other
+            errors.
     """
     try:
         yield
@@ -128,7 +145,9 @@ def readable(
         raise
     except errors as error:
         lacking = if_absent and isinstance(error, FileNotFoundError)
-        raise DataError(f"{where}: {if_absent if lacking else f'{fault} ({explain_error(error)})'}") from None
+        raise DataError(
+            f"{where}: {if_absent if lacking else f'{fault} ({explain_error(error)})'}"
+        ) from None
 
 
 class Problems(list[str]):
@@ -141,9 +160,11 @@ class Problems(list[str]):
         self.source = source
 
     def add(self, where: str | Path, what: str) -> Any:
-        """Note that at `where` (file, array, row) something is wrong: `what`, and what was expected.
+        """Note that at `where` (file, array, row) something is wrong: `what`,
+        and what was expected.
 
-        Returns None, so that a reader that has nothing to return can end with it; so does `add_rows`.
+        Returns None, so that a reader that has nothing to return can end with it;
+        so does `add_rows`.
         """
         self.append(f"{where}: {shorten(what)}")
 
@@ -155,10 +176,16 @@ class Problems(list[str]):
         if len(names) > self.LIMIT:
             self.append(f"{where}: {what}; the same in {len(names) - self.LIMIT} more rows")
 
-    def add_values(self, where: str | Path, rows: Sequence[str], values: Any, good: Any, what: str) -> bool:
-        """Note `what` for rows whose values (S, ...) are not `good` (S,); returns whether there are any."""
+    def add_values(
+        self, where: str | Path, rows: Sequence[str], values: Any, good: Any, what: str
+    ) -> bool:
+        """Note `what` for rows whose values (S, ...) are not `good` (S,);
+        returns whether there are any.
+        """
         bad = np.flatnonzero(~good).tolist()
-        self.add_rows(where, (f"{rows[i]} = {np.array2string(values[i], separator=', ')}" for i in bad), what)
+        self.add_rows(
+            where, (f"{rows[i]} = {np.array2string(values[i], separator=', ')}" for i in bad), what
+        )
         return len(bad) > 0
 
     def attempt(self, read: Callable[[], _Found]) -> _Found | None:

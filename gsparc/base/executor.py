@@ -1,7 +1,8 @@
-"""Where independent pieces of work are done: in this process, in several of this machine (joblib), on Ray.
+"""Where independent pieces of work are done: in this process, in several of this machine (joblib),
+on Ray.
 
-Work is stored by what it does, and looks for what is stored first: a piece that is begun again, because the
-process that did it has died or the command was interrupted, is then not computed again.
+Work is stored by what it does, and looks for what is stored first: a piece that is begun again,
+because the process that did it has died or the command was interrupted, is then not computed again.
 """
 
 from __future__ import annotations
@@ -82,11 +83,13 @@ def run_each(
 ) -> Iterator[tuple[int, _Result]]:
     """Yield numbers of pieces and what `work` makes of them, as they end; in order in this process.
 
-    Work and pieces are pickled for other processes, work once for each; these have the threads of this one.
+    Work and pieces are pickled for other processes, work once for each;
+    these have the threads of this one.
 
     Args:
         work, pieces: independent of one another.
-        what: pieces are called in the log, which says after each how many are left and how long; "": no log.
+        what: pieces are called in the log, which says after each how many are left and how long;
+            "": no log.
         cost: of a piece beside the others, for the time left.
         wanted: asked when a piece would begin; others are left out.
         threads: of this process that do pieces side by side where no other process does.
@@ -121,16 +124,22 @@ def run_each(
             yield number, result
 
 
-def run_all(work: Callable[[_Piece], _Result], pieces: Sequence[_Piece], what: str = "") -> list[_Result]:
+def run_all(
+    work: Callable[[_Piece], _Result], pieces: Sequence[_Piece], what: str = ""
+) -> list[_Result]:
     """Return what `work` makes of pieces in their order, whichever ends first; see `run_each`."""
     found = dict(run_each(work, pieces, what))
     return [found[number] for number in range(len(pieces))]
 
 
 def _time_left(left: Mapping[float, int], spent: Mapping[float, Sequence[float]]) -> float:
-    """Seconds that pieces `left` by cost take, as those of the same cost took, else in proportion to it."""
+    """Seconds that pieces `left` by cost take, as those of the same cost took,
+    else in proportion to it.
+    """
     # Costs are guesses: some take a hundredth of theirs, others several times theirs.
-    rate = sum(map(sum, spent.values())) / max(sum(cost * len(times) for cost, times in spent.items()), 1e-9)
+    rate = sum(map(sum, spent.values())) / max(
+        sum(cost * len(times) for cost, times in spent.items()), 1e-9
+    )
     mean = {cost: sum(times) / len(times) for cost, times in spent.items()}
     return sum(count * mean.get(cost, rate * cost) for cost, count in left.items())
 
@@ -149,12 +158,16 @@ def _read(where: Any) -> Callable[[Any], Any]:
 def _piece(where: list[Any], number: int, piece: Any) -> tuple[int, Any]:
     try:
         return number, _read(*where)(piece)
-    except Exception as error:  # as it is, not in an error of the engine: the command says it in one line
+    except Exception as error:
+        # as it is, not in an error of the engine: the command says it in one line
         return number, error
 
 
-def _in_threads(call: Callable[[int], tuple[int, Any]], numbers: Iterator[int], threads: int) -> Results:
-    # Its end waits for pieces that have begun: a thread inside compiled code aborts a process that exits.
+def _in_threads(
+    call: Callable[[int], tuple[int, Any]], numbers: Iterator[int], threads: int
+) -> Results:
+    # Its end waits for pieces that have begun:
+    # a thread inside compiled code aborts a process that exits.
     with ThreadPoolExecutor(threads) as pool:
         begun = {pool.submit(call, number) for number in islice(numbers, threads)}
         while begun:
@@ -193,7 +206,10 @@ def _in_processes(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) ->
                 failures.update(list(begun))
                 if max(failures.values(), default=TRIES) >= TRIES:
                     raise
-                log.warning("a process died, its work starts again (%s)", explain_error(error).split(". ")[0])
+                log.warning(
+                    "a process died, its work starts again (%s)",
+                    explain_error(error).split(". ")[0],
+                )
 
 
 def _ray() -> Any:
@@ -217,7 +233,9 @@ def _on_ray(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Resul
     try:
         while True:
             most = _chosen.workers or max(int(ray.cluster_resources().get("CPU", 1)) // threads, 1)
-            running += [call.remote([stored], n, pieces[n]) for n in islice(numbers, most - len(running))]
+            running += [
+                call.remote([stored], n, pieces[n]) for n in islice(numbers, most - len(running))
+            ]
             if not running:
                 return
             (first, *_), running = ray.wait(running)

@@ -1,4 +1,6 @@
-"""Files and folders that appear whole or not at all, also under a kill or on a full disk; tables in YAML."""
+"""Files and folders that appear whole or not at all, also under a kill or on a full disk;
+tables in YAML.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +36,9 @@ def platform_cache() -> Path:
 
 
 def read_text(path: Path, missing_message: str, kind: str = "text") -> str:
-    """Read a text in UTF-8; `DataError` says `missing_message`, or that it is not readable as `kind`."""
+    """Read a text in UTF-8; `DataError` says `missing_message`,
+    or that it is not readable as `kind`.
+    """
     with readable(path, f"not readable as {kind}", (UnicodeDecodeError, OSError), missing_message):
         return path.read_text(encoding="utf-8-sig")
 
@@ -53,10 +57,14 @@ def read_shipped_table(package: str, name: str) -> list[dict[str, str]]:
 
 
 def refuse_repeated(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return a record of JSON, as `object_pairs_hook` does; `ValueError` where a name is twice in it."""
+    """Return a record of JSON, as `object_pairs_hook` does;
+    `ValueError` where a name is twice in it.
+    """
     record = dict(pairs)
     if len(record) < len(pairs):
-        twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
+        twice = next(
+            name for name, count in Counter(name for name, _ in pairs).items() if count > 1
+        )
         raise ValueError(f"{twice!r} is twice in one record")
     return record
 
@@ -64,7 +72,9 @@ def refuse_repeated(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def check_line_length(path: str | Path, number: int, line: str) -> str:
     """Return the line of a table; DataError where it is longer than `LONGEST_LINE`."""
     if len(line) > LONGEST_LINE:
-        fault = f"{len(line):,} characters; expected at most {LONGEST_LINE:,}, and a line for each row"
+        fault = (
+            f"{len(line):,} characters; expected at most {LONGEST_LINE:,}, and a line for each row"
+        )
         raise DataError(f"{path}, line {number}: {fault}")
     return line
 
@@ -73,11 +83,15 @@ def check_fetched(path: Path) -> None:
     """Raise `DataError` of a file that only says where Git keeps its content."""
     with suppress(OSError), path.open("rb") as file:  # said where it is read
         if file.read(len(POINTER)) == POINTER:
-            raise DataError(f"{path}: not the file but a Git LFS pointer to it; git lfs pull fetches it")
+            raise DataError(
+                f"{path}: not the file but a Git LFS pointer to it; git lfs pull fetches it"
+            )
 
 
 def check_content(path: str | Path, text: str | bytes, marks: str) -> None:
-    """Raise `DataError` of a large text of which hardly more is left without one of marks than the marks."""
+    """Raise `DataError` of a large text of which hardly more is left without one
+    of marks than the marks.
+    """
     for mark in marks if len(text) > LONGEST_LINE else "":
         if LEAST_CONTENT * text.count(mark if isinstance(text, str) else mark.encode()) > len(text):  # type: ignore[arg-type]
             fault = f"nearly nothing but {mark!r} in {len(text):,} characters"
@@ -85,14 +99,23 @@ def check_content(path: str | Path, text: str | bytes, marks: str) -> None:
 
 
 def check_depth(source: str | Path, text: str) -> None:
-    """Raise `DataError` of a text with more than `DEEPEST` brackets in brackets, which parsers hang on."""
+    """Raise `DataError` of a text with more than `DEEPEST` brackets in brackets,
+    which parsers hang on.
+    """
     depth = 0
     for start in range(0, len(text), LONGEST_LINE):
-        codes = np.frombuffer(text[start : start + LONGEST_LINE].encode("utf-32-le", "replace"), "<u4")
-        opened, closed = np.isin(codes, OPENING).astype(np.int32), np.isin(codes, CLOSING).astype(np.int32)
+        codes = np.frombuffer(
+            text[start : start + LONGEST_LINE].encode("utf-32-le", "replace"), "<u4"
+        )
+        opened, closed = (
+            np.isin(codes, OPENING).astype(np.int32),
+            np.isin(codes, CLOSING).astype(np.int32),
+        )
         depths = depth + np.cumsum(opened - closed)
         if depths.max(initial=0) > DEEPEST:
-            raise DataError(f"{source}: more than {DEEPEST} brackets within brackets; expected a table")
+            raise DataError(
+                f"{source}: more than {DEEPEST} brackets within brackets; expected a table"
+            )
         depth = int(depths[-1])
 
 
@@ -117,7 +140,9 @@ def load_yaml(text: str, source: str | Path) -> Any:
 
 
 def _expanded(node: yaml.Node, sizes: dict[int, float]) -> float:
-    """Number of nodes where aliases are written out; `sizes` holds those that are counted, by identity."""
+    """Number of nodes where aliases are written out; `sizes` holds those that are counted,
+    by identity.
+    """
     if id(node) not in sizes:
         sizes[id(node)] = math.inf  # of one inside itself
         inside = [] if isinstance(node, yaml.ScalarNode) else node.value
@@ -131,7 +156,8 @@ def read_yaml(path: Path, missing_message: str, expected: str) -> Mapping[str, A
 
     Args:
         path: of the file.
-        missing_message, expected: what the message says is wanted where there is no file, or no table in it.
+        missing_message, expected: what the message says is wanted where there is no file, or no
+            table in it.
 
     Raises:
         DataError: missing, not readable, or no table.
@@ -144,10 +170,13 @@ def read_yaml(path: Path, missing_message: str, expected: str) -> Mapping[str, A
 
 
 def check_yaml(folder: str | None) -> None:
-    """Refuse (DataError) brackets or aliases without end in configurations, which Hydra would write out."""
+    """Refuse (DataError) brackets or aliases without end in configurations,
+    which Hydra would write out.
+    """
     for path in () if folder is None else sorted(Path(folder).rglob("*.yaml")):
         text = path.read_bytes()
-        with suppress(yaml.YAMLError, UnicodeDecodeError, RecursionError):  # Hydra says so, where it reads it
+        # Hydra says so, where it reads it
+        with suppress(yaml.YAMLError, UnicodeDecodeError, RecursionError):
             check_depth(path, text.decode())
             _ = load_yaml(text.decode(), path) if b"&" in text and b"*" in text else None
 
@@ -156,8 +185,8 @@ def check_yaml(folder: str | None) -> None:
 def whole_file(path: str | Path) -> Iterator[Path]:
     """Open a path beside `path` to write a file to; its folder is made.
 
-    When the block ends the file is on the disk and takes the place of `path`. A block that fails leaves what
-    was there, and nothing else.
+    When the block ends the file is on the disk and takes the place of `path`. A block that fails
+    leaves what was there, and nothing else.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -179,20 +208,24 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
 
 def write_archive(path: str | Path, arrays: Mapping[str, Any]) -> None:
     """Write arrays by name as npz, whole or not at all."""
-    # An open file: given a name without .npz, which that of an unfinished file is, NumPy appends it.
+    # An open file: given a name without .npz, which that of an unfinished file is,
+    # NumPy appends it.
     with whole_file(path) as partial, partial.open("wb") as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 @contextmanager
 def whole_folder(path: str | Path) -> Iterator[Path]:
-    """Open an empty folder beside `path`, which must not exist, and which it becomes when the block ends.
+    """Open an empty folder beside `path`, which must not exist,
+    and which it becomes when the block ends.
 
-    For contents that are a function of the name: where another process made `path` meanwhile, that one stays.
+    For contents that are a function of the name: where another process made `path` meanwhile,
+    that one stays.
     """
     path = Path(path)
     partial = _partial(path)
-    shutil.rmtree(partial, ignore_errors=True)  # of a killed process, whose number this one has again
+    # Of a killed process, whose number this one has again
+    shutil.rmtree(partial, ignore_errors=True)
     partial.mkdir(parents=True)
     try:
         yield partial
@@ -212,7 +245,9 @@ def is_out_of_space(error: BaseException | None) -> bool:
 
 
 def list_causes(error: BaseException | None) -> list[BaseException]:
-    """Return an error, what caused it, and so on; each once, as one raised again may be its own context."""
+    """Return an error, what caused it, and so on; each once,
+    as one raised again may be its own context.
+    """
     found: list[BaseException] = []
     while error is not None and error not in found:
         found.append(error)
@@ -227,8 +262,12 @@ def set_aside(folder: Path, *patterns: str) -> bool:
 
 
 def delete_partial_files(folder: Path) -> None:
-    """Delete what processes that are gone left half written in a folder that nobody else writes to."""
-    for path in [path for above in ("", "*/", "*/*/") for path in folder.glob(f"{above}.*.partial")]:
+    """Delete what processes that are gone left half written in a folder
+    that nobody else writes to.
+    """
+    for path in [
+        path for above in ("", "*/", "*/*/") for path in folder.glob(f"{above}.*.partial")
+    ]:
         pid = path.name.split(".")[-2]
         if pid.isdecimal() and (int(pid) == os.getpid() or not _runs(int(pid))):
             shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)

@@ -1,4 +1,6 @@
-"""Whether text in HDF5 can be read: another process tries first, as the library may crash or hang."""
+"""Whether text in HDF5 can be read: another process tries first,
+as the library may crash or hang.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ with h5py.File(sys.argv[1], "r") as file:
 
 
 def hdf5_text_error(path: Path, seconds: float = SECONDS) -> str | None:
-    """Say why text in HDF5 cannot be read within `seconds`; None when it can, or when there is none."""
+    """Say why text in HDF5 cannot be read within `seconds`; None when it can,
+    or when there is none.
+    """
     if not _has_heap(path):
         return None
     try:

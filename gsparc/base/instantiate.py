@@ -24,7 +24,9 @@ def suggest_or_list(name: str, known: Iterable[str]) -> str:
     return suggest_name(name, known) or f"; there are {', '.join(sorted(known))}"
 
 
-def from_settings(kind: type[_Kind], config: Mapping[str, Any], group: str, noun: str = "setting") -> _Kind:
+def from_settings(
+    kind: type[_Kind], config: Mapping[str, Any], group: str, noun: str = "setting"
+) -> _Kind:
     """Build the dataclass `kind` with the values of a config group.
 
     Raises:
@@ -50,7 +52,9 @@ def iterate_targets(node: Any) -> Iterator[Any]:
     """Yield every `_target_` in a config (plain containers), at any depth."""
     if isinstance(node, dict) and "_target_" in node:
         yield node["_target_"]
-    for value in node.values() if isinstance(node, dict) else node if isinstance(node, list) else ():
+    for value in (
+        node.values() if isinstance(node, dict) else node if isinstance(node, list) else ()
+    ):
         yield from iterate_targets(value)
 
 
@@ -64,7 +68,8 @@ def import_target(path: str) -> Any:
 
 
 def refuse_foreign(path: Any) -> None:
-    """Refuse a `_target_` that is not a class of gsparc or of an installed plugin, for text out of a file.
+    """Refuse a `_target_` that is not a class of gsparc or of an installed plugin,
+    for text out of a file.
 
     `gsparc.x.os.system` starts with gsparc too: what counts is where the class was defined.
 
@@ -77,7 +82,9 @@ def refuse_foreign(path: Any) -> None:
         return  # before plugins are looked for: that reads the notes of all installed packages
     if not any(path in plugins(group).values() for group in OF_FILES):
         instead = "refused; where it is a plugin's, install that package here"
-        raise ValueError(f"the file asks to run {path!r}, which is not a class of gsparc; {instead}")
+        raise ValueError(
+            f"the file asks to run {path!r}, which is not a class of gsparc; {instead}"
+        )
 
 
 GROUPS = {"model": "gsparc.models", "dataset": "gsparc.datasets"}
@@ -87,7 +94,9 @@ PLAIN = (bool, int, float, str, list, dict, type(None))
 
 def plugins(group: str) -> dict[str, str]:
     """Return the import path `module.Class` of every plugin: of `model`, `dataset` or `terms`."""
-    return {point.name: f"{point.module}.{point.attr}" for point in entry_points(group=OF_FILES[group])}
+    return {
+        point.name: f"{point.module}.{point.attr}" for point in entry_points(group=OF_FILES[group])
+    }
 
 
 def plugin_node(group: str, name: str) -> dict[str, Any]:
@@ -107,7 +116,8 @@ def plugin_node(group: str, name: str) -> dict[str, Any]:
 def config_node(kind: type) -> dict[str, Any]:
     """Return the configuration that builds a class: what it takes with defaults; `???` without one.
 
-    Dataclasses of settings are nodes of their own. Left out are defaults that no configuration can hold.
+    Dataclasses of settings are nodes of their own.
+    Left out are defaults that no configuration can hold.
     """
     plain = {name: _plain(default) for name, default in accepted_arguments(kind).items()}
     defaults = {name: default for name, default in plain.items() if default is not _OTHER}
@@ -118,13 +128,16 @@ _OTHER = object()
 
 
 def accepted_arguments(kind: Any) -> dict[str, Any]:
-    """Return what a class or function takes, with defaults; of a class `**names` is what its base class, or
-    `hands_on`, takes.
+    """Return what a class or function takes, with defaults; of a class `**names` is what its base
+    class, or `hands_on`, takes.
     """
     if kind is object:
         return {}
     of_class = isinstance(kind, type)
-    args, base = [*inspect.signature(kind.__init__ if of_class else kind).parameters.values()][of_class:], {}
+    args, base = (
+        [*inspect.signature(kind.__init__ if of_class else kind).parameters.values()][of_class:],
+        {},
+    )
     if of_class and any(p.kind is p.VAR_KEYWORD for p in args):
         base = accepted_arguments(vars(kind).get("hands_on", kind.__mro__[1]))
     named = {p.name: p.default for p in args if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)}

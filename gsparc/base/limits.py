@@ -1,8 +1,9 @@
 """What a setting may be, said where the setting is defined and checked when it is given.
 
 A dataclass of settings inherits `Checked` and gives limits beside defaults, such as
-`count: int = setting(500, whole(0))`; a constructor calls `check_arguments`. The error names the setting; the
-command line puts the group it stands in before that (`gsparc.evaluation.console.error_in_one_line`).
+`count: int = setting(500, whole(0))`; a constructor calls `check_arguments`. The error names the
+setting; the command line puts the group it stands in before that
+(`gsparc.evaluation.console.error_in_one_line`).
 """
 
 from __future__ import annotations
@@ -57,7 +58,9 @@ def whole(least: int, most: int | None = None) -> Limit:
     return Limit(words, lambda v: type(v) is int and v >= least and (most is None or v <= most))
 
 
-def number(low: float, high: float = math.inf, *, open_low: bool = False, open_high: bool = False) -> Limit:
+def number(
+    low: float, high: float = math.inf, *, open_low: bool = False, open_high: bool = False
+) -> Limit:
     """Allow a finite number between `low` and `high`.
 
     >>> number(0, 1, open_low=True).check("share", 0)
@@ -65,21 +68,29 @@ def number(low: float, high: float = math.inf, *, open_low: bool = False, open_h
         ...
     gsparc.base.limits.SettingError: share=0: a number above 0 and at most 1 is needed
     """
-    words = f"a number {'above' if open_low else 'of at least'} {low:g}" if low > -math.inf else "a number"
+    words = (
+        (f"a number {'above' if open_low else 'of at least'} {low:g}")
+        if low > -math.inf
+        else "a number"
+    )
     words += "" if high == math.inf else f" and {'below' if open_high else 'at most'} {high:g}"
     return Limit(
         words,
-        lambda v: _real(v) and (v > low if open_low else v >= low) and (v < high if open_high else v <= high),
+        lambda v: (
+            _real(v)
+            and (v > low if open_low else v >= low)
+            and (v < high if open_high else v <= high)
+        ),
     )
 
 
 def choice(*values: str) -> Limit:
     """Allow one of a few words.
 
-    >>> choice("random", "blocks").check("name", "blok")
+    >>> choice("auto", "each").check("k", "eech")
     Traceback (most recent call last):
         ...
-    gsparc.base.limits.SettingError: name='blok': one of random, blocks is needed; did you mean 'blocks'?
+    gsparc.base.limits.SettingError: k='eech': one of auto, each is needed; did you mean 'each'?
     """
     return Limit(f"one of {list_first(values, MOST_NAMED)}", lambda v: v in values, values)
 
@@ -96,7 +107,9 @@ def or_word(limit: Limit, word: str) -> Limit:
     >>> or_word(whole(1), "auto").words
     'a whole number of at least 1, or auto'
     """
-    return Limit(f"{limit.words}, or {word}", lambda v: v == word or limit.holds(v), (*limit.known, word))
+    return Limit(
+        f"{limit.words}, or {word}", lambda v: v == word or limit.holds(v), (*limit.known, word)
+    )
 
 
 def or_null(limit: Limit) -> Limit:
@@ -111,7 +124,8 @@ def or_null(limit: Limit) -> Limit:
 # Of files, whoever wrote them.
 LIFTED_BY = "GSPARC_MOST_BYTES"  # in the environment: another number of bytes than the following
 MOST_BYTES = 2**27  # of a table of text, which takes twenty times as many in memory
-MOST_UNPACKED, LEAST_UNPACKED = 100, 2**24  # times its packed bytes, rows of levels are 3 to 20; bytes of any
+# Times its packed bytes, rows of levels are 3 to 20; bytes of any
+MOST_UNPACKED, LEAST_UNPACKED = 100, 2**24
 MOST_COLUMNS = 10_000  # read in two seconds; a hundred thousand in a minute
 MOST_CELLS = 3 * 10**7  # of 90 bytes each in memory
 MOST_VALUES = 10_000  # of a cell
@@ -119,12 +133,14 @@ LEAST_CONTENT = 5  # characters for each line, tag or bracket of a large file
 LONGEST_LINE = 2**20  # characters: of 200 MB of them cells took 10 GiB
 LONGEST_HEAD = 1_000  # characters: words and units are sought in each
 DEEPEST = 500  # brackets within brackets
-MOST_GROWTH = 10  # times a YAML text, with its aliases written out: a few lines may be a billion values
+# Times a YAML text, with its aliases written out: a few lines may be a billion values
+MOST_GROWTH = 10
 LEAST_NODES = 10_000  # of YAML that are not counted
 
 
 def most_text(packed: int | None = None) -> int:
-    """Return how many bytes of text are read from a file; from so many `packed` ones of a compressed file.
+    """Return how many bytes of text are read from a file;
+    from so many `packed` ones of a compressed file.
 
     Raises:
         SettingError: `GSPARC_MOST_BYTES` is no whole number.
@@ -133,7 +149,11 @@ def most_text(packed: int | None = None) -> int:
     if lifted:
         whole(1).check(LIFTED_BY, int(lifted) if lifted.isdecimal() else lifted)
         return int(lifted)
-    return MOST_BYTES if packed is None else min(MOST_BYTES, max(LEAST_UNPACKED, MOST_UNPACKED * packed))
+    return (
+        MOST_BYTES
+        if packed is None
+        else min(MOST_BYTES, max(LEAST_UNPACKED, MOST_UNPACKED * packed))
+    )
 
 
 MOST_NAMED = 30  # of the words that may stand in a setting
@@ -146,7 +166,8 @@ def _real(value: Any) -> bool:
 
 
 def finite_array(numbers: Any) -> np.ndarray:
-    """Return numbers as float64 in the shape in which they were given; (0,) where one is none, or not finite.
+    """Return numbers as float64 in the shape in which they were given; (0,) where one is none,
+    or not finite.
 
     >>> finite_array([[1, 2.5]]), finite_array([1.0, "2"])
     (array([[1. , 2.5]]), array([], dtype=float64))

@@ -1,4 +1,6 @@
-"""A file that is read, changed and written again: by one process, and one thread of it, at a time."""
+"""A file that is read, changed and written again: by one process, and one thread of it,
+at a time.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ POLL_S = 0.02  # between two looks whether a lock is free
 
 @contextmanager
 def hold_file(path: str | Path, wait_s: float) -> Iterator[None]:
-    """Hold a file against all others who hold it so, in turn; the system lets it go when the process ends.
+    """Hold a file against all others who hold it so, in turn;
+    the system lets it go when the process ends.
 
     >>> with hold_file("model.ckpt", wait_s=60):
     ...     pass  # read, change, write
@@ -25,9 +28,12 @@ def hold_file(path: str | Path, wait_s: float) -> Iterator[None]:
     """
     path, end = Path(path).resolve(), time.monotonic() + wait_s  # a link and its file are one
     with ExitStack() as held:
-        # Who comes next waits with the turn: else who has just written would be there again before it looks.
+        # Who comes next waits with the turn: else who has just written would be there again before
+        # it looks.
         with _held(path.with_name(f".{path.name}.turn"), wait_s):
-            held.enter_context(_held(path.with_name(f".{path.name}.lock"), max(end - time.monotonic(), 0)))
+            held.enter_context(
+                _held(path.with_name(f".{path.name}.lock"), max(end - time.monotonic(), 0))
+            )
         yield
 
 
@@ -37,6 +43,7 @@ def _held(file: Path, wait_s: float) -> Iterator[None]:
         try:
             yield
         finally:
-            # Deleted while it is held: who locked it meanwhile sees that it is gone, and makes another.
+            # Deleted while it is held: who locked it meanwhile sees that it is gone,
+            # and makes another.
             with suppress(OSError):
                 file.unlink()

@@ -38,7 +38,9 @@ class Placeholder:
 
 
 class FromBuffer(Placeholder):
-    """Makes the array that bytes hold, as NumPy's function of that name; a pickle cannot alter it."""
+    """Makes the array that bytes hold, as NumPy's function of that name;
+    a pickle cannot alter it.
+    """
 
     def __new__(cls, buffer: Any, dtype: Any, shape: Any, order: Any, *_: Any) -> Any:
         """Return the array."""
@@ -56,11 +58,17 @@ ARRAYS: dict[str, Callable[..., Any]] = {
     "_codecs.encode": codecs.encode,
 }
 FRAMES = {  # of pandas 1 to 3
-    "pandas.core.frame.DataFrame", "pandas.core.internals.managers.BlockManager",
-    "pandas._libs.internals._unpickle_block", "pandas.core.indexes.base._new_Index",
-    "pandas.core.indexes.base.Index", "pandas.core.indexes.numeric.Int64Index",
-    "pandas.core.indexes.range.RangeIndex", "pandas.DataFrame", "pandas.Index", "pandas.RangeIndex",
-}  # fmt: skip
+    "pandas.core.frame.DataFrame",
+    "pandas.core.internals.managers.BlockManager",
+    "pandas._libs.internals._unpickle_block",
+    "pandas.core.indexes.base._new_Index",
+    "pandas.core.indexes.base.Index",
+    "pandas.core.indexes.numeric.Int64Index",
+    "pandas.core.indexes.range.RangeIndex",
+    "pandas.DataFrame",
+    "pandas.Index",
+    "pandas.RangeIndex",
+}
 
 
 class _Unpickler(pickle.Unpickler):
@@ -75,7 +83,9 @@ class _Unpickler(pickle.Unpickler):
             return ARRAYS[f"{plain}.{name}"]
         if f"{module}.{name}" in self.stand_ins:
             return Placeholder
-        fault = f"asks for {module}.{name}, which is neither an array nor a part of a table: not run"
+        fault = (
+            f"asks for {module}.{name}, which is neither an array nor a part of a table: not run"
+        )
         raise pickle.UnpicklingError(fault)
 
 

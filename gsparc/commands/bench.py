@@ -16,9 +16,12 @@ from gsparc.prediction.timing import ClockSettings, time_interleaved
 from gsparc.runs.output import finish_run, run_directory
 
 COLUMNS = (
-    Column("kernel", ""), Column("size", ""), Column("seconds", ".3g"), Column("in torch", ".3g"),
+    Column("kernel", ""),
+    Column("size", ""),
+    Column("seconds", ".3g"),
+    Column("in torch", ".3g"),
     Column("times faster", ".3g"),
-)  # fmt: skip
+)
 # A dense reference may take seconds: after half a second no new round begins.
 REFERENCE = ClockSettings(rounds=3, least=1, warmup=0, rounds_s=0.5)
 
@@ -29,9 +32,16 @@ def task(config: DictConfig) -> dict[str, Any]:
     check_arguments(config, device=choice("cpu", "cuda"))
     device = config.device
     backend_named(device)  # where there is no such device, its reason comes first
-    every = [case for of in product(config.counts, config.projections) for case in kernel_cases(*of, device)]
+    every = [
+        case
+        for of in product(config.counts, config.projections)
+        for case in kernel_cases(*of, device)
+    ]
     # Emission and channels are the same under every projection: a dictionary keeps one of each.
-    every += [loss_case(device), *(training_step_case(of, device=device) for of in config.projections)]
+    every += [
+        loss_case(device),
+        *(training_step_case(of, device=device) for of in config.projections),
+    ]
     chosen = {(case.name, case.size): case for case in every}
     rows, facts = [], {}
     for (name, size), case in chosen.items():

@@ -35,7 +35,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         divisions.append(run_trials(evidence, promise, True, *draws))
     except ValueError:
         # With fewer patches than parts no division by whole cells exists.
-        log.warning("the positions lie in too few patches of the plane: tried on random divisions alone")
+        log.warning(
+            "the positions lie in too few patches of the plane: tried on random divisions alone"
+        )
     facts = run_facts | calibration_facts(evidence, divisions, promise) | {"seed": config.seed}
     # Written before a threshold is stored: where storing fails, these figures are there.
     write_summary(run_dir / "summary.json", facts)
@@ -58,28 +60,39 @@ def task(config: DictConfig) -> dict[str, Any]:
 def calibration_tables(facts: dict[str, Any]) -> list[Table]:
     """Return tables of confidences side by side, and of bounds beside what came of them."""
     curves = [
-        Column("confidence", "", of="kind"), Column("area under risk-coverage", of="area"),
+        Column("confidence", "", of="kind"),
+        Column("area under risk-coverage", of="area"),
         Column("less than of distance", ".0%", of="area_below_distance"),
         Column("mean error of the surest 70 %", of="risk_at_70"),
         Column("rank correlation", ".2f", of="rank_correlation"),
-    ]  # fmt: skip
+    ]
     kinds = [{"kind": kind, **facts_under(facts, f"confidence/{kind}")} for kind in NAMES]
     draws = [
-        Column("rows divided", "", of="how"), Column("confidence", "", of="kind"),
-        Column("answers accepted", ".0%", of="coverage"), Column("bad among them", ".1%", of="realised"),
+        Column("rows divided", "", of="how"),
+        Column("confidence", "", of="kind"),
+        Column("answers accepted", ".0%", of="coverage"),
+        Column("bad among them", ".1%", of="realised"),
         Column("trials accepting none", ".0%", of="silent"),
         Column("failed, of all trials", ".1%", of="broken_of_all"),
         Column("promised: at most", ".0%", of=lambda row: facts["promise/delta"]),
         Column("failed, of accepting trials: no promise", ".1%", of=_broken),
-    ]  # fmt: skip
+    ]
     # Spatial draws are left out where the patches are too few.
-    trials_of = [{"how": how, **facts_under(facts, f"trial/{how}")} for how in ("random", "spatial")]
+    trials_of = [
+        {"how": how, **facts_under(facts, f"trial/{how}")} for how in ("random", "spatial")
+    ]
     of = f"{facts['dataset/name']}, {facts['positions']} test positions of {facts['model/name']}"
     heading = f"{of}: which confidence orders errors best (a smaller area is better)"
     bad = f"bad (an error above {facts['promise/limit_db']:g} dB)"
     trials = "Trials, each with a threshold from some rows and a test on others"
-    promise = f"{trials}; one fails if more than {facts['promise/alpha']:.0%} of accepted answers are {bad}"
-    note = f"Trials calibrate on {SHARES[1]:.0%} of the rows, the stored threshold on {1 - SHARES[0]:.0%}"
+    promise = (
+        f"{trials}; one fails if more than {facts['promise/alpha']:.0%} of accepted "
+        f"answers are {bad}"
+    )
+    note = (
+        f"Trials calibrate on {SHARES[1]:.0%} of the rows, the stored threshold on "
+        f"{1 - SHARES[0]:.0%}"
+    )
     return [
         Table.from_rows(heading, curves, [row for row in kinds if "area" in row]),
         Table.from_rows(promise, draws, [row for row in trials_of if "coverage" in row], note=note),
@@ -87,4 +100,8 @@ def calibration_tables(facts: dict[str, Any]) -> list[Table]:
 
 
 def _broken(row: Mapping[str, Any]) -> Interval | None:
-    return None if row["broken"] is None else Interval(row["broken"], row["broken_low"], row["broken_high"])
+    return (
+        None
+        if row["broken"] is None
+        else Interval(row["broken"], row["broken_low"], row["broken_high"])
+    )

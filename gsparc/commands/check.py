@@ -14,8 +14,10 @@ from rich.console import Console
 from gsparc.base.errors import Caution, DataError, group_warnings
 
 TILTED = (
-    "antenna tilts are given, but no heights, so that all is at 0 m: give a column Height in the list of "
-    "stations and dataset.columns.height=1.5 for places, or expect no more of the tilts than of azimuths"
+    "antenna tilts are given, but no heights, so that all is at 0 m: give a column Height in the "
+    "list of "
+    "stations and dataset.columns.height=1.5 for places, or expect no more of the tilts than of "
+    "azimuths"
 )
 UNUSED = ("_target_", "name", "batch_size", "align", "file")  # of conf/dataset/own.yaml, by check
 
@@ -28,7 +30,8 @@ def check(
     draw: str | None = None,
     **settings: Any,
 ) -> bool:
-    """Write what was understood of a file, or its problems one per line; returns whether it is good.
+    """Write what was understood of a file, or its problems one per line;
+    returns whether it is good.
 
     Args:
         path, columns, stations_file, settings: see `read_any`.
@@ -53,7 +56,9 @@ def check(
         return False
     implausible, levels, steps = find_implausible(reading.data, reading.file_row, most=math.inf)
     notes = [*reading.notes, *check_azimuths(reading.data)]
-    warnings = outlier_warnings(reading.data) + [note for note in notes if isinstance(note, Caution)]
+    warnings = outlier_warnings(reading.data) + [
+        note for note in notes if isinstance(note, Caution)
+    ]
     warnings += layout_warnings(reading.data) + carrier_warnings(reading.data) + implausible
     topics = describe(reading.data)
     topics += [("note", note) for note in notes if not isinstance(note, Caution)]
@@ -81,7 +86,11 @@ def check(
     except DataError as error:
         _line(console, f"{path}: readable, but too small to train on ({error})")
         return False
-    verdict = f"readable, but see its {len(doubts)} warning{'s' * (len(doubts) > 1)}" if doubts else "good"
+    verdict = (
+        (f"readable, but see its {len(doubts)} warning{'s' * (len(doubts) > 1)}")
+        if doubts
+        else "good"
+    )
     _line(console, f"{path}: {verdict}")
     return True
 
@@ -92,7 +101,8 @@ def _line(console: Console, text: str) -> None:
 
 
 def read_settings(words: Sequence[str]) -> dict[str, Any]:
-    """Return the settings of conf/dataset/own.yaml with `words` like dataset.absent=silent, as training does.
+    """Return the settings of conf/dataset/own.yaml with `words` like dataset.absent=silent,
+    as training does.
 
     Raises:
         HydraException, OmegaConfBaseException: what cannot be read, or no such setting.
@@ -109,13 +119,20 @@ def read_settings(words: Sequence[str]) -> dict[str, Any]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; exit status 0 when everything given is good, else 1."""
     own = files("gsparc.conf").joinpath("dataset/own.yaml").read_text(encoding="utf-8")
-    epilog = f"settings dataset.KEY=VALUE, as training takes them:\n\n{own[own.index('stations: ') :]}"
+    epilog = (
+        f"settings dataset.KEY=VALUE, as training takes them:\n\n{own[own.index('stations: ') :]}"
+    )
     parser = argparse.ArgumentParser(
-        prog="gsparc check", description=__doc__, epilog=epilog,
+        prog="gsparc check",
+        description=__doc__,
+        epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
-    )  # fmt: skip
+    )
     add = parser.add_argument
-    kinds = "npz or HDF5 file, a table (csv, parquet), a campaign's file, or a folder like the RFID release"
+    kinds = (
+        "npz or HDF5 file, a table (csv, parquet), a campaign's file, or a folder like the "
+        "RFID release"
+    )
     add("path", nargs="+", metavar="FILE|dataset.KEY=VALUE", help=kinds)
     add("--stations-file", help="of a table: a second one that lists the stations")
     add("--draw", metavar="FILE.png", help="where the map goes; else to outputs/check")
@@ -141,7 +158,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not paths:
         parser.error("name a file or a folder, too")
     if args.draw is not None and (len(paths) > 1 or not args.draw.lower().endswith(".png")):
-        parser.error("--draw takes the name of a PNG file, and goes with one file; --no-draw draws none")
+        parser.error(
+            "--draw takes the name of a PNG file, and goes with one file; --no-draw draws none"
+        )
     console = Console()
 
     def picture(number: int) -> str | None:
@@ -150,5 +169,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         name = stems[-1] + f"-{again}" * (again > 1)
         return None if args.no_draw else args.draw or f"outputs/check/{name}.png"
 
-    good = [check(path, console, draw=picture(number), **settings) for number, path in enumerate(paths)]
+    good = [
+        check(path, console, draw=picture(number), **settings) for number, path in enumerate(paths)
+    ]
     return 0 if all(good) else 1

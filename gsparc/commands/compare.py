@@ -55,20 +55,28 @@ def task(config: DictConfig) -> pd.DataFrame:
     if filled.empty:
         raise ValueError("no cell is filled: nothing to report (train=true fills them)")
     timed = time_by_dataset(filled) if settings["latency"] else None
-    return write_comparison(filled, timed, str(settings["ours"]), run_dir, settings["figures"], published)
+    return write_comparison(
+        filled, timed, str(settings["ours"]), run_dir, settings["figures"], published
+    )
 
 
 def write_comparison(
-    filled: pd.DataFrame, timed: pd.DataFrame | None, ours: str, run_dir: Path,
-    figures: Sequence[str] = (), published: pd.DataFrame | None = None,
-) -> pd.DataFrame:  # fmt: skip
-    """Write `compare.csv`, `cells.csv`, `compare.md`, `summary.json` and pictures, and show the page.
+    filled: pd.DataFrame,
+    timed: pd.DataFrame | None,
+    ours: str,
+    run_dir: Path,
+    figures: Sequence[str] = (),
+    published: pd.DataFrame | None = None,
+) -> pd.DataFrame:
+    """Write `compare.csv`, `cells.csv`, `compare.md`, `summary.json` and pictures,
+    and show the page.
 
     `figures` are formats beside PNG, see `drawing.save`; `published`: rows that stand beside, see
     `read_published`.
 
-    Splits that are drawn several times have a picture per dataset, all others are panels of `compare.png`;
-    each has the distributions of its methods' errors, and of spectra the same rows as all predict them.
+    Splits that are drawn several times have a picture per dataset, all others are panels of
+    `compare.png`; each has the distributions of its methods' errors,
+    and of spectra the same rows as all predict them.
     """
     rows = average_cells(filled, timed)
     rows = rows if published is None else beside_published(rows, published)
@@ -91,6 +99,8 @@ def write_comparison(
             save(draw_spectra(examples, title), run_dir / f"{stem}-rows.png", 100, figures)
     best = {f"{title_of(block)}/first": block.method.iloc[0] for block in blocks}
     write_summary(run_dir / "summary.json", {"cells": len(filled), **best, **provenance()})
-    parts: list[Any] = [part for block in blocks for part in (table_of(block, ours), *remarks(block, ours))]
+    parts: list[Any] = [
+        part for block in blocks for part in (table_of(block, ours), *remarks(block, ours))
+    ]
     show_result(run_dir, *parts)
     return rows

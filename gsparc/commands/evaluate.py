@@ -32,8 +32,8 @@ def evaluate_files(
 ) -> tuple[Evaluation, Measurements, Split]:
     """Evaluate checkpoints of one run, one per fold.
 
-    Other data than theirs are tested whole where no split is given, beside baselines that learned from the
-    rows that the models learned from.
+    Other data than theirs are tested whole where no split is given, beside baselines that learned
+    from the rows that the models learned from.
 
     Args:
         paths, dataset, split: see `open_files`.
@@ -53,9 +53,15 @@ def evaluate_files(
     train_s = None if None in seconds else [float(s) for s in seconds if s is not None]
     hearing = [read_hearing(one.extra) for one in run.stored]
     evaluation = evaluate(
-        run.methods, train_s, run.data, run.split, eval_on=eval_on, baselines=baselines,
-        learned=run.trained if other else None, hearing=hearing,
-    )  # fmt: skip
+        run.methods,
+        train_s,
+        run.data,
+        run.split,
+        eval_on=eval_on,
+        baselines=baselines,
+        learned=run.trained if other else None,
+        hearing=hearing,
+    )
     evaluation.facts.update({"split/foreign": run.doubt, "split/without_baselines": without})
     return evaluation, run.data, run.split
 

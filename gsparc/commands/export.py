@@ -1,4 +1,6 @@
-"""`gsparc export ckpt=FILE to=c`: a trained model for programs without Python and link simulators."""
+"""`gsparc export ckpt=FILE to=c`: a trained model for programs without Python
+and link simulators.
+"""
 
 from __future__ import annotations
 
@@ -58,7 +60,10 @@ def _library(predictor: Predictor, config: DictConfig, folder: Path, out: Path) 
     facts |= {"export/error": result.error}
     facts |= {"export/worst": result.worst, "export/figure": FIGURES[predictor.site.kind]}
     build = f"cmake -S {out}/source/field -B {out}/build && cmake --build {out}/build"
-    return facts, [result.summary, f"{len(blob) / 1e6:.2f} MB in {out}/field.gsparc; the library: {build}"]
+    return facts, [
+        result.summary,
+        f"{len(blob) / 1e6:.2f} MB in {out}/field.gsparc; the library: {build}",
+    ]
 
 
 def _places(predictor: Predictor, config: DictConfig) -> np.ndarray:
@@ -79,7 +84,8 @@ def _impulses(predictor: Predictor, config: DictConfig, folder: Path, out: Path)
     facts = write_taps(predictor, Trajectory(time_s, place), to_dict(config), folder / "taps.npz")
     taps, rate_hz = facts.pop("taps/count"), facts.pop("taps/rate_hz")
     line = (
-        f"{taps} taps at {rate_hz / 1e6:g} MHz leave {facts['taps/residual_db']:.1f} dB of the channels "
+        f"{taps} taps at {rate_hz / 1e6:g} MHz leave {facts['taps/residual_db']:.1f} dB of the "
+        "channels "
         f"({facts['taps/worst_db']:.1f} at worst) in {out}/taps.npz; "
         f"first {facts['taps/early_s'] * 1e9:.1f} ns"
     )
@@ -90,7 +96,9 @@ def _scenario(predictor: Predictor, config: DictConfig, folder: Path, out: Path)
     place = _places(predictor, config)
     paths, rest = deepmimo.write_scenario(folder, predictor, place)
     facts = {"deepmimo/places": len(place), "deepmimo/paths": paths, "deepmimo/left_out": rest}
-    return facts, [f"{len(place)} places, at most {paths} paths; beyond these {rest:.2g} of the power: {out}"]
+    return facts, [
+        f"{len(place)} places, at most {paths} paths; beyond these {rest:.2g} of the power: {out}"
+    ]
 
 
 WRITERS = {"c": _library, "taps": _impulses, "deepmimo": _scenario}

@@ -23,17 +23,24 @@ from gsparc.runs.output import begin_run, finish_run
 log = logging.getLogger(__name__)
 
 RATES = (
-    Column("median SNR dB", "g", of="level"), Column("oracle Mbit/s", ".1f", of="oracle_mbps"),
-    Column("chosen", ".1f", of="chosen_mbps"), Column("short", ".1%", of="shortfall"),
-    Column("short, accepted", ".1%", of="shortfall_accepted"), Column("TBLER", ".1%", of="tbler"),
+    Column("median SNR dB", "g", of="level"),
+    Column("oracle Mbit/s", ".1f", of="oracle_mbps"),
+    Column("chosen", ".1f", of="chosen_mbps"),
+    Column("short", ".1%", of="shortfall"),
+    Column("short, accepted", ".1%", of="shortfall_accepted"),
+    Column("TBLER", ".1%", of="tbler"),
     Column("outage", ".1%", of="outage"),
-)  # fmt: skip
+)
 BEAMS = (
-    Column("antennas", "d", of="antennas"), Column("gain dB", ".2f", of="gain_db"),
-    Column("predicted", ".2f", of="predicted_gain_db"), Column("loss dB", ".2f", of="loss_db"),
-    Column("mean loss", ".2f", of="loss_db_mean"), Column("95 %", ".2f", of="loss_db_p95"),
-    Column("worst", ".2f", of="loss_db_max"), Column("mean, accepted", ".2f", of="loss_db_accepted"),
-)  # fmt: skip
+    Column("antennas", "d", of="antennas"),
+    Column("gain dB", ".2f", of="gain_db"),
+    Column("predicted", ".2f", of="predicted_gain_db"),
+    Column("loss dB", ".2f", of="loss_db"),
+    Column("mean loss", ".2f", of="loss_db_mean"),
+    Column("95 %", ".2f", of="loss_db_p95"),
+    Column("worst", ".2f", of="loss_db_max"),
+    Column("mean, accepted", ".2f", of="loss_db_accepted"),
+)
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -70,9 +77,12 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 
 def flat_curves(facts: Mapping[str, Any], points: Mapping[str, list[float]]) -> list[str]:
-    """Say of modulations that no curve of theirs crosses 10 % of failed blocks at the Eb/N0 sent."""
+    """Say of modulations that no curve of theirs crosses 10 % of failed blocks
+    at the Eb/N0 sent.
+    """
     return [
-        f"{name}: no curve crosses 10 % failed blocks from {min(sent):g} to {max(sent):g} dB, see bler.png; "
+        f"{name}: no curve crosses 10 % failed blocks from {min(sent):g} to {max(sent):g} dB, "
+        "see bler.png; "
         f"pusch.ebno_db.{name}=[...] sends at other Eb/N0"
         for name, sent in points.items()
         if not _crosses(facts, name)
@@ -84,7 +94,9 @@ def _crosses(facts: Mapping[str, Any], modulation: str) -> bool:
     return any(facts.get(key) is not None for key in keys)
 
 
-def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels: list[float]) -> list[Table]:
+def tables(
+    facts: Mapping[str, Any], title: str, modulations: list[str], levels: list[float]
+) -> list[Table]:
     """Return tables of rates, block errors and beams; what was not computed has no table."""
     kind = facts["confidence/kind"]
     accepted = f"{facts['accepted']:.0%} of {facts['positions']} positions accepted by {kind}"
@@ -103,7 +115,9 @@ def tables(facts: Mapping[str, Any], title: str, modulations: list[str], levels:
         heading += facts["pusch/truth"]
         sections.append(Table(heading, [Column("receiver", ""), *columns], receivers))
     # As numbers: as text 16 comes before 4.
-    antennas = sorted(int(key.split("/")[1]) for key in facts if re.fullmatch(r"beams/\d+/gain_db", key))
+    antennas = sorted(
+        int(key.split("/")[1]) for key in facts if re.fullmatch(r"beams/\d+/gain_db", key)
+    )
     if antennas:
         beams = [{"antennas": n, **facts_under(facts, f"beams/{n}")} for n in antennas]
         sections.append(Table.from_rows("maximum-ratio beams, all test positions", BEAMS, beams))

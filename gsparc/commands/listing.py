@@ -27,10 +27,15 @@ class Command:
 
     def arguments(self, words: Sequence[str]) -> list[str]:
         """Return a command line in Hydra's words: bare paths become `<bare>=[...]`."""
-        paths = [word for word in words if self.bare and "=" not in word and not word.startswith("-")]
+        paths = [
+            word for word in words if self.bare and "=" not in word and not word.startswith("-")
+        ]
         # Quoted in Hydra's grammar, as paths may hold spaces, commas and brackets.
         quoted = ",".join("'" + path.replace("'", "\\'") + "'" for path in paths)
-        return [*(word for word in words if word not in paths), *[f"{self.bare}=[{quoted}]"] * bool(paths)]
+        return [
+            *(word for word in words if word not in paths),
+            *[f"{self.bare}=[{quoted}]"] * bool(paths),
+        ]
 
     def run(self) -> None:
         """Run it with the command line in `sys.argv`; ends the process when it fails."""
@@ -51,8 +56,12 @@ COMMANDS = {
     for command in (
         Command("train", "train a method on a dataset and test it beside baselines"),
         Command("evaluate", "test a checkpoint again: ckpt=FILE"),
-        Command("check", "what is in files of measurements, or what is wrong: FILE...", configured=False),
-        Command("data", "public sets of measurements: listed, or fetched by NAME", configured=False),
+        Command(
+            "check", "what is in files of measurements, or what is wrong: FILE...", configured=False
+        ),
+        Command(
+            "data", "public sets of measurements: listed, or fetched by NAME", configured=False
+        ),
         Command("predict", "predictions at places of a table: ckpt=FILE places=FILE"),
         Command("simulate", "ray-trace a dataset with the effects it needs: out=FILE"),
         Command("study", "variants of one model: kind=effects, positions or measurements"),
@@ -60,13 +69,17 @@ COMMANDS = {
         Command("compare", "every method under the same data, metrics and clock"),
         Command("calibrate", "compare confidences; a threshold with a bounded risk: ckpt=FILE"),
         Command("link", "rates and block errors with predicted channels: ckpt=FILE"),
-        Command("update", "a model with rows that came later, and what changed: ckpt=FILE data=FILE"),
+        Command(
+            "update", "a model with rows that came later, and what changed: ckpt=FILE data=FILE"
+        ),
         Command("export", "the model for other programs: ckpt=FILE to=c, taps, deepmimo"),
         Command("serve", "answers over HTTP: ckpt=FILE"),
         Command("locate", "where rows were heard, by the field's likelihood: ckpt=FILE"),
         Command("map", "received power over an area with a promised error: ckpt=FILE"),
         Command("view", "the field in three dimensions, in a browser or saved: ckpt=FILE"),
-        Command("plan", "where to measure next: ckpt=FILE, or area=... before anything is measured"),
+        Command(
+            "plan", "where to measure next: ckpt=FILE, or area=... before anything is measured"
+        ),
         Command("place", "where one more station serves an area best: ckpt=FILE"),
         Command("report", "one page about many runs: RUN...", bare="runs"),
         Command("bench", "seconds of kernels beside plain PyTorch"),
@@ -78,7 +91,10 @@ def list_commands() -> str:
     """List all commands with one line each."""
     width = max(map(len, COMMANDS))
     rows = "".join(f"  {name:<{width}}  {command.answers}\n" for name, command in COMMANDS.items())
-    return f"gsparc COMMAND key=value ...\n\n{rows}\n`gsparc COMMAND --help` lists a command's settings.\n"
+    return (
+        f"gsparc COMMAND key=value ...\n\n{rows}\n`gsparc COMMAND --help` lists a command's "
+        "settings.\n"
+    )
 
 
 def suggest_command(name: str) -> str:

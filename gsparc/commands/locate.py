@@ -11,15 +11,29 @@ from gsparc.apps.locate.fingerprints import locate_fingerprints
 from gsparc.apps.locate.judging import locate_by_model
 from gsparc.apps.locate.neighbours import PLAIN
 from gsparc.apps.maps.floor_plan import read_plan_settings
-from gsparc.base.limits import POSITIVE, SHARE, check_arguments, choice, number, or_null, switch, whole
+from gsparc.base.limits import (
+    POSITIVE,
+    SHARE,
+    check_arguments,
+    choice,
+    number,
+    or_null,
+    switch,
+    whole,
+)
 from gsparc.runs.output import finish_run, run_directory
 from gsparc.runs.settings import RunSettings, to_dict
 
 LIMITS = {
-    "prior": choice("box", "trained"), "share": SHARE, "offset_db": or_null(number(0)),
-    "calibrate": whole(0), "calibrate_effort": or_null(POSITIVE), "rows": or_null(whole(1)),
-    "phase_known": switch(), "renew": switch(),
-}  # fmt: skip
+    "prior": choice("box", "trained"),
+    "share": SHARE,
+    "offset_db": or_null(number(0)),
+    "calibrate": whole(0),
+    "calibrate_effort": or_null(POSITIVE),
+    "rows": or_null(whole(1)),
+    "phase_known": switch(),
+    "renew": switch(),
+}
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -37,5 +51,7 @@ def locate(config: DictConfig, run_dir: Path) -> dict[str, Any]:
         facts, tables, lines = locate_fingerprints(config, run_dir)
     else:
         plan = read_plan_settings(to_dict(config))
-        facts, tables, lines = locate_by_model(config, run_dir, None if plan is None else plan.is_open)
+        facts, tables, lines = locate_by_model(
+            config, run_dir, None if plan is None else plan.is_open
+        )
     return finish_run(run_dir, facts, *tables, lines=lines)

@@ -54,7 +54,9 @@ def _pictures(config: DictConfig, field: FieldMap) -> list[str]:
     names = [file_name(layer, suffix) for layer in _layers(field) for suffix in SUFFIXES]
     if save and not any(fnmatch(name, save[0]) for name in names):
         pdf_names = ", ".join(name for name in names if name.endswith(".pdf"))
-        raise DataError(f"save={save[0]}: no layer's file is called so; there are *.pdf, *.svg, {pdf_names}")
+        raise DataError(
+            f"save={save[0]}: no layer's file is called so; there are *.pdf, *.svg, {pdf_names}"
+        )
     return [*(["*.png"] if config.pictures else []), *save]
 
 
@@ -66,12 +68,21 @@ def task(config: DictConfig) -> dict[str, Any]:
     warn_of_held_out(predictor)
     how = PromiseSettings(**settings["promise"])
     query = {
-        "area": settings["area"], "height_m": config.height_m, "step_m": config.step_m,
-        "threshold_db": float(config.threshold_db), "stations": stations_of(settings["stations"]),
-        "load": settings["load"], "noise_db": config.noise_db, "other_end": settings["other_end"],
-        "plan": floor, "share": how.share, "tolerance_db": float(config.tolerance_db), "unit": config.unit,
-        "buildings": config.buildings, "indoor_db": settings["indoor_db"],
-    }  # fmt: skip
+        "area": settings["area"],
+        "height_m": config.height_m,
+        "step_m": config.step_m,
+        "threshold_db": float(config.threshold_db),
+        "stations": stations_of(settings["stations"]),
+        "load": settings["load"],
+        "noise_db": config.noise_db,
+        "other_end": settings["other_end"],
+        "plan": floor,
+        "share": how.share,
+        "tolerance_db": float(config.tolerance_db),
+        "unit": config.unit,
+        "buildings": config.buildings,
+        "indoor_db": settings["indoor_db"],
+    }
     # Refuses what cannot be before any evidence is gathered.
     first = add_changes(predict_map(predictor, dry=True, **query), predictor, dry=True)
     wanted = _pictures(config, first)
@@ -97,16 +108,25 @@ def task(config: DictConfig) -> dict[str, Any]:
         if layer.words:
             write_samples(run_dir / file_name(layer, ".csv"), layer.class_table())
         if layer.words and tiff:
-            write_classes(run_dir / file_name(layer, ".tif"), field, layer.values, layer.words, layer.table())
+            write_classes(
+                run_dir / file_name(layer, ".tif"), field, layer.values, layer.words, layer.table()
+            )
     if tiff:
         write_geotiff(run_dir / "map.tif", field)
     if tiff and field.grid.origin is not None:
-        write_kmz(run_dir / "map.kmz", field, [layer for layer in every if layer.name not in of_one])
+        write_kmz(
+            run_dir / "map.kmz", field, [layer for layer in every if layer.name not in of_one]
+        )
     facts = {
-        **field.summarise(), "dataset/name": predictor.site.name, "dataset/kind": predictor.site.kind,
-        "model/name": predictor.method.name, "ckpt": str(config.ckpt), "promise/share": how.share,
-        "promise/calibrated": int(promise is not None), **peak_memory(),
-    }  # fmt: skip
+        **field.summarise(),
+        "dataset/name": predictor.site.name,
+        "dataset/kind": predictor.site.kind,
+        "model/name": predictor.method.name,
+        "ckpt": str(config.ckpt),
+        "promise/share": how.share,
+        "promise/calibrated": int(promise is not None),
+        **peak_memory(),
+    }
     if coverage is not None and promise is not None and ends is not None:
         reach = promise.calibration(how.share).reach
         facts |= {f"promise/held/{name}": value for name, value in vars(coverage).items()}

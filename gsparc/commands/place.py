@@ -25,46 +25,74 @@ def task(config: DictConfig) -> dict[str, Any]:
     predictor = load(path)
     warn_of_held_out(predictor)
     where = {
-        "area": settings["area"], "height_m": config.height_m, "sites": config.sites, "count": config.count,
-        "station_height_m": config.station_height_m, "antenna": placing.NewAntenna(**settings["antenna"]),
-    }  # fmt: skip
+        "area": settings["area"],
+        "height_m": config.height_m,
+        "sites": config.sites,
+        "count": config.count,
+        "station_height_m": config.station_height_m,
+        "antenna": placing.NewAntenna(**settings["antenna"]),
+    }
     placing.lay_candidates(predictor, **where)  # refuses before anything is fitted
     promise, error = read_or_gather(path, settings), placing.NewStationError()
     # Stations left out one by one tell how far the level of a new one is off.
     if config.left_out:
-        error = placing.new_station_error(reopen_training(path, settings["dataset"]), int(config.left_out))
+        error = placing.new_station_error(
+            reopen_training(path, settings["dataset"]), int(config.left_out)
+        )
     level, unit = float(config.threshold_db), predictor.site.level_unit
-    found = placing.place_station(predictor, threshold_db=level, promise=promise, error=error, **where)
+    found = placing.place_station(
+        predictor, threshold_db=level, promise=promise, error=error, **where
+    )
     columns = {
-        **coordinates(found.places, predictor), "coverage": found.coverage, "gain": found.gain,
+        **coordinates(found.places, predictor),
+        "coverage": found.coverage,
+        "gain": found.gain,
         **dict(zip(("low", "high", "gain_low", "gain_high"), found.between.T, strict=True)),
         "nearest_m": found.nearest_m,
-    }  # fmt: skip
-    write_samples(run_dir / "place.csv", {name: v.tolist() for name, v in {**found.given, **columns}.items()})
+    }
+    write_samples(
+        run_dir / "place.csv", {name: v.tolist() for name, v in {**found.given, **columns}.items()}
+    )
     draw_placement(found, run_dir / "place.png", level, unit)
     # Candidates come best first.
-    best = {name: None if isnan(values[0]) else float(values[0]) for name, values in columns.items()}
+    best = {
+        name: None if isnan(values[0]) else float(values[0]) for name, values in columns.items()
+    }
     at = "({x:.2f}, {y:.2f}, {z:.2f})"
     if predictor.site.georeference is not None:
         at = "{latitude:.6f}, {longitude:.6f} degrees, {z:.4g} m high"
     facts = {f"place/{name}": value for name, value in best.items()} | {
-        "place/before": found.before, "place/after": best["coverage"], "place/refused": found.refused,
-        "place/candidates": len(found.places), "place/threshold_db": level,
-        "place/offset_db": error.offset_db, "place/left_out": error.stations, "ckpt": path,
-    }  # fmt: skip
-    next_one = ", {nearest_m:.4g} m from the next" * (best["nearest_m"] is not None)  # at a known place
+        "place/before": found.before,
+        "place/after": best["coverage"],
+        "place/refused": found.refused,
+        "place/candidates": len(found.places),
+        "place/threshold_db": level,
+        "place/offset_db": error.offset_db,
+        "place/left_out": error.stations,
+        "ckpt": path,
+    }
+    # At a known place
+    next_one = ", {nearest_m:.4g} m from the next" * (best["nearest_m"] is not None)
     sentence = "with a station at " + at + next_one + ": {coverage:.1%}, gaining "
     interval = "no interval is known: no station could be left out, or promised=false, left_out=0"
     if best["low"] is not None:
         low, high = found.between[:, 2:].T
         alike = ((low <= found.gain[0]) & (found.gain[0] <= high))[1:].sum()
-        interval = "90 % intervals {low:.1%} to {high:.1%}, of the gain " + f"{100 * low[0]:.1f} to "
+        interval = "90 % intervals {low:.1%} to {high:.1%}, of the gain " + (
+            f"{100 * low[0]:.1f} to "
+        )
         interval += f"{100 * high[0]:.1f} points"
         interval += f", not significantly above {alike} of {len(low) - 1} others" * (len(low) > 1)
     lines = [
         placing.assumption(predictor.site, found.places[0, 2], where["antenna"]),
-        f"now {found.before:.1%} of the area, {found.grid.step:.3g} m squares, with {level:g} {unit} or more"
-        + (f"; {found.refused:.0%} of it was never tested, and is left out here" if found.refused else ""),
-        sentence.format(**best) + f"{100 * found.gain[0]:.1f} points", interval.format(**best),
-    ]  # fmt: skip
+        f"now {found.before:.1%} of the area, {found.grid.step:.3g} m squares, with {level:g} "
+        f"{unit} or more"
+        + (
+            f"; {found.refused:.0%} of it was never tested, and is left out here"
+            if found.refused
+            else ""
+        ),
+        sentence.format(**best) + f"{100 * found.gain[0]:.1f} points",
+        interval.format(**best),
+    ]
     return finish_run(run_dir, facts, lines=lines, before=f"{len(found.places)} candidates; ")

@@ -30,12 +30,23 @@ def task(config: DictConfig) -> dict[str, Any]:
         warn_of_held_out(predictor)
     promise = None if predictor is None else read_or_gather(str(config.ckpt), settings)
     plan = plan_measurements(
-        predictor, config.count, settings["area"], height_m=config.height_m, walkable=config.walkable,
-        plan=floor, stations=stations, other_end=settings["other_end"],
-        promise=promise, least_gain_db=float(config.least_gain_db), route=config.route,
-        start=settings["start"], route_m=config.route_m, length_m=config.length_m,
-        goal=config.goal, threshold_db=settings["threshold_db"],
-    )  # fmt: skip
+        predictor,
+        config.count,
+        settings["area"],
+        height_m=config.height_m,
+        walkable=config.walkable,
+        plan=floor,
+        stations=stations,
+        other_end=settings["other_end"],
+        promise=promise,
+        least_gain_db=float(config.least_gain_db),
+        route=config.route,
+        start=settings["start"],
+        route_m=config.route_m,
+        length_m=config.length_m,
+        goal=config.goal,
+        threshold_db=settings["threshold_db"],
+    )
     columns = {"order": np.arange(1, len(plan.places) + 1), **coordinates(plan.places, predictor)}
     # Rows are in the order of the walk; the rank is that of their gains.
     columns |= {"rank": plan.chosen + 1, "expected_error_db": plan.expected_db.round(4)}
@@ -50,22 +61,38 @@ def task(config: DictConfig) -> dict[str, Any]:
     write_samples(run_dir / "plan.csv", {name: values.tolist() for name, values in columns.items()})
     draw_measurement_plan(plan, run_dir / "plan.png", promise, predictor, floor)
     facts = {
-        "plan/places": len(plan.places), "plan/expected_error_db": plan.after_db,
+        "plan/places": len(plan.places),
+        "plan/expected_error_db": plan.after_db,
         "plan/expected_error_before_db": plan.before_db,
-        "plan/length_m": plan.length_m, "plan/stopped": plan.stopped or None,
-        "plan/scatter_db": plan.scatter_db, "plan/in_vain": int(bool(plan.in_vain)),
-        "plan/promised": int(promise is not None), "ckpt": None if config.ckpt is None else str(config.ckpt),
-    }  # fmt: skip
-    before = f"{len(plan.places)} places: expected error {plan.before_db:.2f} -> {plan.after_db:.2f} dB"
+        "plan/length_m": plan.length_m,
+        "plan/stopped": plan.stopped or None,
+        "plan/scatter_db": plan.scatter_db,
+        "plan/in_vain": int(bool(plan.in_vain)),
+        "plan/promised": int(promise is not None),
+        "ckpt": None if config.ckpt is None else str(config.ckpt),
+    }
+    before = (
+        f"{len(plan.places)} places: expected error {plan.before_db:.2f} -> {plan.after_db:.2f} dB"
+    )
     if predictor is not None and predictor.site.stations is not None:
         alike = config.goal == "all" and config.threshold_db is None
-        every = "all stations alike (a map shows the strongest)" if alike else "the strongest station"
+        every = (
+            ("all stations alike (a map shows the strongest)") if alike else "the strongest station"
+        )
         every = every if stations is None else ", ".join(map(str, stations))
-        doubt = "" if config.threshold_db is None else f", where {config.threshold_db:g} is in doubt"
+        doubt = (
+            "" if config.threshold_db is None else (f", where {config.threshold_db:g} is in doubt")
+        )
         before += f" of {every}{doubt}"
-        if promise is not None and (each := promise.stations_of_place()) < len(predictor.site.stations):
+        if promise is not None and (each := promise.stations_of_place()) < len(
+            predictor.site.stations
+        ):
             before += f", if a place lists the {each} strongest of {len(predictor.site.stations)}"
-    kind = "straight from place to place" if config.walkable is None else "along the lines of walkable"
+    kind = (
+        "straight from place to place"
+        if config.walkable is None
+        else ("along the lines of walkable")
+    )
     way_line = f"a way of {plan.length_m:.0f} m, {kind}; rows logged on the way do not count"
     lines = filter(None, (plan.stopped, plan.in_vain, way_line))
     return finish_run(run_dir, facts, lines=lines, before=f"{before}; plan ")

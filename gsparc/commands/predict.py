@@ -1,4 +1,6 @@
-"""`gsparc predict ckpt=FILE places=FILE`: predictions at places in degrees or metres, as a table."""
+"""`gsparc predict ckpt=FILE places=FILE`: predictions at places in degrees or metres,
+as a table.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,9 @@ from gsparc.runs.output import begin_run, finish_run
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """Predict at places of a table; return the facts written to `summary.json` in the run directory."""
+    """Predict at places of a table; return the facts written to `summary.json`
+    in the run directory.
+    """
     run_dir, settings = begin_run(config)
     predictor = load(config.ckpt, confidence=config.confidence, unit=config.unit)
     if config.frequency_hz is not None:
@@ -27,12 +31,18 @@ def task(config: DictConfig) -> dict[str, Any]:
     if stations:
         before += f", {stations} station{'s' * (stations > 1)}"
     # Powers alone have a lowest and a highest.
-    ends = [value for name, value in facts.items() if name.startswith(("predict/lowest", "predict/highest"))]
+    ends = [
+        value
+        for name, value in facts.items()
+        if name.startswith(("predict/lowest", "predict/highest"))
+    ]
     if ends:
         before += f": {' to '.join(f'{end:.4g}' for end in ends)} {predictor.unit}"
     before += f", {empty} predictions empty" if (empty := facts["predict/empty"]) else ""
     before += f"; predictions in {facts['out']}"
     if promise is None and predictor.site.target.is_level:
-        before += "; deviations are the model's own: gsparc map ckpt=FILE tests them, then ask again"
+        before += (
+            "; deviations are the model's own: gsparc map ckpt=FILE tests them, then ask again"
+        )
     before += "; summary "
     return finish_run(run_dir, facts | {"ckpt": str(config.ckpt)}, before=before)

@@ -18,9 +18,13 @@ from gsparc.runs.output import finish_run, run_directory
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """Write one page about runs; return the facts written to `summary.json` in the run directory."""
+    """Write one page about runs; return the facts written to `summary.json`
+    in the run directory.
+    """
     if OmegaConf.is_missing(config, "runs"):
-        raise ValueError("no run is named; say gsparc report RUN..., folders of runs or of whole sweeps")
+        raise ValueError(
+            "no run is named; say gsparc report RUN..., folders of runs or of whole sweeps"
+        )
     for form in config.figures:
         PRINTED.check("figures", form)
     paths = [Path(path) for path in config.runs]
@@ -40,4 +44,7 @@ def _fronts(paths: Sequence[Path]) -> list[tuple[str, dict[str, np.ndarray]]]:
     # Sorted, as the order of a file system differs from machine to machine.
     files = [file for path in paths for file in sorted(path.rglob("tradeoff.csv"))]
     facts = (read_summary(file.parent / SUMMARY) or {} for file in files)
-    return [(str(of.get("dataset/name")), read_columns(file)) for of, file in zip(facts, files, strict=True)]
+    return [
+        (str(of.get("dataset/name")), read_columns(file))
+        for of, file in zip(facts, files, strict=True)
+    ]

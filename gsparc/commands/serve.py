@@ -38,7 +38,9 @@ def task(config: DictConfig) -> None:
     token = config.token or os.environ.get("GSPARC_TOKEN")
     # Without a token only this machine's own users may be answered.
     if not token and not is_loopback(config.host):
-        raise SettingError(f"host={config.host}: others reach it; set GSPARC_TOKEN, or say token=WORD")
+        raise SettingError(
+            f"host={config.host}: others reach it; set GSPARC_TOKEN, or say token=WORD"
+        )
     if find_spec("fastapi") is None or find_spec("uvicorn") is None:
         raise DataError("gsparc serve needs the extra `serve`: pip install 'gsparc[serve]'")
     from gsparc.apps.export.serving import LimitedServer, Limits, build_application
@@ -54,12 +56,16 @@ def task(config: DictConfig) -> None:
     site, powers = predictor.site, predictor.site.target.is_level
     # Powers of all stations are one answer; channels and spectra are of one station each.
     if site.paired or (site.stations and not powers):
-        raise DataError("serve: one end that stands still is needed; of several stations say station=NAME")
+        raise DataError(
+            "serve: one end that stands still is needed; of several stations say station=NAME"
+        )
     told = ToldFile(stored, as_stored) if config.updates else None
     if told is not None and (config.station is not None or not powers):
         raise DataError("updates=true: is of powers, and of all stations of the model")
     app = build_application(predictor, limits, token, told)
-    open_console().print(f"{predictor} at http://{config.host}:{config.port}", highlight=False, markup=False)
+    open_console().print(
+        f"{predictor} at http://{config.host}:{config.port}", highlight=False, markup=False
+    )
     gc.freeze()  # going through all that was loaded held up answers by half a second
     with suppress(KeyboardInterrupt):  # the server has ended by then
         LimitedServer(app, limits, host=config.host, port=config.port).run()

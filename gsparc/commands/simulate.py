@@ -39,18 +39,22 @@ def campaign(config: DictConfig) -> CampaignSettings:
     settings = to_dict(config)
     scene = scene_from_config({**settings["scene"], "moved": settings["moved"]})
     return CampaignSettings(
-        scene, _effects(settings["effects"]), Sampling(**settings["sampling"]),
+        scene,
+        _effects(settings["effects"]),
+        Sampling(**settings["sampling"]),
         from_settings(SpectrumSettings, settings["spectrum"], "spectrum"),
         from_settings(ArraySettings, settings["csi"], "csi"),
         **{name: settings[name] for name in ("shard", "check", "measurement")},
-    )  # fmt: skip
+    )
 
 
 def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
     # Effects that are to be chosen among stand under `full`; without it they are given.
     if "full" not in config:
         return effects_from_config(config)
-    return from_settings(AutoSettings, {**config, "full": effects_from_config(config["full"])}, "effects")
+    return from_settings(
+        AutoSettings, {**config, "full": effects_from_config(config["full"])}, "effects"
+    )
 
 
 def task(config: DictConfig) -> Outcome | None:
@@ -74,7 +78,8 @@ def task(config: DictConfig) -> Outcome | None:
         **machine_facts(),
         **summary_facts(outcome),
         "time/total_s": seconds,
-        "time/cpu_s": time.process_time() - busy,  # of all threads: what a busy machine cannot inflate
+        # Of all threads: what a busy machine cannot inflate
+        "time/cpu_s": time.process_time() - busy,
         "out": str(config.out),
         "out/mb": out.stat().st_size / 1e6,
     }

@@ -1,4 +1,5 @@
-"""`gsparc study kind=effects|positions|measurements`: variants of one model, and baselines, on the same data.
+"""`gsparc study kind=effects|positions|measurements`: variants of one model, and baselines,
+on the same data.
 
 Leaves `study.csv`, a row a variant and condition (`study.ROW`), `study.png` and `summary.json`.
 """
@@ -28,18 +29,24 @@ from gsparc.runs.settings import to_dict
 
 
 def configs_of(config: DictConfig) -> dict[str, DictConfig]:
-    """Return what trains each of `config.variants`, overrides of `config.model`, then `config.baselines`."""
+    """Return what trains each of `config.variants`, overrides of `config.model`,
+    then `config.baselines`.
+    """
     whole = compose({}, ())
     for name in ("dataset", "split", "trainer", "callbacks", "seed", "effort", "threads"):
         OmegaConf.update(whole, name, config[name], merge=False)
     OmegaConf.update(whole, "init", None, merge=False)  # a variant names its own, if any
-    # Resolved first: an interpolation would take the place of the model's own settings, not join them.
+    # Resolved first: an interpolation would take the place of the model's own settings,
+    # not join them.
     models = {
         str(name): OmegaConf.merge(config.model, overrides)
         for name, overrides in to_dict(config.variants).items()
     }
     models |= {name: OmegaConf.create(config_node(method_class(name))) for name in config.baselines}
-    return {name: OmegaConf.merge(whole, {"model": None}, {"model": one}) for name, one in models.items()}  # type: ignore[misc]
+    return {
+        name: OmegaConf.merge(whole, {"model": None}, {"model": one})
+        for name, one in models.items()
+    }  # type: ignore[misc]
 
 
 def task(config: DictConfig) -> pd.DataFrame:
@@ -53,14 +60,19 @@ def task(config: DictConfig) -> pd.DataFrame:
         jobs = plan_rounds(configs_of(config), conditions, int(config.rounds), data, split, run_dir)
         fits = run_jobs(jobs, train_job)
     except KeyboardInterrupt:  # whose advice is that of a comparison
-        message = f"the study was interrupted; hydra.run.dir={run_dir} goes on after the rounds that are done"
+        message = (
+            f"the study was interrupted; hydra.run.dir={run_dir} goes on after the rounds "
+            "that are done"
+        )
         raise KeyboardInterrupt(message) from None
     clock = ClockSettings(rounds=int(config.queries), rounds_s=float(config.query_s))
     rows = average_rounds(fits, conditions, clock)
     facts: dict[str, Any] = {
-        **dataset_facts(data), **split_facts(split),
-        "seed": config.seed, "study/rounds": int(config.rounds),
-    }  # fmt: skip
+        **dataset_facts(data),
+        **split_facts(split),
+        "seed": config.seed,
+        "study/rounds": int(config.rounds),
+    }
     title = f"{data.site.name}, split {split.title}: {instantiate(config.kind).title}"
     write_samples(run_dir / "study.csv", rows.to_dict("list"))
     draw_study(rows, title, run_dir / "study.png")

@@ -37,16 +37,20 @@ def task(config: DictConfig) -> dict[str, Any]:
     run_dir = run_directory()
     run = open_files([config.ckpt], to_dict(config.dataset), to_dict(config.split))
     state = FitInputs.from_config(config, measurements_hash(run.data), run.split.sha256)
-    trained = run.stored[0].extra.get("run_id")  # the front is stored in the file itself, which changes it
+    # The front is stored in the file itself, which changes it
+    trained = run.stored[0].extra.get("run_id")
     state = replace(state, files=state.files | ({"ckpt": trained} if trained else {}))
     with locked(run_dir / ".job"):
-        return run_once(run_dir, state, lambda left: _swept(config, run, run_dir), again=not in_multirun())
+        return run_once(
+            run_dir, state, lambda left: _swept(config, run, run_dir), again=not in_multirun()
+        )
 
 
 def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     """Measure, draw and write."""
     data, method = run.data, run.methods[0]
-    # What each component contributes is measured on rows that were learned from: test rows choose nothing.
+    # What each component contributes is measured on rows that were learned from:
+    # test rows choose nothing.
     learned = np.sort(run.split.folds[0].learned())
     inputs = method.reduction_inputs(data, learned)
     settings = list(list_settings(method, to_dict(config.grid)))
@@ -65,11 +69,13 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     save(draw_front(points, beside, method.name, title), run_dir / "tradeoff.png")
     facts = {
         **tradeoff.facts_of(points, beside),
-        **peak_memory(), **run.facts(),
-        "ckpt": str(config.ckpt), "seed": run.stored[0].configuration.get("seed"),
+        **peak_memory(),
+        **run.facts(),
+        "ckpt": str(config.ckpt),
+        "seed": run.stored[0].configuration.get("seed"),
         "time/includes": "one query end to end: world position in, physical units out; warm",
         "tradeoff/stored": len(model_points) if config.store else 0,
-    }  # fmt: skip
+    }
     best = points[points.front == 1].to_dict("records")
     sheet = Table.from_rows(title, [*tradeoff.POINT, Column(best[0]["figure"], of="value")], best)
     with tracking.open_loggers(config) as loggers:
@@ -84,7 +90,11 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
 
 def _threads(setting: Sequence[int] | None) -> list[int]:
     # Small queries are mostly fastest on one thread, large batches on all.
-    counts = sorted({1, torch.get_num_threads()}) if setting is None else sorted({int(n) for n in setting})
+    counts = (
+        sorted({1, torch.get_num_threads()})
+        if setting is None
+        else sorted({int(n) for n in setting})
+    )
     for count in counts or [0]:  # at most the cores of this machine
         whole(1, os.cpu_count()).check("threads", count)
     return counts

@@ -35,8 +35,8 @@ def train(
 ) -> tuple[dict[str, Any], TrainedRun]:
     """Fit a method on every fold of a split, test it beside baselines, and write it all down.
 
-    The folder is locked meanwhile; files of an earlier run there, which this one does not go on from, are
-    moved aside.
+    The folder is locked meanwhile; files of an earlier run there, which this one does not go on
+    from, are moved aside.
 
     Args:
         config: as composed from conf/train.yaml.
@@ -65,7 +65,8 @@ def train(
                 init_from=config.get("init_from") and Path(config.init_from),
                 datamodule=inputs.module,
                 batch_size=config.dataset.get("batch_size", 16),
-                trainer=instantiate(config.trainer, _partial_=True),  # each stage of a fit makes its own
+                # Each stage of a fit makes its own
+                trainer=instantiate(config.trainer, _partial_=True),
                 callbacks=partial(folds.build_callbacks, config.get("callbacks")),
                 loggers=loggers,
                 config_yaml=OmegaConf.to_yaml(config, resolve=True),
@@ -76,9 +77,15 @@ def train(
             fits = folds.fit_folds(method, data, split, contexts, learned=inputs.learned, keep=keep)
             unused = options.warn_of_unheeded(config, fits.methods[0], data) if in_full else None
             evaluation = evaluate(
-                fits.methods, fits.train_s, data, split, eval_on=config.eval_on, baselines=config.baselines,
-                shared=same_as_baseline(config, method), timed=in_full,
-            )  # fmt: skip
+                fits.methods,
+                fits.train_s,
+                data,
+                split,
+                eval_on=config.eval_on,
+                baselines=config.baselines,
+                shared=same_as_baseline(config, method),
+                timed=in_full,
+            )
             folds.end_curves(contexts, fits.train_s, evaluation.columns, config.eval_on)
             facts = {**evaluation.facts, **summary.provenance(), **fits.facts(), "run_id": run_id}
             facts |= {"seed": int(config.seed), "options/unused": unused}
@@ -93,7 +100,8 @@ def train(
 def train_job(job: Job, left: str | None) -> None:
     """Train a job into its folder, from what an interrupted try has `left` there."""
     config = deepcopy(job.config)
-    forget_vectors()  # solved for another job, they would be missing from this one's processor seconds
+    # Solved for another job, they would be missing from this one's processor seconds
+    forget_vectors()
     config.ckpt_path = config.ckpt_path or left  # what the settings name to go on from wins
     inputs = replace(read_inputs(config, job.data), split=job.split, learned=job.learned)
     _, trained_run = train(config, job.folder, inputs, in_full=False)

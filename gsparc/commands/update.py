@@ -1,4 +1,6 @@
-"""`gsparc update ckpt=FILE data=NEW out=FILE`: a model with rows that came later, and what changed."""
+"""`gsparc update ckpt=FILE data=NEW out=FILE`: a model with rows that came later,
+and what changed.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ from gsparc.training.stopwatch import Stopwatch
 log = logging.getLogger(__name__)
 
 OWN_LIMITS = {"undo": whole(0), "batch": or_null(whole(1)), "again": switch()}
-COLUMNS = ("station", "kind", "since", "at", "change_db", "x", "y")  # and degrees where they are known
+# And degrees where they are known
+COLUMNS = ("station", "kind", "since", "at", "change_db", "x", "y")
 
 
 def task(config: DictConfig) -> dict[str, Any]:
@@ -35,7 +38,9 @@ def task(config: DictConfig) -> dict[str, Any]:
     run_dir, settings = begin_run(config)
     check_arguments(config, **LIMITS, **OWN_LIMITS)
     if (config.data is None) == (config.undo == 0):
-        raise DataError("gsparc update: say data=FILE to add rows, or undo=COUNT to take updates back")
+        raise DataError(
+            "gsparc update: say data=FILE to add rows, or undo=COUNT to take updates back"
+        )
     with checkpoint.rewriting(config.ckpt, config.out) as file:
         check_updatable(file.stored.site)  # before the data are read
         predictor = load(file.stored)
@@ -48,15 +53,21 @@ def task(config: DictConfig) -> dict[str, Any]:
         file.store(versions_extra(predictor.versions))
     table = alarm_rows(predictor)
     text = io.StringIO()
-    writer = csv.DictWriter(text, dict.fromkeys([*COLUMNS, *(table or [{}])[0]]), lineterminator="\n")
+    writer = csv.DictWriter(
+        text, dict.fromkeys([*COLUMNS, *(table or [{}])[0]]), lineterminator="\n"
+    )
     writer.writeheader()
     writer.writerows(table)
     write_whole(run_dir / "changes.csv", text.getvalue())
     facts = {
-        "ckpt": str(config.ckpt), "out": str(out), "model/name": predictor.method.name,
-        "update/rows_kept": len(predictor.rows), "update/alarms": len(table) - alarms_before,
-        "update/versions": len(predictor.versions), "time/update_s": seconds,
-    }  # fmt: skip
+        "ckpt": str(config.ckpt),
+        "out": str(out),
+        "model/name": predictor.method.name,
+        "update/rows_kept": len(predictor.rows),
+        "update/alarms": len(table) - alarms_before,
+        "update/versions": len(predictor.versions),
+        "time/update_s": seconds,
+    }
     silent = f", {skipped} skipped (silence where it was expected)" if skipped else ""
     message = f"{row_count} rows added{silent}, alarms: {len(table) - alarms_before}"
     message = f"back by {config.undo}: {len(predictor.rows)} rows kept" if config.undo else message
@@ -66,7 +77,10 @@ def task(config: DictConfig) -> dict[str, Any]:
 
 
 def _add_rows(
-    predictor: Predictor, stored: checkpoint.StoredModel, config: DictConfig, settings: dict[str, Any]
+    predictor: Predictor,
+    stored: checkpoint.StoredModel,
+    config: DictConfig,
+    settings: dict[str, Any],
 ) -> tuple[int, int]:
     """Tell the rows of a file; return how many are kept, and how many were skipped."""
     data, placed = read_like_stored(stored, config.data)
@@ -81,7 +95,9 @@ def _add_rows(
     for start in range(0, len(rows), size):
         refit = config.refit and start + size >= len(rows)
         key = content if start == 0 and not config.again else None
-        found = predictor.update(rows.subset(slice(start, start + size)), refit=refit, key=key, **how)
+        found = predictor.update(
+            rows.subset(slice(start, start + size)), refit=refit, key=key, **how
+        )
         row_count, skipped = row_count + len(found.rows), skipped + found.skipped
     return row_count, skipped
 
@@ -100,5 +116,9 @@ def alarm_rows(predictor: Predictor) -> list[dict[str, Any]]:
 
 def changes_table(rows: list[dict[str, Any]]) -> Table:
     """Return what changed, as people read it."""
-    columns = [Column(name, ".1f" if name in ("change_db", "x", "y") else "", of=name) for name in COLUMNS]
-    return Table.from_rows("What changed: kind, numbers of rows, dB, about where [m]", columns, rows[-20:])
+    columns = [
+        Column(name, ".1f" if name in ("change_db", "x", "y") else "", of=name) for name in COLUMNS
+    ]
+    return Table.from_rows(
+        "What changed: kind, numbers of rows, dB, about where [m]", columns, rows[-20:]
+    )

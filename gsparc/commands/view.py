@@ -37,9 +37,12 @@ def task(config: DictConfig) -> dict[str, Any]:
     end = serve(view, str(config.host), int(config.port)) if save is None else write(view, save)
     viewed, site = view.viewed, view.viewed.site
     facts = {
-        "dataset/name": site.name, "dataset/kind": site.kind, "model/name": viewed.predictor.method.name,
-        "ckpt": str(config.ckpt), **peak_memory(),
-    }  # fmt: skip
+        "dataset/name": site.name,
+        "dataset/kind": site.kind,
+        "model/name": viewed.predictor.method.name,
+        "ckpt": str(config.ckpt),
+        **peak_memory(),
+    }
     return finish_run(run_dir, facts, lines=[*viewed.notes, end], before="summary ")
 
 
@@ -51,16 +54,22 @@ def check(save: Path | None, port: int) -> None:
     # Pages are made of viser's client; splat files are not.
     if (save is None or save.suffix.lower() == ".html") and find_spec("viser") is None:
         raise DataError(
-            "viewing in a browser needs viser: pip install 'gsparc[viewer]' (save=gaussians.ply does without)"
+            "viewing in a browser needs viser: pip install 'gsparc[viewer]' (save=gaussians.ply "
+            "does without)"
         )
 
 
 def view_of(settings: dict[str, Any]) -> SiteView:
-    """Return everything that is shown, by a configuration; `DataError` for a file or place that cannot be."""
+    """Return everything that is shown, by a configuration;
+    `DataError` for a file or place that cannot be.
+    """
     plan = read_plan_settings(settings)
-    check_dataset(settings["ckpt"], settings["dataset"])  # what else is wrong with data is a note alone
+    # What else is wrong with data is a note alone
+    check_dataset(settings["ckpt"], settings["dataset"])
     viewed = open_model(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
-    at, other = (None if settings[k] is None else read_place(k, settings[k]) for k in ("at", "other_end"))
+    at, other = (
+        None if settings[k] is None else read_place(k, settings[k]) for k in ("at", "other_end")
+    )
     return SiteView(viewed, plan, lay_power_plane(viewed, settings, plan), at, other)
 
 
@@ -86,6 +95,8 @@ def write(view: SiteView, path: Path) -> str:
     cloud = model_gaussians(view.viewed, name, view.station(name).measured)
     if cloud is None:
         model = f"{view.viewed.predictor.method.name} of {view.viewed.site.name}"
-        raise DataError(f"save={path}: {model} holds no Gaussians to write; save=FILE.html draws it")
+        raise DataError(
+            f"save={path}: {model} holds no Gaussians to write; save=FILE.html draws it"
+        )
     write_ply(path, cloud, cloud_colours(cloud)[1])
     return f"{len(cloud)} Gaussians written to {path}"

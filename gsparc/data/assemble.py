@@ -17,8 +17,12 @@ from gsparc.data.schema import Measurements
 FARTHEST = 1e7  # [m]; an Earth radius and a half: anything beyond is not a position in metres
 
 
-def check_positions(problems: Problems, where: str, position: np.ndarray, row_names: list[str]) -> bool:
-    """Note rows whose position (S, 3) [m] is not finite or not on Earth; returns whether there are any."""
+def check_positions(
+    problems: Problems, where: str, position: np.ndarray, row_names: list[str]
+) -> bool:
+    """Note rows whose position (S, 3) [m] is not finite or not on Earth;
+    returns whether there are any.
+    """
     with np.errstate(invalid="ignore"):
         good = np.isfinite(position).all(axis=-1) & (np.abs(position) <= FARTHEST).all(axis=-1)
     expected = f"expected three finite coordinates in metres, none beyond {FARTHEST:.0e}"
@@ -26,10 +30,12 @@ def check_positions(problems: Problems, where: str, position: np.ndarray, row_na
 
 
 def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Return the root mean square of rows `values` (S, ...), real or complex, in whole dB; 0 if all are zero.
+    """Return the root mean square of rows `values` (S, ...), real or complex, in whole dB;
+    0 if all are zero.
 
-    This is a constant of the site, taken over all rows but those of `find_strong_outliers`: rounding keeps
-    any single row (which may be a test row) from influencing it. `weight` is a bool mask of measured entries.
+    This is a constant of the site, taken over all rows but those of `find_strong_outliers`:
+    rounding keeps any single row (which may be a test row) from influencing it.
+    `weight` is a bool mask of measured entries.
     """
     highest = peak_magnitudes(values, weight)
     usual = ~find_strong_outliers(highest)
@@ -47,7 +53,9 @@ def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
 
 
 def content_hash(arrays: Mapping[str, np.ndarray | float | None]) -> str:
-    """Return the SHA-256 of named arrays (type, shape, bytes), the same whatever file they came from."""
+    """Return the SHA-256 of named arrays (type, shape, bytes),
+    the same whatever file they came from.
+    """
     digest = hashlib.sha256()
     for name in sorted(arrays):
         if arrays[name] is None:
@@ -62,8 +70,8 @@ def content_hash(arrays: Mapping[str, np.ndarray | float | None]) -> str:
 def identity_hash(data: Measurements) -> str:
     """Return the SHA-256 of all that a method learns from, for the names of kept results.
 
-    The content hash of a site (`Site.sha256`) is of the measurements alone: on another grid, in another unit
-    or about another origin they are other data.
+    The content hash of a site (`Site.sha256`) is of the measurements alone: on another grid, in
+    another unit or about another origin they are other data.
     """
     return hashlib.sha256(f"{_fact_text(data.site)} {auxiliary_hash(data)}".encode()).hexdigest()
 
@@ -79,7 +87,9 @@ def _fact_text(fact: Any) -> str:
     if isinstance(fact, np.ndarray):
         return content_hash({"": fact})
     if is_dataclass(fact):
-        return str({one.name: _fact_text(getattr(fact, one.name)) for one in fields(fact) if one.compare})
+        return str(
+            {one.name: _fact_text(getattr(fact, one.name)) for one in fields(fact) if one.compare}
+        )
     return repr(fact.item() if isinstance(fact, np.generic) else fact)
 
 
@@ -87,8 +97,9 @@ def centre_positions(data: Measurements) -> Measurements:
     """Return measurements in world coordinates about the middle of their box, with their hash.
 
     Args:
-        data: ends and stations in float64, validated, targets divided by `site.target_scale`; of the site
-            `origin`, the boxes, `sha256`, `static_position` and `rx_rotation` are set here.
+        data: ends and stations in float64, validated, targets divided by `site.target_scale`; of
+            the site `origin`, the boxes, `sha256`, `static_position`
+            and `rx_rotation` are set here.
     """
     site, tx, rx = data.site, data.tx, data.rx_position
     stations, static = site.every_station, site.static_end
@@ -99,21 +110,40 @@ def centre_positions(data: Measurements) -> Measurements:
     origin = (ends.min(axis=0) + ends.max(axis=0)) / 2
     moved = replace(data, tx=tx - origin, rx_position=rx - origin)
     moving = moved.moving[usual]
-    of_rows = ("tx", "rx_rotation", "target", "mask", "noise_variance", "station", "place", "censored", "run",
-               "position_std", "device")  # fmt: skip
+    of_rows = (
+        "tx",
+        "rx_rotation",
+        "target",
+        "mask",
+        "noise_variance",
+        "station",
+        "place",
+        "censored",
+        "run",
+        "position_std",
+        "device",
+    )
     hashed = {name: getattr(data, name) for name in of_rows} | {
-        "rx": rx, "array": site.array, "subcarriers_hz": site.subcarriers_hz,
-        "target_scale": site.target_scale, "carrier_hz": site.carrier_hz,
-        "carriers_hz": stations.carrier_hz, "arrays": stations.array,
-    }  # fmt: skip
+        "rx": rx,
+        "array": site.array,
+        "subcarriers_hz": site.subcarriers_hz,
+        "target_scale": site.target_scale,
+        "carrier_hz": site.carrier_hz,
+        "carriers_hz": stations.carrier_hz,
+        "arrays": stations.array,
+    }
     still = None
     if static is not None and not site.several:
         still = (rx if static == "rx" else tx)[0] - origin
         still = still if np.isfinite(still).all() else None
     site = replace(
-        site, origin=origin, box=np.stack([ends.min(axis=0) - origin, ends.max(axis=0) - origin]),
-        moving_box=np.stack([moving.min(axis=0), moving.max(axis=0)]), sha256=content_hash(hashed),
-        static_position=still, rx_rotation=np.array(data.rx_rotation[0], dtype=np.float64),
+        site,
+        origin=origin,
+        box=np.stack([ends.min(axis=0) - origin, ends.max(axis=0) - origin]),
+        moving_box=np.stack([moving.min(axis=0), moving.max(axis=0)]),
+        sha256=content_hash(hashed),
+        static_position=still,
+        rx_rotation=np.array(data.rx_rotation[0], dtype=np.float64),
         stations=site.stations and replace(stations, position=stations.position - origin),
-    )  # fmt: skip
+    )
     return replace(moved, site=site)

@@ -41,7 +41,8 @@ def iterate_bytes(array: np.ndarray) -> Iterator[bytes]:
 
 
 class OnDisk(np.memmap):
-    """An array in a file. A process that is started with it opens the file, instead of getting a copy.
+    """An array in a file. A process that is started with it opens the file,
+    instead of getting a copy.
 
     Attributes:
         file: what it maps, kept open; parts of the array have none, and are copied.
@@ -50,14 +51,18 @@ class OnDisk(np.memmap):
     file: IO[bytes] | None = None
 
     @staticmethod
-    def from_file(file: IO[bytes], dtype: Any, mode: Any, shape: tuple[int, ...], offset: int = 0) -> OnDisk:
+    def from_file(
+        file: IO[bytes], dtype: Any, mode: Any, shape: tuple[int, ...], offset: int = 0
+    ) -> OnDisk:
         """Return what lies in an open file from `offset` on [bytes]."""
         array = OnDisk(file, dtype, mode, offset, shape)
         array.file = file
         return array
 
     def __reduce__(self) -> Any:
-        """For a process that is being started: a duplicate of the open file, which may have no name."""
+        """For a process that is being started: a duplicate of the open file,
+        which may have no name.
+        """
         if self.file is None or context.get_spawning_popen() is None:
             return super().__reduce__()
         duplicate = reduction.DupFd(self.file.fileno())
@@ -107,7 +112,9 @@ def take(array: np.ndarray, rows: np.ndarray) -> np.ndarray:
 
 
 def map_from_disk(dataset: h5py.Dataset) -> OnDisk:
-    """Return a dataset's values where they are, or, stored in chunks, copied beside them by blocks."""
+    """Return a dataset's values where they are, or, stored in chunks,
+    copied beside them by blocks.
+    """
     offset = dataset.id.get_offset()
     if offset is not None and dataset.dtype.isnative:
         file = open(dataset.file.filename, "rb")  # noqa: SIM115 (the array keeps it)

@@ -1,4 +1,6 @@
-"""Where queries and rows are, as kernels read them: what moves, what stands, and which station that is."""
+"""Where queries and rows are, as kernels read them: what moves, what stands,
+and which station that is.
+"""
 
 from __future__ import annotations
 
@@ -40,8 +42,13 @@ class Ends:
 
     @classmethod
     def from_query(cls, site: Site, query: Query) -> Ends:
-        """Return ends in a site's terms; of a query without stations, of those who stand where it says."""
-        still, turned = query.tx if site.moving_end == "rx" else query.rx.position, query.rx.rotation
+        """Return ends in a site's terms; of a query without stations,
+        of those who stand where it says.
+        """
+        still, turned = (
+            query.tx if site.moving_end == "rx" else query.rx.position,
+            query.rx.rotation,
+        )
         still = still.expand(len(query), -1).cpu().double()
         if site.stations is None:
             station = torch.zeros(len(query), dtype=torch.long)
@@ -49,13 +56,17 @@ class Ends:
             station = stations_at(torch.from_numpy(site.stations.position), still)
         else:
             station = query.station.cpu().long()
-        return cls(query.places(site), still, turned.expand(len(query), -1, -1).cpu().double(), station)
+        return cls(
+            query.places(site), still, turned.expand(len(query), -1, -1).cpu().double(), station
+        )
 
 
 def stations_at(known: Tensor, places: Tensor) -> Tensor:
-    """Return the numbers (n,) int64 of stations at (T, 3) [m] that places (n, 3) are, `NOBODY` where none is.
+    """Return the numbers (n,) int64 of stations at (T, 3) [m] that places (n, 3) are,
+    `NOBODY` where none is.
 
-    >>> stations_at(torch.tensor([[0.0, 0, 0], [5, 0, 0]]), torch.tensor([[5.0, 0, 0.001], [3, 0, 0]]))
+    >>> places = torch.tensor([[0.0, 0, 0], [5, 0, 0]])
+    >>> stations_at(places, torch.tensor([[5.0, 0, 0.001], [3, 0, 0]]))
     tensor([ 1, -1])
     """
     away, number = station_distances(known, places).min(1)
@@ -63,6 +74,8 @@ def stations_at(known: Tensor, places: Tensor) -> Tensor:
 
 
 def station_distances(known: Tensor, places: Tensor) -> Tensor:
-    """Return distances (n, T) [m]; of an unknown place 0 to unknown stations, and infinity to others."""
+    """Return distances (n, T) [m]; of an unknown place 0 to unknown stations,
+    and infinity to others.
+    """
     both_unknown = places.isnan().any(1)[:, None] & known.isnan().any(1)
     return torch.cdist(places.detach(), known).nan_to_num(math.inf).masked_fill(both_unknown, 0.0)

@@ -10,7 +10,8 @@ from pyproj import Proj
 
 from gsparc.base.errors import DataError
 
-DIGITS = 4  # of an origin's degrees: 11 m, so that the same campaign with a few rows more keeps its origin
+# Of an origin's degrees: 11 m, so that the same campaign with a few rows more keeps its origin
+DIGITS = 4
 # Latitude and longitude [deg]; both customs of longitude are taken: -180 to 180, and 0 to 360.
 ON_EARTH = ((-90, 90), (-180, 360))
 
@@ -19,10 +20,10 @@ ON_EARTH = ((-90, 90), (-180, 360))
 class Georeference:
     """The origin of local coordinates: x points east there, y north.
 
-    The projection is azimuthal equidistant about the origin (Snyder, Map Projections, 1987, chapter 25),
-    computed from geodesics (Karney, J. Geodesy 87, 2013), so that poles and the antimeridian are places like
-    any other. Distances from the origin are exact, across them they are stretched by (r / 6371 km)^2 / 6:
-    0.4 millionths at 10 km, 41 millionths at 100 km.
+    The projection is azimuthal equidistant about the origin (Snyder, Map Projections, 1987, chapter
+    25), computed from geodesics (Karney, J. Geodesy 87, 2013), so that poles and the antimeridian
+    are places like any other. Distances from the origin are exact, across them they are stretched
+    by (r / 6371 km)^2 / 6: 0.4 millionths at 10 km, 41 millionths at 100 km.
 
     Attributes:
         latitude: of the origin [deg], -90 to 90.
@@ -42,7 +43,9 @@ class Georeference:
         Raises:
             DataError: no places, or a value is not in range.
         """
-        latitude, longitude = (np.atleast_1d(np.asarray(v, np.float64)) for v in (latitude, longitude))
+        latitude, longitude = (
+            np.atleast_1d(np.asarray(v, np.float64)) for v in (latitude, longitude)
+        )
         if not latitude.size:
             raise DataError("origin: no places")
         _refuse_invalid(latitude, longitude, "origin: ")
@@ -55,7 +58,8 @@ class Georeference:
         """Return local coordinates (n, 2) [m], east and north, of places (n,) [deg].
 
         Raises:
-            DataError: a value is not finite or out of range (latitude -90 to 90, longitude -180 to 360).
+            DataError: a value is not finite or out of range (latitude -90 to 90, longitude -180 to
+                360).
         """
         _refuse_invalid(latitude, longitude)
         east, north = (np.array(one, np.float64, ndmin=1) for one in (longitude, latitude))
@@ -71,7 +75,9 @@ class Georeference:
         if xy.ndim != 2 or xy.shape[1] != 2:
             raise DataError(f"local coordinates: expected shape (n, 2), found {xy.shape}")
         if not (np.hypot(xy[:, 0], xy[:, 1]) < 2.0e7).all():
-            raise DataError("local coordinates: not finite, or not on Earth; expected metres from the origin")
+            raise DataError(
+                "local coordinates: not finite, or not on Earth; expected metres from the origin"
+            )
         longitude, latitude = self._projection(xy[:, 0], xy[:, 1], inverse=True)
         return np.asarray(latitude), np.asarray(longitude)
 
@@ -80,7 +86,9 @@ class Georeference:
         return Proj(proj="aeqd", ellps="WGS84", lat_0=self.latitude, lon_0=self.longitude)
 
 
-def _refuse_invalid(latitude: np.ndarray | float, longitude: np.ndarray | float, what: str = "") -> None:
+def _refuse_invalid(
+    latitude: np.ndarray | float, longitude: np.ndarray | float, what: str = ""
+) -> None:
     if (fault := find_invalid_coordinate(latitude, longitude)) is not None:
         raise DataError(f"{what}{fault[1]}")
 
@@ -88,7 +96,9 @@ def _refuse_invalid(latitude: np.ndarray | float, longitude: np.ndarray | float,
 def find_invalid_coordinate(
     latitude: np.ndarray | float, longitude: np.ndarray | float
 ) -> tuple[int, str] | None:
-    """Return the first row of (n,) [deg] that is not on Earth, and what is wrong; None when all are."""
+    """Return the first row of (n,) [deg] that is not on Earth, and what is wrong;
+    None when all are.
+    """
     latitude, longitude = np.atleast_1d(latitude, longitude)
     for name, values, (low, high) in zip(
         ("latitude", "longitude"), (latitude, longitude), ON_EARTH, strict=True
@@ -97,5 +107,7 @@ def find_invalid_coordinate(
         if len(wrong):
             swapped = name == "latitude" and (np.abs(longitude) <= 90).all()
             hint = "; are latitude and longitude swapped?" if swapped else ""
-            return int(wrong[0]), f"{name} {values[wrong[0]]:g} is outside {low} to {high} degrees{hint}"
+            return int(wrong[0]), (
+                f"{name} {values[wrong[0]]:g} is outside {low} to {high} degrees{hint}"
+            )
     return None

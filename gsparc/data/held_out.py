@@ -42,11 +42,15 @@ def grouped_folds(positions: np.ndarray, settings: SplitSettings) -> list[TrainT
 def block_rows(
     positions: np.ndarray, rows: np.ndarray, settings: SplitSettings, share: float, seed: list[int]
 ) -> np.ndarray:
-    """Those of `rows` in whole squares of floor, drawn until they are a `share` of `rows` at least."""
+    """Those of `rows` in whole squares of floor,
+    drawn until they are a `share` of `rows` at least.
+    """
     floor = positions[:, :2]
     side = settings.side_m or tenth_of_extent(floor)
     if not tenth_of_extent(floor) > 0:
-        raise DataError("split=blocks: all positions are one above the other, there are no squares of floor")
+        raise DataError(
+            "split=blocks: all positions are one above the other, there are no squares of floor"
+        )
     square = number_squares(floor[rows], side)
     order = np.random.default_rng(seed).permutation(square.max() + 1)
     # Whole squares are added until the share is reached: the test set is never smaller.
@@ -61,7 +65,9 @@ def block_rows(
 
 
 def corner_fold(positions: np.ndarray, settings: SplitSettings) -> TrainTest:
-    """A rectangle in one corner of the site, seen from above, holding `test_fraction` of the rows."""
+    """A rectangle in one corner of the site, seen from above,
+    holding `test_fraction` of the rows.
+    """
     lower, extent = positions[:, :2].min(axis=0), np.ptp(positions[:, :2], axis=0)
     # A site without extent along an axis is divided by 1: that axis tells no row from another.
     unit = (positions[:, :2] - lower) / np.where(extent > 0, extent, 1.0)

@@ -1,7 +1,9 @@
-"""Folds inside the training and validation rows, cut as the test rows were cut from all: for choosing models.
+"""Folds inside the training and validation rows, cut as the test rows were cut from all:
+for choosing models.
 
-Errors of rows left out otherwise rank models wrongly: what interpolates well between neighbours (a random
-cut) may extrapolate badly into a square of floor that nobody walked (blocks), and the other way round.
+Errors of rows left out otherwise rank models wrongly: what interpolates well between neighbours (a
+random cut) may extrapolate badly into a square of floor that nobody walked (blocks),
+and the other way round.
 """
 
 from __future__ import annotations
@@ -17,10 +19,19 @@ from gsparc.base.errors import DataError
 from gsparc.data import spacing
 from gsparc.data.schema import Measurements, TrainTest
 from gsparc.data.spacing import neighbour_distance
-from gsparc.data.splits import CORNERS, WHOLE, AnySplit, FileSettings, Fold, SplitSettings, make_split
+from gsparc.data.splits import (
+    CORNERS,
+    WHOLE,
+    AnySplit,
+    FileSettings,
+    Fold,
+    SplitSettings,
+    make_split,
+)
 
 Draws = np.random.Generator
-FARTHER = 2.0  # times the usual distance to the nearest training row, from which validation rows are apart
+# Times the usual distance to the nearest training row, from which validation rows are apart
+FARTHER = 2.0
 SIDES = np.sqrt(2) ** np.arange(9)  # of squares tried for a file's gap, in units of that gap
 HALVINGS = 6  # of the side of squares, where too few squares hold training rows
 DRAWS = 12  # of squares per fold, of which those are taken that share the fewest rows
@@ -34,8 +45,9 @@ class InnerFolds:
     Attributes:
         name: of the split they are cut by, one of `gsparc.data.splits.NAMES`.
         folds: one or more, of rows as the outer fold counts them.
-        unit: (S,) int64 of all rows, which were left out together as one: a place, a square, a station or a
-            stretch; errors within a unit are not independent. `NOT_TESTED` of the rest.
+        unit: (S,) int64 of all rows, which were left out together as one: a place, a square, a
+            station or a stretch; errors within a unit are not independent.
+            `NOT_TESTED` of the rest.
     """
 
     name: str
@@ -52,14 +64,16 @@ def inner_folds(
     place: np.ndarray | None = None,
     station: np.ndarray | None = None,
 ) -> InnerFolds:
-    """Cut the training and validation rows of a fold as `split` cut the test rows off; a pure function.
+    """Cut the training and validation rows of a fold as `split` cut the test rows off;
+    a pure function.
 
-    `random` and `sparse` leave out pieces of one permutation of the places, so that folds share none where
-    `count` pieces fit; `sparse` does not thin again, as its training rows are thin already. `blocks` leaves
-    out squares of the same side, `grouped` stretches as long, `corner` the other corners first, `stations`
-    and `runs` as many of these at a time. Folds of a file are random, unless its validation rows lie clearly
-    farther from training rows than these from one another: then squares as far apart. Where too few squares,
-    stretches or units remain, squares are made smaller, then rows are drawn at random; `name` says so.
+    `random` and `sparse` leave out pieces of one permutation of the places, so that folds share
+    none where `count` pieces fit; `sparse` does not thin again, as its training rows are thin
+    already. `blocks` leaves out squares of the same side, `grouped` stretches as long, `corner` the
+    other corners first, `stations` and `runs` as many of these at a time. Folds of a file are
+    random, unless its validation rows lie clearly farther from training rows than these from one
+    another: then squares as far apart. Where too few squares, stretches or units remain, squares
+    are made smaller, then rows are drawn at random; `name` says so.
 
     Args:
         positions: (S, 3) [m] of the moving end, or (S, 6) of both, of all rows.
@@ -75,7 +89,9 @@ def inner_folds(
     """
     rows = np.sort(fold.learned())
     positions, place = positions - positions.min(axis=0), spacing.group_visits(positions, place)
-    number = np.arange(len(rows)) if place is None else np.unique(place[rows], return_inverse=True)[1]
+    number = (
+        np.arange(len(rows)) if place is None else np.unique(place[rows], return_inverse=True)[1]
+    )
     _, first, which = np.unique(number, return_index=True, return_inverse=True)
     which, where = which.reshape(-1), positions[rows][first]
     if len(where) < 2:
@@ -99,11 +115,13 @@ def inner_folds(
     return InnerFolds(cut.name, folds, units)
 
 
-def cut_folds(data: Measurements, fold: Fold, split: AnySplit | None, count: int, seed: int) -> InnerFolds:
+def cut_folds(
+    data: Measurements, fold: Fold, split: AnySplit | None, count: int, seed: int
+) -> InnerFolds:
     """Return `inner_folds` of measurements.
 
-    Where both ends are taken for moving only because stations are learned together, what moves is the other
-    end than theirs, as it was for the split.
+    Where both ends are taken for moving only because stations are learned together, what moves is
+    the other end than theirs, as it was for the split.
     """
     positions = data.moving
     if data.site.paired and data.station is not None:
@@ -124,11 +142,16 @@ def _inside(positions: np.ndarray, fold: Fold, split: AnySplit | None) -> SplitS
         return SplitSettings()
     if isinstance(split, FileSettings):
         return _like_a_file(positions, fold)
-    whole: dict[str, object] = {"thin": 1.0, "train_count": None, "spacing_m": None, "redraw": False}
+    whole: dict[str, object] = {
+        "thin": 1.0,
+        "train_count": None,
+        "spacing_m": None,
+        "redraw": False,
+    }
     if split.name != "stations":
         whole["leave_out"] = ()
-    # Nothing was held out that could be followed; or as dense as what is learned from: thinned again it would
-    # be another task.
+    # Nothing was held out that could be followed; or as dense as what is learned from: thinned
+    # again it would be another task.
     if split.name in ("none", "sparse"):
         whole["name"] = "random"
     if split.name == "blocks" and split.side_m is None:
@@ -139,7 +162,9 @@ def _inside(positions: np.ndarray, fold: Fold, split: AnySplit | None) -> SplitS
 
 
 def _like_a_file(positions: np.ndarray, fold: Fold) -> SplitSettings:
-    """Random, or squares that leave rows as far from the others as validation rows are from training rows."""
+    """Random, or squares that leave rows as far from the others as validation rows are
+    from training rows.
+    """
     share = min(max(len(fold.val) / max(len(fold.train) + len(fold.val), 1), 0.1), 0.5)
     settings = SplitSettings(test_fraction=share, val_fraction=share)
     if not len(fold.val) or len(fold.train) < 2:
@@ -181,10 +206,17 @@ def _cut(where: np.ndarray, settings: SplitSettings, count: int, rng: Draws) -> 
         corners = [*map(str, rng.permutation(others)), settings.corner][:count]
     if settings.name in ("grouped", "corner"):
         with suppress(DataError):
-            cut = [f for corner in corners for f in make_split(where, replace(settings, corner=corner)).folds]
-            chosen = rng.permutation(len(cut))[:count] if settings.name == "grouped" else range(len(cut))
+            cut = [
+                f
+                for corner in corners
+                for f in make_split(where, replace(settings, corner=corner)).folds
+            ]
+            chosen = (
+                rng.permutation(len(cut))[:count] if settings.name == "grouped" else range(len(cut))
+            )
             unit = np.full(len(where), NOT_TESTED)
-            for number, i in reversed([*enumerate(chosen)]):  # a row of two folds is counted with the first
+            # A row of two folds is counted with the first
+            for number, i in reversed([*enumerate(chosen)]):
                 unit[cut[i].test] = number
             return InnerFolds(settings.name, tuple(cut[i] for i in chosen), unit)
     settings = replace(settings, name="random")
@@ -194,7 +226,9 @@ def _cut(where: np.ndarray, settings: SplitSettings, count: int, rng: Draws) -> 
 
 
 def _pieces(places: int, settings: SplitSettings, count: int, rng: Draws) -> Iterator[TrainTest]:
-    """(training, test) places of each fold: pieces of one permutation, overlapping only where they must."""
+    """(training, test) places of each fold: pieces of one permutation,
+    overlapping only where they must.
+    """
     order = rng.permutation(places)
     size = min(max(round(settings.test_fraction * places), 1), places - 1)
     for number in range(min(count, places)):
@@ -203,11 +237,17 @@ def _pieces(places: int, settings: SplitSettings, count: int, rng: Draws) -> Ite
 
 
 def _draws(
-    where: np.ndarray, settings: SplitSettings, count: int, rng: Draws, station: np.ndarray | None = None
+    where: np.ndarray,
+    settings: SplitSettings,
+    count: int,
+    rng: Draws,
+    station: np.ndarray | None = None,
 ) -> tuple[Fold, ...]:
     """`count` distinct draws of a split by seeds of their own, each with the fewest rows again."""
     seeds = rng.integers(2**31, size=DRAWS * count)
-    folds = [make_split(where, replace(settings, seed=int(s)), station=station).folds[0] for s in seeds]
+    folds = [
+        make_split(where, replace(settings, seed=int(s)), station=station).folds[0] for s in seeds
+    ]
     first, *rest = {fold.test.tobytes(): fold for fold in folds}.values()
     chosen = [first]
     while rest and len(chosen) < count:
@@ -217,8 +257,12 @@ def _draws(
     return tuple(chosen)
 
 
-def _stations(station: np.ndarray, settings: SplitSettings, count: int, rng: Draws) -> InnerFolds | None:
-    """Folds of rows of stations or runs (n,) that leave out whole ones; None where there is one alone."""
+def _stations(
+    station: np.ndarray, settings: SplitSettings, count: int, rng: Draws
+) -> InnerFolds | None:
+    """Folds of rows of stations or runs (n,) that leave out whole ones;
+    None where there is one alone.
+    """
     number, name = int(station.max()) + 1, settings.name
     together = max(min(settings.held_out_count(number), number - 2), 0)
     settings = replace(settings, name="stations", leave_out=together)
@@ -227,7 +271,9 @@ def _stations(station: np.ndarray, settings: SplitSettings, count: int, rng: Dra
         return None
     if number == 2:  # one to learn from; none is left to choose on
         none = np.zeros(0, np.int64)
-        folds = [Fold(np.flatnonzero(station != t), none, np.flatnonzero(station == t)) for t in range(2)]
+        folds = [
+            Fold(np.flatnonzero(station != t), none, np.flatnonzero(station == t)) for t in range(2)
+        ]
     elif together <= 1:
         every = make_split(where, replace(settings, leave_out=0), station=station).folds
         folds = [every[i] for i in rng.permutation(number)[:count]]

@@ -65,7 +65,9 @@ class Snapshots:
 
 
 def number_moments(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Return numbers (S,) of the moments of rows; without stations, or places in common, each has its own."""
+    """Return numbers (S,) of the moments of rows; without stations, or places in common,
+    each has its own.
+    """
     if data.station is None or data.place is None:
         return np.arange(len(rows))
     import pandas as pd  # here, as it takes half a second

@@ -1,7 +1,8 @@
 """Few rows far beyond all others, with a gap between: damaged bytes, wrong units, sentinels.
 
-They are named where data are checked and read, set no scale, and are learned from and tested on unless
-`split.leave_out=outliers` says otherwise. A tail without a gap, or more rows than a few, belongs to the site.
+They are named where data are checked and read, set no scale, and are learned from and tested on
+unless `split.leave_out=outliers` says otherwise. A tail without a gap, or more rows than a few,
+belongs to the site.
 """
 
 from __future__ import annotations
@@ -19,11 +20,14 @@ FEW = 0.02  # share of the rows, at least one row
 GAP_DB = 50.0  # to the next row: no step of a receiver between two of its neighbours is as high
 FAR = 10.0  # times the farthest distance of the others from the median place
 FAR_M = 50.0  # and this much farther: in a small box nothing is far
-WITHIN, APART_PLACES = 0.1, 3  # of a box: its margin, how wide rows lie in it at least; rows that tell
+# Of a box: its margin, how wide rows lie in it at least; rows that tell
+WITHIN, APART_PLACES = 0.1, 3
 
 
 def find_strong_outliers(peaks: np.ndarray) -> np.ndarray:
-    """Tell which rows (S,) have a largest magnitude, `peaks` (S,), far above all others'; no silent ones."""
+    """Tell which rows (S,) have a largest magnitude, `peaks` (S,), far above all others';
+    no silent ones.
+    """
     with np.errstate(divide="ignore"):
         level = 20 * np.log10(np.asarray(peaks, dtype=np.float64))
     finite = np.isfinite(level)
@@ -40,14 +44,19 @@ def too_far(positions: np.ndarray) -> np.ndarray:
 
 def far_from_box(positions: np.ndarray, box: np.ndarray) -> np.ndarray:
     """Tell which `positions` (n, 3) [m] lie as far outside the `box` (2, 3) of other rows."""
-    distance, reach = np.linalg.norm(positions - box.mean(0), axis=1), np.linalg.norm(np.ptp(box, axis=0)) / 2
+    distance, reach = (
+        np.linalg.norm(positions - box.mean(0), axis=1),
+        np.linalg.norm(np.ptp(box, axis=0)) / 2,
+    )
     return (distance > FAR * reach) & (distance - reach > FAR_M)
 
 
 def are_kilometres(positions: np.ndarray, box: np.ndarray) -> bool:
-    """Tell whether a `box` (2, 3) [m] holds `positions` (n, 3) only when these are taken for kilometres.
+    """Tell whether a `box` (2, 3) [m] holds `positions` (n, 3)
+    only when these are taken for kilometres.
 
-    Or holds both, but these as a heap about the origin, and their thousandfold spread out as rows are.
+    Or holds both, but these as a heap about the origin,
+    and their thousandfold spread out as rows are.
     """
     margin = np.maximum(WITHIN * np.ptp(box, axis=0), LOW_M)
 
@@ -115,18 +124,24 @@ def outlier_warnings(data: Measurements) -> list[str]:
     """Say each kind of outlier in one sentence, with the names of the first rows."""
     advice = "if they are wrong, leave them out with split.leave_out=outliers"
     found = find_outliers(data).items()
-    return [f"{list_first([data.row_names[i] for i in rows])}: {what}; {advice}" for what, rows in found]
+    return [
+        f"{list_first([data.row_names[i] for i in rows])}: {what}; {advice}" for what, rows in found
+    ]
 
 
 WIDTHS = 30.0  # of the rows' box
-DISTANT_M, TOO_DISTANT_M = 1e4, 1e6  # from there on positions in float32 move in steps of centimetres
+# From there on positions in float32 move in steps of centimetres
+DISTANT_M, TOO_DISTANT_M = 1e4, 1e6
 APART_M = 200.0  # in height, between a station and all rows
 LOW_M = 0.1  # no station's height above ground where rows are higher
 BENEATH_M = 2.0  # the same of one that is below 0, too: rooms may be measured from a table
 
 
-def check_static_ends(still: np.ndarray, moving: np.ndarray, origin: Georeference | None) -> tuple[str, bool]:
-    """Say what is wrong with the places of static ends, empty: nothing, and whether that is certain.
+def check_static_ends(
+    still: np.ndarray, moving: np.ndarray, origin: Georeference | None
+) -> tuple[str, bool]:
+    """Say what is wrong with the places of static ends, empty: nothing,
+    and whether that is certain.
 
     Args:
         still: (T, 3) places of static ends, in the world [m].
@@ -139,7 +154,9 @@ def check_static_ends(still: np.ndarray, moving: np.ndarray, origin: Georeferenc
     width = float(np.ptp(rows[:, :2], axis=0).max())
 
     def beyond(place: np.ndarray) -> np.ndarray:  # distances (n,) from the box of the rows
-        return np.linalg.norm(np.maximum(low[:2] - place, 0) + np.maximum(place - high[:2], 0), axis=1)
+        return np.linalg.norm(
+            np.maximum(low[:2] - place, 0) + np.maximum(place - high[:2], 0), axis=1
+        )
 
     distance = beyond(still[:, :2])
     far = int(distance.argmax())
@@ -152,7 +169,10 @@ def check_static_ends(still: np.ndarray, moving: np.ndarray, origin: Georeferenc
                 turned = origin.from_degrees(longitude, latitude)
         swapped = bool(beyond(turned)[0] < 0.1 * distance[far])
         hint = f"are {axes} swapped?" if swapped else "are both in one system and unit?"
-        fault = f"a static end {distance[far] / 1e3:.4g} km from all rows, which reach over {width:.4g} m"
+        fault = (
+            f"a static end {distance[far] / 1e3:.4g} km from all rows, which reach over "
+            f"{width:.4g} m"
+        )
         return f"{fault}; {hint}", swapped or bool(distance[far] > TOO_DISTANT_M)
     lowest = float(still[:, 2].min())
     below, above = float(low[2]) - lowest, float(still[:, 2].max() - high[2])
@@ -161,7 +181,9 @@ def check_static_ends(still: np.ndarray, moving: np.ndarray, origin: Georeferenc
         fault = f"a static end {max(below, above):.4g} m {side} all rows"
         return f"{fault}: heights above the sea beside heights above the ground?", False
     if 0 < np.abs(still[:, 2]).max() < LOW_M < low[2]:
-        return f"static ends at heights of {np.abs(still[:, 2]).max():.2g} m at most: in kilometres?", False
+        return (
+            f"static ends at heights of {np.abs(still[:, 2]).max():.2g} m at most: in kilometres?"
+        ), False
     if below > BENEATH_M and lowest < 0 <= low[2]:
         return f"a static end at a height of {lowest:.4g} m, below 0 and all rows: its sign?", False
     return "", False

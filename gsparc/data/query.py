@@ -20,19 +20,24 @@ if TYPE_CHECKING:
 class Query:
     """B places that are asked about together, in local coordinates [m].
 
-    Precision follows that of the places: float32, or float64 where autograd is to follow the answer.
+    Precision follows that of the places: float32,
+    or float64 where autograd is to follow the answer.
 
-    >>> query = Query(tx=torch.zeros(5, 3), rx=Pose.identity(torch.zeros(3)))  # one receiver for all
+    One receiver for all:
+
+    >>> query = Query(tx=torch.zeros(5, 3), rx=Pose.identity(torch.zeros(3)))
     >>> tuple(len(part) for part in query.split(2))
     (2, 2, 1)
 
     Attributes:
         tx: (B, 3) [m].
         rx: one Pose that all share, or B poses.
-        station: (B,) int64, which of the site's stations each is of; None: who stands at the static end.
-        run: (B,) int64, see `Measurements`: answers are in the phase and level of that run; None, or a run
-            that was not learned from: in those of the largest.
-        uplink: (B, U, L) complex64 received at the same moment, in target units; None where there is none.
+        station: (B,) int64, which of the site's stations each is of; None: who stands at the static
+            end.
+        run: (B,) int64, see `Measurements`: answers are in the phase and level of that run; None,
+            or a run that was not learned from: in those of the largest.
+        uplink: (B, U, L) complex64 received at the same moment, in target units; None where there
+            is none.
         noise_variance: (B,) float32 in target units; None when unknown.
     """
 
@@ -47,7 +52,9 @@ class Query:
         return len(self.tx)
 
     def rows(self, chosen: slice | Tensor) -> Self:
-        """Return some of them, as an index of the first axis chooses; a pose that all share stays one."""
+        """Return some of them, as an index of the first axis chooses;
+        a pose that all share stays one.
+        """
         return self._with(lambda v: v if isinstance(v, Pose) and not v.batched else v[chosen])
 
     def split(self, size: int) -> Iterator[Self]:
@@ -60,18 +67,24 @@ class Query:
         return self._with(lambda v: v.to(device))
 
     def places(self, site: Site) -> Tensor:
-        """Return where the moving end is, (B, 3) float64 [m] on the CPU; (B, 6) of both where both move."""
+        """Return where the moving end is, (B, 3) float64 [m] on the CPU; (B, 6)
+        of both where both move.
+        """
         return site.moving(self.tx, self.rx).expand(len(self), -1).cpu().double()
 
     def with_ends(self, places: Mapping[End, Tensor]) -> Self:
         """Return the same with ends at other places (B, 3) [m], all in their precision."""
-        ends, dtype = {"tx": self.tx, "rx": self.rx.position, **places}, next(iter(places.values())).dtype
+        ends, dtype = (
+            {"tx": self.tx, "rx": self.rx.position, **places},
+            next(iter(places.values())).dtype,
+        )
         tx, rx, turned = (one.to(dtype) for one in (ends["tx"], ends["rx"], self.rx.rotation))
         return replace(self, tx=tx, rx=Pose(rx, turned))
 
     @staticmethod
     def from_places(site: Site, places: Tensor, station: Tensor | None = None) -> Query:
-        """Return what is asked of the moving end at places (B, 3) [m], with the static end where it stood.
+        """Return what is asked of the moving end at places (B, 3) [m],
+        with the static end where it stood.
 
         Where nobody knows that it is NaN; receivers are turned as they were when measured.
 
@@ -94,7 +107,9 @@ class Query:
         return Query(tx, Pose(rx, turn.expand(count, 3, 3)), station)
 
     def _with(self, change: Callable[[Any], Any]) -> Self:
-        each = {name: value for name, value in vars(self).items() if isinstance(value, (Tensor, Pose))}
+        each = {
+            name: value for name, value in vars(self).items() if isinstance(value, (Tensor, Pose))
+        }
         return replace(self, **{name: change(value) for name, value in each.items()})
 
 
@@ -106,7 +121,8 @@ class Batch(Query):
         index: (B,) int64 row in the dataset.
         target: (B, H, W) float32, or (B, antennas, subcarriers) complex64, or (B, 1) float32.
         mask: like target, bool, True where measured; None when everything was.
-        share: of a training step's rows, where processes share them; 0 where another has these rows.
+        share: of a training step's rows, where processes share them; 0 where another has these
+            rows.
     """
 
     index: Tensor

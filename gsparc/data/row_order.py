@@ -1,7 +1,8 @@
 """Rows by what they hold: copies of others, and an order that does not depend on the file's.
 
-A file's order is chance: whatever draws rows by number draws others from the same rows shuffled. In an order
-that content decides it draws the same ones. Near places stand near each other, as along a drive.
+A file's order is chance: whatever draws rows by number draws others from the same rows shuffled. In
+an order that content decides it draws the same ones. Near places stand near each other,
+as along a drive.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ REVISITED = 0.25  # of the places with several rows: from there on equal powers 
 
 
 def hash_rows(*arrays: np.ndarray | None) -> np.ndarray:
-    """Return a number (n,) uint64 of the bytes that each row of arrays (n, ...) holds; None are left out.
+    """Return a number (n,) uint64 of the bytes that each row of arrays (n, ...) holds;
+    None are left out.
 
     >>> one, two, again = hash_rows(np.array([[1.0, 2.0], [2.0, 1.0], [1.0, 2.0]])).tolist()
     >>> one == again, one == two
@@ -42,10 +44,11 @@ def hash_rows(*arrays: np.ndarray | None) -> np.ndarray:
 
 
 def find_copies(place: np.ndarray, link: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Tell which rows (n,) repeat earlier ones, as of a packet logged twice or of files that overlap.
+    """Tell which rows (n,) repeat earlier ones,
+    as of a packet logged twice or of files that overlap.
 
-    Coarse levels of a place that was visited again agree by chance: where visits differ, rows are copies only
-    if all of them stand there equally often.
+    Coarse levels of a place that was visited again agree by chance: where visits differ, rows are
+    copies only if all of them stand there equally often.
 
     Args:
         place, link: (n,) numbers of where a row was measured, and of where and with which station.
@@ -57,10 +60,15 @@ def find_copies(place: np.ndarray, link: np.ndarray, values: np.ndarray) -> np.n
     if not len(rows):
         return copies
     first, which, count = np.unique(
-        hash_rows(link[rows], take(values, rows)), return_index=True, return_inverse=True, return_counts=True
+        hash_rows(link[rows], take(values, rows)),
+        return_index=True,
+        return_inverse=True,
+        return_counts=True,
     )[1:]
     turn = np.empty(len(rows), np.int64)  # how often each stood there before
-    turn[np.argsort(which, kind="stable")] = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
+    turn[np.argsort(which, kind="stable")] = np.arange(len(rows)) - np.repeat(
+        np.cumsum(count) - count, count
+    )
     differing = at[np.bincount(of[rows[first]])[of[rows]] > 1]
     once = np.ones(len(count), np.int64)
     if values[0].size == 1 and len(np.unique(differing)) >= REVISITED * len(np.unique(at)):
@@ -72,8 +80,8 @@ def find_copies(place: np.ndarray, link: np.ndarray, values: np.ndarray) -> np.n
 def order_rows(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
     """Return all rows in an order that their content decides, places numbered anew, and their fold.
 
-    Neighbours along a curve that fills space stand together; of the rows of a place, those of one moment.
-    The order of the file stays known (`sequence`): errors that drift are seen in no other.
+    Neighbours along a curve that fills space stand together; of the rows of a place, those of one
+    moment. The order of the file stays known (`sequence`): errors that drift are seen in no other.
     """
     if not (_LAST and _LAST[0][0]() is data):
         order = content_order(data)
@@ -97,22 +105,28 @@ def content_order(data: Measurements) -> np.ndarray:
         *(data.censored, data.position_std, data.uplink, data.device),
     )
     rows = np.arange(len(data))
-    # Visits are counted in the order of the file, and only channels, whose phases moments share, need them.
+    # Visits are counted in the order of the file, and only channels, whose phases moments share,
+    # need them.
     moment = number_moments(data, rows) if data.site.target.is_complex else rows
     together = np.zeros(len(data), np.uint64)
     np.add.at(together, moment, row)
     # The largest moment of a place first: counting visits then finds the same moments again.
     largest = -np.bincount(moment)[moment]
-    # Stations at one place, and runs, may have measured the same: their numbers are of the file's order.
+    # Stations at one place, and runs, may have measured the same:
+    # their numbers are of the file's order.
     names = data.site.every_station.shown
     several = len(names) > 1  # rows of one may have its number among others
     station = np.unique(names, return_inverse=True)[1][data.stations_of()] if several else rows * 0
     among = data.runs_of(rows), station, row
-    return np.lexsort((*among, together[moment], largest, hash_rows(data.moving), along_curve(data.moving)))
+    return np.lexsort(
+        (*among, together[moment], largest, hash_rows(data.moving), along_curve(data.moving))
+    )
 
 
 def along_curve(places: np.ndarray) -> np.ndarray:
-    """Return numbers (n,) of places (n, D) along a curve that fills their box: bits of axes in turns."""
+    """Return numbers (n,) of places (n, D) along a curve that fills their box:
+    bits of axes in turns.
+    """
     bits, axes = 3 * BITS // places.shape[1], places.shape[1]
     low, width = places.min(axis=0), float(np.ptp(places, axis=0).max()) or 1.0
     cell = ((places - low) / width * (2**bits - 1)).astype(np.uint64)

@@ -39,7 +39,9 @@ TrainTest = tuple[np.ndarray, np.ndarray]  # rows (n,) to train and to test on
 
 
 def show_names(names: Sequence[str], labels: Sequence[str] | None) -> tuple[str, ...]:
-    """Return names (T,) of stations as people read them, `W03-2 (150)` of one that a list of cells labels."""
+    """Return names (T,) of stations as people read them,
+    `W03-2 (150)` of one that a list of cells labels.
+    """
     pairs = zip(names if labels is None else labels, names, strict=True)
     return tuple(name if label == name else f"{label} ({name})" for label, name in pairs)
 
@@ -51,13 +53,15 @@ class Stations:
     Attributes:
         position: (T, 3) float64 [m], *local*.
         name: (T,) what a user calls them.
-        rotation: (T, 3, 3) float64, local to world; None where receivers are not turned, or transmit.
+        rotation: (T, 3, 3) float64, local to world; None where receivers are not turned, or
+            transmit.
         carrier_hz: (T,) [Hz]; None where all have the site's.
-        sector: (T, 6) azimuth from north, tilt below the horizon, widths of the beam across and in height
-            [deg], and power [dB], NaN where unknown; None where nothing of it is known.
-        label: (T,) what a list of cells calls them, to be shown; None where that is `name`. It is no fact of
-            the measurements.
-        array: (T, M, 3) [m] receive elements where each carrier has an array of its own; None: the site's.
+        sector: (T, 6) azimuth from north, tilt below the horizon, widths of the beam across and in
+            height [deg], and power [dB], NaN where unknown; None where nothing of it is known.
+        label: (T,) what a list of cells calls them, to be shown; None where that is `name`. It is
+            no fact of the measurements.
+        array: (T, M, 3) [m] receive elements where each carrier has an array of its own; None: the
+            site's.
     """
 
     position: np.ndarray
@@ -91,13 +95,16 @@ class Stations:
     def subset(self, numbers: np.ndarray, names: Sequence[str] | None = None) -> Stations:
         """Return stations of these numbers (n,), which may repeat, under `names` or their own."""
         optional = (self.rotation, self.carrier_hz, self.sector, self.array)
-        rotation, carrier, sector, array = (None if one is None else one[numbers] for one in optional)
+        rotation, carrier, sector, array = (
+            None if one is None else one[numbers] for one in optional
+        )
         called = tuple(names or (self.name[i] for i in numbers))
         label = None if self.label is None else tuple(self.label[i] for i in numbers)
         return Stations(self.position[numbers], called, rotation, carrier, sector, label, array)
 
     def add_carrier(self, frequency_hz: float) -> Stations:
-        """Return these and, last, that of the nearest carrier at another [Hz], arrays alike in wavelengths.
+        """Return these and, last, that of the nearest carrier at another [Hz],
+        arrays alike in wavelengths.
 
         >>> one = Stations(np.zeros((1, 3)), ("2.4 GHz",), carrier_hz=np.array([2.4e9]))
         >>> one.add_carrier(5e9).name
@@ -147,7 +154,8 @@ class Site:
             `rssi` (1,) linear power.
         static_end: which end never moves: `rx` (RFID) or `tx` (Sionna, NeWRF); None when both move.
         grid: directions of a spectrum; None for CSI and RSSI.
-        array: (M, 3) [m] receive element positions, receiver frame; None when unknown or one element.
+        array: (M, 3) [m] receive element positions, receiver frame; None when unknown or one
+            element.
         normalisation: how the published spectrum was scaled: `max`, `minmax`, `power` or `none`.
         carrier_hz: carrier frequency [Hz]; None when unknown.
         subcarriers_hz: (K,) absolute frequencies [Hz]; None for spectra.
@@ -157,26 +165,31 @@ class Site:
         sha256: content hash of what was loaded.
         stand_in: for a simulated replacement, the name of the release it stands in for; else None.
         convergence_error: NMSE between two solver seeds for simulated data; else None.
-        static_position: (3,) float64 [m], the place of the static end, *local*; None when unknown, when there
-            are several, or when both ends move.
+        static_position: (3,) float64 [m], the place of the static end, *local*; None when unknown,
+            when there are several, or when both ends move.
         rx_rotation: (3, 3) float64, how the first row's receiver is turned; None when unknown.
-        uplink_array: (U, 3) float64 [m] antennas that receive a snapshot's uplink; None where there is none.
+        uplink_array: (U, 3) float64 [m] antennas that receive a snapshot's uplink; None where there
+            is none.
         uplink_hz: (L,) absolute frequencies of the uplink [Hz].
         antennas: (A,) rows of `uplink_array` that the target's antennas are.
-        stations: the static ends where there are several; `Measurements.station` says which a row is of.
+        stations: the static ends where there are several; `Measurements.station` says which a row
+            is of.
         georeference: where on Earth the world's origin lies; None when unknown.
-        moving_box: (2, 3) float64 [m], lower and upper corner of where the moving end was, *local*; (2, 6)
-            of both as in `Measurements.moving`.
+        moving_box: (2, 3) float64 [m], lower and upper corner of where the moving end was, *local*;
+            (2, 6) of both as in `Measurements.moving`.
         level_unit: what 10 log10 of a received power is in, `dB` where the file does not say.
         unit: that powers were given in, and are answered in; None: `level_unit`.
-        unknown_factor: what nobody knows of the complex factor of each row, see `gsparc.physics.row_factors`.
-        phase_reference: of rows that were turned to each other: `carrier`, phases over places are those of
-            waves; `neighbours`, near rows were made alike. None where rows are as measured.
+        unknown_factor: what nobody knows of the complex factor of each row, see
+            `gsparc.physics.row_factors`.
+        phase_reference: of rows that were turned to each other: `carrier`, phases over places are
+            those of waves; `neighbours`, near rows were made alike. None where rows are as
+            measured.
         device_names: (D,) what measured powers is called; None where nothing tells.
-        device_levels: (D + 1, 2) offset [dB] of each to their mean, which was taken off, and variance [dB^2]
-            of what is not known of it; the last of a device that nobody named. None before that.
-        measured: (A, K) bool, of a file's antennas and tones those that targets hold, as all others are
-            constant or marked in every row; None: all.
+        device_levels: (D + 1, 2) offset [dB] of each to their mean, which was taken off, and
+            variance [dB^2] of what is not known of it; the last of a device that nobody named. None
+            before that.
+        measured: (A, K) bool, of a file's antennas and tones those that targets hold, as all others
+            are constant or marked in every row; None: all.
     """
 
     name: str
@@ -216,12 +229,18 @@ class Site:
 
     @property
     def scored(self) -> Scored:
-        """The figures of merit that tell of it; rows with factors of their own are aligned first."""
+        """The figures of merit that tell of it; rows with factors
+        of their own are aligned first.
+        """
         # Only channels have phases: powers and spectra are the same under any factor.
-        return "aligned csi" if self.target.is_complex and self.unknown_factor != "none" else self.kind
+        return (
+            "aligned csi" if self.target.is_complex and self.unknown_factor != "none" else self.kind
+        )
 
     def in_shape_of_file(self, channels: Channels) -> Channels:
-        """Return channels (..., a, k) as a file holds them, (..., A, K), NaN where nothing was `measured`."""
+        """Return channels (..., a, k) as a file holds them, (..., A, K),
+        NaN where nothing was `measured`.
+        """
         if self.measured is None:
             return channels
         known: np.ndarray = self.measured
@@ -239,7 +258,8 @@ class Site:
         """Raise `ValueError` where rows have phases of their own, so that `what` cannot be told."""
         if self.unknown_factor != "none":
             raise ValueError(
-                f"{what}: channels are known up to {describe_factor(self.unknown_factor)} of each row"
+                f"{what}: channels are known up to {describe_factor(self.unknown_factor)} of "
+                "each row"
             )
 
     @property
@@ -269,7 +289,8 @@ class Site:
         return {end: part + self.origin for end, part in zip(self.moving_ends, parts, strict=True)}
 
     def name_moving(self, places: Places) -> dict[str, Places]:
-        """Return world places (..., 3) [m] of the moving end under its name, as a `Predictor` takes them.
+        """Return world places (..., 3) [m] of the moving end under its name,
+        as a `Predictor` takes them.
 
         >>> predictor.site.name_moving([1.0, 2.0, 1.5])
         {'rx': [1.0, 2.0, 1.5]}
@@ -277,11 +298,15 @@ class Site:
         return {self.moving_end: places}
 
     def local_places(self, world: Mapping[End, np.ndarray]) -> np.ndarray:
-        """Return local places (n, 3) or (n, 6) [m] of world ones by end: what `world_ends` takes."""
+        """Return local places (n, 3) or (n, 6) [m] of world ones by end:
+        what `world_ends` takes.
+        """
         return np.hstack([world[end] - self.origin for end in self.moving_ends])
 
     def moving(self, tx: Tensor, rx: Pose) -> Tensor:
-        """Return positions [m] of what moves: (B, 3) of one end (or one for all), or (B, 6) of both."""
+        """Return positions [m] of what moves: (B, 3) of one end (or one for all), or (B, 6)
+        of both.
+        """
         # A static receiver's pose has no leading axis, a batch of poses has one.
         place = rx.position.reshape(-1, 3)
         if self.paired:
@@ -290,7 +315,8 @@ class Site:
 
     @property
     def every_station(self) -> Stations:
-        """The static ends; where there are no `stations` one without a name, at NaN where that is unknown.
+        """The static ends; where there are no `stations` one without a name,
+        at NaN where that is unknown.
 
         >>> predictor.site.every_station.name, len(gsparc.load("city.ckpt").site.every_station)
         (('',), 2)
@@ -308,7 +334,10 @@ class Site:
     @property
     def carriers(self) -> np.ndarray:
         """(T,) float64 [Hz] of every station; NaN where unknown."""
-        own, shared = self.every_station.carrier_hz, np.nan if self.carrier_hz is None else self.carrier_hz
+        own, shared = (
+            self.every_station.carrier_hz,
+            np.nan if self.carrier_hz is None else self.carrier_hz,
+        )
         return np.full(len(self.every_station), shared, np.float64) if own is None else own
 
     @property
@@ -341,8 +370,10 @@ class Site:
         """Why these spectra cannot be modelled through the receive array; None when they can."""
         array = np.zeros((0, 3)) if self.array is None else self.array
         faults = {
-            f"targets are {self.kind}, not spectra on a grid": not self.target.is_image or self.grid is None,
-            # Plane waves at fixed elements: with a moving array each row would have another manifold.
+            f"targets are {self.kind}, not spectra on a grid": not self.target.is_image
+            or self.grid is None,
+            # Plane waves at fixed elements: with a moving array each row would have another
+            # manifold.
             "the receiver moves; its array must be static": self.static_end != "rx",
             "the dataset declares no antenna array": len(array) < 2,
             "all antennas of the declared array are at one place": not (array != array[:1]).any(),
@@ -351,7 +382,9 @@ class Site:
         return next((fault for fault, holds in faults.items() if holds), None)
 
     def array_geometry(self) -> tuple[np.ndarray, SphereGrid, float]:
-        """Return the array (M, 3) [m], grid and wavelength [m] of spectra whose `array_problem` is None."""
+        """Return the array (M, 3) [m], grid and wavelength [m]
+        of spectra whose `array_problem` is None.
+        """
         assert self.array is not None and self.grid is not None and self.wavelength is not None
         return self.array, self.grid, self.wavelength
 
@@ -374,17 +407,22 @@ class Site:
         return replace(self, level_unit=wanted.name, unit=wanted.name, target_scale=scale)
 
     def tones(self) -> np.ndarray:
-        """Return frequencies (K,) float64 [Hz] of the channel; `ValueError` when nothing names them."""
+        """Return frequencies (K,) float64 [Hz] of the channel;
+        `ValueError` when nothing names them.
+        """
         if self.subcarriers_hz is not None:
             return np.asarray(self.subcarriers_hz, dtype=np.float64)
         if self.carrier_hz is None:
-            raise ValueError(f"{self.name}: neither subcarriers_hz nor carrier_hz is known; phase needs them")
+            raise ValueError(
+                f"{self.name}: neither subcarriers_hz nor carrier_hz is known; phase needs them"
+            )
         return np.array([self.carrier_hz], dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """A whole dataset, in memory but for large targets; arrays keep their stored precision and type.
+    """A whole dataset, in memory but for large targets;
+    arrays keep their stored precision and type.
 
     >>> predictor.site.name, predictor.site.kind  # facts of what a model learned from
     ('arrays', 'rssi')
@@ -405,19 +443,22 @@ class Measurements:
         row_names: name of each row for messages (file name, CSV line).
         release_split: (train, test) int64 rows that the data themselves name, or None.
         provenance: where the data came from, as their makers wrote it down.
-        uplink: (S, U, L) complex64 received at the same moment as the target, in its units, or None.
+        uplink: (S, U, L) complex64 received at the same moment as the target, in its units, or
+            None.
         station: (S,) int64, which of `site.stations` a row is of; None where there is one.
-        place: (S,) int64, the number of the place that a row is of: one place, several stations, or visits;
-            None where every row is one.
-        censored: (S,) int8, 1 where a power was below what can be heard and the target is that level, -1
-            where the receiver was saturated and the power is above the target, 0 where it was measured; the
-            mask of the former two is False. None where nothing is.
-        run: (S,) int64; channels of one run share an unknown complex factor. None where all are in phase.
-        position_std: (S,) float64 [m], standard deviation of each coordinate of the end that moves; None
-            where positions count as exact.
-        sequence: (S,) int64, number of each row in the order in which they were taken; None: as they stand.
-        device: (S,) int64, which of `site.device_names` measured a row; None where nothing tells, or their
-            offsets are taken off.
+        place: (S,) int64, the number of the place that a row is of: one place, several stations, or
+            visits; None where every row is one.
+        censored: (S,) int8, 1 where a power was below what can be heard and the target is that
+            level, -1 where the receiver was saturated and the power is above the target, 0 where it
+            was measured; the mask of the former two is False. None where nothing is.
+        run: (S,) int64; channels of one run share an unknown complex factor. None where all are in
+            phase.
+        position_std: (S,) float64 [m], standard deviation of each coordinate of the end that moves;
+            None where positions count as exact.
+        sequence: (S,) int64, number of each row in the order in which they were taken; None: as
+            they stand.
+        device: (S,) int64, which of `site.device_names` measured a row; None where nothing tells,
+            or their offsets are taken off.
     """
 
     site: Site
@@ -455,7 +496,9 @@ class Measurements:
 
     @property
     def moving(self) -> np.ndarray:
-        """Positions of what moves, (S, 3) or of both ends (S, 6), float64 [m]: the query of every method."""
+        """Positions of what moves, (S, 3) or of both ends (S, 6), float64 [m]:
+        the query of every method.
+        """
         moving = [self.ends[end] for end in self.site.moving_ends]
         return np.hstack(moving) if len(moving) > 1 else moving[0]
 
@@ -472,7 +515,9 @@ class Measurements:
 
     def censored_side(self, rows: Chosen = slice(None)) -> np.ndarray:
         """Return `censored` of rows (n,), (n,) int8; 0 of each where nothing is."""
-        return (np.zeros(len(self)) if self.censored is None else self.censored)[rows].astype(np.int8)
+        return (np.zeros(len(self)) if self.censored is None else self.censored)[rows].astype(
+            np.int8
+        )
 
     def stations_of(self, rows: Chosen = slice(None)) -> np.ndarray:
         """Return `station` of rows (n,), (n,) int64; 0 of each where there is one."""
@@ -485,7 +530,8 @@ class Measurements:
     def targets(self, index: np.ndarray | Tensor) -> Tensor:
         """Return targets of the given rows as float32 or complex64, in stored units."""
         chosen = torch.from_numpy(np.ascontiguousarray(self.target[np.asarray(index)]))
-        # uint8 images are kept as read, a quarter of float32's memory, and become [0, 1] by batches.
+        # uint8 images are kept as read, a quarter of float32's memory, and become [0,
+        # 1] by batches.
         return chosen.float() / 255 if chosen.dtype == torch.uint8 else chosen
 
     def subset(self, rows: np.ndarray, site: Site | None = None) -> Measurements:
@@ -493,7 +539,9 @@ class Measurements:
 
         def take_rows(value: Any) -> Any:
             # Lists may be empty, for instance row names of data made from arrays.
-            return [value[i] for i in rows if value] if isinstance(value, list) else take(value, rows)
+            return (
+                [value[i] for i in rows if value] if isinstance(value, list) else take(value, rows)
+            )
 
         # A release's split names rows of the whole, which the subset numbers otherwise.
         whole = ("site", "provenance", "release_split")
@@ -509,13 +557,17 @@ class Measurements:
         seen = rows[0] if one else rows
         rx = Pose(self._f32(self.rx_position[seen]), self._f32(self.rx_rotation[seen]))
         optional = ((name, getattr(self, name)) for name in ("mask", "uplink", "station", "run"))
-        parts: dict[str, Any] = {name: torch.from_numpy(v[rows]) for name, v in optional if v is not None}
+        parts: dict[str, Any] = {
+            name: torch.from_numpy(v[rows]) for name, v in optional if v is not None
+        }
         return Batch(
             index=torch.from_numpy(rows.astype(np.int64)),
             tx=self._f32(self.tx[rows]),
             rx=rx,
             target=self.targets(rows),
-            noise_variance=None if self.noise_variance is None else self._f32(self.noise_variance[rows]),
+            noise_variance=None
+            if self.noise_variance is None
+            else self._f32(self.noise_variance[rows]),
             **parts,
         )
 
@@ -531,7 +583,8 @@ class Field:
 
     Attributes:
         name: of the array.
-        shape: allowed; S samples, K frequencies, A antennas, T stations, H x W pixels, P paths, I sources.
+        shape: allowed; S samples, K frequencies, A antennas, T stations, H x W pixels, P paths, I
+            sources.
         unit: required value of `units` where given.
         required: `yes`, `one of`, or when.
         meaning: in words.
@@ -551,7 +604,8 @@ class Field:
 
     @property
     def shapes(self) -> list[tuple[int | str | None, ...]]:
-        """Allowed shapes, a letter for a size of its own; empty where they follow from another array.
+        """Allowed shapes, a letter for a size of its own;
+        empty where they follow from another array.
 
         >>> FIELDS["rx_orientation"].shapes
         [(4,), ('S', 4)]
@@ -565,9 +619,16 @@ FIELDS = {one["name"]: Field(**one) for one in read_shipped_table("gsparc.data",
 POWER = "uint8 or floating point numbers"
 # Kinds of NumPy's dtypes that an array may be of, by the words of messages.
 HOLDS = {
-    "real numbers": "iuf", "whole numbers": "iu", "complex numbers": "c", "numbers": "ciuf", POWER: "uf",
-    "True and False": "biuf", "text": "US", "text or whole numbers": "USiu", "text or numbers": "USiufb",
-}  # fmt: skip
+    "real numbers": "iuf",
+    "whole numbers": "iu",
+    "complex numbers": "c",
+    "numbers": "ciuf",
+    POWER: "uf",
+    "True and False": "biuf",
+    "text": "US",
+    "text or whole numbers": "USiu",
+    "text or numbers": "USiufb",
+}
 MEASUREMENTS = ("spectrum", "csi", "rssi", "rssi_db")
 NORMALISATIONS = ("max", "minmax", "power", "none")
 

@@ -1,6 +1,8 @@
-"""Parts of a campaign: some stations, some runs, powers above a level, fewer rows; what goes is counted.
+"""Parts of a campaign: some stations, some runs, powers above a level, fewer rows;
+what goes is counted.
 
-Rows are links by then: arrays named as in docs/reference/schema.md, `station` and `file_row` of each row.
+Rows are links by then: arrays named as in docs/reference/schema.md,
+`station` and `file_row` of each row.
 """
 
 from __future__ import annotations
@@ -29,7 +31,9 @@ SEED = 0  # of the rows that `max_rows` keeps: the same in every run
 # Names of arrays with a row per sample or path, and how many axes they then have.
 ROW_AXES, PATH_AXES = list_arrays_with_axis("S"), list_arrays_with_axis("P")
 # Arrays all of whose shapes begin with S: their first axis are rows, whatever else has that length.
-OF_ROWS = {name for name, field in FIELDS.items() if all(shape[:1] == ("S",) for shape in field.shapes)}
+OF_ROWS = {
+    name for name, field in FIELDS.items() if all(shape[:1] == ("S",) for shape in field.shapes)
+}
 ALWAYS = {"place", "file_row", *OF_ROWS}
 SPLIT = ("split_train", "split_test")
 Arrays = dict[str, np.ndarray]
@@ -41,12 +45,19 @@ def _listed(value: Any) -> Any:
 
 def _are_names(value: Any) -> bool:
     names = _listed(value)
-    return isinstance(names, Sequence) and bool(names) and all(type(name) in (str, int) for name in names)
+    return (
+        isinstance(names, Sequence)
+        and bool(names)
+        and all(type(name) in (str, int) for name in names)
+    )
 
 
 def _are_steps(value: Any) -> bool:
     rows = map(_listed, value.values()) if isinstance(value, Mapping) else [()]
-    return all(isinstance(part, Sequence) and part and all(type(row) is int for row in part) for part in rows)
+    return all(
+        isinstance(part, Sequence) and part and all(type(row) is int for row in part)
+        for part in rows
+    )
 
 
 STEPS = or_null(Limit("first rows after steps by station, like {roof: [1162]},", _are_steps))
@@ -55,7 +66,8 @@ NAMED = or_null(Limit("a list of names like [A,B]", _are_names))
 
 @dataclass(frozen=True)
 class Selection(Checked):
-    """The settings `dataset.stations`, `runs`, ..., of a part of a campaign; None leaves everything in.
+    """The settings `dataset.stations`, `runs`, ..., of a part of a campaign;
+    None leaves everything in.
 
     Attributes:
         stations: names, or numbers from 0, of the stations to keep.
@@ -94,7 +106,9 @@ def take_selection(settings: dict[str, Any]) -> dict[str, Any]:
 Part = tuple[Arrays, Stations | None, list[str]]
 
 
-def select(arrays: Arrays, measured: str, stations: Stations | None, part: Selection, source: str) -> Part:
+def select(
+    arrays: Arrays, measured: str, stations: Stations | None, part: Selection, source: str
+) -> Part:
     """Apply all settings: steps of levels, stations, runs, level, copies, then number of rows.
 
     Args:
@@ -116,40 +130,62 @@ def select(arrays: Arrays, measured: str, stations: Stations | None, part: Selec
         if keep.all():
             return arrays
         if keep.sum() < FEWEST:
-            raise DataError(f"{option}: {keep.sum()} rows of {source} are left; expected {FEWEST} or more")
+            raise DataError(
+                f"{option}: {keep.sum()} rows of {source} are left; expected {FEWEST} or more"
+            )
         notes.append(f"{option}: {(~keep).sum()} of {len(keep)} rows left out")
         return take_rows(arrays, np.flatnonzero(keep), len(keep))
 
-    # Steps of levels come first: they divide stations, whose parts are then kept or left out together.
+    # Steps of levels come first: they divide stations,
+    # whose parts are then kept or left out together.
     for name, firsts in (part.level_steps or {}).items():
-        for first in sorted(firsts):  # ascending, so that each step divides the part after the one before
-            arrays, stations = _split(arrays, _there(stations, "level_steps", source), name, first, source)
+        # Ascending, so that each step divides the part after the one before
+        for first in sorted(firsts):
+            arrays, stations = _split(
+                arrays, _there(stations, "level_steps", source), name, first, source
+            )
     if part.stations is not None:
         stations = _there(stations, "stations", source)
-        numbers = (_number(stations, one, f"dataset.stations={one}", source) for one in part.stations)
+        numbers = (
+            _number(stations, one, f"dataset.stations={one}", source) for one in part.stations
+        )
         chosen = np.unique([t for one in numbers for t in _parts(stations, one)])
         arrays = dict(kept("dataset.stations", np.isin(arrays["station"], chosen)))
-        arrays["station"], stations = (np.searchsorted(chosen, arrays["station"]), stations.subset(chosen))
+        arrays["station"], stations = (
+            np.searchsorted(chosen, arrays["station"]),
+            stations.subset(chosen),
+        )
     if part.runs is not None:
-        arrays = kept(f"dataset.runs={','.join(map(str, part.runs))}", _of_runs(arrays, part.runs, source))
+        arrays = kept(
+            f"dataset.runs={','.join(map(str, part.runs))}", _of_runs(arrays, part.runs, source)
+        )
     if part.min_rssi_db is not None:
         option = f"dataset.min_rssi_db={part.min_rssi_db:g}"
         if measured not in ("rssi", "rssi_db"):
-            raise DataError(f"{option}: {source} holds {measured}; expected powers, rssi or rssi_db")
+            raise DataError(
+                f"{option}: {source} holds {measured}; expected powers, rssi or rssi_db"
+            )
         with np.errstate(divide="ignore", invalid="ignore"):
-            # A power of 0 is minus infinity, below every level; NaN compares as False and stays missing.
+            # A power of 0 is minus infinity, below every level;
+            # NaN compares as False and stays missing.
             level = to_decibels(arrays[measured]) if measured == "rssi" else arrays[measured]
             arrays = kept(option, np.logical_not(level < part.min_rssi_db))
-    arrays = kept("copies of other rows (same places, station and values)", ~_copies(arrays, measured))
+    arrays = kept(
+        "copies of other rows (same places, station and values)", ~_copies(arrays, measured)
+    )
     if part.max_rows is not None:
-        arrays = kept(f"dataset.max_rows={part.max_rows}", _spread(arrays["file_row"], part.max_rows))
+        arrays = kept(
+            f"dataset.max_rows={part.max_rows}", _spread(arrays["file_row"], part.max_rows)
+        )
     return arrays, stations, notes
 
 
 def _copies(arrays: Arrays, measured: str) -> np.ndarray:
     rows, number, device = len(arrays[measured]), arrays.get("station"), arrays.get("device")
     ends = [arrays.get(f"{end}_position", np.zeros(0)) for end in ("rx", "tx")]
-    places = [end.astype(np.float64) for end in ends if end.shape == (rows, 3) and end.dtype.kind in "iuf"]
+    places = [
+        end.astype(np.float64) for end in ends if end.shape == (rows, 3) and end.dtype.kind in "iuf"
+    ]
     if not places:  # one that repeats is no row's own
         return np.zeros(rows, bool)
     place, whole = hash_rows(*places), np.hstack(places)
@@ -173,7 +209,9 @@ def _there(stations: Stations | None, name: str, source: str) -> Stations:
 def _number(stations: Stations, wanted: str | int, option: str, source: str) -> int:
     found = find_station(wanted, stations)
     if found is None:
-        hint = suggest_name(str(wanted), stations.name, 0.6) or f"; there are {list_first(stations.shown, 9)}"
+        hint = suggest_name(str(wanted), stations.name, 0.6) or (
+            f"; there are {list_first(stations.shown, 9)}"
+        )
         if Path(str(wanted)).is_file():
             hint = f"; a table of them is dataset.stations_file={wanted}"
         raise DataError(f"{option}: no station {wanted} in {source}{hint}")
@@ -186,15 +224,21 @@ def _parts(stations: Stations, number: int) -> list[int]:
     return [number, *(t for t, name in enumerate(stations.name) if name.startswith(begins))]
 
 
-def _split(arrays: Arrays, of: Stations, name: str, first: int, source: str) -> tuple[Arrays, Stations]:
+def _split(
+    arrays: Arrays, of: Stations, name: str, first: int, source: str
+) -> tuple[Arrays, Stations]:
     """Rows of a station from `first` of the file on are those of another one, at the same place."""
     rows, option = int(arrays["file_row"].max()) + 1, f"dataset.level_steps.{name}={first}"
     if not 0 < first < rows:
-        raise DataError(f"{option}: expected a row between 1 and {rows - 1}, of rows 0 to {rows - 1}")
+        raise DataError(
+            f"{option}: expected a row between 1 and {rows - 1}, of rows 0 to {rows - 1}"
+        )
     number = _number(of, name, option, source)
     last = _parts(of, number)[-1]  # later steps divide the part after earlier ones
     after = (arrays["station"] == last) & (arrays["file_row"] >= first)
-    more = of.subset(np.array([*range(len(of)), last]), [*of.name, f"{of.name[number]}{FROM_ROW}{first}"])
+    more = of.subset(
+        np.array([*range(len(of)), last]), [*of.name, f"{of.name[number]}{FROM_ROW}{first}"]
+    )
     return {**arrays, "station": np.where(after, len(of), arrays["station"])}, more
 
 
@@ -211,8 +255,9 @@ def _of_runs(arrays: Arrays, runs: Sequence[str | int], source: str) -> np.ndarr
 def _spread(file_row: np.ndarray, most: int) -> np.ndarray:
     """At most so many rows of the file, which cover the campaign as all do.
 
-    The file's order is cut into stretches of equal length, and of each one row is drawn: every stretch of a
-    walk stays, and rows of a raster are not hit in step with its lines, as every n-th would be.
+    The file's order is cut into stretches of equal length, and of each one row is drawn: every
+    stretch of a walk stays, and rows of a raster are not hit in step with its lines,
+    as every n-th would be.
     """
     rows, which = np.unique(file_row, return_inverse=True)
     if len(rows) <= most:
@@ -223,17 +268,19 @@ def _spread(file_row: np.ndarray, most: int) -> np.ndarray:
 
 
 def take_rows(arrays: Arrays, rows: np.ndarray, count: int) -> Arrays:
-    """Take rows (n,), which may repeat, of all arrays with one for each of `count`, splits and paths too.
+    """Take rows (n,), which may repeat, of all arrays with one for each of `count`,
+    splits and paths too.
 
-    Arrays of another number of rows, and rows that a split names and that there are not, are left for whoever
-    reads them to refuse. Splits without rows are left out.
+    Arrays of another number of rows, and rows that a split names and that there are not, are left
+    for whoever reads them to refuse. Splits without rows are left out.
     """
     part = dict(arrays)
     for name, array in arrays.items():
         if (name in ALWAYS or array.ndim in ROW_AXES.get(name, ())) and array.shape[:1] == (count,):
             part[name] = take(array, rows)
         elif name in SPLIT:
-            # Rows may repeat or be gone: a row of the split then stands in several places, or in none.
+            # Rows may repeat or be gone: a row of the split then stands in several places,
+            # or in none.
             order = np.argsort(rows, kind="stable")
             first, last = (np.searchsorted(rows[order], array, side) for side in ("left", "right"))
             outside = array[(array < 0) | (array >= count)]

@@ -21,7 +21,9 @@ class SiteObjects:
     boxes: np.ndarray
 
     @classmethod
-    def from_arrays(cls, planes: np.ndarray | None = None, boxes: np.ndarray | None = None) -> SiteObjects:
+    def from_arrays(
+        cls, planes: np.ndarray | None = None, boxes: np.ndarray | None = None
+    ) -> SiteObjects:
         """Build from planes (P, 4) and boxes (B, 2, 3); None: there are none."""
         planes = np.zeros((0, 4)) if planes is None else planes
         return cls(planes, np.zeros((0, 2, 3)) if boxes is None else boxes)

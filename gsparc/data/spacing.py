@@ -1,4 +1,6 @@
-"""How far places lie apart: usual steps, visits of one place, squares of floor, paths of measuring."""
+"""How far places lie apart: usual steps, visits of one place, squares of floor,
+paths of measuring.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ EDGE = 1e-6  # of a square: places on its edge are in it, however they were roun
 
 
 def neighbour_distance(places: np.ndarray) -> float:
-    """Return the median distance [m] from places (n, D) to the nearest other, copies left out; 0 of one.
+    """Return the median distance [m] from places (n, D) to the nearest other, copies left out;
+    0 of one.
 
     >>> neighbour_distance(np.array([[0.0, 0], [0, 0], [0, 2], [0, 4]]))
     2.0
@@ -30,10 +33,11 @@ def neighbour_distance(places: np.ndarray) -> float:
 
 
 def usual_step(positions: np.ndarray) -> float:
-    """Return the median distance [m] from a place (n, D) to the nearest other; 0 where too few tell it.
+    """Return the median distance [m] from a place (n, D) to the nearest other;
+    0 where too few tell it.
 
-    Looked for from coarse to fine, as all places may have been visited again: what lies in a cell is one, and
-    the first step that is ten cells long stands.
+    Looked for from coarse to fine, as all places may have been visited again: what lies in a cell
+    is one, and the first step that is ten cells long stands.
 
     >>> round(usual_step(np.c_[np.arange(20.0), np.zeros(20)]), 3)  # along a line, every metre
     1.0
@@ -41,7 +45,10 @@ def usual_step(positions: np.ndarray) -> float:
     side = extent = float(np.ptp(positions, axis=0).max())
     while side > 1e-12 * extent:
         # Cells of the current side first, so that visits of one place do not make its step zero.
-        places, step = positions[np.unique(_joined(positions, side, side / 2), return_index=True)[1]], 0.0
+        places, step = (
+            positions[np.unique(_joined(positions, side, side / 2), return_index=True)[1]],
+            0.0,
+        )
         if len(places) >= FEWEST_PLACES:
             some = places[evenly_spaced(len(places), SAMPLE)]
             step = float(np.median(cKDTree(places).query(some, k=2)[0][:, 1]))
@@ -52,7 +59,8 @@ def usual_step(positions: np.ndarray) -> float:
 
 
 def group_visits(positions: np.ndarray, place: np.ndarray | None = None) -> np.ndarray | None:
-    """Return the place (S,) int64 of each row where those nearer than `NEAR` usual steps count as one.
+    """Return the place (S,) int64 of each row where those nearer
+    than `NEAR` usual steps count as one.
 
     >>> line = np.c_[np.arange(20.0), np.zeros(20)]  # every metre, and once more 1 mm beside it
     >>> group_visits(np.r_[line, line + 1e-3])[[0, 1, 20, 21]].tolist()
@@ -70,18 +78,26 @@ def group_visits(positions: np.ndarray, place: np.ndarray | None = None) -> np.n
     if reach == 0:
         return place
     # A cell's diagonal is a quarter of `reach`: two representatives are at most 1.5 of it apart.
-    joined = _joined(places, reach / 4 / np.sqrt(places.shape[1]), 1.5 * reach)  # all nearer than `reach`
-    return place if len(np.unique(joined)) == len(places) else number_places(joined[which.reshape(-1), None])
+    # All nearer than `reach`
+    joined = _joined(places, reach / 4 / np.sqrt(places.shape[1]), 1.5 * reach)
+    return (
+        place
+        if len(np.unique(joined)) == len(places)
+        else number_places(joined[which.reshape(-1), None])
+    )
 
 
 def _joined(places: np.ndarray, cell: float, reach: float) -> np.ndarray:
-    """A number (n,) that places (n, D) share in a cell, or where one of each cell is within `reach` [m].
+    """A number (n,) that places (n, D) share in a cell,
+    or where one of each cell is within `reach` [m].
 
     Cells first: thousands of visits of one place would be millions of pairs.
     """
     corner = np.floor((places - places.min(axis=0)) / cell).astype(np.int64)
     # The sums wrap around on overflow, as a hash does: two cells hardly ever share a number.
-    _, first, which = np.unique(corner @ MIXING[: corner.shape[1]], return_index=True, return_inverse=True)
+    _, first, which = np.unique(
+        corner @ MIXING[: corner.shape[1]], return_index=True, return_inverse=True
+    )
     one, two = cKDTree(places[first]).query_pairs(reach, output_type="ndarray").T
     graph = coo_array((np.ones(len(one)), (one, two)), (len(first), len(first)))
     return np.asarray(connected_components(graph)[1][which.reshape(-1)])
@@ -105,11 +121,13 @@ def number_squares(floor: np.ndarray, side: float) -> np.ndarray:
 def path_order(positions: np.ndarray) -> np.ndarray:
     """Return the rows (S,) in the order of the measuring path.
 
-    Rows taken one after the other keep their order. Where consecutive rows are far apart compared with
-    nearest neighbours (a shuffled file, random drops) there is no path: rows are ordered along the
-    longest side of the box, so that a stretch becomes a slab.
+    Rows taken one after the other keep their order. Where consecutive rows are far apart compared
+    with nearest neighbours (a shuffled file, random drops) there is no path: rows are ordered along
+    the longest side of the box, so that a stretch becomes a slab.
 
-    >>> path_order(np.array([[0.0, 0, 0], [9, 0, 0], [1, 0, 0], [8, 0, 0], [2, 0, 0]]))  # no path: along x
+    No path: along x:
+
+    >>> path_order(np.array([[0.0, 0, 0], [9, 0, 0], [1, 0, 0], [8, 0, 0], [2, 0, 0]]))
     array([0, 2, 4, 3, 1])
     """
     rows = np.arange(len(positions))
@@ -124,7 +142,9 @@ def path_order(positions: np.ndarray) -> np.ndarray:
     return np.argsort(positions[:, longest], kind="stable")
 
 
-def rows_far_from(positions: np.ndarray, rows: np.ndarray, others: np.ndarray, distance: float) -> np.ndarray:
+def rows_far_from(
+    positions: np.ndarray, rows: np.ndarray, others: np.ndarray, distance: float
+) -> np.ndarray:
     """Return those `rows` that are more than `distance` [m] away from all `others` (rows).
 
     >>> line = np.arange(5.0)[:, None]
@@ -137,7 +157,8 @@ def rows_far_from(positions: np.ndarray, rows: np.ndarray, others: np.ndarray, d
 def thin_rows(
     positions: np.ndarray, rows: np.ndarray, distance: float, seed: list[int] | np.random.Generator
 ) -> np.ndarray:
-    """Return a largest-as-drawn subset of `rows`, sorted, in which no two are closer than `distance` [m].
+    """Return a largest-as-drawn subset of `rows`, sorted,
+    in which no two are closer than `distance` [m].
 
     >>> line = np.arange(9.0)[:, None]
     >>> rows = thin_rows(line, np.arange(9), distance=2.0, seed=[0])

@@ -8,17 +8,23 @@ from gsparc.data.schema import Stations
 
 
 def find_station(wanted: str | int, stations: Stations) -> int | None:
-    """Return which station is meant by its name, that of the list of cells, or both as they are shown.
+    """Return which station is meant by its name, that of the list of cells,
+    or both as they are shown.
 
     By its number, too, if no name is one.
 
     Returns:
-        None where there is none (7 is not the eighth of the cells 33, 212, ...), or several are called so.
+        None where there is none (7 is not the eighth of the cells 33, 212, ...),
+        or several are called so.
     """
     counted = not any(name.isdigit() for name in stations.name)
     numbers = [str(number) for number in range(len(stations) if counted else 0)]
     name_lists = stations.name, stations.label or (), stations.shown, numbers
-    named = (list(names).index(str(wanted)) for names in name_lists if list(names).count(str(wanted)) == 1)
+    named = (
+        list(names).index(str(wanted))
+        for names in name_lists
+        if list(names).count(str(wanted)) == 1
+    )
     return next(named, None)
 
 

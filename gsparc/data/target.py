@@ -43,7 +43,8 @@ class Target(ABC):
         """Return how many of which shape (`shape` of one) there are, for people."""
 
     def to_real(self, target: np.ndarray) -> np.ndarray:
-        """Return stored targets (n, ...) as float32 rows (n, D), in units in which interpolation is fair.
+        """Return stored targets (n, ...) as float32 rows (n, D),
+        in units in which interpolation is fair.
 
         >>> TARGETS["rssi"].to_real(np.array([[1.0], [0.1]])).tolist()
         [[0.0], [-10.0]]
@@ -55,8 +56,8 @@ class Target(ABC):
         """Return rows (B, D) of `to_real` as targets (B, *shape) in stored units."""
 
     def entry_variance(self, variance: Tensor, mean: Tensor) -> Tensor:
-        """Turn the variance (B,) per real number of `to_real` into the squared error (B,) expected per entry
-        about targets `mean` (B, ...).
+        """Turn the variance (B,) per real number of `to_real` into the squared error (B,) expected
+        per entry about targets `mean` (B, ...).
         """
         return variance * self.numbers
 
@@ -65,7 +66,9 @@ class Target(ABC):
         return values
 
     def moments_in_error_unit(self, mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-        """Return means (B, ...) and the variance (B,) or (B, 1) of their entries, in the unit of errors."""
+        """Return means (B, ...) and the variance (B,) or (B, 1) of their entries,
+        in the unit of errors.
+        """
         return self.in_error_unit(mean), variance
 
     def blend(self, first: Tensor, second: Tensor, weight: float) -> Tensor:
@@ -75,7 +78,9 @@ class Target(ABC):
     def power(self, values: Values) -> Values:
         """Return the power of entries (...) in physical units, float64."""
         magnitude = abs(values)
-        double = magnitude.double() if isinstance(magnitude, Tensor) else magnitude.astype(np.float64)
+        double = (
+            magnitude.double() if isinstance(magnitude, Tensor) else magnitude.astype(np.float64)
+        )
         return double**self.exponent
 
 
@@ -114,7 +119,11 @@ class Channel(Target):
     def to_real(self, target: np.ndarray) -> np.ndarray:
         """Return real and imaginary parts in linear units; see `Target.to_real`."""
         # ascontiguousarray: a view as pairs needs the last axis dense.
-        return np.ascontiguousarray(target, dtype=np.complex64).reshape(len(target), -1).view(np.float32)
+        return (
+            np.ascontiguousarray(target, dtype=np.complex64)
+            .reshape(len(target), -1)
+            .view(np.float32)
+        )
 
     def to_targets(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
         """See `Target.to_targets`."""

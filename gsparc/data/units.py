@@ -1,4 +1,6 @@
-"""Units as people write them, and the only way between stored powers and the unit that they were given in."""
+"""Units as people write them, and the only way between stored powers and the unit
+that they were given in.
+"""
 
 from __future__ import annotations
 
@@ -19,7 +21,8 @@ class Unit:
 
     Attributes:
         name: as messages write it.
-        kind: `length`, `angle`, `frequency`, `power` or `level`; one kind has one unit in the schema.
+        kind: `length`, `angle`, `frequency`, `power` or `level`; one kind has one unit in the
+            schema.
         factor: multiplies a value.
         offset: is added after that.
         times: the part of the factor that a setting gives, as it was written; empty: none.
@@ -33,7 +36,11 @@ class Unit:
 
     def convert(self, values: np.ndarray) -> np.ndarray:
         """Convert values of this unit to the schema's unit of its kind."""
-        return values if (self.factor, self.offset) == (1.0, 0.0) else values * self.factor + self.offset
+        return (
+            values
+            if (self.factor, self.offset) == (1.0, 0.0)
+            else values * self.factor + self.offset
+        )
 
     @property
     def changes(self) -> bool:
@@ -75,8 +82,11 @@ class PowerUnit:
     scale: float
 
     @classmethod
-    def from_name(cls, name: str | None, level_unit: str, scale: float = 1.0, levels: bool = False) -> Self:
-        """Return the unit of a name, for stored powers that times `scale` have levels in `level_unit`.
+    def from_name(
+        cls, name: str | None, level_unit: str, scale: float = 1.0, levels: bool = False
+    ) -> Self:
+        """Return the unit of a name, for stored powers
+        that times `scale` have levels in `level_unit`.
 
         Levels whose reference nobody said (`dB`) are in whatever unit of levels is asked for.
 
@@ -93,7 +103,13 @@ class PowerUnit:
         unit, watt = UNITS.get(str(name).lower()), WATTS.get(level_unit)
         decibels = unit is not None and unit.kind == "level"
         if unit is None or unit.name not in WATTS or (not decibels and (levels or watt is None)):
-            powers = "" if levels else f", {LINEAR}" if watt is None else f", {LINEAR}, {list_units('power')}"
+            powers = (
+                ""
+                if levels
+                else f", {LINEAR}"
+                if watt is None
+                else (f", {LINEAR}, {list_units('power')}")
+            )
             raise ValueError(f"unit={name}: of powers in {level_unit} expected dBm, dBW{powers}")
         return cls(unit.name, decibels, scale if watt is None else scale * watt / WATTS[unit.name])
 
@@ -103,20 +119,25 @@ class PowerUnit:
         return 10 * math.log10(self.scale)
 
     def values(self, stored: Tensor) -> Tensor:
-        """Return powers in the unit, like `stored`; levels are -inf of silence and NaN of what is less."""
+        """Return powers in the unit, like `stored`;
+        levels are -inf of silence and NaN of what is less.
+        """
         if self.decibels:
             return to_decibels(stored.double()) + self.raised_db
         return stored if self.scale == 1 else stored * self.scale
 
     def variance(self, stored: Tensor, variance: Tensor) -> Tensor:
-        """Return the variance (B,) of `values`, from stored powers (B, 1) or other targets and theirs (B,).
+        """Return the variance (B,) of `values`, from stored powers (B, 1)
+        or other targets and theirs (B,).
 
         Powers (B, T) of several stations have variances (B, T).
 
         In float64: squares of powers in watts are beyond float32.
         """
         if self.decibels:
-            return variance.double() * (RELATIVE_DB / stored.double().reshape(variance.shape)).square()
+            return (
+                variance.double() * (RELATIVE_DB / stored.double().reshape(variance.shape)).square()
+            )
         return variance.double() * self.scale**2
 
     def stored(self, values: Tensor) -> Tensor:
@@ -126,5 +147,7 @@ class PowerUnit:
 
 
 def power_in_decibels(mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the mean and deviation (n,) [dB] of powers of `mean` and `variance` (n,), linear and above 0."""
+    """Return the mean and deviation (n,) [dB] of powers of `mean` and `variance` (n,),
+    linear and above 0.
+    """
     return to_decibels(mean), RELATIVE_DB * np.sqrt(variance) / mean

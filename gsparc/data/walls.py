@@ -16,10 +16,27 @@ from gsparc.base.limits import Checked, Limit, finite_array, or_null, setting
 
 EXPECTED = "`walls` (a list of `corners_m`) or `room` (`size_m`, `boxes_m`)"
 SIMULATED = {  # of scenes that are simulated: known, and not needed here
-    "name", "transmitter_m", "area_m", "height_m", "num_receivers", "carrier_hz", "bandwidth_hz",
-    "subcarriers", "test_share", "builder", "builtin", "xml", "open_sky", "scattering", "seed", "file",
-    "transmitters", "receivers", "over", "moved",
-}  # fmt: skip
+    "name",
+    "transmitter_m",
+    "area_m",
+    "height_m",
+    "num_receivers",
+    "carrier_hz",
+    "bandwidth_hz",
+    "subcarriers",
+    "test_share",
+    "builder",
+    "builtin",
+    "xml",
+    "open_sky",
+    "scattering",
+    "seed",
+    "file",
+    "transmitters",
+    "receivers",
+    "over",
+    "moved",
+}
 FLAT_M = 0.01  # [m], of corners from their plane
 SMALLEST_M2 = 1e-6  # [m^2], of faces that are read
 
@@ -46,7 +63,9 @@ def _are_boxes(value: Any) -> bool:
 
 
 SIZE = Limit("a list of three lengths above 0 [m]", lambda value: _are_boxes([[[0, 0, 0], value]]))
-BOXES = Limit("a list of [[x, y, z], [x, y, z]], lower corner first [m],", lambda v: not v or _are_boxes(v))
+BOXES = Limit(
+    "a list of [[x, y, z], [x, y, z]], lower corner first [m],", lambda v: not v or _are_boxes(v)
+)
 
 
 @dataclass(frozen=True)
@@ -96,7 +115,10 @@ def _table(path: Path, problems: Problems) -> SceneWalls:
     settings = {} if content.get("room") is None else content["room"]
     if not isinstance(settings, dict):
         settings = problems.add(path, "room: expected size_m and boxes_m") or {}
-    room = problems.attempt(lambda: from_settings(RoomSettings, settings, f"{path}: room")) or RoomSettings()
+    room = (
+        problems.attempt(lambda: from_settings(RoomSettings, settings, f"{path}: room"))
+        or RoomSettings()
+    )
     faces = [] if room.size_m is None else box_faces(np.zeros(3), finite_array(room.size_m))
     walls = content.get("walls") or []
     if not isinstance(walls, list):
@@ -131,7 +153,9 @@ def box_faces(low: np.ndarray, high: np.ndarray) -> list[np.ndarray]:
 
 
 def polygon_normal(corners: np.ndarray) -> np.ndarray:
-    """Return the normal (3,) of a polygon (C, 3), of length twice its area [m^2], by Newell's method."""
+    """Return the normal (3,) of a polygon (C, 3), of length twice its area [m^2],
+    by Newell's method.
+    """
     # About the mean, as far from the origin the cross products would cancel each other.
     about = corners - corners.mean(0)
     return np.asarray(np.cross(about, np.roll(about, -1, axis=0)).sum(0))

@@ -1,8 +1,10 @@
-"""The Argos release's layout: `csidata.npy` [N, 8, 52] and `base-station.yml`, uplink in, downlink out.
+"""The Argos release's layout: `csidata.npy` [N, 8, 52] and `base-station.yml`, uplink in,
+downlink out.
 
-The first 26 tones are the uplink, the last 26 the downlink of the same snapshot. Users' positions were not
-recorded: they come from an encoder of the uplink (`gsparc.data.position_encoder`), or from the stand-in's
-truth. Every prediction therefore uses a fresh uplink of the same snapshot, if only to locate the user.
+The first 26 tones are the uplink, the last 26 the downlink of the same snapshot. Users' positions
+were not recorded: they come from an encoder of the uplink (`gsparc.data.position_encoder`), or from
+the stand-in's truth. Every prediction therefore uses a fresh uplink of the same snapshot,
+if only to locate the user.
 """
 
 from __future__ import annotations
@@ -33,24 +35,30 @@ FACTS = ("count", "seed", "scatterers")  # of a stand-in, from which its streets
 
 
 def load_argos(
-    root: str | Path, *, antenna: int | str = 0, tone: int | str = "all", positions: str | bool = "encoder",
-    align: bool = True
-) -> Measurements:  # fmt: skip
-    """Read a folder in the release's layout: kind csi, static transmitter, targets (S, A, K) complex64.
+    root: str | Path,
+    *,
+    antenna: int | str = 0,
+    tone: int | str = "all",
+    positions: str | bool = "encoder",
+    align: bool = True,
+) -> Measurements:
+    """Read a folder in the release's layout: kind csi, static transmitter, targets (S, A, K)
+    complex64.
 
     Args:
         root: the folder; `csidata-64.npy` is preferred where a folder has it.
         antenna: number of the antenna to predict, or `all`.
         tone: number of the downlink's tone to predict, or `all` 26.
-        positions: `encoder`, those of `encode_positions` by the training rows, or `true` where the folder has
-            `positions.npy` (the stand-in).
+        positions: `encoder`, those of `encode_positions` by the training rows, or `true` where the
+            folder has `positions.npy` (the stand-in).
         align: turn every snapshot by the phase and the mean delay of its own uplink. These are
             offsets of the snapshot; a factor of modulus 1 changes no error.
 
     Raises:
         DataError: anything is missing or wrong.
     """
-    root, positions, align = Path(root), str(positions).lower(), bool(align)  # `true` in YAML is no text
+    # `true` in YAML is no text
+    root, positions, align = Path(root), str(positions).lower(), bool(align)
     choice("encoder", "true").check("dataset.positions", positions)
     expected = "`base_station:` with a list of antenna positions [m]"
     description = read_yaml(root / "base-station.yml", "the antennas' positions", expected)
@@ -79,24 +87,43 @@ def load_argos(
     facts = {name: str(description[name]) for name in FACTS if name in description}
     base, frequency = places.mean(axis=0), carrier + tones * spacing
     site = Site(
-        STAND_IN if simulated else "argos", "csi", "tx", None, None, carrier, frequency[downlink],
-        stand_in="argos" if simulated else None, target_scale=scale, uplink_array=places - base,
-        uplink_hz=frequency[:UPLINK], antennas=chosen,
-    )  # fmt: skip
-    return centre_positions(Measurements(
-        site, np.tile(base, (len(csi), 1)), where, np.tile(np.eye(3), (len(csi), 1, 1)), target,
-        noise_variance=None if noise is None else np.full(len(csi), float(noise) / scale**2),
-        row_names=[f"snapshot {i}" for i in range(len(csi))], release_split=split,
-        provenance={"layout": "argos", "positions": positions, "aligned": str(align), **facts},
-        uplink=np.ascontiguousarray(uplink),
-    ))  # fmt: skip
+        STAND_IN if simulated else "argos",
+        "csi",
+        "tx",
+        None,
+        None,
+        carrier,
+        frequency[downlink],
+        stand_in="argos" if simulated else None,
+        target_scale=scale,
+        uplink_array=places - base,
+        uplink_hz=frequency[:UPLINK],
+        antennas=chosen,
+    )
+    return centre_positions(
+        Measurements(
+            site,
+            np.tile(base, (len(csi), 1)),
+            where,
+            np.tile(np.eye(3), (len(csi), 1, 1)),
+            target,
+            noise_variance=None if noise is None else np.full(len(csi), float(noise) / scale**2),
+            row_names=[f"snapshot {i}" for i in range(len(csi))],
+            release_split=split,
+            provenance={"layout": "argos", "positions": positions, "aligned": str(align), **facts},
+            uplink=np.ascontiguousarray(uplink),
+        )
+    )
 
 
 def remove_uplink_offsets(csi: np.ndarray, tones: np.ndarray) -> np.ndarray:
-    """Return snapshots (S, A, K) without mean delay and phase of their uplink (its tones come first)."""
+    """Return snapshots (S, A, K) without mean delay and phase
+    of their uplink (its tones come first).
+    """
     uplink, numbers = csi[..., :UPLINK], tones[:UPLINK]
     step = np.diff(numbers)[0]
-    # Mean phase step between neighbouring tones, weighted by their power: a delay without unwrapping.
+    # Mean phase step between neighbouring tones, weighted by their power:
+    # a delay without unwrapping.
     turn = np.angle((uplink[..., 1:] * uplink[..., :-1].conj()).sum((1, 2))) / step
     middle = numbers.mean()
     # The downlink too: timing and phase offsets belong to the snapshot, not to a band.
@@ -155,15 +182,22 @@ class Argos(Release):
     """The Argos release or any folder in its layout; settings of `load_argos` and `Release`."""
 
     called, reader = "Argos", staticmethod(load_argos)
-    hint = "It comes with the code of FIRE and NeRF2: put csidata.npy and base-station.yml into a folder"
+    hint = (
+        "It comes with the code of FIRE and NeRF2: put csidata.npy and base-station.yml into "
+        "a folder"
+    )
 
 
 class ArgosSim(Argos):
     """The simulated stand-in in the Argos layout: `dataset=argos_sim`; arguments as of `Argos`."""
 
-    def __init__(self, stand_in: StandIn, root: None = None, name: str = "argos_sim", **rest: Any) -> None:
+    def __init__(
+        self, stand_in: StandIn, root: None = None, name: str = "argos_sim", **rest: Any
+    ) -> None:
         if root is not None:
-            raise DataError(f"dataset.root={root}: the stand-in has none; say dataset=argos for a release")
+            raise DataError(
+                f"dataset.root={root}: the stand-in has none; say dataset=argos for a release"
+            )
         super().__init__(None, name=name, stand_in=stand_in, **rest)
 
     def load(self) -> Measurements:

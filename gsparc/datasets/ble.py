@@ -1,10 +1,11 @@
 """Received powers of a Bluetooth beacon at the sensors of a hall (Position-Annotated BLE RSSI).
 
-The release is a folder: cnf/tetam.dev says where sensors are (its first line, Dongles: and JSON), and
-hst/set_N/SENSOR_X_Y_Z.mbd holds a line `time,sensor,beacon,dBm` per packet heard from the place X, Y, Z [m].
+The release is a folder: cnf/tetam.dev says where sensors are (its first line, Dongles: and JSON),
+and hst/set_N/SENSOR_X_Y_Z.mbd holds a line `time,sensor,beacon,dBm` per packet heard
+from the place X, Y, Z [m].
 
-The same as an npz, of one set: mobile_position (S, 3), station_position (T, 3) [m]; rssi_db (S, T) [dBm],
-means; station (T,) names; frequency_hz () [Hz].
+The same as an npz, of one set: mobile_position (S, 3), station_position (T, 3) [m]; rssi_db (S, T)
+[dBm], means; station (T,) names; frequency_hz () [Hz].
 """
 
 from __future__ import annotations
@@ -31,14 +32,16 @@ def read_ble(path: str | Path, hall: int = 1) -> Raw:
         hall: number of the set, in a folder: hst/set_1 or hst/set_2.
 
     Returns:
-        `tx_position` (S, 3), `station_position` (T, 3) [m], `rssi_db` (S, T) [dBm], `station_name` (T,)
-        and `carrier_hz` ().
+        `tx_position` (S, 3), `station_position` (T, 3) [m], `rssi_db` (S, T) [dBm], `station_name`
+        (T,) and `carrier_hz` ().
 
     Raises:
         DataError: no such file, or an array is missing, or a line is none of the release.
     """
     folder = Path(path).is_dir()
-    return _of_release(Path(path), hall) if folder else read_converted(path, "ble npz", layout="ble")
+    return (
+        _of_release(Path(path), hall) if folder else read_converted(path, "ble npz", layout="ble")
+    )
 
 
 def _of_release(root: Path, hall: int) -> Raw:
@@ -54,8 +57,12 @@ def _of_release(root: Path, hall: int) -> Raw:
             levels[name, place] = mean
     problems.raise_if_any()
     if not levels:
-        raise DataError(f"{folder}: no *.mbd files; expected packets of each sensor in hst/set_{hall}")
-    where = sorted({place for _, place in levels}, key=lambda place: tuple(map(float, place.split("_"))))
+        raise DataError(
+            f"{folder}: no *.mbd files; expected packets of each sensor in hst/set_{hall}"
+        )
+    where = sorted(
+        {place for _, place in levels}, key=lambda place: tuple(map(float, place.split("_")))
+    )
     rssi = [[levels.get((name, place), np.nan) for name in sensors] for place in where]
     arrays = {
         "tx_position": np.array([place.split("_") for place in where], np.float64),
@@ -68,14 +75,18 @@ def _of_release(root: Path, hall: int) -> Raw:
 
 
 def read_sensor_places(path: Path) -> dict[str, np.ndarray]:
-    """Return places (3,) [m] of the sensors by name, out of `tetam.dev`; DataError where it is another."""
+    """Return places (3,) [m] of the sensors by name, out of `tetam.dev`;
+    DataError where it is another.
+    """
     expected = 'expected a first line Dongles:{"ADDRESS": [[x, y, z], COLOUR, "NAME"], ...}'
     head = read_text(path, f"missing; {expected}").partition("\n")[0]
     try:
         if not head.startswith("Dongles:"):
             raise ValueError
         listed = json.loads(head.removeprefix("Dongles:"))
-        return {str(name): np.array(place, np.float64).reshape(3) for place, _, name in listed.values()}
+        return {
+            str(name): np.array(place, np.float64).reshape(3) for place, _, name in listed.values()
+        }
     except (ValueError, TypeError, AttributeError, RecursionError):
         raise DataError(f"{path}, line 1: {expected}") from None
 
@@ -93,7 +104,9 @@ def read_mean_level(path: Path) -> float:
 
 
 class BLE(Campaign):
-    """Powers of a beacon at many places, at the sensors of a hall; settings of `read_ble`, `Campaign`."""
+    """Powers of a beacon at many places, at the sensors of a hall; settings of `read_ble`,
+    `Campaign`.
+    """
 
     choice, reader = "ble", staticmethod(read_ble)
     inside, marks = "cnf/tetam.dev", frozenset({"mobile_position", "rssi_db"})

@@ -1,4 +1,6 @@
-"""What campaigns and releases share: arrays are checked, a part is selected, a stand-in takes their place."""
+"""What campaigns and releases share: arrays are checked, a part is selected,
+a stand-in takes their place.
+"""
 
 from __future__ import annotations
 
@@ -49,7 +51,8 @@ class Campaign(DataModule):
     inside: ClassVar[str] = ""  # pattern of a file that folders of the release hold
     switches: ClassVar[tuple[str, ...]] = ()  # settings that `reader` takes besides its arguments
     hands_on = Selection  # whose settings it takes
-    reader: ClassVar[Callable[..., Raw]]  # the arrays of a file, named as in docs/reference/schema.md
+    # The arrays of a file, named as in docs/reference/schema.md
+    reader: ClassVar[Callable[..., Raw]]
 
     def __init__(
         self,
@@ -61,12 +64,16 @@ class Campaign(DataModule):
         super().__init__(name or self.choice, batch_size)
         file = fetched_path(self.choice) if file in (None, "", "???") else file
         if not isinstance(file, str | Path):
-            raise SettingError(f"dataset.file={[*map(str, file)]}: expected one file; join tables first")
+            raise SettingError(
+                f"dataset.file={[*map(str, file)]}: expected one file; join tables first"
+            )
         self.file = Path(file)
         self.settings, self.selection = settings, Selection(**take_selection(settings))
 
     def raw(self) -> Raw:
-        """Read the file's arrays, named as in docs/reference/schema.md; `DataError` where they are bad."""
+        """Read the file's arrays, named as in docs/reference/schema.md;
+        `DataError` where they are bad.
+        """
         return self.reader(self.file, **self.settings)
 
     def load(self) -> Measurements:
@@ -88,7 +95,9 @@ MOST_LINKS = 1_000_000  # of places and stations; all are held at once
 def find_implausible(
     data: Measurements, file_row: np.ndarray | None, most: float = MOST_LINKS
 ) -> tuple[list[str], LinkLevels | None, list[tuple[int, LevelStep]]]:
-    """Return warnings of units, conventions and levels, and the levels and their steps, of `most` links."""
+    """Return warnings of units, conventions and levels, and the levels and their steps,
+    of `most` links.
+    """
     hints: list[str] = [Severe(f"units? {hint}") for hint in unit_warnings(data)]
     places = len(data) if data.place is None else len(np.unique(data.place))
     if places * len(data.site.every_station) > most:
@@ -102,7 +111,9 @@ def find_implausible(
 
 
 class StandIn(Protocol):
-    """Simulated measurements in a release's layout, handed to the release's module by the configuration."""
+    """Simulated measurements in a release's layout,
+    handed to the release's module by the configuration.
+    """
 
     def folder(self) -> Path:
         """Return where they are; simulated when they are not there yet.
@@ -113,7 +124,8 @@ class StandIn(Protocol):
 
 
 class Release(DataModule):
-    """A folder of a published release: one that is named, the fetched one, or what stands in for it.
+    """A folder of a published release: one that is named, the fetched one,
+    or what stands in for it.
 
     Args:
         root: the folder; None: what `gsparc data` fetched of it, where it did.
@@ -140,11 +152,18 @@ class Release(DataModule):
 
     def missing(self) -> str:
         """Say why the release is not used, and how to get it."""
-        root = f"dataset.root={self.root} does not exist" if self.root else "dataset.root is not set"
-        return f"{root}: the {self.called} release is NOT on disk. {self.hint}, then set dataset.root=FOLDER."
+        root = (
+            f"dataset.root={self.root} does not exist" if self.root else ("dataset.root is not set")
+        )
+        return (
+            f"{root}: the {self.called} release is NOT on disk. {self.hint}, then set "
+            "dataset.root=FOLDER."
+        )
 
     def read(self, folder: Path) -> Measurements:
-        """Read a folder in the release's layout; `DataError` where something is missing or wrong."""
+        """Read a folder in the release's layout;
+        `DataError` where something is missing or wrong.
+        """
         return self.reader(folder, **self.settings)
 
     def load(self) -> Measurements:
@@ -157,7 +176,9 @@ class Release(DataModule):
         return load_stand_in(self.stand_in, self.called, self.read)
 
 
-def load_stand_in(stand_in: StandIn, called: str, read: Callable[[Path], Measurements]) -> Measurements:
+def load_stand_in(
+    stand_in: StandIn, called: str, read: Callable[[Path], Measurements]
+) -> Measurements:
     """Return the measurements of what stands in for the release `called`."""
     folder = stand_in.folder()
     layout = f"{called.lower()}-sim: SIMULATED data in the layout of the {called} release"
@@ -174,14 +195,19 @@ def make_once(folder: Path, write: Callable[[Path], None]) -> Path:
 
 
 def write_split(folder: Path, count: int, seed: int, first: int = 0, form: str = "%d") -> None:
-    """Write rows' numbers from `first` on, a random fifth of them for testing, in a text file each."""
+    """Write rows' numbers from `first` on, a random fifth of them for testing,
+    in a text file each.
+    """
     order, test = np.random.default_rng(seed).permutation(count) + first, max(round(0.2 * count), 1)
     for name, rows in (("test", order[:test]), ("train", order[test:])):
         np.savetxt(folder / f"{name}_index.txt", np.sort(rows), fmt=form)
 
 
-def read_split(folder: Path, count: int | None, problems: Problems, first: int = 0) -> TrainTest | None:
-    """Read (train, test) rows from 0, out of `train_index.txt` and `test_index.txt`; None without them.
+def read_split(
+    folder: Path, count: int | None, problems: Problems, first: int = 0
+) -> TrainTest | None:
+    """Read (train, test) rows from 0, out of `train_index.txt` and `test_index.txt`;
+    None without them.
 
     Args:
         folder: of the release.
@@ -194,7 +220,9 @@ def read_split(folder: Path, count: int | None, problems: Problems, first: int =
     if not present:
         return None
     for absent in {*paths} - {*present}:
-        return problems.add(absent, f"missing, but {present[0].name} is there; expected both or none")
+        return problems.add(
+            absent, f"missing, but {present[0].name} is there; expected both or none"
+        )
     train, test = (_read_index(path, count, problems, first) for path in paths)
     if train is None or test is None:
         return None
@@ -206,7 +234,9 @@ def read_split(folder: Path, count: int | None, problems: Problems, first: int =
 def _read_index(path: Path, count: int | None, problems: Problems, first: int) -> np.ndarray | None:
     """Rows (n,) from 0, sorted."""
     lines = (problems.attempt(lambda: read_text(path, "missing")) or "").split("\n")
-    words = [(n, word.removesuffix(".png")) for n, line in enumerate(lines, 1) for word in line.split()]
+    words = [
+        (n, word.removesuffix(".png")) for n, line in enumerate(lines, 1) for word in line.split()
+    ]
     plain = [word if re.fullmatch(f"[0-9]{{1,{LONGEST}}}", word) else "-1" for _, word in words]
     rows = np.array(plain, np.int64) - first
     wrong = (rows < 0) | (rows >= (np.inf if count is None else count))
@@ -275,4 +305,6 @@ def read_converted(path: str | Path, of: str, **about: str) -> Raw:
     if missing:
         raise DataError(missing, path)
     listed = {name: raw.arrays[name] for name in fields}
-    return rename_arrays(replace(raw, arrays=listed, attributes={**raw.attributes, **about}), fields)
+    return rename_arrays(
+        replace(raw, arrays=listed, attributes={**raw.attributes, **about}), fields
+    )

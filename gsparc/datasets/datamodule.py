@@ -1,4 +1,6 @@
-"""Batches in an order that is a pure function of (seed, step), so that a resumed run continues exactly."""
+"""Batches in an order that is a pure function of (seed, step),
+so that a resumed run continues exactly.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,9 @@ def rows_of_step(seed: int, step: int, batch_size: int, pool: np.ndarray) -> np.
         pool: (n,) training rows.
     """
     epoch, position = divmod(step, steps_per_epoch(len(pool), batch_size))
-    return pool[_permutation(seed, epoch, len(pool))[position * batch_size : (position + 1) * batch_size]]
+    return pool[
+        _permutation(seed, epoch, len(pool))[position * batch_size : (position + 1) * batch_size]
+    ]
 
 
 @lru_cache(maxsize=2)
@@ -83,12 +87,15 @@ class StepLoader:
             rows = rows_of_step(self.seed, step, self.batch_size, self.pool)
             mine = rows[self.rank :: self.devices]
             mine = mine if len(mine) else rows[self.rank % len(rows) :][:1]  # all take the step
-            # A device without a row of its own repeats one, so that it joins the step, with weight 0.
+            # A device without a row of its own repeats one, so that it joins the step,
+            # with weight 0.
             part = len(mine) / len(rows) if self.rank < len(rows) else 0.0
             yield replace(self.data.batch(mine), share=part)
 
     def state_dict(self) -> dict[str, int]:
-        """Store nothing: the order is a pure function of (seed, step). Marks the loader as resumable."""
+        """Store nothing: the order is a pure function of (seed, step).
+        Marks the loader as resumable.
+        """
         return {}
 
     def load_state_dict(self, state: dict[str, int]) -> None:
@@ -159,7 +166,9 @@ class DataModule(pl.LightningDataModule, ABC):
         self.measurements  # noqa: B018 (reading is what is wanted)
 
     def train_dataloader(self) -> StepLoader:
-        """Return training batches, starting where the trainer stands (also in the middle of an epoch)."""
+        """Return training batches, starting where the trainer stands (also
+        in the middle of an epoch).
+        """
         trainer = self.trainer
         rank, devices = (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
         how = self._rows().train, self.batch_size, self.seed, self._batches_shown, rank, devices
@@ -177,7 +186,9 @@ class DataModule(pl.LightningDataModule, ABC):
         """Return the test rows; `Trainer.predict` asks for them."""
         return self.test_dataloader()
 
-    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+    def transfer_batch_to_device(
+        self, batch: Batch, device: torch.device, dataloader_idx: int
+    ) -> Batch:
         """Move the batch, a frozen dataclass, which Lightning does not move itself."""
         return batch.to(device)
 
@@ -190,7 +201,8 @@ class DataModule(pl.LightningDataModule, ABC):
         # Without a trainer, as in a notebook, batches begin with the first one.
         if self.trainer is None:
             return 0
-        # `completed` is what a checkpoint restores; `ready` would count the batch a kill interrupted.
+        # `completed` is what a checkpoint restores;
+        # `ready` would count the batch a kill interrupted.
         return self.trainer.fit_loop.epoch_loop.batch_progress.total.completed
 
 

@@ -14,7 +14,9 @@ from gsparc.tables.checks.coherence import estimate_coherence
 
 
 def describe(data: Measurements) -> list[tuple[str, str]]:
-    """Return (topic, sentence) pairs about a dataset; topics of what it has none of are left out."""
+    """Return (topic, sentence) pairs about a dataset;
+    topics of what it has none of are left out.
+    """
     site, pair, error = data.site, data.release_split, data.site.convergence_error
     phases = estimate_coherence(data)
     tones = np.zeros(1) if site.subcarriers_hz is None else site.subcarriers_hz
@@ -22,41 +24,77 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
     # Wavelengths and stored scales tell who reads powers nothing.
     paths, scale, powers = data.directions, site.target_scale, site.target.is_level
     lines = [
-        ("name", site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else "")),
+        (
+            "name",
+            site.name + (f" (SIMULATED, stands in for {site.stand_in})" if site.stand_in else ""),
+        ),
         ("kind", f"{site.kind}: {_targets(data)}"),
         ("stays", _static(site)),
         ("moves", _moving(data)),
         ("neighbours", spacing_words(distinct_places(data), None if powers else site.carriers)),
         ("carrier", _carrier(site)),
-        ("band", f"{len(tones)} subcarriers over {np.ptp(tones) / 1e6:.6g} MHz" if len(tones) > 1 else ""),
+        (
+            "band",
+            f"{len(tones)} subcarriers over {np.ptp(tones) / 1e6:.6g} MHz"
+            if len(tones) > 1
+            else "",
+        ),
         ("grid", "" if site.grid is None else _grid(site.grid)),
         ("array", "" if site.array is None else f"{len(site.array)} receive antennas"),
-        ("scale", "" if powers or scale == 1 else f"measurements are divided by {scale:.4g}, then stored"),
-        ("censored", f"{weak} of {len(data)} powers lie below a level (unheard, unlisted), {strong} above one"
-         if data.censored is not None else ""),
-        ("runs", "" if data.run is None else f"{data.run.max() + 1}" + ", of unknown factors" * (not powers)),
+        (
+            "scale",
+            "" if powers or scale == 1 else f"measurements are divided by {scale:.4g}, then stored",
+        ),
+        (
+            "censored",
+            f"{weak} of {len(data)} powers lie below a level (unheard, unlisted), "
+            f"{strong} above one"
+            if data.censored is not None
+            else "",
+        ),
+        (
+            "runs",
+            ""
+            if data.run is None
+            else f"{data.run.max() + 1}" + ", of unknown factors" * (not powers),
+        ),
         ("phases", "" if phases is None else str(phases)),
-        ("mask", f"{data.mask.mean():.1%} of the entries were measured"
-         if data.mask is not None and data.censored is None else ""),
+        (
+            "mask",
+            f"{data.mask.mean():.1%} of the entries were measured"
+            if data.mask is not None and data.censored is None
+            else "",
+        ),
         ("directions", "" if paths is None else f"{sum(map(len, paths))} directions of arrival"),
-        ("split", "" if pair is None else f"its own: {len(pair[0])} rows to train, {len(pair[1])} to test"),
+        (
+            "split",
+            ""
+            if pair is None
+            else f"its own: {len(pair[0])} rows to train, {len(pair[1])} to test",
+        ),
         ("split?", propose_split(data)),
-        ("convergence", "" if error is None else f"solver error (NMSE between two seeds) {error:.3g}"),
+        (
+            "convergence",
+            "" if error is None else f"solver error (NMSE between two seeds) {error:.3g}",
+        ),
         ("sha256", site.sha256),
-    ]  # fmt: skip
+    ]
     return [(topic, sentence) for topic, sentence in lines if sentence]
 
 
 def summarise(data: Measurements, split: Split) -> list[tuple[str, str]]:
     """Return (topic, sentence) pairs about a dataset and how a run divides it."""
     count = len(split.folds)
-    whole = [sum(len(getattr(fold, part)) for fold in split.folds) for part in ("train", "val", "test")]
+    whole = [
+        sum(len(getattr(fold, part)) for fold in split.folds) for part in ("train", "val", "test")
+    ]
     train, val, test = (round(rows / count) for rows in whole)
     folds = f"each of {count} folds has about " if count > 1 else ""
     rows = f"{folds}{train} training, {val} validation and {test} test rows"
     if split.name == "none":
         rows = (
-            f"all {train + val} rows are learned from ({val} of them also decide between choices of a method)"
+            f"all {train + val} rows are learned from ({val} of them also decide between choices "
+            "of a method)"
         )
     lines = [
         ("data", f"{data.site.name}, {data.site.kind}: {_targets(data)}"),
@@ -80,7 +118,11 @@ def _carrier(site: Site) -> str:
 
 def distinct_places(data: Measurements) -> np.ndarray:
     """Return places (n, 3) or (n, 6) [m], one of each visit."""
-    return data.moving if data.place is None else data.moving[np.unique(data.place, return_index=True)[1]]
+    return (
+        data.moving
+        if data.place is None
+        else data.moving[np.unique(data.place, return_index=True)[1]]
+    )
 
 
 def _targets(data: Measurements) -> str:
@@ -88,7 +130,9 @@ def _targets(data: Measurements) -> str:
 
 
 def spacing_words(positions: np.ndarray, carriers: np.ndarray | None) -> str:
-    """Say how far places (n, 3) [m] are from the nearest other, and in wavelengths of the lowest carrier."""
+    """Say how far places (n, 3) [m] are from the nearest other,
+    and in wavelengths of the lowest carrier.
+    """
     different, counts = np.unique(positions, axis=0, return_counts=True)
     if len(different) < 2:
         return "one place alone"
@@ -161,7 +205,9 @@ def propose_side(data: Measurements) -> float | None:
 
 
 def held_out_block_rows(data: Measurements, side: float) -> np.ndarray:
-    """Return rows that `split=blocks split.side_m=<side>` tests on; none where it cannot be cut so."""
+    """Return rows that `split=blocks split.side_m=<side>` tests on;
+    none where it cannot be cut so.
+    """
     try:
         split = split_for({"name": "blocks", "side_m": side}, data)
         split.check()

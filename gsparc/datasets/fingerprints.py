@@ -1,8 +1,9 @@
 """Fingerprints: levels of access points whose places nobody knows, heard at known places.
 
-An archive (npz, HDF5) holds `rss_dbm` (S, P), NaN where nothing was heard, and `position` (S, 2) or (S, 3).
-A table (CSV) has the columns of UJIIndoorLoc (J. Torres-Sospedra et al., "UJIIndoorLoc: a new multi-building
-and multi-floor database for WLAN fingerprint-based indoor localization problems", IPIN 2014).
+An archive (npz, HDF5) holds `rss_dbm` (S, P), NaN where nothing was heard, and `position` (S, 2) or
+(S, 3). A table (CSV) has the columns of UJIIndoorLoc (J. Torres-Sospedra et al., "UJIIndoorLoc: a
+new multi-building and multi-floor database for WLAN fingerprint-based indoor localization
+problems", IPIN 2014).
 """
 
 from __future__ import annotations
@@ -24,7 +25,13 @@ How = Literal["released", "random", "places", "blocks", "walks", "later"]
 SILENT = 100.0  # of a table: not heard
 LOUDEST, FAINTEST = 20.0, -160.0  # levels of no receiver lie beyond [dBm]
 STOREY_M = 3.7  # between floors of a table, which has no heights
-NUMBERS = {"floor": "floor", "building": "building", "walk": "walk", "month": "campaign", "round": "campaign"}
+NUMBERS = {
+    "floor": "floor",
+    "building": "building",
+    "walk": "walk",
+    "month": "campaign",
+    "round": "campaign",
+}
 COLUMNS = {"FLOOR": "floor", "BUILDINGID": "building", "TIMESTAMP": "time_s"}
 
 
@@ -53,21 +60,28 @@ class Fingerprints:
 
     def subset(self, rows: np.ndarray) -> Fingerprints:
         """Return the rows (n,) alone."""
-        parts = {f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "access_point"}
+        parts = {
+            f.name: getattr(self, f.name)[rows] for f in fields(self) if f.name != "access_point"
+        }
         return replace(self, **parts)
 
     def select_access_points(self, names: np.ndarray) -> Fingerprints:
-        """Return columns in the order of `names` (P,) of another campaign; NaN where they are not here."""
+        """Return columns in the order of `names` (P,) of another campaign;
+        NaN where they are not here.
+        """
         column = {name: number for number, name in enumerate(self.access_point.tolist())}
         columns = np.array([column.get(name, -1) for name in names.tolist()])
         if not (columns >= 0).any():
-            raise DataError(f"no access point of {list_first(list(names))} is among {list_first([*column])}")
+            raise DataError(
+                f"no access point of {list_first(list(names))} is among {list_first([*column])}"
+            )
         level = np.where(columns >= 0, self.level[:, columns], np.nan)
         return replace(self, level=level, access_point=names)
 
 
 def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
-    """Read rows of an archive or a table; NaN stands for lacking places, unless they must be `placed`.
+    """Read rows of an archive or a table; NaN stands for lacking places,
+    unless they must be `placed`.
 
     Example:
         rows = read_fingerprints("wifine-floor4.npz")
@@ -86,7 +100,9 @@ def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
     if dimensions not in (2, 3):
         raise DataError(f"{path}, position: expected 2 or 3 coordinates, found {dimensions}")
     if np.isnan(level).all():
-        raise DataError(f"{path}, rss_dbm: no row heard an access point; expected levels in dBm, else NaN")
+        raise DataError(
+            f"{path}, rss_dbm: no row heard an access point; expected levels in dBm, else NaN"
+        )
     wrong = np.argwhere((level > LOUDEST) | (level < FAINTEST))
     if len(wrong):
         row, column = wrong[0]
@@ -100,15 +116,19 @@ def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
         twice = f"a name twice in {list_first(list(names))}"
         raise DataError(f"{path}, access_point: {twice}; expected each once")
     return Fingerprints(
-        level=level, position=np.pad(position, ((0, 0), (0, 3 - dimensions))), **numbers,
+        level=level,
+        position=np.pad(position, ((0, 0), (0, 3 - dimensions))),
+        **numbers,
         test=checked.get("test", np.zeros(count)).astype(bool),
         time_s=checked.get("time_s", np.zeros(count)).astype(np.float64),
         access_point=names,
-    )  # fmt: skip
+    )
 
 
 def _of_table(path: Path, placed: bool) -> Raw:
-    """The same arrays of a table with columns WAP001, ..., LONGITUDE, LATITUDE [m], FLOOR, BUILDINGID."""
+    """The same arrays of a table with columns WAP001, ..., LONGITUDE, LATITUDE [m], FLOOR,
+    BUILDINGID.
+    """
     import pandas as pd  # half a second
 
     with readable(path, "not readable as CSV text", (ValueError, OSError)):
@@ -117,10 +137,14 @@ def _of_table(path: Path, placed: bool) -> Raw:
     places = ["LONGITUDE", "LATITUDE"] if placed or "LONGITUDE" in frame else []
     missing = [name for name in places if name not in frame] or ([] if names else ["WAP001"])
     if missing:
-        raise DataError(f"{path}, line 1: no column {missing[0]}; expected the columns of UJIIndoorLoc")
+        raise DataError(
+            f"{path}, line 1: no column {missing[0]}; expected the columns of UJIIndoorLoc"
+        )
     for name in (*names, *places, *(COLUMNS.keys() & set(frame.columns))):
         if frame[name].dtype.kind not in "iuf":
-            raise DataError(f"{path}, column {name}: expected numbers, found {frame[name].iloc[0]!r}")
+            raise DataError(
+                f"{path}, column {name}: expected numbers, found {frame[name].iloc[0]!r}"
+            )
     arrays = {field: frame[name].to_numpy() for name, field in COLUMNS.items() if name in frame}
     height = STOREY_M * arrays.get("floor", np.zeros(len(frame)))
     level = frame[names].replace(SILENT, np.nan).to_numpy(np.float32)
@@ -130,14 +154,18 @@ def _of_table(path: Path, placed: bool) -> Raw:
 
 
 def split_fingerprints(
-    rows: Fingerprints, how: How = "released", side_m: float = 1.0, share: float = 0.2, seed: int = 0
+    rows: Fingerprints,
+    how: How = "released",
+    side_m: float = 1.0,
+    share: float = 0.2,
+    seed: int = 0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Part rows into training and test (n,), (m,), sorted; a pure function of its arguments.
 
     Args:
-        how: `released`: as the file says; `random`: rows; `places`: all rows of cubes of `side_m` [m];
-            `blocks`: of squares of floor, all floors alike; `walks`: whole ones; `later`: campaigns after the
-            first.
+        how: `released`: as the file says; `random`: rows; `places`: all rows of cubes of `side_m`
+            [m]; `blocks`: of squares of floor, all floors alike; `walks`: whole ones; `later`:
+            campaigns after the first.
         share: held out, of rows, places, squares or walks.
 
     Raises:
@@ -147,7 +175,9 @@ def split_fingerprints(
     if how in ("released", "later"):
         test = rows.test if how == "released" else rows.campaign > rows.campaign.min()
         if test.all() or not test.any():
-            raise DataError(f"split={how}: the file names no such rows; take random, places or blocks")
+            raise DataError(
+                f"split={how}: the file names no such rows; take random, places or blocks"
+            )
         return np.flatnonzero(~test), np.flatnonzero(test)
     name = {"walks": "runs", "blocks": "blocks"}.get(how, "random")
     settings = SplitSettings(name, seed, 0.0, share, side_m=side_m, share=share)

@@ -24,7 +24,14 @@ from gsparc.data.outliers import find_outliers
 from gsparc.data.row_order import content_order
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import read_split
-from gsparc.data.splits import FileSettings, Split, SplitSettings, make_split, remove_rows, rows_to_leave_out
+from gsparc.data.splits import (
+    FileSettings,
+    Split,
+    SplitSettings,
+    make_split,
+    remove_rows,
+    rows_to_leave_out,
+)
 from gsparc.datasets.datamodule import DataModule
 
 log = logging.getLogger(__name__)
@@ -61,7 +68,9 @@ def datamodule(config: Mapping[str, Any], *, trusted: bool = True) -> DataModule
     kind = instantiate.import_target(str(target))
     if not callable(kind) or (isinstance(kind, type) and not issubclass(kind, DataModule)):
         only = "; only gsparc locate takes it" if name == "fingerprints" else ""
-        raise DataError(f"dataset._target_={target} is no gsparc.datasets.datamodule.DataModule{only}")
+        raise DataError(
+            f"dataset._target_={target} is no gsparc.datasets.datamodule.DataModule{only}"
+        )
     has_own = "align" in _parameters(kind)  # Argos turns snapshots by their uplink
     free = "auto" if has_own else str(settings.pop("align", None) or "auto")
     settings = _checked(settings, kind)
@@ -96,27 +105,38 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         split = read_split(settings.path, len(data), data.site.sha256)
         absent = rows_to_leave_out(settings.leave_out, wrong, len(data))
         return answerable(remove_rows(split, absent) if len(absent) else split, data)
-    carriers = None if data.carrier_hz is None else np.unique(data.carrier_hz, return_inverse=True)[1]
+    carriers = (
+        None if data.carrier_hz is None else np.unique(data.carrier_hz, return_inverse=True)[1]
+    )
     unit = {"runs": data.run, "carriers": carriers}.get(settings.name, data.station)
     place = spacing.group_visits(data.moving, data.place)
     if place is not None and place is not data.place:
-        text = "split: %d rows are of %d places: those within a hundredth of the usual step stay together"
+        text = (
+            "split: %d rows are of %d places: those within a hundredth of the usual step stay "
+            "together"
+        )
         log.info(text, len(data), len(np.unique(place)))
-    # From the lowest place on: where stations stand moves local coordinates, and would move squares.
+    # From the lowest place on: where stations stand moves local coordinates,
+    # and would move squares.
     where = data.moving - data.moving.min(axis=0)
     order = content_order(data) if settings.name == "none" else data.sequence
-    return answerable(make_split(where, settings, data.release_split, wrong, place, unit, order), data)
+    return answerable(
+        make_split(where, settings, data.release_split, wrong, place, unit, order), data
+    )
 
 
-def answerable(split: Split, data: Measurements, learned: tuple[Measurements, Split] | None = None) -> Split:
+def answerable(
+    split: Split, data: Measurements, learned: tuple[Measurements, Split] | None = None
+) -> Split:
     """Return the same folds without test rows that plain methods cannot answer.
 
-    Those are of stations with next to no training rows, at unknown places or, of `learned`, not expected
-    there. Folds that test such stations alone stay as they are: methods refuse them.
+    Those are of stations with next to no training rows, at unknown places or, of `learned`, not
+    expected there. Folds that test such stations alone stay as they are: methods refuse them.
 
     Args:
         split, data: what is tested.
-        learned: what was learned from, and its folds, where it is other data with the same stations.
+        learned: what was learned from, and its folds, where it is other data with the same
+            stations.
     """
     source, before = learned or (data, split)
     if data.station is None or source.station is None:
@@ -124,15 +144,22 @@ def answerable(split: Split, data: Measurements, learned: tuple[Measurements, Sp
     places, folds = data.site.every_station.position, list[splits.Fold]()
     for fold, old in zip(split.folds, before.folds, strict=True):
         heard = old.train[source.censored_side(old.train) <= 0]
-        train, test = (np.bincount(source.station[rows], minlength=len(places)) for rows in (heard, old.test))
+        train, test = (
+            np.bincount(source.station[rows], minlength=len(places)) for rows in (heard, old.test)
+        )
         usable = (train >= splits.LEAST_ROWS) | ((test > 0) & np.isfinite(places).all(1))
         test_rows = fold.test[usable[data.station[fold.test]]]
         folds.append(replace(fold, test=test_rows) if len(test_rows) else fold)
     pairs = zip(split.folds, folds, strict=True)
     rejects = np.concatenate([np.setdiff1d(old.test, new.test) for old, new in pairs])
     if len(rejects):
-        new, rows = np.unique(data.station[rejects[data.censored_side(rejects) <= 0]], return_counts=True)
-        names = [f"{data.site.every_station.shown[t]} (in {n} rows)" for t, n in zip(new, rows, strict=True)]
+        new, rows = np.unique(
+            data.station[rejects[data.censored_side(rejects) <= 0]], return_counts=True
+        )
+        names = [
+            f"{data.site.every_station.shown[t]} (in {n} rows)"
+            for t, n in zip(new, rows, strict=True)
+        ]
         message = "split: %d test rows are left out, of stations with under %d training rows%s"
         heard_now = f"; heard now: {list_first(names, 12)}" * bool(names)
         log.warning(message, len(rejects), splits.LEAST_ROWS, heard_now)
@@ -157,7 +184,9 @@ def _plain(config: Mapping[str, Any] | Any) -> dict[str, Any]:
 
 @functools.cache
 def _choices() -> dict[str, DictConfig]:
-    """What conf/dataset holds, by name; settings that come from other groups are left to their defaults."""
+    """What conf/dataset holds, by name; settings that come from other groups are left
+    to their defaults.
+    """
     choices: dict[str, DictConfig] = {}
     for file in files("gsparc.conf").joinpath("dataset").iterdir():
         if file.name.endswith(".yaml"):
@@ -173,14 +202,21 @@ def _choice(name: Any, choices: Mapping[str, DictConfig]) -> DictConfig:
 
 
 def _parameters(kind: Any) -> dict[str, Any]:
-    """What `kind` takes, with defaults; what a dataset hands on by keyword is what its reader takes."""
-    reader, arguments_of = getattr(kind, "reader", lambda path: path), instantiate.accepted_arguments
+    """What `kind` takes, with defaults; what a dataset hands on
+    by keyword is what its reader takes.
+    """
+    reader, arguments_of = (
+        getattr(kind, "reader", lambda path: path),
+        instantiate.accepted_arguments,
+    )
     _, *read = arguments_of(reader).items()
     return {**dict.fromkeys(getattr(kind, "switches", ())), **dict(read), **arguments_of(kind)}
 
 
 def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
-    """The settings that `kind` takes, none unknown or missing; an unknown one that is null was not said."""
+    """The settings that `kind` takes, none unknown or missing;
+    an unknown one that is null was not said.
+    """
     parameters = inspect.signature(kind).parameters.values()
     if any(p.kind is p.VAR_KEYWORD for p in parameters) and not hasattr(kind, "reader"):
         return settings  # it checks them itself
@@ -194,7 +230,9 @@ def _checked(settings: dict[str, Any], kind: Any) -> dict[str, Any]:
         elif value is not None:
             other = PATHS.get(key)
             if other in defaults:
-                raise DataError(f"dataset.{key} is not a setting of dataset={name}; say dataset.{other}=...")
+                raise DataError(
+                    f"dataset.{key} is not a setting of dataset={name}; say dataset.{other}=..."
+                )
             hint = instantiate.suggest_or_list(key, defaults)
             raise DataError(f"dataset.{key}: no such setting of dataset={name}{hint}")
     for key in defaults:

@@ -1,11 +1,11 @@
 """Rooms of NeWRF: one transmitter, many receivers, one complex channel each.
 
-The release is a pickled pandas table of a row per receiver: TxPos, RxPos (3,) [m]; CSI (1,) complex;
-Frequency [GHz]; LastXPts (3, P) [m] and RxChanPerRay (P, 1), of P paths each; LineOfSight.
+The release is a pickled pandas table of a row per receiver: TxPos, RxPos (3,) [m]; CSI (1,)
+complex; Frequency [GHz]; LastXPts (3, P) [m] and RxChanPerRay (P, 1), of P paths each; LineOfSight.
 
-The same as an npz: tx_pos (3,), rx_pos (S, 3) [m]; csi (S,) or (S, K) complex; frequency_hz () or (K,) [Hz];
-optional: path_offsets (S + 1,), path_last_point (P, 3) [m], path_gain (P,); line_of_sight (S,);
-split_train, split_test.
+The same as an npz: tx_pos (3,), rx_pos (S, 3) [m]; csi (S,) or (S, K) complex; frequency_hz () or
+(K,) [Hz]; optional: path_offsets (S + 1,), path_last_point (P, 3) [m], path_gain (P,);
+line_of_sight (S,); split_train, split_test.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ def read_newrf(path: str | Path) -> Raw:
     raw = Raw(_of_release(path)) if path.suffix.lower() in NeWRF.suffixes else read_raw(path)
     missing = [name for name in (*NAMES, "csi", "frequency_hz") if name not in raw.arrays]
     if missing:
-        raise DataError([f"{path}, {n}: missing; expected in the layout of NeWRF" for n in missing], path)
+        raise DataError(
+            [f"{path}, {n}: missing; expected in the layout of NeWRF" for n in missing], path
+        )
     return rename_arrays(raw, NAMES)
 
 
@@ -42,8 +44,12 @@ def _of_release(path: Path) -> dict[str, np.ndarray]:
     frame = read_pickled_frame(path)
     missing = [name for name in COLUMNS if name not in frame]
     if missing:
-        raise DataError(f"{path}: no columns {', '.join(missing)}; it holds {', '.join(map(str, frame))}")
-    whole = [i for i in range(len(frame["CSI"])) if all(_finite(frame[name][i]) for name in COLUMNS)]
+        raise DataError(
+            f"{path}: no columns {', '.join(missing)}; it holds {', '.join(map(str, frame))}"
+        )
+    whole = [
+        i for i in range(len(frame["CSI"])) if all(_finite(frame[name][i]) for name in COLUMNS)
+    ]
     with readable(path, "not the table of a room", (ValueError, TypeError)):
         rows = {name: [np.asarray(frame[name][i]) for i in whole] for name in COLUMNS}
         arrays = {
@@ -53,11 +59,15 @@ def _of_release(path: Path) -> dict[str, np.ndarray]:
             "frequency_hz": np.unique(np.array(rows["Frequency"], np.float64) * 1e9),
             "path_offsets": np.cumsum([0, *(gain.size for gain in rows["RxChanPerRay"])]),
             "path_last_point": np.concatenate(rows["LastXPts"], axis=1).T.astype(np.float32),
-            "path_gain": np.concatenate([g.ravel() for g in rows["RxChanPerRay"]]).astype(np.complex64),
+            "path_gain": np.concatenate([g.ravel() for g in rows["RxChanPerRay"]]).astype(
+                np.complex64
+            ),
             "line_of_sight": np.array(rows["LineOfSight"]) != 0,
         }
     if len(arrays["frequency_hz"]) != 1 or (arrays["tx_pos"] != arrays["tx_pos"][0]).any():
-        raise DataError(f"{path}: several transmitters or frequencies; expected one of each in a room")
+        raise DataError(
+            f"{path}: several transmitters or frequencies; expected one of each in a room"
+        )
     arrays |= {"tx_pos": arrays["tx_pos"][0], "frequency_hz": arrays["frequency_hz"][0]}
     return arrays
 

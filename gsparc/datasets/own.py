@@ -48,7 +48,9 @@ def read_own(
     raw = apply_settings(read_file_or_table(path, columns, stations_file), **settings)
     campaign = dataset_by_arrays(raw)
     if campaign is not None:
-        raise DataError(f"{path}: this is a file of dataset={campaign.choice}; say dataset={campaign.choice}")
+        raise DataError(
+            f"{path}: this is a file of dataset={campaign.choice}; say dataset={campaign.choice}"
+        )
     return raw
 
 
@@ -67,12 +69,13 @@ def apply_settings(
 
     Args:
         raw: as it was read.
-        not_heard: levels that mean that nothing was heard; None: those that stand apart from all others.
-        absent: `silent`: a station without a level at a place where others have one was not heard there;
-            `auto`: one that a list of the strongest leaves out is below its weakest, levels that are missing
-            beside weak ones alone are below their station's; `unknown`: neither.
-        saturation_db: level [dB] from which on powers are at least that; `auto`: the highest where it
-            repeats; `none`: there is none.
+        not_heard: levels that mean that nothing was heard; None: those that stand apart from all
+            others.
+        absent: `silent`: a station without a level at a place where others have one was not heard
+            there; `auto`: one that a list of the strongest leaves out is below its weakest, levels
+            that are missing beside weak ones alone are below their station's; `unknown`: neither.
+        saturation_db: level [dB] from which on powers are at least that; `auto`: the highest where
+            it repeats; `none`: there is none.
         tx_position: of a transmitter that stood still, where the file does not say it [m].
         frequency_hz: of the tones, likewise [Hz].
         carrier_hz, spacing_hz: of tones, the middle one and from one to the next, instead [Hz].
@@ -82,7 +85,9 @@ def apply_settings(
         SettingError: another word for a convention.
     """
     settings = {"not_heard": not_heard, "absent": absent, "saturation_db": saturation_db}
-    facts: dict[str, Any] = {name: value for name, value in settings.items() if value not in (None, "auto")}
+    facts: dict[str, Any] = {
+        name: value for name, value in settings.items() if value not in (None, "auto")
+    }
     for name, follows in conventions.items():
         or_null(switch()).check(f"dataset.{name}", follows)
     followed = [name for name, follows in conventions.items() if follows]
@@ -94,7 +99,9 @@ def apply_settings(
 
 
 class Own(Campaign):
-    """Measurements of one's own; suspicious units are warned of. Settings of `read_own` and `Campaign`."""
+    """Measurements of one's own; suspicious units are warned of.
+    Settings of `read_own` and `Campaign`.
+    """
 
     choice, reader = "own", staticmethod(read_own)
     # Arguments of `apply_settings` but its data and its conventions, which are listed by name.
@@ -137,9 +144,12 @@ def read_any(path: str | Path, **settings: Any) -> Reading:
     if release is not None:
         raw, note = release.reader(path), f"this is the release of dataset={release.choice}"
     elif path.is_dir():
-        if not any((path / name).exists() for name in ("gateway_info.yml", "tx_pos.csv", "spectrum")):
+        if not any(
+            (path / name).exists() for name in ("gateway_info.yml", "tx_pos.csv", "spectrum")
+        ):
             raise DataError(
-                f"{path}: a folder without gateway_info.yml, tx_pos.csv and spectrum/ (the RFID release's "
+                f"{path}: a folder without gateway_info.yml, tx_pos.csv and spectrum/ (the RFID "
+                "release's "
                 "layout); for measurements of your own give the npz or HDF5 file"
             )
         return Reading(load_rfid(path), ())
@@ -156,14 +166,17 @@ def read_file_or_table(
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
 ) -> Raw:
-    """Read the arrays of a file of the schema, or of a table; notes say how its columns were understood.
+    """Read the arrays of a file of the schema, or of a table;
+    notes say how its columns were understood.
 
     Raises:
         DataError: not readable, or columns that nothing can be made of.
     """
     if not is_table(path):
         named = any(value is not None for value in (columns or {}).values())
-        for name in [name for name, entry in (("columns", named), ("stations_file", stations_file)) if entry]:
+        for name in [
+            name for name, entry in (("columns", named), ("stations_file", stations_file)) if entry
+        ]:
             raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
         return read_raw(path)
     from gsparc.tables.read import parse_table  # here, as pandas takes half a second to import

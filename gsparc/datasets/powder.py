@@ -1,12 +1,13 @@
-"""Received powers of a walking transmitter at fixed stations of a campus (POWDER, University of Utah).
+"""Received powers of a walking transmitter at fixed stations
+of a campus (POWDER, University of Utah).
 
-The release is a table, `single_tx.csv`: a row per place with `timestamp`, one column per station [dB],
-columns `bus-*` of stations that drive (left out), and the transmitter's `tx_x_coord` (latitude!) and
-`tx_y_coord` (longitude) [deg]; -101 stands for no value. `location_coordinates.json` beside it has the
-stations' places. The carrier is 462.7 MHz.
+The release is a table, `single_tx.csv`: a row per place with `timestamp`, one column per station
+[dB], columns `bus-*` of stations that drive (left out), and the transmitter's `tx_x_coord`
+(latitude!) and `tx_y_coord` (longitude) [deg]; -101 stands for no value.
+`location_coordinates.json` beside it has the stations' places. The carrier is 462.7 MHz.
 
-The same as an npz: mobile_position (S, 2), station_position (T, 2) [m, east and north], rssi_db (S, T) [dB],
-station (T,) names, latitude, longitude (S,) [deg], frequency_hz () [Hz].
+The same as an npz: mobile_position (S, 2), station_position (T, 2) [m, east and north], rssi_db (S,
+T) [dB], station (T,) names, latitude, longitude (S,) [deg], frequency_hz () [Hz].
 """
 
 from __future__ import annotations
@@ -44,17 +45,20 @@ def read_powder(
 
     Args:
         path: *.npz or *.csv.
-        station_table: coordinates of the stations of a CSV; None takes `location_coordinates.json` beside it.
+        station_table: coordinates of the stations of a CSV; None takes `location_coordinates.json`
+            beside it.
         tx_height, station_height: above ground [m], the same for all; the ground is taken as flat.
         sensitivity_db: of some stations, by name: weaker levels are noise, nothing was heard [dB].
 
     Returns:
-        `latitude`, `longitude` (S,), `station_latitude`, `station_longitude` (T,) [deg], `tx_height`,
-        `station_height` () [m], `rssi_db` (S, T) [dB, each station on a scale of its own], `station_name`
-        (T,), `carrier_hz` (); of a CSV also `row_name` (S,). A note says which columns are no stations.
+        `latitude`, `longitude` (S,), `station_latitude`, `station_longitude` (T,) [deg],
+        `tx_height`, `station_height` () [m], `rssi_db` (S, T) [dB, each station on a scale of its
+        own], `station_name` (T,), `carrier_hz` (); of a CSV also `row_name` (S,).
+        A note says which columns are no stations.
 
     Raises:
-        DataError: no such file, or something in it is missing or wrong; all problems with line and column.
+        DataError: no such file, or something in it is missing or wrong; all problems with line and
+            column.
     """
     path = Path(path)
     for name, height in (("tx_height", tx_height), ("station_height", station_height)):
@@ -63,12 +67,17 @@ def read_powder(
         raw = _of_csv(path, Path(station_table or path.with_name(STATIONS)))
     else:
         raw = _of_npz(path)
-    heights = {"tx_height": np.array(float(tx_height)), "station_height": np.array(float(station_height))}
+    heights = {
+        "tx_height": np.array(float(tx_height)),
+        "station_height": np.array(float(station_height)),
+    }
     if sensitivity_db:
         names = raw.arrays["station_name"].tolist()
         for name in sensitivity_db:
             choice(*names).check("dataset.sensitivity_db", name)
-        heights["sensitivity_db"] = np.array([sensitivity_db.get(name, np.nan) for name in names], float)
+        heights["sensitivity_db"] = np.array(
+            [sensitivity_db.get(name, np.nan) for name in names], float
+        )
     about = {"name": "powder", **raw.attributes, "layout": "powder"}
     return replace(raw, arrays={**raw.arrays, **heights}, attributes=about)
 
@@ -81,7 +90,9 @@ def _of_npz(path: Path) -> Raw:
     middle, mean = places.mean(axis=0), degrees.mean(axis=0)
     turn = np.linalg.lstsq(places - middle, degrees - mean, rcond=None)[0]
     latitude, longitude = ((stations - middle) @ turn + mean).T
-    return replace(raw, arrays={**raw.arrays, "station_latitude": latitude, "station_longitude": longitude})
+    return replace(
+        raw, arrays={**raw.arrays, "station_latitude": latitude, "station_longitude": longitude}
+    )
 
 
 def _of_csv(path: Path, table: Path) -> Raw:
@@ -92,27 +103,38 @@ def _of_csv(path: Path, table: Path) -> Raw:
     sheet, stations = read_sheet(path), read_station_places(table)
     missing = [head for head in PLACE.values() if head not in sheet.heads]
     if missing:
-        raise DataError(f"{path}, line 1: no column {' and '.join(missing)}; expected those of single_tx.csv")
+        raise DataError(
+            f"{path}, line 1: no column {' and '.join(missing)}; expected those of single_tx.csv"
+        )
 
     columns = [head for head in sheet.heads if head in stations]
     if not columns:
         example = next(iter(stations), "none")
         raise DataError(f"{path}, line 1: no column is a station of {table}, e.g. {example}")
-    walk = read_places(sheet, {role: (Column(role, head=head),) for role, head in PLACE.items()}, "tx_")
+    walk = read_places(
+        sheet, {role: (Column(role, head=head),) for role, head in PLACE.items()}, "tx_"
+    )
     levels = [sheet.numbers(name) for name in columns]
     sheet.problems.raise_if_any()
     assert walk is not None
     rssi = np.stack([level for level in levels if level is not None], axis=1)
     rest = [head for head in sheet.heads if head not in (*columns, *PLACE.values(), TIME)]
-    notes = (shorten(f"{len(rest)} columns left out, no fixed place: {', '.join(rest)}"),) if rest else ()
+    notes = (
+        (shorten(f"{len(rest)} columns left out, no fixed place: {', '.join(rest)}"),)
+        if rest
+        else ()
+    )
     where = np.array([stations[name] for name in columns])
     arrays = {
-        "latitude": walk.across[:, 0], "longitude": walk.across[:, 1],
-        "station_latitude": where[:, 0], "station_longitude": where[:, 1],
-        "station_name": np.array(columns), "carrier_hz": np.array(CARRIER_HZ),
+        "latitude": walk.across[:, 0],
+        "longitude": walk.across[:, 1],
+        "station_latitude": where[:, 0],
+        "station_longitude": where[:, 1],
+        "station_name": np.array(columns),
+        "carrier_hz": np.array(CARRIER_HZ),
         "rssi_db": np.where(rssi == NO_VALUE_DB, np.nan, rssi),
         "row_name": np.array(sheet.rows),
-    }  # fmt: skip
+    }
     return Raw(arrays, notes=notes)
 
 
@@ -120,7 +142,8 @@ def read_station_places(path: Path) -> dict[str, tuple[float, float]]:
     """Return latitude and longitude [deg] of the stations that stay put, by name.
 
     Args:
-        path: a table from names to pairs in Python's notation; None stands for a station that drives.
+        path: a table from names to pairs in Python's notation; None stands for a station that
+            drives.
 
     Raises:
         DataError: missing, not readable, or no pair of degrees.
@@ -132,12 +155,16 @@ def read_station_places(path: Path) -> dict[str, tuple[float, float]]:
     except (ValueError, SyntaxError, TypeError, RecursionError, MemoryError):
         content = None
     if not isinstance(content, Mapping):
-        raise DataError(f"{path}: not readable; expected a table from names to (latitude, longitude)")
+        raise DataError(
+            f"{path}: not readable; expected a table from names to (latitude, longitude)"
+        )
     problems, places = Problems(path), {}
     for name, value in content.items():
         degrees = finite_array(value)
         if value is not None and degrees.shape != (2,):
-            problems.add(f"{path}, {name}", f"expected latitude and longitude [deg], found {value!r}")
+            problems.add(
+                f"{path}, {name}", f"expected latitude and longitude [deg], found {value!r}"
+            )
         elif value is not None and (fault := find_invalid_coordinate(*degrees)):
             problems.add(f"{path}, {name}", fault[1])
         elif value is not None:
@@ -149,7 +176,9 @@ def read_station_places(path: Path) -> dict[str, tuple[float, float]]:
 
 
 class Powder(Campaign):
-    """Powers of a walking transmitter at fixed stations; settings of `read_powder` and of `Campaign`."""
+    """Powers of a walking transmitter at fixed stations;
+    settings of `read_powder` and of `Campaign`.
+    """
 
     choice, reader = "powder", staticmethod(read_powder)
     marks = frozenset({"mobile_position", "latitude"})

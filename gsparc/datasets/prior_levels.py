@@ -24,18 +24,22 @@ log = logging.getLogger(__name__)
 
 Files = str | Path | Sequence[str]
 Levels = tuple[np.ndarray, np.ndarray]  # places (M, 2) [m], world, and levels (M,) [dB] there
-BAND = "power_db"  # of the strongest station, as `gsparc map` writes; with a name behind it of one of several
+# Of the strongest station, as `gsparc map` writes; with a name behind it of one of several
+BAND = "power_db"
 MOST = 4_000_000  # levels: they are kept with a model
 ABOUT_M = 100.0  # least distance from the box of rows and stations that levels are kept within [m]
 
 
 def read_prior_levels(path: Files, data: Measurements, station: str = "") -> Levels:
-    """Return places (M, 2) [m] in the world coordinates of the measurements, and levels (M,) [dB] there.
+    """Return places (M, 2) [m] in the world coordinates of the measurements, and levels (M,)
+    [dB] there.
 
     Args:
-        path: *.tif, or what `dataset=own` reads; several, or a folder of *.tif: each named by its station.
+        path: *.tif, or what `dataset=own` reads; several, or a folder of *.tif: each named by its
+            station.
         data: measurements, which the levels must overlap.
-        station: whose levels are wanted, as it is shown; empty: the measurements are of one station.
+        station: whose levels are wanted, as it is shown; empty: the measurements are of one
+            station.
 
     Raises:
         DataError: no such file, no levels, none of this station, or of another place.
@@ -46,7 +50,8 @@ def read_prior_levels(path: Files, data: Measurements, station: str = "") -> Lev
 def read_prior_maps(
     path: Files, data: Measurements, stations: Sequence[str]
 ) -> list[tuple[int, bool, Levels]]:
-    """Return number, whether it is of the station and not of its site, and levels, of stations with a map.
+    """Return number, whether it is of the station and not of its site, and levels,
+    of stations with a map.
 
     Args:
         path, data: see `read_prior_levels`.
@@ -79,13 +84,19 @@ def read_prior_maps(
         found += [] if match is None else [(number, match[1], maps[match[0]])]
     if not found:
         shown = list_first(stations) or "one station"
-        advice = f"call bands of a GeoTIFF `{BAND} NAME`, columns of a table NAME, as the measurements do"
+        advice = (
+            f"call bands of a GeoTIFF `{BAND} NAME`, columns of a table NAME, as the "
+            "measurements do"
+        )
         if list(maps) == [""]:
             raise DataError(
-                f"model.prior={path}: one map of no station's name, and there are several: as of a best "
+                f"model.prior={path}: one map of no station's name, and there are several: as of "
+                "a best "
                 f"server it tells nothing of {shown}; {advice}"
             )
-        raise DataError(f"model.prior={path}: of {list_first([*maps], 12)}, not of {shown}; {advice}")
+        raise DataError(
+            f"model.prior={path}: of {list_first([*maps], 12)}, not of {shown}; {advice}"
+        )
     with_map = {number for number, *_ in found}
     if lacking := [shown for number, shown in enumerate(stations) if number not in with_map]:
         log.warning("model.prior=%s: no map of %s", path, list_first(lacking))
@@ -107,10 +118,13 @@ def _read_file(
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield name, places and levels of each map in one file."""
     if path.suffix == ".ckpt":
-        raise DataError(f"model.prior={path}: draw it first, gsparc map ckpt={path}, and give its map.tif")
+        raise DataError(
+            f"model.prior={path}: draw it first, gsparc map ckpt={path}, and give its map.tif"
+        )
     if not path.is_file():
         raise DataError(
-            f"model.prior={path}: no such file; a GeoTIFF is needed, or a table of places and powers"
+            f"model.prior={path}: no such file; a GeoTIFF is needed, or a table of places and "
+            "powers"
         )
     read = _read_raster if path.suffix in (".tif", ".tiff") else _read_rows
     yield from read(path, data, stations)
@@ -119,18 +133,24 @@ def _read_file(
 def _near_rows(path: Path, data: Measurements, points: np.ndarray, level: np.ndarray) -> Levels:
     """What is known about rows and stations; `DataError` where that is nothing, or too much."""
     finite = np.isfinite(level) & (np.abs(level) <= MOST_DB) & np.isfinite(points).all(1)
-    _say_marks(path, int((np.isfinite(level) & (np.abs(level) > MOST_DB)).sum()), f"beyond {MOST_DB} dB")
+    _say_marks(
+        path, int((np.isfinite(level) & (np.abs(level) > MOST_DB)).sum()), f"beyond {MOST_DB} dB"
+    )
     if not finite.any():
         raise DataError(f"model.prior={path}: no level is known in it")
     points, level = points[finite], level[finite]
     at = data.moving[:, :2] + data.site.origin[:2]
     if not ((at >= points.min(0) - 1) & (at <= points.max(0) + 1)).all(1).any():
         box, rows = (
-            f"x {a:.0f} to {b:.0f}, y {c:.0f} to {d:.0f} m" for (a, b), (c, d) in map(_extent, (points, at))
+            f"x {a:.0f} to {b:.0f}, y {c:.0f} to {d:.0f} m"
+            for (a, b), (c, d) in map(_extent, (points, at))
         )
         raise DataError(f"model.prior={path}: it is of {box}, and all rows lie elsewhere: {rows}")
     # Of a whole country only what lies about rows and stations is kept.
-    margin, still = max(float(np.ptp(at, axis=0).max()), ABOUT_M), data.site.every_station.position[:, :2]
+    margin, still = (
+        max(float(np.ptp(at, axis=0).max()), ABOUT_M),
+        data.site.every_station.position[:, :2],
+    )
     ends = np.r_[at, still[np.isfinite(still).all(1)] + data.site.origin[:2]]
     near = ((points >= ends.min(0) - margin) & (points <= ends.max(0) + margin)).all(1)
     if near.sum() > MOST:
@@ -147,7 +167,9 @@ def _near_rows(path: Path, data: Measurements, points: np.ndarray, level: np.nda
 def _say_marks(path: Path, count: int, what: str) -> None:
     if count:
         advice = "left out as no levels; tag them as nodata of the file"
-        log.warning("model.prior=%s: %d levels are %s, apart from all others: %s", path, count, what, advice)
+        log.warning(
+            "model.prior=%s: %d levels are %s, apart from all others: %s", path, count, what, advice
+        )
 
 
 def _extent(points: np.ndarray) -> np.ndarray:
@@ -158,7 +180,9 @@ def _extent(points: np.ndarray) -> np.ndarray:
 def _read_raster(
     path: Path, data: Measurements, stations: Collection[str]
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, centres of squares and their levels, of named bands, else of `BAND` or of the first."""
+    """Yield name, centres of squares and their levels, of named bands,
+    else of `BAND` or of the first.
+    """
     try:
         import rasterio
         from rasterio.warp import transform
@@ -171,7 +195,8 @@ def _read_raster(
         named = [t.removeprefix(f"{BAND} ") for t in titles]
         bands = {t: k for k, t in enumerate(named) if t != titles[k] or t in known}
         if not bands and file.count > 1 and BAND not in titles:
-            if stations and all(titles):  # of others: as a station alone is asked for, none of them is known
+            # Of others: as a station alone is asked for, none of them is known
+            if stations and all(titles):
                 bands = {t: k for k, t in enumerate(named)}
             else:
                 shown = list_first([title or f"{k}" for k, title in enumerate(titles, 1)])
@@ -193,25 +218,35 @@ def _read_raster(
 
 
 def _to_decibels(path: Path, values: np.ndarray, name: str) -> np.ndarray:
-    """Levels of values whose unit a file names, if it names one; `DataError` where that is none of powers."""
+    """Levels of values whose unit a file names, if it names one;
+    `DataError` where that is none of powers.
+    """
     unit = UNITS.get(name.lower())
     if unit is None:
         return values
     if unit.kind not in ("level", "power"):
-        raise DataError(f"model.prior={path}: its unit is {name}; levels are needed, or powers such as mW")
+        raise DataError(
+            f"model.prior={path}: its unit is {name}; levels are needed, or powers such as mW"
+        )
     with np.errstate(divide="ignore", invalid="ignore"):  # of no power nothing is known
-        return to_decibels(unit.convert(values)) + 30 if unit.kind == "power" else unit.convert(values)
+        return (
+            to_decibels(unit.convert(values)) + 30 if unit.kind == "power" else unit.convert(values)
+        )
 
 
 def _read_rows(
     path: Path, data: Measurements, stations: Collection[str]
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, places and levels of each station of a table, whose heads may be their names, or an npz."""
+    """Yield name, places and levels of each station of a table, whose heads may be their names,
+    or an npz.
+    """
     if is_table(path):
         from gsparc.tables.read import parse_table  # here, as pandas takes half a second to import
 
         raw = parse_table(path, stations=stations)
-        for note in [note for note in raw.notes if isinstance(note, Caution) and "not used" in note]:
+        for note in [
+            note for note in raw.notes if isinstance(note, Caution) and "not used" in note
+        ]:
             log.warning("model.prior=%s: %s", path, note)
     else:
         raw = read_own(path)

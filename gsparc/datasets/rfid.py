@@ -2,17 +2,19 @@
 
 gateway_info.yml     dataset_name, then per gateway: position [m], orientation (x, y, z, w)
 tx_pos.csv           header x,y,z; row i (from 1) belongs to spectrum/%05d.png of i [m]
-spectrum/00001.png   8-bit grey, 360 wide (azimuth, degrees) x 90 high (elevation, row 0 = 0 degrees)
-train_index.txt, test_index.txt   optional, both or none: one number per line
+spectrum/00001.png   8-bit grey, 360 wide (azimuth, degrees) x 90 high (elevation, row 0 = 0
+degrees) train_index.txt, test_index.txt   optional, both or none: one number per line
 freq.txt             optional: line i is the carrier of spectrum i [GHz]
 
-With freq.txt it is the layout of Wideband3DGS and XFreq-GS: each carrier is a station of its own at the
-gateway, with an array half a wavelength apart in the receiver's yz plane; row i of an image is the zenith
-angle of i degrees, and azimuths run clockwise. Their spectra say so: all but .0003 of their energy is in the
-lags of that array (elevations, or the plane xy, leave .05 at least), and direct paths appear mirrored.
+With freq.txt it is the layout of Wideband3DGS and XFreq-GS: each carrier is a station of its own at
+the gateway, with an array half a wavelength apart in the receiver's yz plane; row i of an image is
+the zenith angle of i degrees, and azimuths run clockwise. Their spectra say so: all but .0003 of
+their energy is in the lags of that array (elevations, or the plane xy, leave .05 at least),
+and direct paths appear mirrored.
 
-GSpaRC's room has the same with `rx_pos.csv`: the gateway is the transmitter that stands, the receiver moves
-and its axes are the world's. Its spectra are `00001.npy`: (90, 360) real numbers from 0 to 1, or of 8 bits.
+GSpaRC's room has the same with `rx_pos.csv`: the gateway is the transmitter that stands, the
+receiver moves and its axes are the world's. Its spectra are `00001.npy`: (90, 360)
+real numbers from 0 to 1, or of 8 bits.
 """
 
 from __future__ import annotations
@@ -49,7 +51,9 @@ STAND_IN = "rfid-sim"  # `dataset_name` of a simulated replacement
 
 
 def planar_array(rows: int = 4, columns: int = 4, spacing_m: float = 0.16) -> np.ndarray:
-    """Return element positions (rows * columns, 3) [m] of a grid centred in the receiver's xy plane."""
+    """Return element positions (rows * columns, 3)
+    [m] of a grid centred in the receiver's xy plane.
+    """
     x = (np.arange(columns) - (columns - 1) / 2) * spacing_m
     y = (np.arange(rows) - (rows - 1) / 2) * spacing_m
     grid_x, grid_y = np.meshgrid(x, y)
@@ -71,18 +75,20 @@ def load_rfid(
         root: the folder.
         gateway: which receiver of gateway_info.yml; None takes the first.
         wavelength_m: carrier wavelength [m].
-        array: (M, 3) [m] element positions, receiver frame, or arguments of `planar_array`; None for the
-            release's 4 x 4 array.
+        array: (M, 3) [m] element positions, receiver frame, or arguments of `planar_array`; None
+            for the release's 4 x 4 array.
         normalisation: how the published images were scaled.
-        listed: CSV with the columns spectrum and split: only these are used, split like this; 160: those of
-            our tables out of `gsparc data rfid-200`.
+        listed: CSV with the columns spectrum and split: only these are used, split like this; 160:
+            those of our tables out of `gsparc data rfid-200`.
 
     Raises:
         DataError: anything is missing or wrong; all problems are listed with file and row.
     """
     root = Path(root)
     if not root.is_dir():
-        raise DataError(f"{root}: no such folder; expected gateway_info.yml, tx_pos.csv and spectrum/ in it")
+        raise DataError(
+            f"{root}: no such folder; expected gateway_info.yml, tx_pos.csv and spectrum/ in it"
+        )
     problems = Problems(root)
     info = _read_gateway(root / "gateway_info.yml", gateway, problems)
     moving: End = "rx" if (root / "rx_pos.csv").exists() else "tx"
@@ -96,39 +102,62 @@ def load_rfid(
     release_split = read_split(root, count, problems, first=1)
     rows = np.arange(count or 0)
     if listed is not None and count is not None:
-        # 160 is shipped with the package: the rows of our tables, whatever was downloaded around them.
-        file = files("gsparc.datasets.public").joinpath("rfid-160.csv") if listed in (160, "160") else listed
+        # 160 is shipped with the package: the rows of our tables,
+        # whatever was downloaded around them.
+        file = (
+            files("gsparc.datasets.public").joinpath("rfid-160.csv")
+            if listed in (160, "160")
+            else listed
+        )
         rows, release_split = _read_list(Path(str(file)), count, problems)
     problems.raise_if_any()
     assert info is not None and positions is not None and spectra is not None and count is not None
     # A simulated replacement has the layout, and says so in `dataset_name` so that tables mark it.
     simulated = info.dataset == STAND_IN
     layout = {} if array is None else array
-    places = planar_array(**layout) if isinstance(layout, Mapping) else np.asarray(layout, np.float64)
+    places = (
+        planar_array(**layout) if isinstance(layout, Mapping) else np.asarray(layout, np.float64)
+    )
     suffix = ".png" if spectra.dtype == np.uint8 else ".npy"
     name = STAND_IN if simulated else "rfid"
     site = Site(
-        name, "spectrum", "rx", SphereGrid.hemisphere(HEIGHT, WIDTH), places, LIGHT / float(wavelength_m),
-        None, normalisation=str(normalisation), stand_in="rfid" if simulated else None,
-    )  # fmt: skip
+        name,
+        "spectrum",
+        "rx",
+        SphereGrid.hemisphere(HEIGHT, WIDTH),
+        places,
+        LIGHT / float(wavelength_m),
+        None,
+        normalisation=str(normalisation),
+        stand_in="rfid" if simulated else None,
+    )
     if moving == "rx":  # neither its array nor the carrier is in the files
         site = replace(site, name=info.dataset, static_end="tx", array=None, carrier_hz=None)
     turned = info.rotation if moving == "tx" else np.eye(3)
     still, rotation = (np.repeat(one[None], len(rows), axis=0) for one in (info.position, turned))
     tx, rx = (positions[rows], still) if moving == "tx" else (still, positions[rows])
     data = Measurements(
-        site, tx, rx, rotation, spectra if listed is None else spectra[rows],
-        row_names=[f"spectrum/{i + 1:05d}{suffix}" for i in rows], release_split=release_split,
+        site,
+        tx,
+        rx,
+        rotation,
+        spectra if listed is None else spectra[rows],
+        row_names=[f"spectrum/{i + 1:05d}{suffix}" for i in rows],
+        release_split=release_split,
         provenance={"release": info.dataset, "gateway": info.name, "layout": "rfid"},
-    )  # fmt: skip
+    )
     if carriers is not None:
         half = planar_array(**{**layout, "spacing_m": 0.5} if isinstance(layout, Mapping) else {})
-        data = _at_carriers(replace(data, site=replace(site, name=info.dataset)), carriers[rows], half)
+        data = _at_carriers(
+            replace(data, site=replace(site, name=info.dataset)), carriers[rows], half
+        )
     return centre_positions(data)
 
 
 def _at_carriers(data: Measurements, carrier_hz: np.ndarray, array: np.ndarray) -> Measurements:
-    """A station for each carrier (S,) [Hz], of an array (M, 3) in wavelengths; in our conventions."""
+    """A station for each carrier (S,) [Hz], of an array (M, 3) in wavelengths;
+    in our conventions.
+    """
     carriers, station = np.unique(carrier_hz, return_inverse=True)
     arrays = LIGHT / carriers[:, None, None] * array[:, [2, 0, 1]]
     places = np.repeat(data.rx_position[:1], len(carriers), axis=0)
@@ -150,7 +179,10 @@ def _read_list(path: Path, count: int, problems: Problems) -> tuple[np.ndarray, 
     wrong = np.flatnonzero(~(np.isin(number, np.arange(1, count + 1)) & np.isin(part, SPLITS)))
     expected = f"expected the number of a spectrum, 1 to {count}, and train or test"
     sheet.refuse_rows("spectrum", wrong, expected)
-    return number.astype(np.int64) - 1, (np.flatnonzero(part == "train"), np.flatnonzero(part == "test"))
+    return number.astype(np.int64) - 1, (
+        np.flatnonzero(part == "train"),
+        np.flatnonzero(part == "test"),
+    )
 
 
 def _sheet(path: Path, heads: list[str], problems: Problems) -> Sheet:
@@ -176,13 +208,19 @@ class _Gateway(NamedTuple):
 
 def _read_gateway(path: Path, wanted: str | None, problems: Problems) -> _Gateway | None:
     entry = "entries like `gateway1: {position: [x, y, z], orientation: [x, y, z, w]}`"
-    content = problems.attempt(lambda: read_yaml(path, "the gateway's position and orientation", entry))
+    content = problems.attempt(
+        lambda: read_yaml(path, "the gateway's position and orientation", entry)
+    )
     if content is None:
         return None
     gateways = {str(k): v for k, v in content.items() if isinstance(v, Mapping)}
     name = next(iter(gateways), "gateway1") if wanted is None else wanted
     if name not in gateways:
-        there = f"there are {', '.join(gateways)}" if gateways else f"no gateway in it; expected {entry}"
+        there = (
+            f"there are {', '.join(gateways)}"
+            if gateways
+            else (f"no gateway in it; expected {entry}")
+        )
         return problems.add(path, f"no gateway named {name!r}; {there}")
     pose = [gateways[name].get(key) for key in ("position", "orientation")]
     position, orientation = map(finite_array, pose)
@@ -210,20 +248,29 @@ def _read_positions(path: Path, problems: Problems) -> np.ndarray | None:
     return positions
 
 
-def _read_carriers(path: Path, positions: str, count: int | None, problems: Problems) -> np.ndarray | None:
+def _read_carriers(
+    path: Path, positions: str, count: int | None, problems: Problems
+) -> np.ndarray | None:
     """Carriers (S,) [Hz] of the rows; None where there is no such file."""
     if not path.exists() or count is None:
         return None
     words = (problems.attempt(lambda: read_text(path, "missing")) or "").split()
     carriers = 1e9 * parse_numbers(words)
     if carriers.shape != (count,) or not ((carriers >= LOWEST_HZ) & (carriers <= HIGHEST_HZ)).all():
-        expected = f"expected the carrier of each of the {count} rows of {positions} [GHz], one number a line"
+        expected = (
+            f"expected the carrier of each of the {count} rows of {positions} [GHz], one "
+            "number a line"
+        )
         return problems.add(path, f"{len(words)} words; {expected}")
     return carriers
 
 
-def _read_spectra(folder: Path, positions: str, count: int | None, problems: Problems) -> np.ndarray | None:
-    """Images (S, 90, 360) uint8 or float32, in the order of their numbers; on disk where they are many."""
+def _read_spectra(
+    folder: Path, positions: str, count: int | None, problems: Problems
+) -> np.ndarray | None:
+    """Images (S, 90, 360) uint8 or float32, in the order of their numbers;
+    on disk where they are many.
+    """
     if not folder.is_dir():
         return problems.add(folder, "missing; expected images 00001.png, 00002.png, ...")
     suffix = ".npy" if any(folder.glob("*.npy")) else ".png"
@@ -250,9 +297,14 @@ def _read_image(path: Path, into: np.ndarray) -> None:
     expected = f"expected an 8-bit grey PNG of {WIDTH} x {HEIGHT} pixels"
     errors = (OSError, SyntaxError, ValueError, Image.DecompressionBombError)
     # The format is fixed: Pillow would otherwise run any of its decoders on a damaged file.
-    with readable(path, f"{expected}, not readable", errors), Image.open(path, formats=["PNG"]) as image:
+    with (
+        readable(path, f"{expected}, not readable", errors),
+        Image.open(path, formats=["PNG"]) as image,
+    ):
         if image.mode != "L" or image.size != (WIDTH, HEIGHT):
-            size = f"{image.size[0]} x {image.size[1]}" if image.mode == "L" else f"mode {image.mode}"
+            size = (
+                f"{image.size[0]} x {image.size[1]}" if image.mode == "L" else f"mode {image.mode}"
+            )
             raise DataError(f"{path}: {expected}, found {size}")
         into[:] = np.asarray(image)
 
@@ -271,7 +323,9 @@ def _read_numbers(path: Path, into: np.ndarray) -> None:
 
 
 class RFID(Release):
-    """The RFID release (NeRF2, set s23) or any folder in its layout; settings of `load_rfid`, `Release`."""
+    """The RFID release (NeRF2, set s23) or any folder in its layout; settings of `load_rfid`,
+    `Release`.
+    """
 
     called, reader = "RFID", staticmethod(load_rfid)
     hint = (
@@ -281,5 +335,7 @@ class RFID(Release):
     )
 
     def read(self, folder: Path) -> Measurements:
-        """Read spectra (S, 90, 360) uint8 of tags about a static gateway; stand-ins have no settings."""
+        """Read spectra (S, 90, 360) uint8 of tags about a static gateway;
+        stand-ins have no settings.
+        """
         return super().read(folder) if folder == self.root else load_rfid(folder)

@@ -1,4 +1,6 @@
-"""Files of `gsparc simulate` with spectra, channels and paths, read as spectra, channels or powers."""
+"""Files of `gsparc simulate` with spectra, channels and paths, read as spectra,
+channels or powers.
+"""
 
 from __future__ import annotations
 
@@ -17,20 +19,24 @@ from gsparc.tables.own import interpret_and_log
 from gsparc.tables.raw import Raw, read_raw, rename_arrays
 
 TARGETS = ("spectrum", "csi", "rssi")
-STORED = {"spectrum": "spectrum", "csi": "csi", "rssi": "received_power"}  # array that a target is read from
+# Array that a target is read from
+STORED = {"spectrum": "spectrum", "csi": "csi", "rssi": "received_power"}
 
 
-def load_sionna(path: str | Path, target: str | None = None, truth: str | Path | None = None) -> Measurements:
+def load_sionna(
+    path: str | Path, target: str | None = None, truth: str | Path | None = None
+) -> Measurements:
     """Load a simulated dataset as spectra, as channels or as powers, the sums of path powers.
 
     Args:
         path: file that the simulator wrote.
         target: one of `TARGETS`; None for the one the file was mainly made for.
-        truth: another simulation of the same receivers, whose targets replace those of the test rows: the
-            loss by training on a simulation with fewer effects.
+        truth: another simulation of the same receivers, whose targets replace those of the test
+            rows: the loss by training on a simulation with fewer effects.
 
     Raises:
-        DataError: not such a file, no such target, other receivers, or anything that `load_own` refuses.
+        DataError: not such a file, no such target, other receivers, or anything that `load_own`
+            refuses.
     """
     data = _load(path, target)
     if truth is None or Path(truth).resolve() == Path(path).resolve():
@@ -53,7 +59,9 @@ def with_true_targets(data: Measurements, truth: Measurements, named: str) -> Me
         raise DataError(f"{named}: both files must name the same test rows (scene.test_share)")
     test, target = splits[0][1], data.target.copy()
     ratio = truth.site.target_scale / data.site.target_scale
-    target[test] = truth.target[test] if ratio == 1 else truth.target[test] * target.dtype.type(ratio)
+    target[test] = (
+        truth.target[test] if ratio == 1 else truth.target[test] * target.dtype.type(ratio)
+    )
     mask = _tested(data.mask, truth.mask, test, True)
     censored = _tested(data.censored, truth.censored, test, False)
     mixed = sha256(f"{data.site.sha256} {truth.site.sha256}".encode()).hexdigest()
@@ -87,8 +95,13 @@ def _load(path: str | Path, target: str | None) -> Measurements:
 def select_measurement(raw: Raw, target: str) -> Raw:
     """Return the same file with one measurement, its array, noise and solver error."""
     other = [name for name in ("spectrum", "csi") if name != target]
-    arrays = {k: v for k, v in raw.arrays.items() if k not in (*other, "array_position", "noise_variance")}
-    names = {f"{target}_array_position": "array_position", f"{target}_noise_variance": "noise_variance"}
+    arrays = {
+        k: v for k, v in raw.arrays.items() if k not in (*other, "array_position", "noise_variance")
+    }
+    names = {
+        f"{target}_array_position": "array_position",
+        f"{target}_noise_variance": "noise_variance",
+    }
     attributes = {**raw.attributes, "measurement": target}
     if target == "rssi":
         arrays |= _in_decibels(np.asarray(arrays.pop("received_power"), dtype=np.float64))
@@ -102,10 +115,12 @@ def select_measurement(raw: Raw, target: str) -> Raw:
 
 
 def _in_decibels(power: np.ndarray) -> dict[str, np.ndarray]:
-    """Powers (S,) in decibels; where no path arrives, they lie below the weakest that is no outlier.
+    """Powers (S,) in decibels; where no path arrives,
+    they lie below the weakest that is no outlier.
 
-    One path through five walls may be 70 dB below the next power: no receiver hears it, and a place without
-    any path is not weaker for it. Outliers are those of J. W. Tukey, "Exploratory Data Analysis" (1977).
+    One path through five walls may be 70 dB below the next power: no receiver hears it, and a place
+    without any path is not weaker for it. Outliers are those of J. W. Tukey,
+    "Exploratory Data Analysis" (1977).
     """
     with np.errstate(divide="ignore"):
         decibels = to_decibels(power)
@@ -116,7 +131,10 @@ def _in_decibels(power: np.ndarray) -> dict[str, np.ndarray]:
     if len(arrived):
         lower, upper = np.quantile(arrived, (0.25, 0.75))
         level = arrived[arrived >= lower - 1.5 * (upper - lower)].min()
-    return {"rssi_db": np.where(decibels < level, np.nan, decibels), "sensitivity_db": np.array(level)}
+    return {
+        "rssi_db": np.where(decibels < level, np.nan, decibels),
+        "sensitivity_db": np.array(level),
+    }
 
 
 class Sionna(DataModule):
@@ -130,7 +148,9 @@ class Sionna(DataModule):
 
     reader = staticmethod(load_sionna)
 
-    def __init__(self, file: str | Path, name: str = "sionna", batch_size: int = 16, **settings: Any) -> None:
+    def __init__(
+        self, file: str | Path, name: str = "sionna", batch_size: int = 16, **settings: Any
+    ) -> None:
         super().__init__(name, batch_size)
         self.file, self.settings = Path(file), settings
 

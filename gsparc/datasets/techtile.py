@@ -1,12 +1,14 @@
-"""Channels of a moving transmitter at the ceiling antennas of Techtile (KU Leuven, ELLIIIT-dataset-26).
+"""Channels of a moving transmitter at the ceiling antennas
+of Techtile (KU Leuven, ELLIIIT-dataset-26).
 
-The release is a NetCDF file of experiments E, cycles C (stops of the robot) and hosts H (one antenna each):
-csi_real, csi_imag (E, C, H); rover_x, rover_y, rover_z (E, C) [m]; experiment_id (E,), cycle_id (C,),
-hostname (H,); optional csi_available (E, C, H), position_available (E, C). A file of one experiment may lack
-its axis. The antennas are in a file of their own, `techtile_antenna_locations.yml` of techtile-description.
+The release is a NetCDF file of experiments E, cycles C (stops of the robot) and hosts H (one
+antenna each): csi_real, csi_imag (E, C, H); rover_x, rover_y, rover_z (E, C) [m]; experiment_id
+(E,), cycle_id (C,), hostname (H,); optional csi_available (E, C, H), position_available (E, C). A
+file of one experiment may lack its axis. The antennas are in a file of their own,
+`techtile_antenna_locations.yml` of techtile-description.
 
-The same as an npz: tx_position (S, 3), rx_antenna_position (T, 3) [m], csi (S, T), mask (S, T), run (S,),
-frequency_hz ().
+The same as an npz: tx_position (S, 3), rx_antenna_position (T, 3) [m], csi (S, T), mask (S, T), run
+(S,), frequency_hz ().
 """
 
 from __future__ import annotations
@@ -33,8 +35,8 @@ def read_techtile(path: str | Path, antennas: str | Path | None = None) -> Raw:
 
     Args:
         path: *.npz, or *.nc (also *.nc4, *.cdf).
-        antennas: YAML file with the antennas' places, for NetCDF files without `rx_antenna_position`; None
-            takes `techtile_antenna_locations.yml` beside `path`.
+        antennas: YAML file with the antennas' places, for NetCDF files without
+            `rx_antenna_position`; None takes `techtile_antenna_locations.yml` beside `path`.
 
     Returns:
         `tx_position` (S, 3), `station_position` (T, 3) [m], `csi` (S, T) complex that follows
@@ -72,7 +74,9 @@ def _of_release(raw: Raw, path: Path, antennas: str | Path | None) -> Raw:
     csi = variables["csi_real"].astype(np.float64) - 1j * variables["csi_imag"].astype(np.float64)
     heard = np.isfinite(csi) & (variables.get("csi_available", np.ones(csi.shape)) == 1)
     where = np.stack([variables[f"rover_{axis}"] for axis in "xyz"], axis=-1).astype(np.float64)
-    placed = np.isfinite(where).all(-1) & (variables.get("position_available", np.ones(where.shape[:2])) == 1)
+    placed = np.isfinite(where).all(-1) & (
+        variables.get("position_available", np.ones(where.shape[:2])) == 1
+    )
     measured = heard.any(-1)
     experiment, cycle = np.nonzero(measured & placed)
     if not len(experiment):
@@ -80,7 +84,11 @@ def _of_release(raw: Raw, path: Path, antennas: str | Path | None) -> Raw:
     run = variables["experiment_id"].astype(str)[experiment]
     number = variables["cycle_id"].astype(str)[cycle]
     drop_count = int((measured & ~placed).sum())
-    notes = (f"{drop_count} of {int(measured.sum())} cycles left out: no position",) if drop_count else ()
+    notes = (
+        (f"{drop_count} of {int(measured.sum())} cycles left out: no position",)
+        if drop_count
+        else ()
+    )
     arrays = {
         "tx_position": where[experiment, cycle],
         "station_position": np.asarray(places, dtype=np.float64),
@@ -95,7 +103,8 @@ def _of_release(raw: Raw, path: Path, antennas: str | Path | None) -> Raw:
 
 
 def read_antenna_positions(path: Path, hosts: np.ndarray) -> np.ndarray:
-    """Return places (T, 3) float64 [m] of the receiving antennas of `hosts` (T,) from Techtile's table.
+    """Return places (T, 3) float64 [m] of the receiving antennas of `hosts` (T,)
+    from Techtile's table.
 
     Args:
         path: YAML with `antennes:`, a list of `tile` and its two `channels` with `x`, `y`, `z` [m].
@@ -110,10 +119,14 @@ def read_antenna_positions(path: Path, hosts: np.ndarray) -> np.ndarray:
     entries = content.get("antennes", content.get("antennas"))
     if not isinstance(entries, list):
         raise DataError(f"{path}: expected {expected}")
-    table = {str(entry.get("tile")).upper(): entry for entry in entries if isinstance(entry, Mapping)}
+    table = {
+        str(entry.get("tile")).upper(): entry for entry in entries if isinstance(entry, Mapping)
+    }
     missing = [str(host) for host in hosts if str(host).upper() not in table]
     if missing:
-        raise DataError(f"{path}: no antenna of the tiles {', '.join(missing)}; expected one of each host")
+        raise DataError(
+            f"{path}: no antenna of the tiles {', '.join(missing)}; expected one of each host"
+        )
     return np.array([_channel(path, str(host), table[str(host).upper()]) for host in hosts])
 
 
@@ -125,12 +138,16 @@ def _channel(path: Path, host: str, entry: Mapping[str, Any]) -> np.ndarray:
     except (TypeError, KeyError, IndexError):
         place = np.zeros(0)
     if not len(place):
-        raise DataError(f"{path}, {host}: expected x, y, z [m] of channel {CHANNEL}, found {channels!r:.80}")
+        raise DataError(
+            f"{path}, {host}: expected x, y, z [m] of channel {CHANNEL}, found {channels!r:.80}"
+        )
     return place
 
 
 class Techtile(Campaign):
-    """Channels of a moving transmitter at 42 antennas; settings of `read_techtile` and of `Campaign`."""
+    """Channels of a moving transmitter at 42 antennas;
+    settings of `read_techtile` and of `Campaign`.
+    """
 
     choice, reader = "techtile", staticmethod(read_techtile)
     marks, suffixes = frozenset({"rx_antenna_position", "csi"}), NETCDF_SUFFIXES

@@ -1,7 +1,9 @@
-"""Received power on a plane under Techtile's ceiling (KU Leuven, geometry-based wireless power transfer).
+"""Received power on a plane under Techtile's ceiling (KU Leuven, geometry-based wireless power
+transfer).
 
-The release is a folder of a run, with TIME_positions.npy and TIME_values.npy: arrays of Python objects,
-positions with x, y, z [m], values with pwr_pw [pW]. The 42 antennas transmit one tone, with unknown weights.
+The release is a folder of a run, with TIME_positions.npy and TIME_values.npy: arrays of Python
+objects, positions with x, y, z [m], values with pwr_pw [pW]. The 42 antennas transmit one tone,
+with unknown weights.
 
 The same as an npz: rx_position (S, 3) [m], rssi_db (S,) [dBm], frequency_hz () [Hz].
 """
@@ -22,7 +24,8 @@ from gsparc.tables.raw import Raw, read_raw
 
 CARRIER_HZ = 920e6
 PICOWATT_DB = -90.0  # relative to a milliwatt
-POSITIONS, VALUES = {"Positioner.PositionerValue"}, {"lib.ep.ep_data"}  # classes of the makers' recorder
+# Classes of the makers' recorder
+POSITIONS, VALUES = {"Positioner.PositionerValue"}, {"lib.ep.ep_data"}
 
 
 def read_techtile_power(path: str | Path) -> Raw:
@@ -41,7 +44,9 @@ def read_techtile_power(path: str | Path) -> Raw:
 def _of_release(folder: Path) -> Raw:
     places = sorted(folder.glob("*_positions.npy"))
     if len(places) != 1:
-        raise DataError(f"{folder}: expected one *_positions.npy with its *_values.npy, found {len(places)}")
+        raise DataError(
+            f"{folder}: expected one *_positions.npy with its *_values.npy, found {len(places)}"
+        )
     file = places[0].with_name(places[0].name.replace("_positions", "_values"))
     where = _attributes(places[0], POSITIONS, ("x", "y", "z"))
     power = _attributes(file, VALUES, ("pwr_pw",))[:, 0]

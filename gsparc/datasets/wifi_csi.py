@@ -1,7 +1,9 @@
-"""Wi-Fi channels as cards log them: one log, or a folder of logs, and a table that says where each was taken.
+"""Wi-Fi channels as cards log them: one log, or a folder of logs,
+and a table that says where each was taken.
 
-Places are a row per file (`file`, `x`, `y`), or a track (`time_s`, `x`, `y`) of all files or, with `file`, of
-each; `z`, `rssi_dbm` and `channel` may stand beside them. Every packet is a row; those of one place share it.
+Places are a row per file (`file`, `x`, `y`), or a track (`time_s`, `x`, `y`) of all files or, with
+`file`, of each; `z`, `rssi_dbm` and `channel` may stand beside them. Every packet is a row;
+those of one place share it.
 """
 
 from __future__ import annotations
@@ -30,9 +32,11 @@ log = logging.getLogger(__name__)
 
 PLACES, NUMBERS = "places.csv", ("time_s", "x", "y", "z", "rssi_dbm", "channel")
 CHIPS = ("43455c0", "4339", "4358", "4366c0")
-# First and last subcarrier that a frame of 802.11a/g/n/ac fills, by the last that an FFT of its width has.
+# First and last subcarrier that a frame of 802.11a/g/n/ac fills,
+# by the last that an FFT of its width has.
 FILLED = {32: (1, 26), 64: (2, 58), 128: (2, 122)}
-WEAK_DB, STRONG_DB = -20.0, 10.0  # of a subcarrier beside the others: nothing is sent below, junk is above
+# Of a subcarrier beside the others: nothing is sent below, junk is above
+WEAK_DB, STRONG_DB = -20.0, 10.0
 KEPT_DB = 2.0  # between the channel's power and RSSI, less a constant: the level is in the channel
 
 
@@ -54,9 +58,10 @@ def read_wifi_csi(
         transmitters: places [m] of senders by their addresses; None: nobody knows them.
 
     Returns:
-        `rx_position` (S, 3), `station_position` (T, 3) [m], `station` (S,), `station_name` (T,), `time_s`
-        (S,), and `csi` (S, A, K) [root of mW where RSSI is known, of which the level is where the gain
-        control took it out of the channel] with `frequency_hz` (K,), subcarriers in ascending order.
+        `rx_position` (S, 3), `station_position` (T, 3) [m], `station` (S,), `station_name` (T,),
+        `time_s` (S,), and `csi` (S, A, K) [root of mW where RSSI is known, of which the level is
+        where the gain control took it out of the channel] with `frequency_hz` (K,),
+        subcarriers in ascending order.
 
     Raises:
         DataError: a log or a place is missing or damaged, or logs are not of one kind.
@@ -69,14 +74,18 @@ def read_wifi_csi(
     logs = [_placed(one, table, card, chip) for one in _logs(path, card)]
     logs = [one for one in logs if len(one.csi)]
     if not logs:
-        raise DataError(f"{path}: no packet has a place in the table of places; see the warnings above")
+        raise DataError(
+            f"{path}: no packet has a place in the table of places; see the warnings above"
+        )
     kinds = sorted({(str(one.csi.shape[1:]), one.carrier_hz) for one in logs}, key=str)
     if len(kinds) > 1:
         variants = f"antennas, subcarriers and carriers {list_first(kinds)}"
         raise DataError(f"{path}: {variants}; give each a folder of its own")
     carrier = carrier_hz or logs[0].carrier_hz
     if carrier is None:
-        raise DataError(f"{path}: neither it nor the places name the channel; say dataset.carrier_hz")
+        raise DataError(
+            f"{path}: neither it nor the places name the channel; say dataset.carrier_hz"
+        )
     of_packets = ("time_s", "sender", "csi", "rssi_dbm", "position")
     joined = [np.concatenate([getattr(one, name) for one in logs]) for name in of_packets]
     heard = (joined[2] != 0).any(axis=(1, 2))  # a packet of zeros has no level in dB
@@ -88,10 +97,14 @@ def read_wifi_csi(
     names, station = np.unique(sender, return_inverse=True)
     sender_places = dict(transmitters or {})
     for name in set(sender_places) - set(names):
-        raise DataError(f"dataset.transmitters: no packet is from {name!r}; there are {', '.join(names)}")
+        raise DataError(
+            f"dataset.transmitters: no packet is from {name!r}; there are {', '.join(names)}"
+        )
     arrays = {
         "rx_position": position,
-        "station_position": np.array([sender_places.get(name, [np.nan] * 3) for name in names], np.float64),
+        "station_position": np.array(
+            [sender_places.get(name, [np.nan] * 3) for name in names], np.float64
+        ),
         "station_name": np.array([name or "transmitter" for name in names]),
         "station": station.reshape(-1),
         "time_s": time,
@@ -141,19 +154,29 @@ def _placed(path: Path, table: pd.DataFrame, card: str | None, chip: str) -> Pac
         rows, clock = np.arange(len(at) * len(time)), np.zeros(len(at))
     if len(rows) < len(time):
         ends = f"no place for them; they are of {time.min():.3f} to {time.max():.3f} s"
-        log.warning("%s: %d of %d packets left out: %s", path, len(time) - len(rows), len(time), ends)
-    on = {name: np.interp(time[rows], clock, at[name]) for name in NUMBERS if len(rows) and name in at}
+        log.warning(
+            "%s: %d of %d packets left out: %s", path, len(time) - len(rows), len(time), ends
+        )
+    on = {
+        name: np.interp(time[rows], clock, at[name]) for name in NUMBERS if len(rows) and name in at
+    }
     nothing, rssi = np.zeros(len(rows)), packets.rssi_dbm[rows]
     return replace(
-        packets, time_s=time[rows], sender=packets.sender[rows], csi=packets.csi[rows],
+        packets,
+        time_s=time[rows],
+        sender=packets.sender[rows],
+        csi=packets.csi[rows],
         rssi_dbm=np.where(np.isnan(rssi), on.get("rssi_dbm", rssi), rssi),
-        carrier_hz=packets.carrier_hz or (channel_hz(int(on["channel"][0])) if "channel" in on else None),
+        carrier_hz=packets.carrier_hz
+        or (channel_hz(int(on["channel"][0])) if "channel" in on else None),
         position=np.stack([on.get(axis, nothing) for axis in "xyz"], 1),
-    )  # fmt: skip
+    )
 
 
 def _filled(tone: np.ndarray, csi: np.ndarray, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Subcarriers (K',) in ascending order that carry the channel, and the channel (S, A, K') at them."""
+    """Subcarriers (K',) in ascending order that carry the channel, and the channel (S, A, K')
+    at them.
+    """
     order = np.argsort(tone)
     tone, csi = tone[order], csi[..., order]
     low, high = FILLED.get(int(-tone.min()), (0, int(tone.max())))
@@ -167,13 +190,17 @@ def _filled(tone: np.ndarray, csi: np.ndarray, path: Path) -> tuple[np.ndarray, 
     if not (in_band & right).all():
         wrong = list(tone[in_band & ~right])
         odd = f", and {list_first(wrong)}: their level is none" if wrong else ""
-        what = f"{(in_band & right).sum()} of {len(tone)} subcarriers; guard and unused ones left out"
+        what = (
+            f"{(in_band & right).sum()} of {len(tone)} subcarriers; guard and unused ones left out"
+        )
         log.info("%s: %s%s", path, what, odd)
     return tone[in_band & right], csi[..., in_band & right]
 
 
 def _levelled(csi: np.ndarray, rssi_dbm: np.ndarray, path: Path) -> tuple[np.ndarray, str]:
-    """Channels (S, A, K) at the level of their RSSI (S,) where that is not in them, and the level's unit."""
+    """Channels (S, A, K) at the level of their RSSI (S,) where that is not in them,
+    and the level's unit.
+    """
     if np.isnan(rssi_dbm).all():
         log.warning("%s: no RSSI: levels are what the gain control left, and may say nothing", path)
         return csi, "dB"

@@ -1,7 +1,7 @@
 """Packets of Wi-Fi logs, read by `csiread`: Nexmon and Intel 5300; ESP32 on no log of a card yet.
 
-`csiread` trusts the lengths that a file states: a packet longer than its buffer overwrites its stack, and a
-file that is not there ends the process. So lengths are looked at before it reads.
+`csiread` trusts the lengths that a file states: a packet longer than its buffer overwrites its
+stack, and a file that is not there ends the process. So lengths are looked at before it reads.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ STREAMS = 3  # most antennas at either end of the cards
 BUFFER = 1024  # bytes of `csiread` for a record of an Intel 5300
 TICKS = 2.0**32  # microseconds after which the clock of an Intel 5300 begins again
 HEADS = 16, 60  # bytes of a packet before its Ethernet frame, and of that before the channel
-POINTS = {256: 20, 512: 40, 1024: 80}  # MHz by bytes of the channel, after which come a few that are none
+# MHz by bytes of the channel, after which come a few that are none
+POINTS = {256: 20, 512: 40, 1024: 80}
 PADDING = 256  # bytes, more than those
 OLD_MAGIC = b"\x11" * 4  # of Nexmon's packets without RSSI
 
@@ -66,7 +67,9 @@ def read_packets(path: Path, card: str | None = None, chip: str = "43455c0") -> 
     try:
         import csiread
     except ImportError:
-        raise DataError(f"{path}: Wi-Fi logs need csiread; say: pip install 'gsparc[wifi]'") from None
+        raise DataError(
+            f"{path}: Wi-Fi logs need csiread; say: pip install 'gsparc[wifi]'"
+        ) from None
     card = card or SUFFIXES.get(path.suffix.lower())
     if card not in READERS:
         raise DataError(f"{path}: no log of a known card; say dataset.card={'|'.join(READERS)}")
@@ -93,15 +96,23 @@ def _nexmon(path: Path, csiread: Any, chip: str) -> Packets:
     sizes = sorted({size for size, _, _ in frames})
     if len(sizes) != 1 or sizes[0] not in POINTS:
         found = ", ".join(map(str, sizes)) or "none"
-        raise DataError(f"{path}: bytes of channels: {found}; expected those of one of 20, 40, 80 MHz")
+        raise DataError(
+            f"{path}: bytes of channels: {found}; expected those of one of 20, 40, 80 MHz"
+        )
     silent = frames[0][1] == OLD_MAGIC
-    log = (csiread.Nexmon if silent else csiread.NexmonPull256)(str(path), chip, POINTS[sizes[0]], False)
+    log = (csiread.Nexmon if silent else csiread.NexmonPull256)(
+        str(path), chip, POINTS[sizes[0]], False
+    )
     log.read()
     # Other cores and streams are packets of their own; the last packet may be cut short.
     one = np.flatnonzero((log.core == 0) & (log.spatial == 0))
     one = one[one < sum(whole for _, _, whole in frames)]
     spec, points = int(log.chan_spec[0]), sizes[0] // 4
-    rssi = np.full(len(one), np.nan) if silent else log.rssi[one].astype(np.uint8).view(np.int8).astype(float)
+    rssi = (
+        np.full(len(one), np.nan)
+        if silent
+        else log.rssi[one].astype(np.uint8).view(np.int8).astype(float)
+    )
     return Packets(
         log.sec[one] + log.usec[one] * (1e-9 if log.nano else 1e-6),
         format_address(log.src_addr[one]),
@@ -113,7 +124,9 @@ def _nexmon(path: Path, csiread: Any, chip: str) -> Packets:
 
 
 def _frames(path: Path) -> Iterator[tuple[int, bytes, bool]]:
-    """Bytes of the channel and first bytes of each of Nexmon's packets, and whether it is there whole."""
+    """Bytes of the channel and first bytes of each of Nexmon's packets,
+    and whether it is there whole.
+    """
     content = path.read_bytes()
     order = "big" if content[:1] == b"\xa1" else "little"
     before, head = HEADS
@@ -129,16 +142,20 @@ def _frames(path: Path) -> Iterator[tuple[int, bytes, bool]]:
 def _intel(path: Path, csiread: Any, _: str) -> Packets:
     content = path.read_bytes()
     size = int.from_bytes(content[:2], "big")
-    if size + 2 == RECORD.itemsize:  # with time and sender, which `csiread` would take for the channel
+    # With time and sender, which `csiread` would take for the channel
+    if size + 2 == RECORD.itemsize:
         records = read_log(path)
-        power = np.sum(np.abs(records.csi) ** 2, axis=2).mean(axis=1).clip(1e-300)  # of zeros: no level in dB
+        # Of zeros: no level in dB
+        power = np.sum(np.abs(records.csi) ** 2, axis=2).mean(axis=1).clip(1e-300)
         sender = format_address(np.frombuffer(records.sender.tobytes(), np.uint8).reshape(-1, 6))
         return Packets(records.time, sender, records.csi.swapaxes(1, 2), TONES, to_decibels(power))
     at, count = 0, 0
     while at + 2 < len(content):
         size = int.from_bytes(content[at : at + 2], "big")
         if size > BUFFER:
-            raise DataError(f"{path}, byte {at}: a record of {size} bytes; is it a log of an Intel 5300?")
+            raise DataError(
+                f"{path}, byte {at}: a record of {size} bytes; is it a log of an Intel 5300?"
+            )
         at, count = at + 2 + size, count + 1
     log = csiread.Intel(str(path), STREAMS, STREAMS, if_report=False, bufsize=count)
     log.read()
@@ -149,7 +166,8 @@ def _intel(path: Path, csiread: Any, _: str) -> Packets:
     return Packets(
         1e-6 * tick,
         np.full(len(tick), ""),
-        log.csi[valid, :, : int(log.Nrx.max(initial=0)), 0].swapaxes(1, 2),  # the first transmit antenna
+        # The first transmit antenna
+        log.csi[valid, :, : int(log.Nrx.max(initial=0)), 0].swapaxes(1, 2),
         TONES_40 if wide[:1].any() else TONES,
         log.get_total_rss()[valid],
     )
@@ -158,10 +176,13 @@ def _intel(path: Path, csiread: Any, _: str) -> Packets:
 def _esp32(path: Path, csiread: Any, _: str) -> Packets:
     log = csiread.ESP32(str(path), if_report=False)
     log.read()
-    tone = np.fft.fftfreq(64, 1 / 64).round().astype(int)  # of the legacy training field, which comes first
+    # Of the legacy training field, which comes first
+    tone = np.fft.fftfreq(64, 1 / 64).round().astype(int)
     carrier = channel_hz(int(log.channel[0]))
     csi = log.csi[:, None, :64]
-    return Packets(1e-6 * log.local_timestamp, np.array(log.mac), csi, tone, log.rssi * 1.0, carrier)
+    return Packets(
+        1e-6 * log.local_timestamp, np.array(log.mac), csi, tone, log.rssi * 1.0, carrier
+    )
 
 
 READERS = {"nexmon": _nexmon, "intel": _intel, "esp32": _esp32}

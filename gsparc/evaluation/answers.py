@@ -40,7 +40,8 @@ CHUNK = 512  # places predicted at a time
 MOST_ENTRIES = 16  # of a channel, as columns of a table
 DIGITS = 6  # of decibels: `evaluate` and an error computed from the file agree so far
 ENDINGS = (".csv", ".npz")
-# Expected errors (N,) [dB] of local places, numbers of stations and deviations [dB]; NaN where refused.
+# Expected errors (N,) [dB] of local places, numbers of stations and deviations [dB];
+# NaN where refused.
 Tested = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -51,11 +52,13 @@ class Answers:
     Attributes:
         place: (N,) int64, row of the places.
         station: (N,) its number; 0 where there is one.
-        names: (N,) of stations by heads of columns, see `Stations.named`; empty where the model has none.
+        names: (N,) of stations by heads of columns, see `Stations.named`; empty where the model has
+            none.
         said: (N, ...) in the predictor's unit.
         refused: (N,) bool, as maps refuse places; None where no error was tested.
-        heard: (N,) in the predictor's unit, of powers given that they are heard, see `Hearing.given_heard`,
-            by the names of its results; empty where the model learned of no silence.
+        heard: (N,) in the predictor's unit, of powers given that they are heard, see
+            `Hearing.given_heard`, by the names of its results;
+            empty where the model learned of no silence.
     """
 
     place: np.ndarray
@@ -74,9 +77,15 @@ class Answers:
 
 
 def predict_file(
-    predictor: Predictor, places: str | Path, out: str | Path | None = None, *, station: str | None = None,
-    columns: dict[str, object] | None = None, overwrite: bool = False, tested: Tested | None = None,
-) -> dict[str, Any]:  # fmt: skip
+    predictor: Predictor,
+    places: str | Path,
+    out: str | Path | None = None,
+    *,
+    station: str | None = None,
+    columns: dict[str, object] | None = None,
+    overwrite: bool = False,
+    tested: Tested | None = None,
+) -> dict[str, Any]:
     """Predict at the places of a file and write the answers; what was guessed is logged.
 
     Args:
@@ -86,7 +95,8 @@ def predict_file(
         station: name or number of the only one to predict.
         columns: of a table of places, by quantity, where a guess will not do.
         overwrite: whether a file that is there may be replaced.
-        tested: expected errors of powers by what was held out, which stand for the model's own deviations.
+        tested: expected errors of powers by what was held out, which stand for the model's own
+            deviations.
 
     Returns:
         Facts for `summary.json`.
@@ -107,11 +117,16 @@ def predict_file(
         log.warning("%s: %s", places, speck)
     if far.any():
         log.warning(
-            "%s: %d of %d places lie more than %.3g m outside the box of the training places%s, the first in "
+            "%s: %d of %d places lie more than %.3g m outside the box of the training places%s, "
+            "the first in "
             "%s: predictions there are unreliable",
-            places, int(far.sum()), len(far), margin, say_height_error(world, site, far),
+            places,
+            int(far.sum()),
+            len(far),
+            margin,
+            say_height_error(world, site, far),
             queries.rows[int(np.argmax(far))],
-        )  # fmt: skip
+        )
     power = site.power_unit(predictor.unit) if site.target.is_level else None
     if power is not None:
         predictions = _with_heard(predictor, queries, site.local_places(world), predictions, power)
@@ -123,23 +138,38 @@ def predict_file(
             log.warning("%s: %s: too far from what was measured", places, what)
     write_answers(path, queries, predictions, site, power)
     facts: dict[str, Any] = {
-        "predict/places": len(queries), "predict/predictions": len(predictions),
+        "predict/places": len(queries),
+        "predict/predictions": len(predictions),
         "predict/far_outside": int(far.sum()),
         "predict/refused": predictions.count_refused(),
         "predict/stations": len(np.unique(predictions.names.get("station", ()))),
-        "dataset/name": site.name, "dataset/kind": site.kind, "model/name": predictor.method.name,
-        "places": str(places), "out": str(path), "predict/unit": predictor.unit,
-    }  # fmt: skip
+        "dataset/name": site.name,
+        "dataset/kind": site.kind,
+        "model/name": predictor.method.name,
+        "places": str(places),
+        "out": str(path),
+        "predict/unit": predictor.unit,
+    }
     # A power of 0 is -inf dB, which would be the lowest of every file and no number of a summary.
     mean = predictions.said.mean.numpy()
     values = mean[np.isfinite(mean)]
     empty = ~np.isfinite(mean.reshape(len(mean), -1)).all(axis=1)
     facts["predict/empty"] = int(empty.sum())
     if empty.any():
-        why = "a power of 0, weaker than single precision holds" if np.isneginf(mean).any() else "no number"
+        why = (
+            ("a power of 0, weaker than single precision holds")
+            if np.isneginf(mean).any()
+            else "no number"
+        )
         first = queries.rows[predictions.place[int(np.argmax(empty))]]
-        log.warning("%s: %d of %d predictions are empty (%s), the first in %s", places, empty.sum(),
-                    len(mean), why, first)  # fmt: skip
+        log.warning(
+            "%s: %d of %d predictions are empty (%s), the first in %s",
+            places,
+            empty.sum(),
+            len(mean),
+            why,
+            first,
+        )
     if power is not None and len(values):
         ends = {"lowest": float(values.min()), "highest": float(values.max())}
         facts |= {f"predict/{name}_{unit_suffix(power)}": value for name, value in ends.items()}
@@ -162,20 +192,34 @@ def _with_tested(answers: Answers, local: np.ndarray, power: PowerUnit, tested: 
 
 
 def _with_heard(
-    predictor: Predictor, queries: QueryPlaces, local: np.ndarray, answers: Answers, power: PowerUnit
+    predictor: Predictor,
+    queries: QueryPlaces,
+    local: np.ndarray,
+    answers: Answers,
+    power: PowerUnit,
 ) -> Answers:
-    """Answers with levels given that they are heard, which `evaluate` judges where rows were chosen so."""
+    """Answers with levels given that they are heard,
+    which `evaluate` judges where rows were chosen so.
+    """
     hearing, method, site = read_hearing(predictor.extra), predictor.method, predictor.site
-    variance, raised_db = answers.said.variance, power.raised_db - site.power_unit(site.level_unit).raised_db
+    variance, raised_db = (
+        answers.said.variance,
+        power.raised_db - site.power_unit(site.level_unit).raised_db,
+    )
     # Numbers of stations are those of a whole model: `select_carrier` leaves one.
-    whole = predictor.queries.station is None and len(site.every_station) > max(hearing.station, default=0)
+    whole = predictor.queries.station is None and len(site.every_station) > max(
+        hearing.station, default=0
+    )
     if not (len(hearing) and whole and power.decibels and method.uses_censored) or variance is None:
         return answers
     device = None
     if queries.device is not None and site.device_names is not None:
         number = {name: find_device(name, site) for name in np.unique(queries.device) if name}
         device = np.array([number.get(name, MEAN_DEVICE) for name in queries.device])[answers.place]
-    level_db, spread_db = answers.said.mean[:, 0].numpy() - raised_db, variance.double().sqrt().numpy()
+    level_db, spread_db = (
+        answers.said.mean[:, 0].numpy() - raised_db,
+        variance.double().sqrt().numpy(),
+    )
     asked = local[answers.place], answers.station, level_db, spread_db, device
     heard = hearing.given_heard(method, *asked)
     heard["heard_db"] += raised_db
@@ -186,7 +230,9 @@ def _notes(queries: QueryPlaces, site: Site) -> list[str]:
     notes, origin = list(queries.notes), site.georeference
     # Metres alone may be about any origin, and a wrong one moves all places alike: it is said.
     if origin is not None and not any(where.degrees for where in queries.ends.values()):
-        notes.append(f"metres are east and north of {origin.latitude:g}, {origin.longitude:g} degrees")
+        notes.append(
+            f"metres are east and north of {origin.latitude:g}, {origin.longitude:g} degrees"
+        )
     if queries.station is not None and site.stations is None:
         notes.append("not used: stations; the model has none")
     if queries.device is not None and site.device_names is None:
@@ -195,7 +241,11 @@ def _notes(queries: QueryPlaces, site: Site) -> list[str]:
 
 
 def predict_places(
-    predictor: Predictor, queries: QueryPlaces, world: dict[End, np.ndarray], station: str | None, path: Path
+    predictor: Predictor,
+    queries: QueryPlaces,
+    world: dict[End, np.ndarray],
+    station: str | None,
+    path: Path,
 ) -> Answers:
     """Predict for `path`; stations that cannot be are left out, which is logged.
 
@@ -219,13 +269,20 @@ def predict_places(
             model = predictor.ask_station(int(one))
         except ValueError as error:
             if named:
-                raise DataError(f"{queries.source}, {queries.rows[row[chosen[0]]]}: {error}") from None
+                raise DataError(
+                    f"{queries.source}, {queries.rows[row[chosen[0]]]}: {error}"
+                ) from None
             silent.append(f"left out: {error}")
             continue
         of = np.full(len(chosen), "") if queries.device is None else queries.device[row[chosen]]
         for device in np.unique(of):
-            device_model, rows = _select_device(model, str(device), queries.source), chosen[of == device]
-            blocks += [(device_model, some) for some in np.split(rows, range(CHUNK, len(rows), CHUNK))]
+            device_model, rows = (
+                _select_device(model, str(device), queries.source),
+                chosen[of == device],
+            )
+            blocks += [
+                (device_model, some) for some in np.split(rows, range(CHUNK, len(rows), CHUNK))
+            ]
     if not blocks:
         raise DataError(silent[0])
 
@@ -284,10 +341,14 @@ def check_fits(path: Path, target: Target, shape: tuple[int, ...]) -> None:
     count = int(np.prod(shape))
     if target.is_image:
         size = " x ".join(map(str, shape))
-        raise DataError(f"out={path}: spectra of {size} directions are no columns; say out=FILE.npz")
+        raise DataError(
+            f"out={path}: spectra of {size} directions are no columns; say out=FILE.npz"
+        )
     if count > MOST_ENTRIES:
         size = f"{shape[0]} antennas x {shape[1]} subcarriers"
-        raise DataError(f"out={path}: {size} are more than {MOST_ENTRIES} pairs of columns; say out=FILE.npz")
+        raise DataError(
+            f"out={path}: {size} are more than {MOST_ENTRIES} pairs of columns; say out=FILE.npz"
+        )
 
 
 def unit_suffix(unit: PowerUnit) -> str:
@@ -300,23 +361,32 @@ def write_answers(
 ) -> None:
     """Write all predictions, whole or not at all; NaN for the level of no power."""
     archive, kind = path.suffix.lower() == ".npz", site.kind
-    columns, name = _places(queries, predictions), kind if power is None else f"{kind}_{unit_suffix(power)}"
+    columns, name = (
+        _places(queries, predictions),
+        kind if power is None else f"{kind}_{unit_suffix(power)}",
+    )
     outputs, mean = predictions.said, predictions.said.mean.numpy()
     if power is not None:
         columns[name] = np.where(np.isfinite(mean[:, 0]), mean[:, 0], np.nan)
-        columns[name] = columns[name].round(DIGITS) if power.decibels else columns[name].astype(np.float32)
+        columns[name] = (
+            columns[name].round(DIGITS) if power.decibels else columns[name].astype(np.float32)
+        )
     if outputs.variance is not None:
-        # Stored as a variance because those of independent parts add; a reader wants it in the level's unit.
+        # Stored as a variance because those of independent parts add;
+        # a reader wants it in the level's unit.
         columns[f"{name}_std"] = outputs.variance.sqrt().float().numpy()
     if power is None:
         mean = site.in_shape_of_file(mean) if site.target.is_complex else mean
         columns |= {kind: mean} if archive else _entries(mean)
     columns |= {name: values.round(DIGITS) for name, values in predictions.heard.items()}
     columns |= {} if outputs.confidence is None else {"confidence": outputs.confidence.numpy()}
-    columns |= {} if predictions.refused is None else {"refused": predictions.refused.astype(np.int8)}
+    columns |= (
+        {} if predictions.refused is None else {"refused": predictions.refused.astype(np.int8)}
+    )
     if not archive:
         columns = _in_order(columns, queries, predictions)
-        # A float32 is written with as many digits as tell it from its neighbours, .1 and not .10000000149.
+        # A float32 is written with as many digits as tell it from its neighbours,
+        # .1 and not .10000000149.
         write_samples(path, {name: list(values) for name, values in columns.items()})
         return
     write_archive(path, columns)
@@ -336,16 +406,22 @@ def _places(queries: QueryPlaces, predictions: Answers) -> dict[str, np.ndarray]
 def _in_order(
     columns: dict[str, np.ndarray], queries: QueryPlaces, predictions: Answers
 ) -> dict[str, np.ndarray]:
-    """The columns of a table of places in its order, those that were not read as they are, then the rest."""
+    """The columns of a table of places in its order, those that were not read as they are,
+    then the rest.
+    """
     ordered: dict[str, np.ndarray] = {}
     used_names: list[str] = []
     for head, role, words in queries.table:
         # With one end that moves columns have no prefix; "^$" takes nothing away.
         axis = re.sub("^(rx|tx)_" if len(queries.ends) == 1 else "^$", "", role or "")
-        names = [name for name in (axis, axis.replace("z", "height")) if name in {*columns} - {*used_names}]
+        names = [
+            name
+            for name in (axis, axis.replace("z", "height"))
+            if name in {*columns} - {*used_names}
+        ]
         if role is not None and names:
-            # As they were written: 48.191910 is no 48.19191 to a join. Names of stations under any other head
-            # are repeated: which columns there are depends on the model alone.
+            # As they were written: 48.191910 is no 48.19191 to a join. Names of stations under any
+            # other head are repeated: which columns there are depends on the model alone.
             used_names.append(head if role == "station" else names[0])
             ordered[head] = words[predictions.place]
         elif role is None:

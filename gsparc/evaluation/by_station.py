@@ -18,15 +18,19 @@ from gsparc.tables.links.strongest import strongest_lists
 
 WORST = 3  # stations shown; the file has all
 OFFSET = 0.5  # of the squared errors of a station, that one offset explains
-BY_CHANCE, SURE = 0.02, 0.999  # chance at which a station is missed; most that a prediction is trusted
+# Chance at which a station is missed; most that a prediction is trusted
+BY_CHANCE, SURE = 0.02, 0.999
 NEAR_M = 50.0  # of a list, whose stations another should hold: shadowing is alike
-ERRORS = ("error_db", "error_db_with_silent")  # of heard rows; of silent ones what predictions exceed
+# Of heard rows; of silent ones what predictions exceed
+ERRORS = ("error_db", "error_db_with_silent")
 
 
 def rmse_after_constants(scores: Scores, station: np.ndarray) -> float | None:
-    """Return RMSE [dB] of powers after the mean error of each `station` (n,) of all rows is taken away.
+    """Return RMSE [dB] of powers after the mean error of each `station` (n,)
+    of all rows is taken away.
 
-    Stations that nobody calibrated differ by constants which nothing tells of a station never heard.
+    Stations that nobody calibrated differ by constants which nothing tells
+    of a station never heard.
     """
     error = pd.Series(scores.samples["error_db"])
     residual = error - error.groupby(station[scores.row]).transform("mean")
@@ -34,23 +38,32 @@ def rmse_after_constants(scores: Scores, station: np.ndarray) -> float | None:
 
 
 def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
-    """Return the share of places, with rows of two stations or more, whose measured strongest is predicted.
+    """Return the share of places, with rows of two stations or more,
+    whose measured strongest is predicted.
 
-    What was not heard counts as weaker than all that was; in lists of the strongest all that is not listed,
-    see `strongest_told`. Of k stations tied as predicted strongest a right one counts 1 / k. Empty without
-    such places.
+    What was not heard counts as weaker than all that was; in lists of the strongest all that is not
+    listed, see `strongest_told`. Of k stations tied as predicted strongest a right one counts 1 /
+    k. Empty without such places.
     """
     row, place = scores.row, np.arange(len(data)) if data.place is None else data.place
     if "strongest_told" in scores.samples:
-        answers = pd.Series(scores.samples["strongest_told"]).groupby([scores.fold, place[row]]).first()
+        answers = (
+            pd.Series(scores.samples["strongest_told"]).groupby([scores.fold, place[row]]).first()
+        )
         return {BEST_SERVER: float(answers.mean())}
-    # A receiver in saturation reports its most: what is at least that has no target, but is the strongest.
+    # A receiver in saturation reports its most: what is at least that has no target,
+    # but is the strongest.
     most = np.where(data.censored_side(row) < 0, data.powers(row)[:, 0], np.nan)
     answers = scores.samples.get("served", scores.samples["prediction"])
-    every = pd.DataFrame({
-        "fold": scores.fold, "place": place[row], "station": data.stations_of(row),
-        "predicted": answers, "measured": np.fmax(scores.samples["target"], most),
-    })  # fmt: skip
+    every = pd.DataFrame(
+        {
+            "fold": scores.fold,
+            "place": place[row],
+            "station": data.stations_of(row),
+            "predicted": answers,
+            "measured": np.fmax(scores.samples["target"], most),
+        }
+    )
     # A station's rows of one place, of several visits, are one by their strongest.
     links = every.groupby(["fold", "place", "station"]).max()
     strongest = links == links.groupby(["fold", "place"]).transform("max")
@@ -61,11 +74,12 @@ def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
 
 
 def unlisted_stations(scores: Scores, data: Measurements) -> pd.DataFrame:
-    """Return stations that no list holds though lists should, a row each: `moments`, `expected`, `chance`.
+    """Return stations that no list holds though lists should, a row each: `moments`, `expected`,
+    `chance`.
 
-    Of `moments` `expected` should list the station. Moments of one square of floor err together and count as
-    one, by their largest probability: a station that is there stays out of all with at most this `chance`.
-    Empty of other data than lists of the strongest.
+    Of `moments` `expected` should list the station. Moments of one square of floor err together and
+    count as one, by their largest probability: a station that is there stays out of all with at
+    most this `chance`. Empty of other data than lists of the strongest.
     """
     shares = scores.never_listed
     if shares is None or not len(shares):
@@ -82,17 +96,21 @@ def unlisted_stations(scores: Scores, data: Measurements) -> pd.DataFrame:
 def newly_listed(old: Measurements, new: Measurements) -> pd.DataFrame:
     """Return stations that lists of a later drive hold and none of the earlier, a row each.
 
-    Columns `lists`: of the later drive that hold it; `expected`: earlier ones that should, by how often they
-    hold what the later list within `NEAR_M` has at the same place among its stations, of stations that both
-    drives heard; `chance` that none does though the station was there, squares counted as by
-    `unlisted_stations`. Empty of other data than lists of the strongest.
+    Columns `lists`: of the later drive that hold it; `expected`: earlier ones that should, by how
+    often they hold what the later list within `NEAR_M` has at the same place among its stations, of
+    stations that both drives heard; `chance` that none does though the station was there, squares
+    counted as by `unlisted_stations`. Empty of other data than lists of the strongest.
     """
     before, now = strongest_lists(old), strongest_lists(new)
     if before is None or now is None:
         return pd.DataFrame(columns=["lists", "expected", "chance"])
     gap, near = cKDTree(now.place).query(before.place)
     pairs = np.flatnonzero(gap <= NEAR_M)
-    was_listed, listed, later = np.isfinite(before.level)[pairs], np.isfinite(now.level), near[pairs]
+    was_listed, listed, later = (
+        np.isfinite(before.level)[pairs],
+        np.isfinite(now.level),
+        near[pairs],
+    )
     is_known = np.isfinite(before.level).any(0)
     fresh = np.flatnonzero(listed.any(0) & ~is_known)
     # Equal levels keep the order of the stations, on any processor.
@@ -119,7 +137,8 @@ def describe_new(old: Measurements, new: Measurements) -> str | None:
     surely = np.where(found.chance < BY_CHANCE, "new", "new, or out of its reach before")
     rows = zip(names, found.lists, found.expected, surely, found.chance, strict=True)
     return ", ".join(
-        f"{n} (in {k} lists, for {e:.0f} of the earlier drive: {s}; chance {c:.0e})" for n, k, e, s, c in rows
+        f"{n} (in {k} lists, for {e:.0f} of the earlier drive: {s}; chance {c:.0e})"
+        for n, k, e, s, c in rows
     )
 
 
@@ -136,7 +155,8 @@ def describe_never_listed(scores: Scores, data: Measurements) -> str | None:
 def station_columns(methods: Mapping[str, Scores], data: Measurements) -> dict[str, Any]:
     """Return columns of `by_station.csv`: rows, rmse and bias of methods by the heads' beginning.
 
-    Of stations with scored rows; silent ones count in `rmse_db_with_silent`. Empty without stations.
+    Of stations with scored rows; silent ones count in `rmse_db_with_silent`.
+    Empty without stations.
     """
     columns: dict[str, Any] = {}
     if not (called := data.site.every_station.named):
@@ -154,32 +174,43 @@ def station_columns(methods: Mapping[str, Scores], data: Measurements) -> dict[s
 
 
 def worst_stations(columns: Mapping[str, Any], method: str, later: bool = False) -> list[Table]:
-    """Return a table of the stations with the largest rmse, of those with rows enough, if these are several.
+    """Return a table of the stations with the largest rmse, of those with rows enough,
+    if these are several.
 
     Of a `later` log, no row of which was learned from, it names the command that learns offsets.
     Baselines beside it tell whether a station is hard, its note at how many the method is better.
     """
     # Among the baselines may be the method itself.
-    names = [one for one in columns if one.endswith("/rmse_db") and one.split("/")[1] not in ("zero", method)]
+    names = [
+        one
+        for one in columns
+        if one.endswith("/rmse_db") and one.split("/")[1] not in ("zero", method)
+    ]
     heads = {
         "rmse_db": method,
         "bias_db": f"bias_db of {method}",
         **{name: name.split("/")[1] for name in names},
     }
     table_columns = [Column("station", "", of="station"), Column("rows", ".0f", of="rows")]
-    table_columns += [Column(head, number_format("rmse_db"), of=name) for name, head in heads.items()]
+    table_columns += [
+        Column(head, number_format("rmse_db"), of=name) for name, head in heads.items()
+    ]
     every = pd.DataFrame(columns, columns=None if columns else ["rows", "rmse_db"])
     rows = every[every["rows"] >= FEW].sort_values("rmse_db", ascending=False, kind="stable")
     if len(rows) < 2:
         return []
-    better = ", ".join(f"than {heads[name]} at {(rows.rmse_db < rows[name]).sum()}" for name in names)
+    better = ", ".join(
+        f"than {heads[name]} at {(rows.rmse_db < rows[name]).sum()}" for name in names
+    )
     compared = f"of {len(rows)} stations ({FEW} rows or more)"
     note = f"{method} has the smaller rmse_db {better} {compared}" if names else ""
     title = "rmse_db of the worst stations; by_station.csv has all"
     named = rows.assign(station=show_names(rows["station"], rows.get("cell")))
     offset = named[rows.bias_db**2 > OFFSET * rows.rmse_db**2] if "bias_db" in rows else rows[:0]
     if len(offset):
-        those = ", ".join(f"{one.station} ({-one.bias_db:+.1f} dB)" for one in offset[:WORST].itertuples())
+        those = ", ".join(
+            f"{one.station} ({-one.bias_db:+.1f} dB)" for one in offset[:WORST].itertuples()
+        )
         note += f"{'; ' * bool(note)}measured levels differ from predicted by one offset: {those}"
         note += ": gsparc update learns that, but not from lists of the strongest" * later
     return [Table.from_rows(title, table_columns, named[:WORST].to_dict("records"), note=note)]

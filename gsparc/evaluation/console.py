@@ -1,4 +1,6 @@
-"""What commands read and say: plain settings, a console, its log, errors in one line with what to do."""
+"""What commands read and say: plain settings, a console, its log,
+errors in one line with what to do.
+"""
 
 from __future__ import annotations
 
@@ -30,12 +32,14 @@ PATH = r"^\S*/\S*: "  # at its head
 
 
 def open_console() -> Console:
-    """Open a console without line breaks in sentences; tables as wide as the terminal, or `WIDE` in a log.
+    """Open a console without line breaks in sentences; tables as wide as the terminal,
+    or `WIDE` in a log.
 
     Without markup: square brackets of a path or a title are no style.
     """
     terminal = Console(soft_wrap=True, markup=False)
-    has_width = terminal.is_terminal or "COLUMNS" in os.environ  # a log has no width: 80 cut headings short
+    # A log has no width: 80 cut headings short
+    has_width = terminal.is_terminal or "COLUMNS" in os.environ
     return terminal if has_width else Console(soft_wrap=True, markup=False, width=WIDE)
 
 
@@ -49,7 +53,8 @@ class ConsoleHandler(logging.StreamHandler):  # type: ignore[type-arg]
         stream: where lines go; None: stdout.
     """
 
-    read: ClassVar[set[str]] = set()  # what was said of files, by any handler: jobs of a sweep have their own
+    # What was said of files, by any handler: jobs of a sweep have their own
+    read: ClassVar[set[str]] = set()
 
     def __init__(self, quiet: Iterable[str] = (), stream: Any = None) -> None:
         super().__init__(stream or sys.stdout)
@@ -78,27 +83,43 @@ class ConsoleHandler(logging.StreamHandler):  # type: ignore[type-arg]
 
 
 def repeated_warnings() -> list[str]:
-    """Return a command's last lines on warnings: severe ones, and where its log's file has others."""
+    """Return a command's last lines on warnings: severe ones,
+    and where its log's file has others.
+    """
     screens = [one for one in logging.getLogger().handlers if isinstance(one, ConsoleHandler)]
     more = [list(texts) for one in screens for texts in one.warned.values() if len(texts) > 1]
-    again = [f"{len(a)} like '{shorten(re.sub(PATH, '', a[0]), AGAIN, placeholder='')} ...'" for a in more]
+    again = [
+        f"{len(a)} like '{shorten(re.sub(PATH, '', a[0]), AGAIN, placeholder='')} ...'"
+        for a in more
+    ]
     severe = dict.fromkeys(text for one in screens for text in one.severe)
     return [*severe, *([f"repeated warnings: {', '.join(again)}"] if again else [])]
 
 
 def to_dict(node: DictConfig) -> dict[str, Any]:
-    """Return a group of settings as plain containers; a setting that is still missing is an error."""
+    """Return a group of settings as plain containers;
+    a setting that is still missing is an error.
+    """
     return OmegaConf.to_container(node, resolve=True, throw_on_missing=True)  # type: ignore[return-value]
 
 
 def error_in_one_line(error: BaseException) -> str:
-    """Return what went wrong and what to do, on one line; misspelt keys and choices get the nearest name."""
-    if isinstance(error, errors.MissingConfigException) and error.missing_cfg_file and error.options:
+    """Return what went wrong and what to do, on one line;
+    misspelt keys and choices get the nearest name.
+    """
+    if (
+        isinstance(error, errors.MissingConfigException)
+        and error.missing_cfg_file
+        and error.options
+    ):
         group, _, choice = str(error.missing_cfg_file).partition("/")
         if group == "hydra":  # hydra/sweeper/optuna
             part, _, choice = choice.rpartition("/")
             there = ", ".join(error.options)
-            return f"{group}/{part}={choice}: no such choice; there are {there} (is its plugin installed?)"
+            return (
+                f"{group}/{part}={choice}: no such choice; there are {there} (is its plugin "
+                "installed?)"
+            )
         if group in GROUPS and (path := plugins(group).get(choice)):
             try:
                 plugin_node(group, choice)
@@ -129,8 +150,13 @@ def error_in_one_line(error: BaseException) -> str:
     text = _first(error)
     # Errors of use are ValueErrors and their like; for a bug the type is shown too.
     expected = isinstance(error, (ValueError, OSError, RuntimeError))
-    expected |= type(error).__name__ == "MisconfigurationException"  # Lightning's, of the Trainer's options
-    return text if expected and text else f"{type(error).__name__}: {text} ({FULL_ERROR}=1 shows where)"
+    # Lightning's, of the Trainer's options
+    expected |= type(error).__name__ == "MisconfigurationException"
+    return (
+        text
+        if expected and text
+        else (f"{type(error).__name__}: {text} ({FULL_ERROR}=1 shows where)")
+    )
 
 
 def config_folder() -> Path:
@@ -139,7 +165,9 @@ def config_folder() -> Path:
 
 
 def list_choices(group: str) -> list[str]:
-    """List every choice of a config group, those in its folders as `folder/choice`, and those of plugins."""
+    """List every choice of a config group, those in its folders as `folder/choice`,
+    and those of plugins.
+    """
     folder = config_folder() / group
     names = {str(file.relative_to(folder).with_suffix("")) for file in folder.rglob("*.yaml")}
     stored = ConfigStore.instance().repo.get(group, {})
@@ -153,7 +181,9 @@ def _override(error: Exception, cause: OmegaConfBaseException) -> str:
         return f"{_first(error)} {_first(cause)}"
     names = [str(k) for k in cause.parent_node if str(k) != "hydra"]
     prefix, dot, key = full.rpartition(".")
-    groups = cause.parent_node.items_ex(resolve=False) if OmegaConf.is_dict(cause.parent_node) else ()
+    groups = (
+        cause.parent_node.items_ex(resolve=False) if OmegaConf.is_dict(cause.parent_node) else ()
+    )
     for group in [k for k, node in groups if OmegaConf.is_dict(node) and key in node]:
         # Such as a column's quantity, which is no setting of the dataset.
         return f"{full}: no such setting; did you mean '{prefix}{dot}{group}.{key}'?"

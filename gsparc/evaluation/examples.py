@@ -1,4 +1,6 @@
-"""A few test rows as every method predicts them: kept beside a run's figures, drawn side by side."""
+"""A few test rows as every method predicts them: kept beside a run's figures,
+drawn side by side.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,8 @@ from gsparc.prediction.left_out import predict_rows
 from gsparc.processes.few_rows import evenly_spaced
 
 FILE = "predictions.npz"
-MOST = 4  # rows kept: spread over the tested ones, as rows beside each other were measured beside each other
+# Rows kept: spread over the tested ones, as rows beside each other were measured beside each other
+MOST = 4
 
 
 @dataclass(frozen=True)
@@ -39,7 +42,9 @@ class Examples:
     predicted: dict[str, np.ndarray]
 
     @classmethod
-    def of_methods(cls, methods: Mapping[str, Method], data: Measurements, rows: np.ndarray) -> Examples:
+    def of_methods(
+        cls, methods: Mapping[str, Method], data: Measurements, rows: np.ndarray
+    ) -> Examples:
         """Ask fitted methods, the run's own last, about a few of `rows` (n,)."""
         assert data.site.grid is not None
         few = rows[evenly_spaced(len(rows), MOST)]
@@ -51,7 +56,9 @@ class Examples:
 
     def write(self, path: Path) -> None:
         """Write them, atomically; values to three digits, which is what is seen of them."""
-        images = {f"of {name}": values for name, values in self.predicted.items()} | {"truth": self.truth}
+        images = {f"of {name}": values for name, values in self.predicted.items()} | {
+            "truth": self.truth
+        }
         arrays = {name: values.astype(np.float16) for name, values in images.items()}
         arrays |= {"rows": self.rows, "edges": self.edges, "confidence": self.confidence}
         write_archive(path, arrays)
@@ -63,15 +70,20 @@ class Examples:
             return None
         with np.load(path) as stored:
             arrays = {name: stored[name].astype(float) for name in stored.files}
-        predictions = {name[3:]: arrays.pop(name) for name in list(arrays) if name.startswith("of ")}
+        predictions = {
+            name[3:]: arrays.pop(name) for name in list(arrays) if name.startswith("of ")
+        }
         return cls(arrays.pop("rows").astype(int), predicted=predictions, **arrays)
 
 
 def join_examples(rows: pd.DataFrame) -> Examples | None:
-    """Return what all runs of a frame kept of the rows that the first kept, baselines first; None without."""
+    """Return what all runs of a frame kept of the rows that the first kept, baselines first;
+    None without.
+    """
     firsts = rows[~rows.baseline].drop_duplicates("setting")
     examples = [
-        (name, Examples.read(run.folder / FILE)) for name, run in zip(firsts.setting, firsts.run, strict=True)
+        (name, Examples.read(run.folder / FILE))
+        for name, run in zip(firsts.setting, firsts.run, strict=True)
     ]
     there = [(name, one) for name, one in examples if one is not None]
     same = [(name, one) for name, one in there if np.array_equal(one.rows, there[0][1].rows)]

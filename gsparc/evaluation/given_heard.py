@@ -13,7 +13,8 @@ from gsparc.tables.links.strongest import StrongestLists, levels_db
 
 
 def names_every_station(data: Measurements, rows: np.ndarray) -> bool:
-    """Tell whether every station of the file was heard at each place of rows (n,): then nothing was chosen.
+    """Tell whether every station of the file was heard at each place of rows (n,):
+    then nothing was chosen.
 
     Levels of others are what was strong enough to be heard or listed.
     """
@@ -25,11 +26,14 @@ def names_every_station(data: Measurements, rows: np.ndarray) -> bool:
     return len(links) == len(np.unique(place[rows])) * len(np.unique(data.stations_of()))
 
 
-def never_listed(method: Method, hearing: Hearing, data: Measurements, asked: Measurements) -> pd.DataFrame:
-    """Return how probably lists hold stations that none of them does: columns `station`, `moment`, `share`.
+def never_listed(
+    method: Method, hearing: Hearing, data: Measurements, asked: Measurements
+) -> pd.DataFrame:
+    """Return how probably lists hold stations that none of them does: columns `station`, `moment`,
+    `share`.
 
-    Of every moment that was asked about, not of a choice of unlisted rows; levels are as the method predicts
-    them. Empty of methods that do not know what lists leave out.
+    Of every moment that was asked about, not of a choice of unlisted rows; levels are as the method
+    predicts them. Empty of methods that do not know what lists leave out.
 
     Args:
         method: fitted.
@@ -55,10 +59,12 @@ def never_listed(method: Method, hearing: Hearing, data: Measurements, asked: Me
 
 
 def strongest_told(method: Method, lists: StrongestLists, asked: Measurements) -> np.ndarray:
-    """Return at rows (n,) of moments whether the measured strongest station is the predicted one of all.
+    """Return at rows (n,) of moments whether the measured strongest station is the predicted one of
+    all.
 
-    Every station that was listed nearby is asked about, listed here or not: what a list of the strongest
-    leaves out is weaker. Of k stations tied as predicted strongest a right one counts 1 / k.
+    Every station that was listed nearby is asked about, listed here or not: what a list of the
+    strongest leaves out is weaker. Of k stations tied
+    as predicted strongest a right one counts 1 / k.
     """
     assert asked.place is not None
     _, first, which = np.unique(asked.place, return_index=True, return_inverse=True)
@@ -79,10 +85,12 @@ def strongest_told(method: Method, lists: StrongestLists, asked: Measurements) -
 
 
 def levels_of_nearest_moment(learned: Measurements, asked: Measurements) -> np.ndarray:
-    """Return levels (n,), linear, of stations of rows asked at the nearest place learned from; 0 if unheard.
+    """Return levels (n,), linear, of stations of rows asked at the nearest place learned from;
+    0 if unheard.
 
-    The strongest of the nearest moment, as anyone would tell a best server; levels of each station's own
-    nearest moments tell it worse (simulated lists of three .30 to .36 for .48 to .76 of the places).
+    The strongest of the nearest moment, as anyone would tell a best server; levels of each
+    station's own nearest moments tell it worse (simulated lists of three .30 to .36 for .48
+    to .76 of the places).
     """
     station, heard = asked.stations_of(), np.flatnonzero(learned.censored_side() <= 0)
     places, which = np.unique(learned.moving[heard], axis=0, return_inverse=True)

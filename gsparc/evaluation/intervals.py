@@ -1,4 +1,6 @@
-"""How honest predicted variances are: errors over deviations, intervals that hold the truth, outages."""
+"""How honest predicted variances are: errors over deviations, intervals that hold the truth,
+outages.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +19,16 @@ SHARE = 0.9  # of the truth that an interval is to hold
 
 
 def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | None]:
-    """Return figures of predicted normal distributions of decibels; empty where the method has no variance.
+    """Return figures of predicted normal distributions of decibels;
+    empty where the method has no variance.
 
     `reduced_chi2` is that of `reduced_chi_squared`, of heard rows in decibels;
     `interval/coverage_90` is the share of heard rows whose power lies in the central 90 % interval,
-    `interval/width_db` its mean width; beside silent rows that of levels given that they are heard, which
-    exceed the others by `heard_above_db`; `levels_rmse_db` is the error of the others there. Where powers
-    may be too weak to be heard or listed, `outage/rate` is the share of rows that were, `outage/brier` the
-    mean square of (predicted probability - what happened), 0 when perfect, and `outage/brier_rate` what
-    always saying the rate gives.
+    `interval/width_db` its mean width; beside silent rows that of levels given that they are heard,
+    which exceed the others by `heard_above_db`; `levels_rmse_db` is the error of the others there.
+    Where powers may be too weak to be heard or listed, `outage/rate` is the share of rows that
+    were, `outage/brier` the mean square of (predicted probability - what happened), 0 when perfect,
+    and `outage/brier_rate` what always saying the rate gives.
     """
     mean, variance = scores.samples["prediction"], scores.variance * data.site.target_scale**2
     # Decibels of a power need a mean above 0.
@@ -39,7 +42,9 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     heard = (data.censored_side(row) == 0) & (power > 0)
     figures: dict[str, float | None] = {}
     if heard.any():
-        moments = [scores.samples[n][valid] for n in ("heard_db", "heard_std_db") if n in scores.samples]
+        moments = [
+            scores.samples[n][valid] for n in ("heard_db", "heard_std_db") if n in scores.samples
+        ]
         middle, spread = (part[heard] for part in moments or (mean_db, spread_db))
         error = to_decibels(power[heard]) - middle
         coverage, width = coverage_and_width(error, half_width(SHARE) * spread)
@@ -63,9 +68,11 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
 
 
 def reduced_chi_squared(scores: Scores, data: Measurements) -> dict[str, float | None]:
-    """Return the mean squared error over its predicted variance; empty where the method has no variance.
+    """Return the mean squared error over its predicted variance;
+    empty where the method has no variance.
 
-    1 where `Predictor.std` is right on average, above where it is too small, below where it is too large.
+    1 where `Predictor.std` is right on average, above where it is too small,
+    below where it is too large.
     """
     variance = scores.variance * data.site.target_scale**2
     valid = np.isfinite(scores.samples["mse"]) & (variance > 0)
@@ -75,8 +82,8 @@ def reduced_chi_squared(scores: Scores, data: Measurements) -> dict[str, float |
 
 
 def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | None]:
-    """Return RMSE [dB] of all rows, silent ones by what predictions exceed their level, and their number,
-    if any.
+    """Return RMSE [dB] of all rows, silent ones by what predictions exceed their level, and their
+    number, if any.
 
     That of heard rows alone says nothing of levels that are not heard.
     """
@@ -96,7 +103,11 @@ def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, 
     if not data.site.target.is_level:
         figures |= reduced_chi_squared(scores, data)
     else:
-        figures |= rmse_with_silent(scores, data) | power_intervals(scores, data) | best_server(scores, data)
+        figures |= (
+            rmse_with_silent(scores, data)
+            | power_intervals(scores, data)
+            | best_server(scores, data)
+        )
         if split.name == "stations":
             figures["rmse_db_after_constant"] = rmse_after_constants(scores, data.stations_of())
     return figures

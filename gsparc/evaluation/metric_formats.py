@@ -26,7 +26,8 @@ class Figure:
     Attributes:
         heading: of its column and axis.
         form: format of its numbers.
-        better: which values are better; a `ratio` of powers is compared in decibels, smaller is better.
+        better: which values are better; a `ratio` of powers is compared in decibels, smaller is
+            better.
         of_sample: the column of `per_sample.csv` that it is made of; empty: its own name.
         root: whether it is the root of the mean square of that column, not its mean.
     """
@@ -38,8 +39,8 @@ class Figure:
     root: bool = False
 
 
-# SSIM in two windows: Gaussian 11, Wang et al. 2004, and uniform 7, scikit-image's default; the first also of
-# images continued by zeros, as in the paper's tables.
+# SSIM in two windows: Gaussian 11, Wang et al. 2004, and uniform 7, scikit-image's default; the
+# first also of images continued by zeros, as in the paper's tables.
 FIGURES = {
     "psnr_db": Figure("PSNR dB", ".2f"),
     "ssim_gauss": Figure("SSIM (Gauss 11)"),
@@ -54,7 +55,9 @@ FIGURES = {
     "snr_db": Figure("SNR dB", ".2f"),
     "power_mae_db": Figure("MAE of power dB", ".2f", "smaller"),
     "rmse_db": Figure("RMSE dB", ".2f", "smaller", "error_db", root=True),
-    "rmse_db_with_silent": Figure("RMSE dB, silent too", ".2f", "smaller", "error_db_with_silent", root=True),
+    "rmse_db_with_silent": Figure(
+        "RMSE dB, silent too", ".2f", "smaller", "error_db_with_silent", root=True
+    ),
     "mae_db": Figure("MAE dB", ".2f", "smaller"),
     "error_db": Figure("error dB", ".2f", "smaller"),
     "best_server": Figure("strongest told", ".1%"),
@@ -73,7 +76,8 @@ WITH_SILENT = "rmse_db_with_silent"
 GIVEN_HEARD = "rmse_db judges levels of rows that are heard or listed, heard_db of gsparc predict"
 LISTED = "ahead_listed"
 BEST_SERVER = "best_server"  # beside errors of several stations, never compared by
-CALIBRATION = "reduced_chi2"  # 1 where predicted variances are right: shown beside errors, never compared
+# 1 where predicted variances are right: shown beside errors, never compared
+CALIBRATION = "reduced_chi2"
 OF_LISTS = WITH_SILENT, "rmse_db", BEST_SERVER, CALIBRATION  # that cells which are off change
 WITHOUT_OFF = "_without_off"  # behind these figures: of all other cells
 
@@ -103,25 +107,45 @@ class KindFigures:
 
 OF_KIND: dict[Scored, KindFigures] = {
     "spectrum": KindFigures(
-        SpectrumMetrics, ("psnr_db", "ssim_gauss", "ssim", "mse"), "ssim", "psnr_db",
-        ("ssim_gauss", "psnr_db", "mse"), ("psnr_db_median", "ssim_gauss_median", "mse_median"),
+        SpectrumMetrics,
+        ("psnr_db", "ssim_gauss", "ssim", "mse"),
+        "ssim",
+        "psnr_db",
+        ("ssim_gauss", "psnr_db", "mse"),
+        ("psnr_db_median", "ssim_gauss_median", "mse_median"),
         compared=("psnr_db_median", "ssim_gauss_median"),
     ),
     "csi": KindFigures(
-        ChannelMetrics, ("nmse", "nmse_scalar", "snr_db"), "snr_db", "snr_db", ("snr_db", "nmse"),
-        ("snr_db_p50",), compared=("snr_db_p50",),
+        ChannelMetrics,
+        ("nmse", "nmse_scalar", "snr_db"),
+        "snr_db",
+        "snr_db",
+        ("snr_db", "nmse"),
+        ("snr_db_p50",),
+        compared=("snr_db_p50",),
     ),
     "aligned csi": KindFigures(
-        AlignedChannelMetrics, ("nmse_aligned", "tone_rmse_db", "snr_db"), "tone_rmse_db", "snr_db",
-        ("snr_db", "nmse"), ("snr_db_p50",), compared=("snr_db_p50",),
+        AlignedChannelMetrics,
+        ("nmse_aligned", "tone_rmse_db", "snr_db"),
+        "tone_rmse_db",
+        "snr_db",
+        ("snr_db", "nmse"),
+        ("snr_db_p50",),
+        compared=("snr_db_p50",),
     ),
     "rssi": KindFigures(
-        PowerMetrics, ("rmse_db", "mae_db"), "mae_db", "error_db", ("error_db",), ("mae_db_median",),
+        PowerMetrics,
+        ("rmse_db", "mae_db"),
+        "mae_db",
+        "error_db",
+        ("error_db",),
+        ("mae_db_median",),
         compared=("mae_db_median",),
     ),
-}  # fmt: skip
+}
 DECIDING: dict[Scored, str] = {kind: figures.columns[0] for kind, figures in OF_KIND.items()}
-PARTS = {figure.of_sample for figure in FIGURES.values()}  # columns that are no figures by themselves
+# Columns that are no figures by themselves
+PARTS = {figure.of_sample for figure in FIGURES.values()}
 
 
 def scored_kind(facts: Mapping[str, Any]) -> Scored:
@@ -137,15 +161,19 @@ def scored_kind(facts: Mapping[str, Any]) -> Scored:
 
 
 def paired_values(samples: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return per-sample values whose means are the flat figures, so that their differences can be paired.
+    """Return per-sample values whose means are the flat figures,
+    so that their differences can be paired.
 
     `nmse` is each sample's share, |e|^2 / mean |h|^2: its mean is the global NMSE.
 
     >>> error, power = np.array([1.0, 3.0]), np.array([10.0, 30.0])
-    >>> float(paired_values({"error_power": error, "target_power": power, "mse": error})["nmse"].mean())
+    >>> samples = {"error_power": error, "target_power": power, "mse": error}
+    >>> float(paired_values(samples)["nmse"].mean())
     0.1
     """
-    values = {name: column for name, column in samples.items() if name in FIGURES and name not in PARTS}
+    values = {
+        name: column for name, column in samples.items() if name in FIGURES and name not in PARTS
+    }
     if "error_db" in samples:
         values["mae_db"] = np.abs(samples["error_db"])
     error, power = samples.get("error_power", samples["mse"]), samples["target_power"]
@@ -187,7 +215,8 @@ def axis_of(name: str) -> str:
 
 
 def score_heading(name: str) -> str:
-    """Return the heading of a figure that methods are placed by, ratios in decibels, with what is better.
+    """Return the heading of a figure that methods are placed by, ratios in decibels,
+    with what is better.
 
     >>> score_heading("nmse"), score_heading("psnr_db")
     ('NMSE dB (less is better)', 'PSNR dB')
@@ -222,7 +251,9 @@ def lower_is_better(name: str) -> bool:
 
 
 def score_of(name: str, value: float) -> float:
-    """Return a number that is larger when the figure is better: ratios in decibels, else as it is."""
+    """Return a number that is larger when the figure is better: ratios in decibels,
+    else as it is.
+    """
     better = _look_up(name).better
     if better == "ratio":
         # 1e-12 stands for a ratio of 0: 120 dB, beyond what float32 targets can tell.

@@ -1,7 +1,8 @@
 """Figures of merit of all methods, accumulated per sample so that differences can be paired.
 
-Undefined values (the signal-to-noise ratio of a silent channel, the SSIM of an image smaller than its window)
-are NaN in the per-sample arrays, never enter a mean, are counted, and come out of `summary` as None.
+Undefined values (the signal-to-noise ratio of a silent channel, the SSIM of an image smaller than
+its window) are NaN in the per-sample arrays, never enter a mean, are counted,
+and come out of `summary` as None.
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from gsparc.physics.decibels import to_decibels
 log = logging.getLogger(__name__)
 
 DB_CAP = 100.0  # a perfect prediction has no finite ratio; 100 dB is beyond any float32 target
-SMALLEST_UNIT = 1e-140  # beyond it or its inverse squares under- or overflow: figures stay in stored units
+# Beyond it or its inverse squares under- or overflow: figures stay in stored units
+SMALLEST_UNIT = 1e-140
 SILENCE = 1e-6  # of the true power: a silent prediction is 60 dB off, not infinitely
 SSIM_WINDOW = 7  # scikit-image's default, the peers' protocol
 SSIM_GAUSS_WINDOW = 11  # truncate 3.5 at sigma 1.5
@@ -45,7 +47,8 @@ class SampleMetric:
         self.parts: list[dict[str, Any]] = []
 
     def update(self, prediction: Tensor, target: Tensor, mask: Tensor | None = None) -> None:
-        """Add B samples; shapes and types of the kind's targets, mask like them (True where measured).
+        """Add B samples; shapes and types of the kind's targets,
+        mask like them (True where measured).
 
         Raises:
             ValueError: shapes differ, or a prediction is not finite.
@@ -95,7 +98,9 @@ class SpectrumMetrics(SampleMetric):
         mse = ((p - t) ** 2).sum((1, 2)) / count
         return {
             "ssim": [_ssim(a, b, w, SSIM_WINDOW) for a, b, w in zip(p, t, m, strict=True)],
-            "ssim_gauss": [_ssim(a, b, w, SSIM_GAUSS_WINDOW) for a, b, w in zip(p, t, m, strict=True)],
+            "ssim_gauss": [
+                _ssim(a, b, w, SSIM_GAUSS_WINDOW) for a, b, w in zip(p, t, m, strict=True)
+            ],
             "ssim_padded": [_ssim_padded(a, b, w) for a, b, w in zip(p, t, m, strict=True)],
             "psnr_db": _db(np.ones_like(mse), mse),
             "mse": mse,
@@ -116,9 +121,11 @@ class SpectrumMetrics(SampleMetric):
 
 
 class ChannelMetrics(SampleMetric):
-    """CSI (B, antennas, subcarriers) complex, denormalised: NMSE, SNR, NMSE after one complex scalar each.
+    """CSI (B, antennas, subcarriers) complex, denormalised: NMSE, SNR,
+    NMSE after one complex scalar each.
 
-    `power_mae_db` is the mean absolute error of a sample's power in dB, the figure of coverage maps.
+    `power_mae_db` is the mean absolute error of a sample's power in dB,
+    the figure of coverage maps.
 
     >>> metric, channel = ChannelMetrics(), torch.tensor([[[1 + 0j, 1j]]])
     >>> metric.update(0.9 * channel, channel)
@@ -147,7 +154,9 @@ class ChannelMetrics(SampleMetric):
             "snr_db": _db(power, error),
             "mse": error / count * unit,
             "mae": np.abs(p - t).sum(1) / count * scale,
-            "power_db": np.where(power > 0, _db(np.maximum(p_power, power * SILENCE), power), np.nan),
+            "power_db": np.where(
+                power > 0, _db(np.maximum(p_power, power * SILENCE), power), np.nan
+            ),
         }
 
     @staticmethod
@@ -155,12 +164,17 @@ class ChannelMetrics(SampleMetric):
         """See the base class."""
         silent = int((samples["target_power"] == 0).sum())
         if silent:
-            log.warning("%d of %d channels are all zero: left out of snr_db", silent, len(samples["mse"]))
+            log.warning(
+                "%d of %d channels are all zero: left out of snr_db", silent, len(samples["mse"])
+            )
         return {
             "nmse": _ratio(samples["error_power"], samples["target_power"]),
             "nmse_scalar": _ratio(samples["scalar_error_power"], samples["target_power"]),
             "snr_db": _statistic(samples["snr_db"]),
-            **{f"snr_db_p{p}": _statistic(samples["snr_db"], np.nanquantile, p / 100) for p in (10, 50, 90)},
+            **{
+                f"snr_db_p{p}": _statistic(samples["snr_db"], np.nanquantile, p / 100)
+                for p in (10, 50, 90)
+            },
             "mse": _statistic(samples["mse"]),
             "mae": _statistic(samples["mae"]),
             "power_mae_db": _statistic(np.abs(samples["power_db"])),
@@ -170,7 +184,8 @@ class ChannelMetrics(SampleMetric):
 
 
 class AlignedChannelMetrics(ChannelMetrics):
-    """Channels whose rows have factors of their own, predictions turned to each row by what is free of it.
+    """Channels whose rows have factors of their own,
+    predictions turned to each row by what is free of it.
 
     `tone_rmse_db` is the error of levels at single subcarriers and antennas.
     """
@@ -196,8 +211,8 @@ class AlignedChannelMetrics(ChannelMetrics):
 class PowerMetrics(SampleMetric):
     """RSSI (B, 1), linear power, denormalised: errors in dB and the linear NMSE.
 
-    A prediction at or below zero is taken as the weakest power measured in the scored set, and counted; a
-    target at or below zero has no decibels and is left out of the dB figures.
+    A prediction at or below zero is taken as the weakest power measured in the scored set, and
+    counted; a target at or below zero has no decibels and is left out of the dB figures.
 
     >>> metric = PowerMetrics()
     >>> metric.update(torch.tensor([[1e-7], [1e-8]]), torch.tensor([[1e-7], [1e-9]]))
@@ -207,7 +222,10 @@ class PowerMetrics(SampleMetric):
 
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
         p, t = (x.double().flatten() * self.scale for x in (prediction, target))
-        return {"prediction": p, "target": t if mask is None else t.masked_fill(~mask.flatten(), torch.nan)}
+        return {
+            "prediction": p,
+            "target": t if mask is None else t.masked_fill(~mask.flatten(), torch.nan),
+        }
 
     def compute(self) -> dict[str, np.ndarray]:
         """Add `power_errors`."""
@@ -217,11 +235,16 @@ class PowerMetrics(SampleMetric):
     @staticmethod
     def summary(samples: dict[str, np.ndarray]) -> dict[str, float | None]:
         """See the base class."""
-        floored, silent = int((samples["prediction"] <= 0).sum()), int((samples["target"] <= 0).sum())
+        floored, silent = (
+            int((samples["prediction"] <= 0).sum()),
+            int((samples["target"] <= 0).sum()),
+        )
         if not samples["prediction"].any():
             floored = 0  # zeros alone are meant, as the baseline's are
         if floored or silent:
-            log.warning("%d predictions and %d targets without power (no decibels there)", floored, silent)
+            log.warning(
+                "%d predictions and %d targets without power (no decibels there)", floored, silent
+            )
         squared = _statistic(samples["error_db"] ** 2)
         return {
             "rmse_db": None if squared is None else float(np.sqrt(squared)),
@@ -235,17 +258,23 @@ class PowerMetrics(SampleMetric):
 
 
 def power_errors(p: np.ndarray, t: np.ndarray) -> dict[str, np.ndarray]:
-    """Return errors (S,) of linear predictions and targets (S,), in decibels and of the linear values."""
+    """Return errors (S,) of linear predictions and targets (S,),
+    in decibels and of the linear values.
+    """
     positive = t > 0
     # A power of 0 or less has no decibels: it counts as the weakest that was measured.
     floor = t[positive].min() if positive.any() else np.finfo(np.float64).tiny
-    error_db = np.where(positive, _db(np.where(p > 0, p, floor), np.where(positive, t, 1.0)), np.nan)
+    error_db = np.where(
+        positive, _db(np.where(p > 0, p, floor), np.where(positive, t, 1.0)), np.nan
+    )
     error = np.where(np.isnan(t), np.nan, (p - t) ** 2)
     return {"error_db": error_db, "error_power": error, "target_power": t**2, "mse": error}
 
 
 def _ssim(prediction: np.ndarray, target: np.ndarray, measured: np.ndarray, window: int) -> float:
-    """Mean structural similarity of two float64 images over measured pixels; NaN below the window's size."""
+    """Mean structural similarity of two float64 images over measured pixels;
+    NaN below the window's size.
+    """
     if min(target.shape) < window:
         return float("nan")
     if window == SSIM_WINDOW:
@@ -260,7 +289,9 @@ def _ssim(prediction: np.ndarray, target: np.ndarray, measured: np.ndarray, wind
 
 
 def _ssim_padded(prediction: np.ndarray, target: np.ndarray, measured: np.ndarray) -> float:
-    """Mean structural similarity over all measured pixels of images continued by zeros (the authors)."""
+    """Mean structural similarity over all measured pixels of images continued
+    by zeros (the authors).
+    """
     if min(target.shape) < SSIM_GAUSS_WINDOW:
         return float("nan")
     blur = partial(gaussian_filter, sigma=1.5, mode="constant", radius=SSIM_GAUSS_WINDOW // 2)
@@ -273,11 +304,15 @@ def _ssim_padded(prediction: np.ndarray, target: np.ndarray, measured: np.ndarra
 
 
 def _db(signal: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """10 log10(signal / noise) within +-DB_CAP; NaN where there is no signal or nothing is known."""
+    """10 log10(signal / noise) within +-DB_CAP;
+    NaN where there is no signal or nothing is known.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         # A difference of logarithms: the ratio of 1e-200 and 1e200 is no float64.
         ratio = to_decibels(signal) - to_decibels(noise)
-    return np.where(signal > 0, np.clip(np.where(noise == 0, np.inf, ratio), -DB_CAP, DB_CAP), np.nan)
+    return np.where(
+        signal > 0, np.clip(np.where(noise == 0, np.inf, ratio), -DB_CAP, DB_CAP), np.nan
+    )
 
 
 def _nonzero(entries: np.ndarray) -> np.ndarray:
@@ -285,8 +320,12 @@ def _nonzero(entries: np.ndarray) -> np.ndarray:
     return np.where(entries > 0, entries, np.nan)
 
 
-def _statistic(values: np.ndarray, of: Callable[..., Any] = np.nanmean, *share: float) -> float | None:
-    """The mean of the values that are not NaN, or another statistic `of` them; None where there are none."""
+def _statistic(
+    values: np.ndarray, of: Callable[..., Any] = np.nanmean, *share: float
+) -> float | None:
+    """The mean of the values that are not NaN, or another statistic `of` them;
+    None where there are none.
+    """
     return None if np.isnan(values).all() else float(of(values, *share))
 
 

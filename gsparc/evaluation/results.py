@@ -21,24 +21,44 @@ from gsparc.prediction.timing import FACTS, p50_p95
 
 # Columns by the facts of a summary that they hold: of the run, of its own method, of any method.
 OF_RUN = {
-    "dataset": "dataset/name", "split": "split/name", "seed": "seed", "kind": "dataset/kind",
-    "load": "machine/load", "data": "dataset/sha256", "git": "git", "simulate_s": "dataset/simulate_s",
-    "rows": "split/sha256", "run_id": "run_id", "cpu": "machine/cpu",
-}  # fmt: skip
+    "dataset": "dataset/name",
+    "split": "split/name",
+    "seed": "seed",
+    "kind": "dataset/kind",
+    "load": "machine/load",
+    "data": "dataset/sha256",
+    "git": "git",
+    "simulate_s": "dataset/simulate_s",
+    "rows": "split/sha256",
+    "run_id": "run_id",
+    "cpu": "machine/cpu",
+}
 OF_MODEL = {
-    "label": "model/label", "gaussians": "model/num_gaussians", "memory_mb": "memory/peak_mb",
-}  # fmt: skip
+    "label": "model/label",
+    "gaussians": "model/num_gaussians",
+    "memory_mb": "memory/peak_mb",
+}
 COSTS = {
-    "train_s": "train_s", "train_cpu_s": "train_cpu_s", "batch_ms": "render_ms_batch64",
+    "train_s": "train_s",
+    "train_cpu_s": "train_cpu_s",
+    "batch_ms": "render_ms_batch64",
     **{name: FACTS[name] for name in ("query_ms", "query_p95_ms")},
-}  # fmt: skip
+}
 PROBLEM = ["dataset", "split"]  # figures of one are comparable
-RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")  # what decides a training
+# What decides a training
+RESOLVED = ("model.", "init.", "trainer.", "callbacks.", "dataset.batch_size")
 # Where data lie and how much is logged changes no result.
 HIDDEN = (
-    "seed", "split.seed", "dataset.root", "dataset.file", "baselines", "threads", "hydra", "experiment",
+    "seed",
+    "split.seed",
+    "dataset.root",
+    "dataset.file",
+    "baselines",
+    "threads",
+    "hydra",
+    "experiment",
     "logger",
-)  # fmt: skip
+)
 
 
 @dataclass(frozen=True)
@@ -75,10 +95,14 @@ class Run:
 
     @property
     def resolved(self) -> dict[str, Any]:
-        """Settings of the model, its training and data by name, with what was chosen for those at `auto`."""
+        """Settings of the model, its training and data by name,
+        with what was chosen for those at `auto`.
+        """
         settings = {name: v for name, v in self.config.items() if name.startswith(RESOLVED)}
         # Choices of `auto` are words like `name=value` in one line of the summary.
-        chosen = [one.partition("=") for one in str(self.facts.get("model/choices") or "").split(", ")]
+        chosen = [
+            one.partition("=") for one in str(self.facts.get("model/choices") or "").split(", ")
+        ]
         return settings | {name: value for name, _, value in chosen if value}
 
     def swept(self, name: str) -> bool:
@@ -90,7 +114,11 @@ class Run:
 
         `shared` are overrides that tell it from no other run.
         """
-        named = [o for o in self.overrides if o not in {*shared} and not o.lstrip("+~").startswith(HIDDEN)]
+        named = [
+            o
+            for o in self.overrides
+            if o not in {*shared} and not o.lstrip("+~").startswith(HIDDEN)
+        ]
         named = [o for o in named if not o.startswith(("model=", "dataset=", "split="))]
         run_row, *others = result_rows(self.facts)
         if len(self.render_ms):
@@ -102,16 +130,18 @@ class Run:
         beside = {row["method"]: row for row in others if row["value"] is not None}
         rows += [
             beside[name] | {"setting": " ".join([f"{name} (baseline)", *of])}
-            for name in plain_methods() if name in beside
-        ]  # fmt: skip
+            for name in plain_methods()
+            if name in beside
+        ]
         return [row | {"run": self} for row in rows]
 
 
 def frame(*folders: str | Path) -> pd.DataFrame:
-    """Return every fit in and below folders, a row each: runs in the order given, then baselines of each.
+    """Return every fit in and below folders, a row each: runs in the order given,
+    then baselines of each.
 
-    Columns are those of `result_rows`, `setting` (what distinguishes it from others but seeds and draws: the
-    method and its overrides) and `run`, its `Run`. What a summary does not tell is None.
+    Columns are those of `result_rows`, `setting` (what distinguishes it from others but seeds and
+    draws: the method and its overrides) and `run`, its `Run`. What a summary does not tell is None.
 
     Raises:
         ValueError: a folder that does not exist or holds no run, or files of two runs; it is named.
@@ -168,11 +198,14 @@ def distinct_baselines(rows: pd.DataFrame) -> pd.DataFrame:
 def average(rows: pd.DataFrame, by: list[str], names: list[str]) -> pd.DataFrame:
     """Return averages of the figures `names` of a frame, a row per group by columns `by`.
 
-    Columns are, of each name, its `mean` over draws of the split, seeds of each draw averaged first, and
-    the `error` of that, the standard error, NaN of one draw; `std`, `least` and `largest` are of all values,
-    what seeds change where there is one draw. NaN of figures that the frame does not have.
+    Columns are, of each name, its `mean` over draws of the split, seeds of each draw averaged
+    first, and the `error` of that, the standard error, NaN of one draw; `std`, `least` and
+    `largest` are of all values, what seeds change where there is one draw.
+    NaN of figures that the frame does not have.
     """
-    table = rows.reindex(columns=[*dict.fromkeys([*rows, *names])]).astype(dict.fromkeys(names, float))
+    table = rows.reindex(columns=[*dict.fromkeys([*rows, *names])]).astype(
+        dict.fromkeys(names, float)
+    )
     draws = table.groupby([*by, "draw"], dropna=False, sort=False)[names].mean().reset_index()
     of_draws, every = (one.groupby(by, dropna=False, sort=False)[names] for one in (draws, table))
     spread = {"std": every.std(), "least": every.min(), "largest": every.max()}
@@ -195,7 +228,9 @@ def read_run(folder: Path) -> Run:
     ids = {run.facts.get("run_id"), *run.samples.pop("run_id", np.zeros(0))[:1].tolist()}
     ids |= {_facts(split).get("run_id") for split in folder.glob("split.json")}
     if len(ids) > 1:
-        raise ValueError(f"{folder}: its summary, samples and split are of two runs; train again elsewhere")
+        raise ValueError(
+            f"{folder}: its summary, samples and split are of two runs; train again elsewhere"
+        )
     return run
 
 
@@ -227,7 +262,9 @@ def _written(path: Path) -> Any:
 
 
 def read_columns(path: Path) -> dict[str, np.ndarray]:
-    """Return a CSV file by column: numbers float64 (NaN where empty), else text; {} without file or rows."""
+    """Return a CSV file by column: numbers float64 (NaN where empty), else text;
+    {} without file or rows.
+    """
     if not path.is_file():
         return {}
     # A sample or method may be called NA: only empty cells are missing.
@@ -244,35 +281,50 @@ def facts_under(facts: Mapping[str, Any], room: str) -> dict[str, Any]:
 
 
 def result_rows(facts: Mapping[str, Any], prefix: str = "test") -> list[dict[str, Any]]:
-    """Return the row of a run's method and those of the baselines beside it, from the facts of its summary.
+    """Return the row of a run's method and those of the baselines beside it,
+    from the facts of its summary.
 
-    Figures are of rows `prefix`: `test`, `train` or `val`. Columns are those of `OF_RUN`, `OF_MODEL` and
-    `COSTS`; `draw` of its test rows, `fold` (None: all are pooled), `method`, `baseline` (whether it is one),
-    `measured` (rows that a model learned from), `effects`, `figure` (the deciding one), its `value`, that of
-    Gaussians `alone`, and every figure under its own name; None where a summary has no such fact.
+    Figures are of rows `prefix`: `test`, `train` or `val`. Columns are those of `OF_RUN`,
+    `OF_MODEL` and `COSTS`; `draw` of its test rows, `fold` (None: all are pooled), `method`,
+    `baseline` (whether it is one), `measured` (rows that a model learned from), `effects`, `figure`
+    (the deciding one), its `value`, that of Gaussians `alone`, and every figure under its own name;
+    None where a summary has no such fact.
     """
     # Counts of a summary are sums over folds; `measured` is per model.
     counts = [int(facts.get(f"split/{name}") or 0) for name in ("train", "val", "folds")]
     folds = max(counts[2], 1)
     shared: dict[str, Any] = {name: facts.get(key) for name, key in OF_RUN.items()}
-    # Test rows alone: a seed may move those of validation only. Older summaries have one hash of all.
+    # Test rows alone: a seed may move those of validation only.
+    # Older summaries have one hash of all.
     shared["draw"] = str(facts.get("split/test_sha256", facts.get("split/sha256")))[:8]
     shared["kind"] = scored_kind(facts)
-    shared |= {"fold": 0 if folds == 1 else None, "figure": main_figure(facts, prefix), "alone": None}
+    shared |= {
+        "fold": 0 if folds == 1 else None,
+        "figure": main_figure(facts, prefix),
+        "alone": None,
+    }
     shared |= {"measured": sum(counts[:2]) // folds, "effects": "none"}
     model_facts = {name: facts.get(key) for name, key in OF_MODEL.items()}
     model = model_facts | {"effects": facts.get("model/effects") or "none"}
     model["alone"] = facts.get(f"field/{shared['figure']}")
     name = str(facts.get("model/name", "?"))
-    rows = [shared | model | row_of_method(name, facts_under(facts, prefix), facts_under(facts, "time"))]
+    rows = [
+        shared | model | row_of_method(name, facts_under(facts, prefix), facts_under(facts, "time"))
+    ]
     # dict.fromkeys: a set of names would forget the order that the summary has them in.
     beside = dict.fromkeys(name.split("/")[1] for name in facts if name.startswith("baseline/"))
     every = ((name, facts_under(facts, f"baseline/{name}")) for name in beside)
-    rows += [dict.fromkeys(model_facts) | shared | row_of_method(name, its, its) for name, its in every]
-    return [{**row, "baseline": row is not rows[0], "value": row.get(row["figure"])} for row in rows]
+    rows += [
+        dict.fromkeys(model_facts) | shared | row_of_method(name, its, its) for name, its in every
+    ]
+    return [
+        {**row, "baseline": row is not rows[0], "value": row.get(row["figure"])} for row in rows
+    ]
 
 
-def row_of_method(name: str, figures: Mapping[str, Any], times: Mapping[str, Any]) -> dict[str, Any]:
+def row_of_method(
+    name: str, figures: Mapping[str, Any], times: Mapping[str, Any]
+) -> dict[str, Any]:
     """Return the columns of one method: its name, figures and `COSTS`."""
     costs = {column: times.get(key) for column, key in COSTS.items()}
     figures = {key: value for key, value in figures.items() if key not in COSTS.values()}

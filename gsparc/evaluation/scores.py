@@ -43,7 +43,8 @@ class Scores:
         fold, row: (S,) int64.
         samples: quantities of the metrics of `kind`, (S,) float64 each.
         confidence, variance: (S,) float64, NaN where the method gives none.
-        never_listed: see `gsparc.evaluation.given_heard.never_listed`; None of other data than lists.
+        never_listed: see `gsparc.evaluation.given_heard.never_listed`; None of other data than
+            lists.
     """
 
     kind: Scored
@@ -59,12 +60,17 @@ class Scores:
         return OF_KIND[self.kind].metric.summary(self.samples)
 
     def dominant_row(self) -> dict[str, Any]:
-        """Return the row that alone makes over half of all error or power, and a figure that no row decides.
+        """Return the row that alone makes over half of all error or power,
+        and a figure that no row decides.
 
-        `decided_by/row`, `decided_by/share` and `decided_by/nmse_median`, the median over rows of |e|^2 /
+        `decided_by/row`, `decided_by/share` and `decided_by/nmse_median`, the median over rows of
+        |e|^2 /
         |h|^2; empty where no row weighs so much, there are few, or errors are in decibels.
         """
-        error, power = self.samples.get("error_power", self.samples["mse"]), self.samples["target_power"]
+        error, power = (
+            self.samples.get("error_power", self.samples["mse"]),
+            self.samples["target_power"],
+        )
         valid = np.isfinite(error) & (power > 0)
         if "error_db" in self.samples or valid.sum() < FEW:
             return {}
@@ -90,7 +96,9 @@ def errors_with_silent(
     if not side.any():
         return {}
     beyond = side * power_errors(samples["prediction"], data.powers(row)[:, 0])["error_db"]
-    return {"error_db_with_silent": np.where(side == 0, samples["error_db"], np.maximum(beyond, 0.0))}
+    return {
+        "error_db_with_silent": np.where(side == 0, samples["error_db"], np.maximum(beyond, 0.0))
+    }
 
 
 def rows_to_score(fold: Fold, eval_on: str) -> np.ndarray:
@@ -108,16 +116,19 @@ def rows_to_score(fold: Fold, eval_on: str) -> np.ndarray:
 
 
 def unseen_runs(data: Measurements, fold: Fold, eval_on: str) -> np.ndarray:
-    """Return numbers (R,) of runs with channels among the rows `eval_on` and none among those learned
-    from.
+    """Return numbers (R,) of runs with channels among the rows `eval_on` and none among those
+    learned from.
     """
     if data.site.scored != "csi" or data.run is None:
         return np.zeros(0, np.int64)
     return np.setdiff1d(data.run[getattr(fold, eval_on)], data.run[fold.learned(eval_on)])
 
 
-def best_phase_of_runs(method: Method, data: Measurements, rows: np.ndarray, runs: np.ndarray) -> Tensor:
-    """Return what predictions of rows (n,) are turned by, (n,) complex64: the best phase of each of `runs`.
+def best_phase_of_runs(
+    method: Method, data: Measurements, rows: np.ndarray, runs: np.ndarray
+) -> Tensor:
+    """Return what predictions of rows (n,) are turned by, (n,) complex64:
+    the best phase of each of `runs`.
 
     A run has a phase of its own, which nothing tells of one that was not learned from.
     """
@@ -129,21 +140,30 @@ def best_phase_of_runs(method: Method, data: Measurements, rows: np.ndarray, run
             product = (prediction.mean.cpu().conj() * batch.target).to(torch.complex128)
             overlap += complex((product if batch.mask is None else product * batch.mask).sum())
         if overlap:
-            # arg of sum conj(p) t maximises Re sum conj(p e^ja) t over a: the best phase in closed form.
-            turn[torch.from_numpy(mine)] = torch.tensor(overlap / abs(overlap), dtype=torch.complex64)
+            # arg of sum conj(p) t maximises Re sum conj(p e^ja) t over a:
+            # the best phase in closed form.
+            turn[torch.from_numpy(mine)] = torch.tensor(
+                overlap / abs(overlap), dtype=torch.complex64
+            )
     return turn
 
 
 def score_methods(
-    methods: Sequence[Method], data: Measurements, split: Split, eval_on: str = "test",
-    learned: tuple[Measurements, Split] | None = None, means: list[Tensor] | None = None,
-    off: Sequence[int] = (), hearing: Sequence[Hearing] | None = None,
-) -> Scores:  # fmt: skip
+    methods: Sequence[Method],
+    data: Measurements,
+    split: Split,
+    eval_on: str = "test",
+    learned: tuple[Measurements, Split] | None = None,
+    means: list[Tensor] | None = None,
+    off: Sequence[int] = (),
+    hearing: Sequence[Hearing] | None = None,
+) -> Scores:
     """Predict the chosen rows of every fold with that fold's method.
 
-    Channels of runs that it did not learn from are scored after the best common phase of each. Where it
-    learned from silent rows, and the chosen ones do not name every station at each place, heard rows are
-    judged by `Hearing.given_heard`, which are among the samples: column `heard_db` of `gsparc predict`.
+    Channels of runs that it did not learn from are scored after the best common phase of each.
+    Where it learned from silent rows, and the chosen ones do not name every station at each place,
+    heard rows are judged by `Hearing.given_heard`, which are among the samples:
+    column `heard_db` of `gsparc predict`.
 
     Args:
         methods: one fitted method per fold.
@@ -159,7 +179,9 @@ def score_methods(
         ValueError: another number of methods than folds, an empty subset, a prediction with NaN.
     """
     if len(methods) != len(split.folds):
-        raise ValueError(f"{len(methods)} methods for the {len(split.folds)} folds of split={split.name}")
+        raise ValueError(
+            f"{len(methods)} methods for the {len(split.folds)} folds of split={split.name}"
+        )
     every, samples = [rows_to_score(fold, eval_on) for fold in split.folds], []
     every = [rows[~np.isin(data.stations_of(rows), off)] for rows in every] if len(off) else every
     missing: list[pd.DataFrame] = []
@@ -185,21 +207,29 @@ def score_methods(
                 if (output := getattr(prediction, name)) is not None:
                     values[chosen] = output.detach().cpu().double().numpy()
             order.append(chosen)
-        # Metrics are in the order of updates, station by station; rows are wanted in that of the fold.
+        # Metrics are in the order of updates, station by station;
+        # rows are wanted in that of the fold.
         back = np.argsort(np.concatenate(order))
         scored = {name: values[back] for name, values in metric.compute().items()} | outputs
         if method.name == "nearest" and data.site.target.is_level and data.station is not None:
             learned_rows = np.sort(taught.learned(eval_on))
-            scored["served"] = levels_of_nearest_moment(learned_data.subset(learned_rows), data.subset(rows))
+            scored["served"] = levels_of_nearest_moment(
+                learned_data.subset(learned_rows), data.subset(rows)
+            )
         if limited:
             variance = scored["variance"] * data.site.target_scale**2
-            with np.errstate(divide="ignore", invalid="ignore"):  # of no power, which has no decibels
+            # Of no power, which has no decibels
+            with np.errstate(divide="ignore", invalid="ignore"):
                 level = power_in_decibels(scored["prediction"], variance)
             queries, told = data.subset(rows), silence.without(np.asarray(off, np.int64))
             if told.lists is not None and are_lists:
                 scored["strongest_told"] = strongest_told(method, told.lists, queries)
-                missing.append(never_listed(method, told, data.subset(np.concatenate(every)), queries))
-            heard = told.given_heard(method, queries.moving, queries.stations_of(), *level, queries.device)
+                missing.append(
+                    never_listed(method, told, data.subset(np.concatenate(every)), queries)
+                )
+            heard = told.given_heard(
+                method, queries.moving, queries.stations_of(), *level, queries.device
+            )
             # Who learned from heard rows alone predicts such levels.
             scored |= heard if method.uses_censored else {"heard_share": heard["heard_share"]}
         samples.append(scored)

@@ -44,10 +44,20 @@ from gsparc.prediction.predictor import Predictor
 from gsparc.training.cost import LINE
 
 _Found = TypeVar("_Found")
-PACKAGES = ("gsparc", "torch", "lightning", "hydra-core", "numpy", "scipy", "scikit-learn", "scikit-image")
+PACKAGES = (
+    "gsparc",
+    "torch",
+    "lightning",
+    "hydra-core",
+    "numpy",
+    "scipy",
+    "scikit-learn",
+    "scikit-image",
+)
 # A load above 1 means waiting; 1.2 leaves room for what the machine does on its own.
 MOST_LEARNED = 4  # notes of a fit below the table; the log has all
-RIGHT_CHI2 = 0.25, 4.0  # std wrong by a factor of two; 73 runs of public and simulated data had .6 to 2.2
+# Std wrong by a factor of two; 73 runs of public and simulated data had .6 to 2.2
+RIGHT_CHI2 = 0.25, 4.0
 BUSY = 1.2  # 1-minute load per core above which times are reported as inflated
 
 
@@ -55,10 +65,13 @@ def write_summary(path: str | Path, facts: Mapping[str, Any]) -> None:
     """Write flat `facts` as JSON, atomically; keys sorted.
 
     Raises:
-        ValueError: a value is not a number, a string or None, or is NaN or infinite; the key is named.
+        ValueError: a value is not a number, a string or None, or is NaN or infinite; the key is
+            named.
     """
     # Sorted keys: summaries of two runs are compared line by line.
-    text = json.dumps({key: _value(key, facts[key]) for key in sorted(facts)}, indent=2, ensure_ascii=False)
+    text = json.dumps(
+        {key: _value(key, facts[key]) for key in sorted(facts)}, indent=2, ensure_ascii=False
+    )
     write_whole(path, text + "\n")
 
 
@@ -76,7 +89,9 @@ def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
 def write_as_found(
     found: Iterable[_Found], path: Path, columns: Callable[[list[_Found]], Any]
 ) -> list[_Found]:
-    """Return all that is found; its columns are written meanwhile, so that an interrupt loses nothing."""
+    """Return all that is found; its columns are written meanwhile,
+    so that an interrupt loses nothing.
+    """
     so_far, written = list[_Found](), time.monotonic()
     try:
         for one in found:
@@ -91,7 +106,9 @@ def write_as_found(
 
 
 def coordinates(places: np.ndarray, predictor: Predictor | None) -> dict[str, np.ndarray]:
-    """Return columns of places (n, 3) [m], in degrees, too, where the model knows its place on Earth."""
+    """Return columns of places (n, 3) [m], in degrees, too,
+    where the model knows its place on Earth.
+    """
     # Tenths of a millimetre here, about a millimetre in 1e-8 degrees.
     columns = dict(zip(("x", "y", "z"), places.T.round(4), strict=True))
     if predictor is not None and predictor.site.georeference is not None and len(places):
@@ -101,7 +118,9 @@ def coordinates(places: np.ndarray, predictor: Predictor | None) -> dict[str, np
 
 
 def new_run_id() -> str:
-    """Return what all files of a run carry, so that those of two are not read together; sorts by time."""
+    """Return what all files of a run carry, so that those of two are not read together;
+    sorts by time.
+    """
     # 8 digits of a random id: two jobs of a sweep may begin in one second.
     return f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:8]}"
 
@@ -121,8 +140,11 @@ def program_version(origin: Mapping[str, str | None]) -> str:
     return f"gsparc {version('gsparc')}" + (f" at commit {commit[:8]}" if commit else "")
 
 
-def results_table(facts: Mapping[str, Any], method: str, title: str = "", prefix: str = "test") -> Table:
-    """Return every method as a row, accuracy beside its seconds and milliseconds; the last row is `method`'s.
+def results_table(
+    facts: Mapping[str, Any], method: str, title: str = "", prefix: str = "test"
+) -> Table:
+    """Return every method as a row, accuracy beside its seconds and milliseconds;
+    the last row is `method`'s.
 
     Args:
         facts: flat facts as in `summary.json`.
@@ -131,20 +153,31 @@ def results_table(facts: Mapping[str, Any], method: str, title: str = "", prefix
         prefix: `test`, `train` or `val`.
     """
     # Silent rows, stations and variances are not of all data and methods.
-    beside = [name for name in (WITH_SILENT, BEST_SERVER, CALIBRATION) if f"{prefix}/{name}" in facts]
+    beside = [
+        name for name in (WITH_SILENT, BEST_SERVER, CALIBRATION) if f"{prefix}/{name}" in facts
+    ]
     wanted = [*OF_KIND[facts["dataset/kind"]].columns, "skill", *beside]
     method_row, *others = result_rows(facts, prefix)
     figures = [method_row.get(name) for name in wanted]
     # A baseline that the method is was fitted once: its row is the method's own.
-    rivals = [o for o in others if o["method"] != method or [o.get(name) for name in wanted] != figures]
+    rivals = [
+        o for o in others if o["method"] != method or [o.get(name) for name in wanted] != figures
+    ]
     plain = plain_methods()
-    rivals.sort(key=lambda row: plain.index(row["method"]) if row["method"] in plain else len(plain))
-    named = [row | {"method": f"{method} (baseline)"} if row["method"] == method else row for row in rivals]
+    rivals.sort(
+        key=lambda row: plain.index(row["method"]) if row["method"] in plain else len(plain)
+    )
+    named = [
+        row | {"method": f"{method} (baseline)"} if row["method"] == method else row
+        for row in rivals
+    ]
     alone = facts_under(facts, "field")
     fields = [row_of_method(f"{method}, Gaussians alone", alone, alone)] if alone else []
     figure_columns = (Column(name, number_format(name), of=name) for name in wanted)
     columns = [Column("method", "", of="method"), *figure_columns, TRAIN, P50]
-    return Table.from_rows(title, columns, [*named, *fields, method_row | {"method": method}], bold=method)
+    return Table.from_rows(
+        title, columns, [*named, *fields, method_row | {"method": method}], bold=method
+    )
 
 
 def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
@@ -153,7 +186,10 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """
     seen = {
         "train": ["these are training rows: eval_on=test scores rows that were not learned from"],
-        "val": ["methods, but not baselines, used these validation rows: compare methods with eval_on=test"],
+        "val": [
+            "methods, but not baselines, used these validation rows: compare methods with "
+            "eval_on=test"
+        ],
     }
     stated = [key.split("/") for key in facts if key.endswith(f"/{CALIBRATION}")]
     chi2 = {key[1]: facts["/".join(key)] for key in stated if key[0] == "baseline"}
@@ -162,16 +198,20 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
     if above := facts.get(f"{prefix}/heard_above_db"):
         rest.append(
-            f"{GIVEN_HEARD}: these rows do not name every station at each place. Levels as they are "
+            f"{GIVEN_HEARD}: these rows do not name every station at each place. Levels as they "
+            "are "
             f"(rssi_db of gsparc predict, maps) are {above:.1f} dB lower in the mean, with rmse_db "
-            f"{facts[f'{prefix}/levels_rmse_db']:.2f} at these rows: compare them with levels of all cells "
+            f"{facts[f'{prefix}/levels_rmse_db']:.2f} at these rows: compare them with levels of "
+            "all cells "
             "(a scanner)"
         )
     if unlisted := facts.get(f"{prefix}/unlisted"):
         rest.append(f"cells that may be off: lists should hold them and none does: {unlisted}")
         without = {name: facts.get(f"{prefix}/{name}{WITHOUT_OFF}") for name in OF_LISTS}
         if said := [
-            f"{name} {value:{number_format(name)}}" for name, value in without.items() if value is not None
+            f"{name} {value:{number_format(name)}}"
+            for name, value in without.items()
+            if value is not None
         ]:
             rest.append(f"figures above count these cells; without them: {', '.join(said)}")
     if new := facts.get(f"{prefix}/new"):
@@ -184,7 +224,9 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
 
 
 def describe_model(facts: Mapping[str, Any]) -> list[str]:
-    """Return which method was chosen and what it is made of, then what it learned, of a law or of beams."""
+    """Return which method was chosen and what it is made of, then what it learned,
+    of a law or of beams.
+    """
     parts, label = facts.get("model/made"), facts.get("model/label")
     # `ImageSources` is said as image sources.
     kind = re.sub("(?<=[a-z])(?=[A-Z])", " ", str(facts.get("model/class") or "")).lower()
@@ -210,10 +252,15 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
     if facts.get("split/without_baselines"):
         conditions.append(f"no baselines: {facts['split/without_baselines']}")
     if release := facts.get("dataset/stand_in"):
-        conditions.append(f"SIMULATED stand-in: these figures do not describe the {release} release")
-    # A run that was not learned from has a phase that nothing tells: its figure is of another question.
+        conditions.append(
+            f"SIMULATED stand-in: these figures do not describe the {release} release"
+        )
+    # A run that was not learned from has a phase that nothing tells:
+    # its figure is of another question.
     if count := facts.get("split/unseen_runs"):
-        conditions.append(f"{count} runs were not learned from: scored after the best common phase of each")
+        conditions.append(
+            f"{count} runs were not learned from: scored after the best common phase of each"
+        )
     load = facts.get("machine/load")
     return conditions + busy_machine([] if load is None else [load])
 
@@ -227,7 +274,9 @@ def busy_machine(loads: Sequence[float]) -> list[str]:
 
 
 def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
-    """Return the row that alone decides sums over all rows, if one does, and the median beside them."""
+    """Return the row that alone decides sums over all rows, if one does,
+    and the median beside them.
+    """
     row, name, share, median = (
         facts.get(f"{prefix}/decided_by/{key}") for key in ("row", "name", "share", "nmse_median")
     )
@@ -236,13 +285,15 @@ def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str
     number = f"row {row}"  # as split.leave_out counts; the file may count otherwise
     called = number if name in (None, number) else f"{name} ({number} of split.leave_out)"
     return [
-        f"{called} alone makes {share:.1%} of the error or power that nmse and mse add up: both describe "
+        f"{called} alone makes {share:.1%} of the error or power that nmse and mse add up: both "
+        "describe "
         f"little else. The median row's NMSE is {median:.3g}"
     ]
 
 
 def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]:
-    """Return methods whose `std` is wrong by a factor of two or more, by their reduced chi-squared, if any.
+    """Return methods whose `std` is wrong by a factor of two or more,
+    by their reduced chi-squared, if any.
 
     >>> wrong_deviations({"gp": 1.2, "field": 25.0, "mean": None}, "nmse")[0].split(": ")[1][:33]
     'std of field is 5 times too small'
@@ -259,11 +310,14 @@ def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]
     if not figure.startswith("rmse"):  # for spectra and channels there are thresholds alone
         tested = "gsparc calibrate ckpt=FILE tests which answers to accept"
     meaning = f"stated uncertainty: std {faults}"
-    return [f"{meaning}; std orders predictions, but is no error bar here; {tested}"] if faults else []
+    return (
+        [f"{meaning}; std orders predictions, but is no error bar here; {tested}"] if faults else []
+    )
 
 
 def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
-    """Return whether the best baseline beats the method, or neither; with silent rows, and of heard ones.
+    """Return whether the best baseline beats the method, or neither; with silent rows,
+    and of heard ones.
 
     Where cells may be off, of all others.
     """
@@ -282,14 +336,20 @@ def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]
             said = judge_baseline(best, method, figure, lead, ahead == LISTED)
             notes += [f"{'without cells that may be off: ' * bool(end)}{note}" for note in said]
         elif scores[best] > score_of(figure, value):
-            notes.append(f"the baseline {best} has the better {figure} here; how surely is not known")
+            notes.append(
+                f"the baseline {best} has the better {figure} here; how surely is not known"
+            )
     return notes
 
 
-def judge_baseline(baseline: str, method: str, figure: str, lead: Lead, listed: bool = False) -> list[str]:
-    """Return whether a baseline, which has `lead` over a method, is significantly better, worse, or neither.
+def judge_baseline(
+    baseline: str, method: str, figure: str, lead: Lead, listed: bool = False
+) -> list[str]:
+    """Return whether a baseline, which has `lead` over a method, is significantly better, worse,
+    or neither.
 
-    Of `listed` rows alone it is no choice: lists hold what is strong, and which cells they hold is not known.
+    Of `listed` rows alone it is no choice: lists hold what is strong,
+    and which cells they hold is not known.
     """
     figure = f"{figure} of heard rows" if listed else figure
     if not lead.sure:
@@ -304,14 +364,21 @@ def _value(key: str, value: Any) -> int | float | str | None:
     value = value.item() if getattr(value, "ndim", None) == 0 else value  # NumPy and torch scalars
     # JSON's true is no number to programs that read figures.
     value = int(value) if isinstance(value, bool) else value
-    if value is None or isinstance(value, (int, str)) or (isinstance(value, float) and math.isfinite(value)):
+    if (
+        value is None
+        or isinstance(value, (int, str))
+        or (isinstance(value, float) and math.isfinite(value))
+    ):
         return value
-    raise ValueError(f"summary: {key} is {value!r}; finite numbers, strings and null (undefined) are kept")
+    raise ValueError(
+        f"summary: {key} is {value!r}; finite numbers, strings and null (undefined) are kept"
+    )
 
 
 def run_git(folder: Path, *arguments: str) -> str | None:
     """Return what git says in a folder, None where it fails."""
-    # `git status` would lock the index to refresh it, and a run that is killed then leaves the lock.
+    # `git status` would lock the index to refresh it,
+    # and a run that is killed then leaves the lock.
     command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
     try:
         process = subprocess.run(command, capture_output=True, text=True, timeout=30)

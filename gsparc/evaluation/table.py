@@ -1,4 +1,6 @@
-"""A table once: values under headings, as a console shows them, in Markdown, as CSV or as cells of a page."""
+"""A table once: values under headings, as a console shows them, in Markdown,
+as CSV or as cells of a page.
+"""
 
 from __future__ import annotations
 
@@ -37,11 +39,17 @@ class Interval:
     def bars(self) -> list[list[float]]:
         """Lengths of error bars below and above, (2, 1)."""
         ends = (self.value if end is None else end for end in (self.low, self.high))
-        return [[max(sign * (end - self.value), 0.0)] for sign, end in zip((-1, 1), ends, strict=True)]
+        return [
+            [max(sign * (end - self.value), 0.0)] for sign, end in zip((-1, 1), ends, strict=True)
+        ]
 
     def text(self, form: str = ".2f") -> str:
         """Return `29.08 [27.4, 30.6]`, or `29.08 ± 0.30`."""
-        ends = "" if self.low is None or self.high is None else f" [{self.low:{form}}, {self.high:{form}}]"
+        ends = (
+            ""
+            if self.low is None or self.high is None
+            else (f" [{self.low:{form}}, {self.high:{form}}]")
+        )
         error = "" if self.error is None or math.isnan(self.error) else f" ± {self.error:{form}}"
         return f"{to_text(self.value, form)}{ends}{error}"
 
@@ -70,7 +78,11 @@ class Column:
         """Return a cell as text."""
         if isinstance(value, Interval):
             return value.text(self.form)
-        return to_text(value, self.form) if value is None or isinstance(value, (int, float)) else str(value)
+        return (
+            to_text(value, self.form)
+            if value is None or isinstance(value, (int, float))
+            else str(value)
+        )
 
 
 # Of all tables of results; seconds are means over folds, each of which trains a model.
@@ -86,7 +98,9 @@ def value_with_error(name: str, error: str) -> Callable[[Row], Interval]:
 
 
 def figure_column(figure: str, note: str = "", of: str | Callable[[Row], Any] = "") -> Column:
-    """Return the column of a figure of merit; `of` where results have it elsewhere than under its name."""
+    """Return the column of a figure of merit;
+    `of` where results have it elsewhere than under its name.
+    """
     return Column(heading_of(figure), number_format(figure), note, of or figure)
 
 
@@ -111,9 +125,13 @@ class Table:
     ends: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def from_rows(cls, title: str, columns: Sequence[Column], results: Iterable[Row], **more: Any) -> Table:
+    def from_rows(
+        cls, title: str, columns: Sequence[Column], results: Iterable[Row], **more: Any
+    ) -> Table:
         """Return a row per result; `more` are `note` and `bold`."""
-        return cls(title, columns, [[column.value(row) for column in columns] for row in results], **more)
+        return cls(
+            title, columns, [[column.value(row) for column in columns] for row in results], **more
+        )
 
     def without(self, *names: str) -> Table:
         """Return the same but for some columns."""
@@ -129,7 +147,9 @@ class Table:
 
     def texts(self) -> tuple[list[str], list[list[str]]]:
         """Return heads and cells as text."""
-        rows = [[c.text(value) for c, value in zip(self.columns, row, strict=True)] for row in self.rows]
+        rows = [
+            [c.text(value) for c, value in zip(self.columns, row, strict=True)] for row in self.rows
+        ]
         return [column.name for column in self.columns], rows
 
     def csv(self) -> str:
@@ -152,13 +172,18 @@ class Table:
         # A bar inside a cell would end it.
         rows = [[cell.replace("|", "\\|") for cell in row] for row in rows]
         rows = [[f"**{cell}**" for cell in row] if row[0] == self.bold else row for row in rows]
-        rule = "|---" + "".join("|---:" if column.form else "|---" for column in self.columns[1:]) + "|"
+        rule = (
+            "|---"
+            + "".join("|---:" if column.form else "|---" for column in self.columns[1:])
+            + "|"
+        )
         first, *lines = (f"| {' | '.join(cells)} |" for cells in (heads, *rows))
         note = f"\n{self.note}\n" if self.note else ""
         return f"### {self.title}\n{note}\n" + "\n".join([first, rule, *lines]) + "\n"
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[RichTable]:
-        """Yield what a console shows: no column of dashes, and words whole where it is wide enough for them.
+        """Yield what a console shows: no column of dashes,
+        and words whole where it is wide enough for them.
 
         Words are broken where they are wider than it, never cut.
         """
@@ -174,11 +199,15 @@ class Table:
             # Words leave room to heads, numbers are as wide as they are.
             head = wrap_head(heads[i], max(least[i], cells if self.columns[i].form else 0))
             result.add_column(
-                head if narrow else heads[i], justify="right" if self.columns[i].form else "left",
-                overflow="fold", min_width=least[i] if narrow else None,
-            )  # fmt: skip
+                head if narrow else heads[i],
+                justify="right" if self.columns[i].form else "left",
+                overflow="fold",
+                min_width=least[i] if narrow else None,
+            )
         for row in rows:
-            result.add_row(*(row[i] for i in indices), style="bold" if row[0] == self.bold else None)
+            result.add_row(
+                *(row[i] for i in indices), style="bold" if row[0] == self.bold else None
+            )
         yield result
 
 

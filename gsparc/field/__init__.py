@@ -1,1 +1,3 @@
-"""The Gaussian field: parameters, emission, encoding, coherent terms, losses, edits, frozen queries."""
+"""The Gaussian field: parameters, emission, encoding, coherent terms, losses, edits,
+frozen queries.
+"""

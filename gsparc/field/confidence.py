@@ -1,4 +1,6 @@
-"""Confidence of a prediction: a network of position (paper, eq. 7; DUSt3R's form), or what is unknown."""
+"""Confidence of a prediction: a network of position (paper, eq. 7; DUSt3R's form),
+or what is unknown.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +39,8 @@ ONE = torch.ones(())  # a number would cost each operation of a single query as 
 
 
 class ErrorModel(nn.Module):
-    """The expected squared error of a pixel, `level (u + LEAST_UNKNOWN)^power`, of an unknown share u.
+    """The expected squared error of a pixel, `level (u + LEAST_UNKNOWN)^power`,
+    of an unknown share u.
 
     What errors of left-out training rows say; nothing is learned by gradient.
 
@@ -48,14 +51,17 @@ class ErrorModel(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.far, self.power = 1.0, 1.0  # numbers: as tensors they would cost a query a tenth of its time
+        # Numbers: as tensors they would cost a query a tenth of its time
+        self.far, self.power = 1.0, 1.0
 
     def set_error_law(self, level: float, power: float) -> None:
         """Take what left-out rows said."""
         self.far, self.power = level * (1 + LEAST_UNKNOWN) ** power, power
 
     def forward(self, unknown: Tensor) -> tuple[Tensor, Tensor]:
-        """Return variances (B,) of unknown shares (B,), and their shares (B,) of those far from all data."""
+        """Return variances (B,) of unknown shares (B,), and their shares (B,)
+        of those far from all data.
+        """
         one = ONE.to(unknown.dtype)
         share = torch.lerp(unknown, one, LEAST_UNKNOWN / (1 + LEAST_UNKNOWN)).pow(self.power)
         return share * self.far, share
@@ -70,10 +76,12 @@ class ErrorModel(nn.Module):
 
 
 def fit_level_and_power(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]:
-    """Return (a, p): the expected squared error of a pixel is about `a (unknown + LEAST_UNKNOWN)^p`.
+    """Return (a, p): the expected squared error of a pixel is about
+    `a (unknown + LEAST_UNKNOWN)^p`.
 
-    The likeliest for errors (n,) that are exponential about it, so that their mean is right at every level: a
-    line through logarithms would fit the many small errors and miss the few large ones.
+    The likeliest for errors (n,) that are exponential about it, so that their mean is right at
+    every level: a line through logarithms would fit the many small errors
+    and miss the few large ones.
     """
     x, y = np.log(unknown + LEAST_UNKNOWN), error + 1e-9
 
@@ -121,7 +129,8 @@ class Confidence(nn.Module):
             self.high.copy_(torch.maximum(g.max(), g.min() + 1e-6))
 
     def normalised_confidence(self, position: Tensor) -> Tensor:
-        """Return the confidence in [0, 1] (B,): C between its least and largest on the calibration data.
+        """Return the confidence in [0, 1] (B,): C between its least and largest
+        on the calibration data.
 
         It decays outside the box of what was measured, where the network's lines run on unchecked.
         """

@@ -1,7 +1,8 @@
 """Training shared by processes: each takes its rows of every batch, and all hold the same model.
 
-Gradients are summed here, not by DistributedDataParallel: its reducer knows the parameters it began with, and
-adding or removing Gaussians replaces them. One buffer a step is enough for models of this size.
+Gradients are summed here, not by DistributedDataParallel: its reducer knows the parameters it began
+with, and adding or removing Gaussians replaces them.
+One buffer a step is enough for models of this size.
 """
 
 from __future__ import annotations
@@ -23,10 +24,11 @@ GRACE_S = 2.0  # a process that lost another waits for that one's error to be th
 
 
 class SummedGradients(DDPStrategy):
-    """Processes of this machine, and of others where `trainer.num_nodes` says so, that end with training.
+    """Processes of this machine, and of others where `trainer.num_nodes` says so,
+    that end with training.
 
-    A loss is to be the process's part of the mean over the whole batch (`Batch.share`): gradients are added
-    up, and equal those of one process but for rounding.
+    A loss is to be the process's part of the mean over the whole batch (`Batch.share`): gradients
+    are added up, and equal those of one process but for rounding.
 
     Args:
         start_method: `spawn`, or `fork`, which is quicker and may hang where other threads run.

@@ -28,7 +28,9 @@ class Edit:
 
 
 def row_parameters(root: nn.Module, count: int) -> dict[str, nn.Parameter]:
-    """Return every parameter that belongs to single Gaussians, by dotted name; their first axis is N."""
+    """Return every parameter that belongs to single Gaussians, by dotted name;
+    their first axis is N.
+    """
     rows = {}
     for name, module in root.named_modules():
         if not getattr(module, "per_gaussian", False):
@@ -56,7 +58,9 @@ def apply_edit(
     groups = {} if optimizer is None else {id(g["params"][0]): g for g in optimizer.param_groups}
     for name, old in rows.items():
         added = edit.replace.get(name, old.detach()[edit.parents])
-        new = nn.Parameter(torch.cat([old.detach()[edit.keep], added.to(old.dtype)]), old.requires_grad)
+        new = nn.Parameter(
+            torch.cat([old.detach()[edit.keep], added.to(old.dtype)]), old.requires_grad
+        )
         _set_parameter(root, name, new)
         group = groups.get(id(old))
         # A parameter that is not learned has no group.
@@ -68,7 +72,9 @@ def apply_edit(
         if state is not None:
             for key in ("exp_avg", "exp_avg_sq"):
                 moment = state[key]
-                state[key] = torch.cat([moment[edit.keep], torch.zeros_like(added, dtype=moment.dtype)])
+                state[key] = torch.cat(
+                    [moment[edit.keep], torch.zeros_like(added, dtype=moment.dtype)]
+                )
             optimizer.state[new] = state
     fresh = gaussians.next_id + torch.arange(len(edit.parents), device=gaussians.ids.device)
     gaussians.ids = torch.cat([gaussians.ids[edit.keep], fresh])
@@ -78,9 +84,13 @@ def apply_edit(
 
 
 def resize_gaussians(root: nn.Module, gaussians: GaussianField, count: int) -> None:
-    """Give every per-Gaussian tensor `count` rows of zeros, so that a state dict of that size fits."""
+    """Give every per-Gaussian tensor `count` rows of zeros,
+    so that a state dict of that size fits.
+    """
     for name, old in row_parameters(root, len(gaussians)).items():
-        _set_parameter(root, name, nn.Parameter(old.new_zeros(count, *old.shape[1:]), old.requires_grad))
+        _set_parameter(
+            root, name, nn.Parameter(old.new_zeros(count, *old.shape[1:]), old.requires_grad)
+        )
     gaussians.ids = gaussians.ids.new_zeros(count)
 
 

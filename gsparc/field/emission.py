@@ -1,4 +1,6 @@
-"""Emission of each Gaussian towards the receiver: one small network per Gaussian, evaluated together."""
+"""Emission of each Gaussian towards the receiver: one small network per Gaussian,
+evaluated together.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,9 @@ class EmissionSettings(Checked):
     Attributes:
         encoding: how the moving end's position enters.
         hidden: hidden units; 0 makes the network linear in the encoding.
-        activation: of the output: `sigmoid` (in (0, 1), carries the log-distance term), `signed_sigmoid`
-            (twice that less 1, in (-1, 1)), `softplus` (powers without a ceiling) or `linear` (signed CSI).
+        activation: of the output: `sigmoid` (in (0, 1), carries the log-distance term),
+            `signed_sigmoid` (twice that less 1, in (-1, 1)), `softplus` (powers without a ceiling)
+            or `linear` (signed CSI).
         log_distance: subtract log d_i before the sigmoid (eq. 1 of the paper).
         init_scale: standard deviation of the last layer's initial weights.
         init_bias: initial bias of the output, in units of the activation's input; `auto` lets all
@@ -94,7 +97,9 @@ class Emission(nn.Module):
         return torch.einsum("bnh,nhc->bnc", inner, self.weight2) + self.bias2
 
     def forward(self, position: Tensor, distance: Tensor) -> Tensor:
-        """Return emissions (B, N, C) at positions (B, 3) [m]; distance (B, N) is d_i / d_ref (eq. 1)."""
+        """Return emissions (B, N, C) at positions (B, 3) [m]; distance (B, N)
+        is d_i / d_ref (eq. 1).
+        """
         logits = self.logits(position)
         if self.settings.log_distance:
             logits = logits.sub_(distance.log().unsqueeze(-1))
@@ -104,7 +109,9 @@ class Emission(nn.Module):
         return nn.functional.softplus(logits) if self.settings.activation == "softplus" else logits
 
     def to_logits(self, emission: Tensor, distance: Tensor) -> Tensor:
-        """Return the logits (n, N, C) whose emission this is: the inverse of `forward` after the network."""
+        """Return the logits (n, N, C) whose emission this is:
+        the inverse of `forward` after the network.
+        """
         if self.settings.activation == "linear":
             return emission
         if self.settings.activation == "softplus":
@@ -116,7 +123,9 @@ class Emission(nn.Module):
 
 
 def _shared_product(encoded: Tensor, weight: Tensor) -> Tensor:
-    """Features (B, E), the same of all Gaussians, times the weights (N, E, K) of each: (B, N, K)."""
+    """Features (B, E), the same of all Gaussians, times the weights (N, E, K) of each:
+    (B, N, K).
+    """
     count, width, outputs = weight.shape
     # One product, as all Gaussians read the same features.
     return (encoded @ weight.permute(1, 0, 2).reshape(width, count * outputs)).view(

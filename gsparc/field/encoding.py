@@ -21,9 +21,10 @@ class EncodingSettings(Checked):
 
     Attributes:
         kind: `raw` coordinates (the paper), `fourier` octaves along the axes, or `kernel`: whitened
-            similarities to training positions, so that a linear read-out with independent weights is a
-            Gaussian process of the emission.
-        octaves: number of octaves of `fourier`; the period of the first is the longest side of the box.
+            similarities to training positions, so that a linear read-out with independent weights
+            is a Gaussian process of the emission.
+        octaves: number of octaves of `fourier`; the period of the first is the longest side of the
+            box.
         anchors: largest number of training positions of `kernel`.
     """
 
@@ -41,9 +42,9 @@ class Smoothness:
         length: correlation length [m].
         noise: variance of the unexplained part relative to the signal's.
         kernel: of `correlation`.
-        whitening: (M, M) float32 that counts the noise and all training rows in, of `whitened`: the features'
-            squared length is then the share of the process that these rows tell. None: that of the anchors
-            alone without noise, and nothing is known about the share.
+        whitening: (M, M) float32 that counts the noise and all training rows in, of `whitened`: the
+            features' squared length is then the share of the process that these rows tell. None:
+            that of the anchors alone without noise, and nothing is known about the share.
     """
 
     anchors: Tensor
@@ -58,7 +59,8 @@ class PositionEncoding(nn.Module):
 
     Args:
         settings: which encoding.
-        box: (2, D) [m], lower and upper corner of the moving end's box, local frame; of both ends, D = 6.
+        box: (2, D) [m], lower and upper corner of the moving end's box, local frame; of both ends,
+            D = 6.
         prior: needed by `kernel`.
     """
 
@@ -70,10 +72,13 @@ class PositionEncoding(nn.Module):
     whitening: Tensor
     tells_share = False  # whether the squared length of the features is a share that is known
 
-    def __init__(self, settings: EncodingSettings, box: Tensor, prior: Smoothness | None = None) -> None:
+    def __init__(
+        self, settings: EncodingSettings, box: Tensor, prior: Smoothness | None = None
+    ) -> None:
         super().__init__()
         box = torch.as_tensor(box, dtype=torch.float64)
-        extent = (box[1] - box[0]).max().clamp_min(1e-6)  # one scale for all axes keeps distances true
+        # One scale for all axes keeps distances true
+        extent = (box[1] - box[0]).max().clamp_min(1e-6)
         self.settings = settings
         self.register_buffer("centre", box.mean(0).float())
         self.register_buffer("half_extent", (extent / 2).float())
@@ -83,23 +88,34 @@ class PositionEncoding(nn.Module):
             axes = (octaves[:, None, None] * torch.eye(box.shape[1])).reshape(-1, box.shape[1])
             self.register_buffer("frequencies", axes.repeat(2, 1), persistent=stored)
             quarter = torch.full((len(axes),), -math.pi / 2)
-            self.register_buffer("phases", torch.cat([torch.zeros(len(axes)), quarter]), persistent=stored)
+            self.register_buffer(
+                "phases", torch.cat([torch.zeros(len(axes)), quarter]), persistent=stored
+            )
         elif settings.kind == "kernel":
             if prior is None:
                 raise ValueError(
-                    "model.emission.encoding.kind=kernel needs a prior learned from training positions"
+                    "model.emission.encoding.kind=kernel needs a prior learned from training "
+                    "positions"
                 )
             self.length, self.noise, self.kernel = prior.length, prior.noise, prior.kernel
             self.tells_share = prior.whitening is not None
             self.register_buffer("anchors", prior.anchors.float())
-            arguments = prior.anchors.double(), prior.length, JITTER, prior.kernel, len(prior.anchors)
+            arguments = (
+                prior.anchors.double(),
+                prior.length,
+                JITTER,
+                prior.kernel,
+                len(prior.anchors),
+            )
             whitening = prior.whitening
             if whitening is None:
                 whitening = whitened_features(*arguments).whitening.float()
             # What the prior holds is stored with it.
             self.register_buffer("whitening", whitening, persistent=prior.whitening is None)
         else:
-            raise ValueError(f"model.emission.encoding.kind={settings.kind!r}: choose raw, fourier or kernel")
+            raise ValueError(
+                f"model.emission.encoding.kind={settings.kind!r}: choose raw, fourier or kernel"
+            )
 
     @property
     def width(self) -> int:
@@ -117,5 +133,7 @@ class PositionEncoding(nn.Module):
 
 
 def unknown_share(features: Tensor) -> Tensor:
-    """Return posterior over prior variance (B,) in [0, 1] of a process: `1 - |phi|^2` of features (B, E)."""
+    """Return posterior over prior variance (B,) in [0, 1] of a process:
+    `1 - |phi|^2` of features (B, E).
+    """
     return (1 - torch.linalg.vecdot(features, features)).clamp_(0, 1)

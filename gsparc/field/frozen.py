@@ -1,4 +1,6 @@
-"""Spectra at a static receiver from emissions alone: projection and depth order are computed once."""
+"""Spectra at a static receiver from emissions alone:
+projection and depth order are computed once.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,8 @@ class FrozenView:
     Attributes:
         version: the field's counter at the time.
         plan: pixels by Gaussians.
-        visible: the model reduced to the Gaussians that the receiver sees, in the plan's order: only their
-            emissions are computed.
+        visible: the model reduced to the Gaussians that the receiver sees, in the plan's order:
+            only their emissions are computed.
     """
 
     version: int
@@ -47,15 +49,18 @@ class FrozenView:
 
 @dataclass(frozen=True)
 class FrozenArray:
-    """The same through an array: A times the view, and times the emission weights where those are linear.
+    """The same through an array: A times the view,
+    and times the emission weights where those are linear.
 
     Attributes:
         version: the field's counter at the time.
         view: (N, M) complex64, emissions to array vectors.
-        weights: (E, 2 M + 2) float32, encoded positions to real and imaginary parts of array vectors and,
-            left at 0, of the unknown share; None where emissions are not linear in them.
+        weights: (E, 2 M + 2) float32, encoded positions to real and imaginary parts of array
+            vectors and, left at 0, of the unknown share; None where emissions are not linear in
+            them.
         offset: (2 M + 2,) float32, added to them.
-        renderer: array vectors to spectra where the unknown share is known; on the site's grid or a coarser.
+        renderer: array vectors to spectra where the unknown share is known; on the site's grid or a
+            coarser.
     """
 
     version: int
@@ -65,7 +70,9 @@ class FrozenArray:
     renderer: SpectrumRenderer
 
     def render(self, model: GaussianModel, tx: Tensor, rx: Pose) -> Rendered:
-        """See `FrozenView.render`; spectra of a known share are cut off at 1. Differentiable in positions."""
+        """See `FrozenView.render`; spectra of a known share are cut off at 1.
+        Differentiable in positions.
+        """
         _check_version(self.version, model)
         response = model.response
         assert isinstance(response, ArrayResponse)
@@ -78,9 +85,13 @@ class FrozenArray:
         kernels = moving.dtype == torch.float32 and queries.has_query_kernel(moving, self.weights)
         if model.tells_unknown and kernels:
             mean, unknown = queries.array_spectrum(
-                moving, (encoding.anchors, encoding.whitening), (self.weights, self.offset),
-                self.renderer.tables, self.renderer.square, matern_mixture(encoding.length, encoding.kernel),
-            )  # fmt: skip
+                moving,
+                (encoding.anchors, encoding.whitening),
+                (self.weights, self.offset),
+                self.renderer.tables,
+                self.renderer.square,
+                matern_mixture(encoding.length, encoding.kernel),
+            )
             return Rendered(mean, None, unknown)
         encoded = encoding(moving)
         parts = torch.addmm(self.offset, encoded, self.weights).view(len(encoded), -1, 2)
@@ -103,7 +114,9 @@ def freeze_view(model: GaussianModel, rx: Pose) -> FrozenView | FrozenArray:
 
 
 @torch.no_grad()
-def freeze_array(model: GaussianModel, view: Tensor, renderer: SpectrumRenderer | None = None) -> FrozenArray:
+def freeze_array(
+    model: GaussianModel, view: Tensor, renderer: SpectrumRenderer | None = None
+) -> FrozenArray:
     """Freeze a model with an array from what the array measures of each Gaussian, `view` (N, M).
 
     Args:
@@ -117,8 +130,11 @@ def freeze_array(model: GaussianModel, view: Tensor, renderer: SpectrumRenderer 
     # Hidden units and distances make emissions no linear function of features.
     if emission.settings.hidden or model.settings.attenuation.inverse_distance:
         return FrozenArray(version, view, None, None, renderer)
-    weight, bias = (torch.view_as_complex(part.contiguous()) for part in (emission.weight2, emission.bias2))
-    lines = torch.nn.functional.pad(torch.cat([weight.T, bias[None]]) @ view, (0, 1))  # and the share
+    weight, bias = (
+        torch.view_as_complex(part.contiguous()) for part in (emission.weight2, emission.bias2)
+    )
+    # And the share
+    lines = torch.nn.functional.pad(torch.cat([weight.T, bias[None]]) @ view, (0, 1))
     parts = torch.view_as_real(lines).flatten(1)
     return FrozenArray(version, view, parts[:-1].contiguous(), parts[-1], renderer)
 
@@ -126,7 +142,9 @@ def freeze_array(model: GaussianModel, view: Tensor, renderer: SpectrumRenderer 
 def _check_version(version: int, model: GaussianModel) -> None:
     now = int(model.gaussians.version)
     if now != version:
-        raise StalePlan(f"this view was frozen at version {version}, the field is at {now}: freeze again")
+        raise StalePlan(
+            f"this view was frozen at version {version}, the field is at {now}: freeze again"
+        )
 
 
 def _copy_gaussians(rows: Tensor, model: GaussianModel) -> GaussianModel:
@@ -139,22 +157,28 @@ def _copy_gaussians(rows: Tensor, model: GaussianModel) -> GaussianModel:
 
 
 def gaussian_vectors(model: GaussianModel, rx: Pose) -> Tensor:
-    """Return A times the frozen view (N, M) complex64: array vector of each Gaussian's unit emission.
+    """Return A times the frozen view (N, M) complex64:
+    array vector of each Gaussian's unit emission.
 
-    Both are linear: what a unit of every Gaussian adds to one antenna is the gradient of that antenna by
-    emissions, so that the cost grows with footprints and antennas, not with the square of the Gaussians.
+    Both are linear: what a unit of every Gaussian adds to one antenna is the gradient of that
+    antenna by emissions, so that the cost grows with footprints and antennas,
+    not with the square of the Gaussians.
     """
     response, count = model.response, len(model.gaussians)
     assert isinstance(response, ArrayResponse) and model.site.grid is not None
     # Queries may come in inference mode, in which nothing is differentiated.
     with torch.inference_mode(False), torch.enable_grad():
-        shape, device = (1, 2, model.site.grid.height, model.site.grid.width), model.gaussians.means.device
+        shape, device = (
+            (1, 2, model.site.grid.height, model.site.grid.width),
+            model.gaussians.means.device,
+        )
         field = torch.zeros(shape, device=device, requires_grad=True)
         parts = torch.view_as_real(response.array_vectors(field)).flatten()
         by_pixel = [torch.autograd.grad(part, field, retain_graph=True)[0][0, 0] for part in parts]
         means, quats, scales, opacities = (part.detach() for part in model.gaussians.geometry())
         emitted = torch.zeros(count, len(parts), device=device, requires_grad=True)
-        plan = model.plan(Pose(rx.position.clone(), rx.rotation.clone()))  # perhaps made in inference mode
+        # Perhaps made in inference mode
+        plan = model.plan(Pose(rx.position.clone(), rx.rotation.clone()))
         image = ops.composite(plan, means, quats, scales, opacities, emitted).image
         (seen,) = torch.autograd.grad(image, emitted, torch.stack(by_pixel).view_as(image))
     return torch.view_as_complex(seen.view(count, len(parts) // 2, 2))

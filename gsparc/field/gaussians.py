@@ -23,10 +23,10 @@ class FieldSettings(Checked):
 
     Attributes:
         count: initial number of Gaussians N.
-        placement: `uniform` in the scene box enlarged by `margin` (the paper), `grid`, every `spacing` there
-            (the authors' program), or `sphere`: evenly spread directions around the static receiver at
-            distances between `near` and `far`. `auto` is settled by the group `init`
-            (`gsparc.models.splat.auto_settings`).
+        placement: `uniform` in the scene box enlarged by `margin` (the paper), `grid`, every
+            `spacing` there (the authors' program), or `sphere`: evenly spread directions around the
+            static receiver at distances between `near` and `far`. `auto` is settled by the group
+            `init` (`gsparc.models.splat.auto_settings`).
         margin: enlargement of the box on each side [m].
         spacing: of `grid` [m], which makes as many Gaussians as fit, whatever `count`.
         near, far: range of distances of `sphere` [m].
@@ -82,7 +82,9 @@ class GaussianField(nn.Module):
 
     @torch.no_grad()
     def to_cloud(self, strengths: Tensor, label: str) -> GaussianCloud:
-        """Return what a picture or a file needs, with what each emits (N,), in the unit of `label`."""
+        """Return what a picture or a file needs, with what each emits (N,),
+        in the unit of `label`.
+        """
         means, quats, scales, opacities = (part.double().numpy() for part in self.geometry())
         quats = quats / np.linalg.norm(quats, axis=1, keepdims=True)
         return GaussianCloud(means, scales, quats, opacities, strengths.double().numpy(), label)
@@ -102,7 +104,9 @@ MOST_IN_GRID = 1_000_000  # Gaussians; networks of more need gigabytes
 
 
 def check_grid(counts: Tensor, spacing: float) -> None:
-    """Raise `ValueError`, which says what to set, where a grid of counts (3,) has more than a million."""
+    """Raise `ValueError`, which says what to set, where a grid of counts (3,)
+    has more than a million.
+    """
     if (total := int(counts.prod())) > MOST_IN_GRID:
         raise ValueError(
             f"model.field.spacing={spacing:g} m makes {total:,} Gaussians of this box; at most "
@@ -129,7 +133,10 @@ def create_field(
         low, high = box[0] - settings.margin, box[1] + settings.margin
         counts = ((high - low) / settings.spacing).long().clamp_min(1)
         check_grid(counts, settings.spacing)
-        axes = [torch.linspace(float(a), float(b), int(n)) for a, b, n in zip(low, high, counts, strict=True)]
+        axes = [
+            torch.linspace(float(a), float(b), int(n))
+            for a, b, n in zip(low, high, counts, strict=True)
+        ]
         means = torch.cartesian_prod(*axes)
         scales = torch.full((len(means), 3), float(settings.scale or settings.spacing))
         return GaussianField(means, scales, settings.opacity)
@@ -141,7 +148,9 @@ def create_field(
         scales = torch.full((count, 3), float(settings.scale or spacing / 2))
         return GaussianField(means, scales, settings.opacity)
     if settings.placement != "sphere":
-        raise ValueError(f"placement={settings.placement!r} is not settled: choose uniform, grid or sphere")
+        raise ValueError(
+            f"placement={settings.placement!r} is not settled: choose uniform, grid or sphere"
+        )
     if receiver is None or rotation is None:
         raise ValueError("init=sphere needs a static receiver; here it moves: use init=uniform")
     step = torch.arange(count) + 0.5
@@ -152,5 +161,9 @@ def create_field(
     distance = settings.near + (settings.far - settings.near) * torch.rand(count, 1)
     means = receiver.float() + distance * directions @ rotation.float().T
     angle = math.sqrt(2 * math.pi / max(count, 1))  # [rad] between neighbours
-    scales = settings.scale * torch.ones(count, 3) if settings.scale else (distance * angle).expand(-1, 3)
+    scales = (
+        settings.scale * torch.ones(count, 3)
+        if settings.scale
+        else (distance * angle).expand(-1, 3)
+    )
     return GaussianField(means, scales, settings.opacity)

@@ -63,7 +63,8 @@ class TrainerResult:
 
 
 def requested_steps(context: FitContext, rows: int, model_steps: int | None = None) -> int | None:
-    """Return the number of steps that the Trainer is given, else the model's own; None where neither is.
+    """Return the number of steps that the Trainer is given, else the model's own;
+    None where neither is.
 
     Args:
         context: of the fit; `trainer.max_steps` and `trainer.max_epochs` win over all others.
@@ -74,14 +75,20 @@ def requested_steps(context: FitContext, rows: int, model_steps: int | None = No
         ValueError: the Trainer is given what is no number of steps.
     """
     options = (context.trainer or DEFAULTS).keywords
-    steps, epochs = (None if options.get(n) == -1 else options.get(n) for n in ("max_steps", "max_epochs"))
+    steps, epochs = (
+        None if options.get(n) == -1 else options.get(n) for n in ("max_steps", "max_epochs")
+    )
     for name, value in (("max_steps", steps), ("max_epochs", epochs)):
         if value is not None and (type(value) is not int or value < 0):
-            raise ValueError(f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or -1")
+            raise ValueError(
+                f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or -1"
+            )
     if model_steps == 0 or (steps is None and epochs is None):  # 0 of either is the start alone
         return model_steps
     if model_steps is not None:
-        log.warning("model.steps=%d gives way to the Trainer's max_steps or max_epochs", model_steps)
+        log.warning(
+            "model.steps=%d gives way to the Trainer's max_steps or max_epochs", model_steps
+        )
     size = context.batch_size if context.datamodule is None else context.datamodule.batch_size
     of_epochs = None if epochs is None else epochs * -(-rows // size)
     return min(one for one in (steps, of_epochs) if one is not None)
@@ -118,7 +125,9 @@ class ReportSteps(L.Callback):
         Of an unfinished schedule, what was taken is kept.
         """
         trainer.callback_metrics[SPENT] = torch.tensor(self.watch.seconds, dtype=torch.float64)
-        trainer.callback_metrics[SPENT_CPU] = torch.tensor(self.watch.cpu_seconds, dtype=torch.float64)
+        trainer.callback_metrics[SPENT_CPU] = torch.tensor(
+            self.watch.cpu_seconds, dtype=torch.float64
+        )
         trainer.callback_metrics[TAKEN] = torch.tensor(trainer.global_step, dtype=torch.float64)
         if trainer.global_step < module.total_steps:
             trainer.callback_metrics.setdefault(KEPT, trainer.callback_metrics[TAKEN])
@@ -137,15 +146,19 @@ def step_is_complete(trainer: L.Trainer) -> bool:
 
 
 class _Stopped(BaseException):
-    """Ends training from inside; Lightning would turn a KeyboardInterrupt into an exit without a word."""
+    """Ends training from inside; Lightning would turn a KeyboardInterrupt into an exit without a
+    word.
+    """
 
 
 class StopBetweenSteps(L.callbacks.Checkpoint):
-    """An interrupt waits for the end of the step, so that the checkpoint it leaves is a whole state.
+    """An interrupt waits for the end of the step,
+    so that the checkpoint it leaves is a whole state.
 
     The last step leaves one, too.
 
-    In several processes it does not wait, nor does a second one: the checkpoint before is what is left.
+    In several processes it does not wait, nor does a second one:
+    the checkpoint before is what is left.
 
     Args:
         file: the checkpoint written when stopped.
@@ -190,9 +203,14 @@ class StopBetweenSteps(L.callbacks.Checkpoint):
 
 
 def make_trainer(
-    module: NetworkModule, data: Measurements, fold: Fold, context: FitContext, checkpoints: CheckpointIO,
-    watch: Stopwatch, keeping: Sequence[L.Callback] = (),
-) -> tuple[L.Trainer, DataModule]:  # fmt: skip
+    module: NetworkModule,
+    data: Measurements,
+    fold: Fold,
+    context: FitContext,
+    checkpoints: CheckpointIO,
+    watch: Stopwatch,
+    keeping: Sequence[L.Callback] = (),
+) -> tuple[L.Trainer, DataModule]:
     """Return the Trainer that trains `module` on `fold.train`, watching `fold.val`, and its data.
 
     `with interruptible(trainer, batches): trainer.fit(module, datamodule=batches, ...)` trains it.
@@ -221,23 +239,33 @@ def make_trainer(
     interval = make.keywords.get("val_check_interval")
     every = interval if type(interval) is int else max(1, module.total_steps // LOOKS)
     # A validation sees the figures of its own step.
-    module.log_every = math.gcd(LOG_EVERY, every) if len(fold.val) else max(LOG_EVERY, every // LOOKS)
+    module.log_every = (
+        math.gcd(LOG_EVERY, every) if len(fold.val) else max(LOG_EVERY, every // LOOKS)
+    )
     per_epoch = max(1, len(fold.train) // batches.batch_size)
     options: dict[str, Any] = {
         "log_every_n_steps": max(1, min(50, per_epoch) // module.log_every) * module.log_every,
         "check_val_every_n_epoch": None,  # validations are counted in steps
         "val_check_interval": every if interval is None else interval,
-        "num_sanity_val_steps": -1,  # all validation rows, before the first step: where the curve begins
+        # All validation rows, before the first step: where the curve begins
+        "num_sanity_val_steps": -1,
     }
     if not len(fold.val):
-        options |= {"val_check_interval": None, "check_val_every_n_epoch": 1, "limit_val_batches": 0}
+        options |= {
+            "val_check_interval": None,
+            "check_val_every_n_epoch": 1,
+            "limit_val_batches": 0,
+        }
     options["max_steps"] = module.total_steps
     options["max_epochs"] = -1
     processes = SummedGradients.from_strategy(make.keywords.get("strategy"))
     if module.count is None:  # networks of published methods make tensors of their own, on the CPU
         if processes is not None or make.keywords.get("accelerator", "cpu") != "cpu":
             log.warning("published methods train in one process on the CPU, whatever trainer= says")
-        processes, options = None, {**options, "accelerator": "cpu", "devices": 1, "strategy": "auto"}
+        processes, options = (
+            None,
+            {**options, "accelerator": "cpu", "devices": 1, "strategy": "auto"},
+        )
     if processes is not None:
         options["strategy"] = processes
     trainer = make(
@@ -248,7 +276,9 @@ def make_trainer(
         **options,
     )
     if trainer.world_size > 1 and processes is None:
-        raise ValueError("trainer.strategy: several devices need ddp, ddp_spawn or ddp_fork; say trainer=ddp")
+        raise ValueError(
+            "trainer.strategy: several devices need ddp, ddp_spawn or ddp_fork; say trainer=ddp"
+        )
     return trainer, batches
 
 
@@ -266,7 +296,11 @@ def interruptible(trainer: L.Trainer, batches: DataModule) -> Iterator[None]:
             yield
     except (_Stopped, SystemExit, ProcessException) as ended:
         # Lightning's answer to a KeyboardInterrupt is SystemExit.
-        advice = f"go on with ckpt_path={stop.file}" if stop.file.exists() else "there is no checkpoint yet"
+        advice = (
+            f"go on with ckpt_path={stop.file}"
+            if stop.file.exists()
+            else ("there is no checkpoint yet")
+        )
         if isinstance(ended, ProcessException) and not stop.requested:
             raise RuntimeError(_describe_lost_process(ended, advice)) from ended
         raise KeyboardInterrupt(f"training was interrupted; {advice}") from None
@@ -275,42 +309,61 @@ def interruptible(trainer: L.Trainer, batches: DataModule) -> Iterator[None]:
 
 
 def read_trainer_result(trainer: L.Trainer, watch: Stopwatch) -> TrainerResult:
-    """Return the steps of a Trainer that has ended, and charge what other processes say of an earlier run."""
+    """Return the steps of a Trainer that has ended,
+    and charge what other processes say of an earlier run.
+    """
     metrics = trainer.callback_metrics
     more = float(metrics[SPENT]) - watch.seconds, float(metrics[SPENT_CPU]) - watch.cpu_seconds
     watch.charge(*(max(spent, 0.0) for spent in more))
     best_step = int(metrics[KEPT]) if KEPT in metrics else None
     steps = int(metrics[TAKEN])
     timers = [c for c in trainer.callbacks if isinstance(c, L.callbacks.Timer)]  # type: ignore[attr-defined]
-    if steps >= trainer.max_steps or not any((timer.time_remaining() or 0) <= 0 for timer in timers):
+    if steps >= trainer.max_steps or not any(
+        (timer.time_remaining() or 0) <= 0 for timer in timers
+    ):
         return TrainerResult(best_step, steps, ())
     ended = f"trainer.max_time ended training after {steps} of {trainer.max_steps} steps"
     log.warning("%s", ended)
     return TrainerResult(best_step, steps, (f"{ended}: another machine ends elsewhere",))
 
 
-def _drop_unusable(callbacks: Sequence[L.Callback], val_rows: int, gaussians: bool) -> Sequence[L.Callback]:
+def _drop_unusable(
+    callbacks: Sequence[L.Callback], val_rows: int, gaussians: bool
+) -> Sequence[L.Callback]:
     """Leave out callbacks that need validation rows, or Gaussians to edit, where there are none."""
-    blind = [] if val_rows else [c for c in callbacks if str(getattr(c, "monitor", "")).startswith("val/")]
+    blind = (
+        []
+        if val_rows
+        else [c for c in callbacks if str(getattr(c, "monitor", "")).startswith("val/")]
+    )
     if blind:
         log.info("without validation rows: no %s", ", ".join(type(one).__name__ for one in blind))
-    return [c for c in callbacks if c not in blind and (gaussians or not hasattr(c, "edits_gaussians"))]
+    return [
+        c for c in callbacks if c not in blind and (gaussians or not hasattr(c, "edits_gaussians"))
+    ]
 
 
 def _describe_lost_process(error: ProcessException, advice: str) -> str:
     """What was said by the process that failed, without its traceback; or which one was killed."""
     if isinstance(error, ProcessExitedException):
         how = error.signal_name or f"exit status {error.exit_code}"
-        return f"training process {error.error_index} ended by {how}, the others were stopped; {advice}"
+        return (
+            f"training process {error.error_index} ended by {how}, the others were stopped; "
+            f"{advice}"
+        )
     lines = [line.strip() for line in str(error).splitlines() if line.strip()]
     return lines[-1].partition("Error: ")[2] or lines[-1] if lines else type(error).__name__
 
 
 def _quieten_lightning() -> None:
-    """Lightning advertises and repeats what the progress line says; its warnings stay, but for a few."""
+    """Lightning advertises and repeats what the progress line says; its warnings stay,
+    but for a few.
+    """
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)  # its report was asked for
-    logging.getLogger("torch.multiprocessing.spawn").setLevel(logging.ERROR)  # our error says it in one line
+    # Its report was asked for
+    logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)
+    # Our error says it in one line
+    logging.getLogger("torch.multiprocessing.spawn").setLevel(logging.ERROR)
     for pointless in (
         r".*isinstance\(treespec, LeafSpec\).*",  # between Lightning and torch
         r".*does not have many workers.*",  # data this small is faster without

@@ -40,10 +40,11 @@ class InitSettings(Checked):
     """Where a field's Gaussians come from; one instance of the config group `init`.
 
     Attributes:
-        name: `sphere` around a static receiver, `uniform` and `grid` in the scene box, with random weights;
-            `images`, the sphere with weights fitted to spectra; `vectors`, the same through an array whose
-            phases are retrieved; `sources`, image sources searched for; `rays`, where measured directions
-            meet; `bearings`, where those of a moving array cross; `scene`, mirror images in known walls;
+        name: `sphere` around a static receiver, `uniform` and `grid` in the scene box, with random
+            weights; `images`, the sphere with weights fitted to spectra; `vectors`, the same
+            through an array whose phases are retrieved; `sources`, image sources searched for;
+            `rays`, where measured directions meet; `bearings`, where those of a moving array cross;
+            `scene`, mirror images in known walls;
             `diffuse`, nowhere: the residual alone.
         file: of the walls, for `scene`.
         searches: of sources: how many, with different seeds; all are kept and averaged.
@@ -103,9 +104,10 @@ class Start:
 
     Attributes:
         prior: features of the encodings, or None.
-        solve: sets the parameters of a fresh model, and may return what `left_out` holds; None: they stay
-            random.
-        left_out: training targets that it predicted without their neighbours, for whoever asks; not stored.
+        solve: sets the parameters of a fresh model, and may return what `left_out` holds; None:
+            they stay random.
+        left_out: training targets that it predicted without their neighbours, for whoever asks; not
+            stored.
     """
 
     prior: Smoothness | None

@@ -1,4 +1,6 @@
-"""Steps that pay: of all looks at validation rows, from before the first step on, the best is kept."""
+"""Steps that pay: of all looks at validation rows, from before the first step on,
+the best is kept.
+"""
 
 from __future__ import annotations
 
@@ -19,19 +21,21 @@ from gsparc.processes.uncertainty import is_surely_above
 log = logging.getLogger(__name__)
 
 SURE = 2.0  # standard errors of paired rows by which a look must be better than the start
-# Looks without one that is, after which steps that nobody asked for end. Of 15 fits (spectra of rfid by two
-# ways and splits, simulated spectra, moving receivers, channels, powers) what gained did so by the second.
+# Looks without one that is, after which steps that nobody asked for end. Of 15 fits (spectra of
+# rfid by two ways and splits, simulated spectra, moving receivers, channels, powers)
+# what gained did so by the second.
 PATIENCE = 3
 
 
 class KeepBest(L.Callback):
     """Restores the parameters of the best look when training ends.
 
-    A look is kept where the error of its rows is below that of the same rows before the first step by two
-    standard errors, and below that of all looks before it.
+    A look is kept where the error of its rows is below that of the same rows before the first step
+    by two standard errors, and below that of all looks before it.
 
     Args:
-        patience: looks after which training ends where none of them is kept; None: it goes on to its end.
+        patience: looks after which training ends where none of them is kept; None: it goes on to
+            its end.
 
     Attributes:
         step: of the kept parameters; 0: as they were before the first.
@@ -64,23 +68,31 @@ class KeepBest(L.Callback):
         """Go back to the best; also after a checkpoint with every step done."""
         if self._kept is None:
             return
-        trainer.callback_metrics[KEPT] = torch.tensor(self.step, dtype=torch.float64)  # leaves a process
+        # Leaves a process
+        trainer.callback_metrics[KEPT] = torch.tensor(self.step, dtype=torch.float64)
         steps = trainer.global_step
         if module.solved and len(self.start) and self.step:
             log.info(
-                "%d gradient steps changed the squared error of %d validation rows from %.4g to %.4g; "
+                "%d gradient steps changed the squared error of %d validation rows from %.4g to "
+                "%.4g; "
                 "a random start (experiment=field) depends more on the loss and on callbacks",
-                self.step, len(self.start), float(self.start.mean()), self.error,
-            )  # fmt: skip
+                self.step,
+                len(self.start),
+                float(self.start.mean()),
+                self.error,
+            )
         if self.step == steps:
             return
         model = module.model
         edit.resize_gaussians(model, model.gaussians, len(self._kept["gaussians.ids"]))
         model.load_state_dict(self._kept)
         log.info(
-            "gradient steps: %d taken, %s kept: more are not significantly better on %d validation rows",
-            steps, f"the first {self.step}" if self.step else "none", len(self.start),
-        )  # fmt: skip
+            "gradient steps: %d taken, %s kept: more are not significantly better on %d "
+            "validation rows",
+            steps,
+            f"the first {self.step}" if self.step else "none",
+            len(self.start),
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Return what is kept, so that a resumed run ends with it, too."""
@@ -94,7 +106,9 @@ class KeepBest(L.Callback):
 
 
 def _is_surely_less(errors: Tensor, start: Tensor) -> bool:
-    """Whether errors (n,) are below those of the start (n,) by `SURE` standard errors of the differences."""
+    """Whether errors (n,) are below those of the start (n,)
+    by `SURE` standard errors of the differences.
+    """
     # A training without a look before its first step keeps the least.
     return len(errors) != len(start) or is_surely_above((start - errors).cpu().numpy(), SURE)
 

@@ -33,8 +33,8 @@ class LossSettings(Checked):
     Attributes:
         ssim_weight: lambda of (1 - l) L1 + l (1 - SSIM); 0 leaves L1 alone, as do images
             smaller than 11 x 11.
-        snapshot: what every channel snapshot has of its own, `none`, `phase` or `phase_timing`; the loss does
-            not look at it.
+        snapshot: what every channel snapshot has of its own, `none`, `phase` or `phase_timing`; the
+            loss does not look at it.
     """
 
     ssim_weight: float = setting(SSIM_WEIGHT, number(0, 1))
@@ -43,10 +43,13 @@ class LossSettings(Checked):
 
 def _ssim_by_convolution(prediction: Tensor, target: Tensor) -> Tensor:
     """Mean SSIM (B,) of images (B, H, W) that no kernel serves."""
-    # Second moments are taken about the target's mean: flat images would lose every digit otherwise.
+    # Second moments are taken about the target's mean:
+    # flat images would lose every digit otherwise.
     shift = target.mean(dim=(-2, -1), keepdim=True)
     p, t = prediction - shift, target - shift
-    mean_p, mean_t, square_p, square_t, cross = _blur(torch.cat((p, t, p * p, t * t, p * t))).chunk(5)
+    mean_p, mean_t, square_p, square_t, cross = _blur(torch.cat((p, t, p * p, t * t, p * t))).chunk(
+        5
+    )
     # Only rounding makes a variance negative.
     variances = (square_p - mean_p**2).clamp_min(0) + (square_t - mean_t**2).clamp_min(0)
     covariance = 2 * (cross - mean_p * mean_t) + STABILITY[1]
@@ -62,7 +65,9 @@ class _Kernel(torch.autograd.Function):
     @staticmethod
     def forward(ctx, prediction: Tensor, target: Tensor) -> Tensor:
         wanted = ctx.needs_input_grad[0]
-        value, slope = similarity_op(prediction.detach(), target.detach(), _window_taps(), STABILITY, wanted)
+        value, slope = similarity_op(
+            prediction.detach(), target.detach(), _window_taps(), STABILITY, wanted
+        )
         if wanted:
             ctx.save_for_backward(slope)
         return value
@@ -83,7 +88,9 @@ def _window_taps() -> tuple[float, ...]:
 
 
 def _blur(images: Tensor) -> Tensor:
-    """Gaussian window over (B, H, W), valid part: (B, H - 10, W - 10). Shifted sums beat a convolution."""
+    """Gaussian window over (B, H, W), valid part: (B, H - 10, W - 10).
+    Shifted sums beat a convolution.
+    """
     for axis in (1, 2):
         length = images.shape[axis] - 2 * WINDOW_RADIUS
         taps = _window_taps()
@@ -100,7 +107,8 @@ def fits_ssim_window(images: Tensor | np.ndarray) -> bool:
 
 
 def ssim(prediction: Tensor, target: Tensor) -> Tensor:
-    """Return the mean structural similarity per image, Gaussian window 11 x 11, sigma 1.5, data range 1.
+    """Return the mean structural similarity per image, Gaussian window 11 x 11, sigma 1.5,
+    data range 1.
 
     Args:
         prediction, target: (B, H, W) in [0, 1].
@@ -113,9 +121,12 @@ def ssim(prediction: Tensor, target: Tensor) -> Tensor:
         RuntimeError: a second derivative in float32 outside `torch.func`.
     """
     if not fits_ssim_window(prediction):
-        raise ValueError(f"SSIM needs images of at least 11 x 11 pixels, got {tuple(prediction.shape[-2:])}")
+        raise ValueError(
+            f"SSIM needs images of at least 11 x 11 pixels, got {tuple(prediction.shape[-2:])}"
+        )
     kernel = prediction.dtype == target.dtype and has_similarity_kernel(prediction)
-    kernel = kernel and not target.requires_grad and not carries_tangent(target)  # it knows one slope
+    # It knows one slope
+    kernel = kernel and not target.requires_grad and not carries_tangent(target)
     return (_Kernel.apply if kernel else _ssim_by_convolution)(prediction, target)
 
 
@@ -162,13 +173,16 @@ def channel_loss(
         prediction, target: alike; (B, A, K) complex where snapshots have offsets.
         mask: like target, True where measured.
         snapshot: `phase`: the least error over one phase per sample; `phase_timing`: over a phase
-            and a delay, `exp(j (phi - 2 pi f tau))`, tones evenly spaced. Both leave the amplitude as it is.
+            and a delay, `exp(j (phi - 2 pi f tau))`, tones evenly spaced.
+            Both leave the amplitude as it is.
 
     Raises:
         ValueError: shapes differ; broadcasting would hide a missing antenna.
     """
     if prediction.shape != target.shape:
-        raise ValueError(f"{tuple(prediction.shape)} channels predicted, {tuple(target.shape)} measured")
+        raise ValueError(
+            f"{tuple(prediction.shape)} channels predicted, {tuple(target.shape)} measured"
+        )
     if snapshot != "none":
         return _error_up_to_phase(prediction, target, mask, snapshot == "phase_timing")
     error = (prediction - target).abs().square()
@@ -177,8 +191,12 @@ def channel_loss(
     return (error * mask).flatten(1).sum(1) / mask.flatten(1).sum(1).clamp_min(1)
 
 
-def _error_up_to_phase(prediction: Tensor, target: Tensor, mask: Tensor | None, timing: bool) -> Tensor:
-    """min |h - p exp(j (phi - 2 pi k tau))|^2 over phi (and tau): |h|^2 + |p|^2 - 2 max |<p, h>|."""
+def _error_up_to_phase(
+    prediction: Tensor, target: Tensor, mask: Tensor | None, timing: bool
+) -> Tensor:
+    """min |h - p exp(j (phi - 2 pi k tau))|^2 over phi (and tau): |h|^2 + |p|^2 - 2 max |<p,
+    h>|.
+    """
     weights = torch.ones_like(target.real) if mask is None else mask.to(target.real.dtype)
     product = (prediction.conj() * target * weights).sum(1)  # (B, K)
     if timing and product.shape[1] > 1:

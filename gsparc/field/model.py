@@ -86,8 +86,8 @@ class Rendered:
     Attributes:
         mean: (B, ...) in stored units.
         raster: of spectra; densification reads its gradients.
-        unknown: (B,) in [0, 1], the share of the field's variance that training positions leave unknown; None
-            where features do not tell.
+        unknown: (B,) in [0, 1], the share of the field's variance that training positions leave
+            unknown; None where features do not tell.
         weights: (P, N), mean over directions of alpha T, of channels that are means of an image.
     """
 
@@ -122,9 +122,14 @@ class GaussianModel(nn.Module):
         averaged = site.target.is_complex and settings.response.channel == "mean"
         signed = (site.target.is_complex and not averaged) or settings.response.array
         if signed and settings.emission.activation != "linear":
-            what = "channels are signed" if site.target.is_complex else "fields at an array are signed"
+            what = (
+                "channels are signed"
+                if site.target.is_complex
+                else ("fields at an array are signed")
+            )
             raise ValueError(
-                f"model.emission.activation={settings.emission.activation}: {what}, choose linear (or auto)"
+                f"model.emission.activation={settings.emission.activation}: {what}, choose "
+                "linear (or auto)"
             )
         self.settings = settings
         self.site = site
@@ -174,7 +179,9 @@ class GaussianModel(nn.Module):
 
     @property
     def channels(self) -> int:
-        """Real outputs of each emission network: one power, one complex gain, or one of each channel."""
+        """Real outputs of each emission network: one power, one complex gain,
+        or one of each channel.
+        """
         settings = self.settings.response
         if self.site.target.is_complex and settings.channel == "mean":
             return 2 * math.prod(self.shape)
@@ -188,7 +195,9 @@ class GaussianModel(nn.Module):
 
     @full_precision
     def unknown_shares(self, tx: Tensor, rx: Pose) -> Tensor | None:
-        """Return unknown shares f^2 (B,) of the field's variance; None where features do not tell."""
+        """Return unknown shares f^2 (B,) of the field's variance;
+        None where features do not tell.
+        """
         if not self.tells_unknown:
             return None
         return unknown_share(self.emission.encoding(self.site.moving(tx, rx)))
@@ -204,15 +213,22 @@ class GaussianModel(nn.Module):
         return emitted if attenuation is None else emitted * attenuation.unsqueeze(-1)
 
     def relative_distances(self, tx: Tensor) -> Tensor:
-        """Return d_i / d_ref (B, N), softened at the transmitter: sqrt(|tx - mu_i|^2 + d_min^2) / d_ref."""
-        x, y, z = (tx[:, None, k] - self.gaussians.means[:, k] for k in range(3))  # a sum over 3 is slow
+        """Return d_i / d_ref (B, N), softened at the transmitter: sqrt(|tx - mu_i|^2 + d_min^2)
+        / d_ref.
+        """
+        # A sum over 3 is slow
+        x, y, z = (tx[:, None, k] - self.gaussians.means[:, k] for k in range(3))
         # In place: fresh memory of megabytes costs more than the arithmetic.
         square = (x * x).addcmul_(y, y).addcmul_(z, z).add_(self.settings.attenuation.d_min**2)
         return square.mul_(1 / self.d_ref**2).sqrt_()
 
     def attenuation(self, distance: Tensor) -> Tensor | None:
-        """Return a_i = gain / d_i (B, N), or None where the switch is off and nothing is to be computed."""
-        return self.log_gain.exp() / distance if self.settings.attenuation.inverse_distance else None
+        """Return a_i = gain / d_i (B, N), or None where the switch is off
+        and nothing is to be computed.
+        """
+        return (
+            self.log_gain.exp() / distance if self.settings.attenuation.inverse_distance else None
+        )
 
     def forward(self, tx: Tensor, rx: Pose) -> Rendered:
         """Predict at tx (B, 3) [m] and one shared or B receiver poses."""
@@ -237,14 +253,16 @@ class GaussianModel(nn.Module):
             return self.response(image, unknown)
         if self.settings.response.image != "modulus":
             return image[:, 0]
-        # `vector_norm` over two planes takes seven times as long; where nothing is, the slope is 0, not NaN.
+        # `vector_norm` over two planes takes seven times as long; where nothing is,
+        # the slope is 0, not NaN.
         return (image[:, 0].square() + image[:, 1].square()).clamp_min(DARK).sqrt()
 
     def raster_of_weights(self, rendered: Rendered, rx: Pose) -> Raster | None:
-        """Return images whose means the channels are, after a backward pass; None where they are no means.
+        """Return images whose means the channels are, after a backward pass;
+        None where they are no means.
 
-        `means2d` has the gradient that rendering all channels would have given: that of one image of what the
-        loss asks of each Gaussian's weight.
+        `means2d` has the gradient that rendering all channels would have given: that of one image
+        of what the loss asks of each Gaussian's weight.
         """
         if rendered.weights is None or rendered.weights.grad is None:
             return None
@@ -292,6 +310,10 @@ class GaussianModel(nn.Module):
         }
 
     def freeze(self, rx: Pose) -> FrozenPlan:
-        """Return the pixel x Gaussian matrix of a static receiver, valid until the field's next edit."""
+        """Return the pixel x Gaussian matrix of a static receiver,
+        valid until the field's next edit.
+        """
         with torch.no_grad():
-            return ops.freeze(self.plan(rx), *self.gaussians.geometry(), version=int(self.gaussians.version))
+            return ops.freeze(
+                self.plan(rx), *self.gaussians.geometry(), version=int(self.gaussians.version)
+            )

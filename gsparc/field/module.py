@@ -39,8 +39,8 @@ class NetworkModule(L.LightningModule):
     """Trains a network by its own loss.
 
     Args:
-        model: called with a query, gives targets (B, ...); `loss(batch, draw)` is () of a batch, with a
-            generator for what is drawn at random.
+        model: called with a query, gives targets (B, ...); `loss(batch, draw)` is () of a batch,
+            with a generator for what is drawn at random.
         site: what the data declare.
         rates: of its schedule, and of its parameters where `rate_of` does not say.
         total_steps: length of the schedules.
@@ -51,9 +51,14 @@ class NetworkModule(L.LightningModule):
     count: int | None = None  # of Gaussians that callbacks may edit
 
     def __init__(
-        self, model: Any, site: Site, rates: OptimizerSettings, total_steps: int, run_dir: Path,
+        self,
+        model: Any,
+        site: Site,
+        rates: OptimizerSettings,
+        total_steps: int,
+        run_dir: Path,
         rate_of: RateOf | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__()
         self.model, self.site, self.rates, self.rate_of = model, site, rates, rate_of
         self.total_steps, self.run_dir = total_steps, run_dir
@@ -62,10 +67,12 @@ class NetworkModule(L.LightningModule):
         self.solved = False  # whether training starts from emissions in closed form
         self.start = "start"  # what the learning curve calls its first point
         self.log_every = 1  # steps; a figure costs as much as a kernel to log
-        self.held_out = torch.zeros(0)  # squared error of each validation row (n,), at the last look
+        # Squared error of each validation row (n,), at the last look
+        self.held_out = torch.zeros(0)
         self.figures: dict[str, float] = {}  # of all validation rows, at the last look
         self._looks: list[tuple[Tensor, dict[str, Tensor]]] = []
-        self.batch: Batch | None = None  # of the current step; evidence when it poisons the parameters
+        # Of the current step; evidence when it poisons the parameters
+        self.batch: Batch | None = None
 
     def mean(self, batch: Batch) -> Tensor:
         """Return targets (B, ...) as predicted."""
@@ -84,7 +91,9 @@ class NetworkModule(L.LightningModule):
         loss, task = self.losses(batch)
         if not torch.isfinite(loss):
             bad = ~torch.isfinite(task)
-            raise self._write_evidence(batch, int(batch.index[bad][0] if bad.any() else batch.index[0]))
+            raise self._write_evidence(
+                batch, int(batch.index[bad][0] if bad.any() else batch.index[0])
+            )
         if (self.global_step + 1) % self.log_every == 0:
             part = batch.share * process_count()  # the mean over processes is that over the batch
             self.log("train/task_loss", task.detach().mean() * part, sync_dist=True)
@@ -95,7 +104,9 @@ class NetworkModule(L.LightningModule):
         return loss * batch.share
 
     def on_train_batch_end(self, outputs: Any, batch: Batch, batch_idx: int) -> None:
-        """Log rates of the step that was taken, by names of their settings (`OptimizerSettings`)."""
+        """Log rates of the step that was taken, by names
+        of their settings (`OptimizerSettings`).
+        """
         if self.global_step % self.log_every == 0:
             groups = self.trainer.optimizers[0].param_groups
             self.log_dict({f"rate/{group['kind']}": group["lr"] for group in groups})
@@ -121,7 +132,9 @@ class NetworkModule(L.LightningModule):
         self.log("time/train_s", self.prepared_seconds + self.train_seconds, batch_size=size)
 
     def on_validation_epoch_end(self) -> None:
-        """Keep the errors of all rows and their figures: Lightning drops those of the look before step 1."""
+        """Keep the errors of all rows and their figures:
+        Lightning drops those of the look before step 1.
+        """
         looks, self._looks = self._looks, []
         if not looks:
             return
@@ -144,7 +157,9 @@ class NetworkModule(L.LightningModule):
 
     @classmethod
     def load_from_checkpoint(cls, *_: Any, **__: Any) -> NoReturn:  # type: ignore[override]
-        """Raise `NotImplementedError`, which says what reads our checkpoints: they hold whole models."""
+        """Raise `NotImplementedError`, which says what reads our checkpoints:
+        they hold whole models.
+        """
         raise NotImplementedError(
             "a checkpoint holds a whole model: say gsparc.models.loading.load_module(FILE)"
         )
@@ -153,7 +168,10 @@ class NetworkModule(L.LightningModule):
         """Return one Adam group per tensor, rates as pure functions of the step."""
         optimizer = optimizer_for(self.model, self.rates, self.rate_of)
         scheduler = scheduler_for(optimizer, self.rates, self.total_steps)
-        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": scheduler, "interval": "step"},
+        }
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Refuse a poisoned state, which must never replace a good checkpoint."""
@@ -165,7 +183,9 @@ class NetworkModule(L.LightningModule):
         bad = (name for name, p in self.model.named_parameters() if not torch.isfinite(p).all())
         return next(bad, None)
 
-    def _write_evidence(self, batch: Batch, sample: int, refused: str | None = None) -> NonFiniteLoss:
+    def _write_evidence(
+        self, batch: Batch, sample: int, refused: str | None = None
+    ) -> NonFiniteLoss:
         """Leave batch, parameters and the first offender on disk; the error that says so."""
         path = self.run_dir / "nonfinite.pt"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -176,9 +196,14 @@ class NetworkModule(L.LightningModule):
             **{"rx_position": batch.rx.position, "rx_rotation": batch.rx.rotation},
         }
         torch.save({**evidence, "state_dict": self.model.state_dict()}, path)
-        culprit = f"first offender: {offender}" if offender else "all parameters are finite, see the batch"
+        culprit = (
+            f"first offender: {offender}"
+            if offender
+            else ("all parameters are finite, see the batch")
+        )
         return NonFiniteLoss(
-            f"the loss became NaN or infinite at step {self.global_step} (sample {sample}; {culprit}); "
+            f"the loss became NaN or infinite at step {self.global_step} (sample {sample}; "
+            f"{culprit}); "
             f"batch and parameters are in {path}"
         )
 
@@ -195,12 +220,17 @@ class GaussianModule(NetworkModule):
     """
 
     def __init__(
-        self, model: GaussianModel, loss: LossSettings, optimizer: OptimizerSettings,
-        total_steps: int, run_dir: Path,
-    ) -> None:  # fmt: skip
+        self,
+        model: GaussianModel,
+        loss: LossSettings,
+        optimizer: OptimizerSettings,
+        total_steps: int,
+        run_dir: Path,
+    ) -> None:
         super().__init__(model, model.site, optimizer, total_steps, run_dir)
         self.loss = loss
-        self.rendered: Rendered | None = None  # of the current step; densification reads its gradients
+        # Of the current step; densification reads its gradients
+        self.rendered: Rendered | None = None
 
     @property
     def count(self) -> int:  # type: ignore[override]
@@ -222,7 +252,9 @@ class GaussianModule(NetworkModule):
         return StepLosses(weighted_loss(task, exponent, confidence.settings.alpha).mean(), task)
 
     def task_loss(self, prediction: Tensor, batch: Batch) -> Tensor:
-        """Return the loss per sample (B,) before confidence; what was not measured counts as met."""
+        """Return the loss per sample (B,) before confidence;
+        what was not measured counts as met.
+        """
         return task_loss(prediction, batch, self.loss, self.site.target)
 
     def _render(self, batch: Batch) -> Rendered:
@@ -236,7 +268,9 @@ class GaussianModule(NetworkModule):
 
     def load_state_dict(self, state_dict: Mapping[str, Any], *args: Any, **kwargs: Any) -> Any:
         """Make room for the number of Gaussians before their tensors arrive."""
-        edit.resize_gaussians(self.model, self.model.gaussians, len(state_dict["model.gaussians.ids"]))
+        edit.resize_gaussians(
+            self.model, self.model.gaussians, len(state_dict["model.gaussians.ids"])
+        )
         return super().load_state_dict(state_dict, *args, **kwargs)
 
     def _find_nonfinite(self) -> str | None:
@@ -249,7 +283,9 @@ class GaussianModule(NetworkModule):
 
 
 def squared_error(mean: Tensor, batch: Batch, target: Target) -> Tensor:
-    """Return the squared error of each row (B,) of what was measured: per entry, of powers [dB^2]."""
+    """Return the squared error of each row (B,) of what was measured: per entry,
+    of powers [dB^2].
+    """
     square = (target.in_error_unit(mean) - target.in_error_unit(batch.target)).abs().square()
     if batch.mask is not None:
         square = torch.where(batch.mask, square, 0)

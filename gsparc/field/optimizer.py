@@ -27,8 +27,8 @@ class OptimizerSettings(Checked):
         scales, rotations, opacities, emission, confidence, gain: initial rates.
         decay: final rate of everything but the positions, as a share of the initial one (cosine).
         warmup: steps over which all rates rise linearly from zero.
-        solved_share: of all rates after a start in closed form: at the whole rates the first two steps cost
-            7 dB there.
+        solved_share: of all rates after a start in closed form: at the whole rates the first two
+            steps cost 7 dB there.
         eps: Adam's epsilon.
     """
 
@@ -47,14 +47,19 @@ class OptimizerSettings(Checked):
     eps: float = internal(1e-15)
 
     def after_closed_form(self, total: int) -> OptimizerSettings:
-        """Return the rates of `total` steps after a start in closed form: a share of these, from zero."""
+        """Return the rates of `total` steps after a start in closed form: a share of these,
+        from zero.
+        """
         shares = {
-            name: self.solved_share * getattr(self, name) for name in (*KINDS.values(), "positions_final")
+            name: self.solved_share * getattr(self, name)
+            for name in (*KINDS.values(), "positions_final")
         }
         return replace(self, **shares, warmup=max(self.warmup, round(WARMUP * total)))
 
     def rate_of(self, name: str) -> tuple[str, float]:
-        """Return a parameter's kind and initial rate by dotted name; `KeyError` where none is declared."""
+        """Return a parameter's kind and initial rate by dotted name;
+        `KeyError` where none is declared.
+        """
         kind = rate_kind(name)
         return kind, getattr(self, kind)
 
@@ -77,11 +82,14 @@ def rate_kind(name: str) -> str:
         if name == prefix or name.startswith(prefix + "."):
             return kind
     raise KeyError(
-        f"no learning rate is declared for parameter {name!r}: add it to gsparc.field.optimizer.KINDS"
+        f"no learning rate is declared for parameter {name!r}: add it to "
+        "gsparc.field.optimizer.KINDS"
     )
 
 
-def optimizer_for(model: nn.Module, settings: OptimizerSettings, rate_of: RateOf | None = None) -> Adam:
+def optimizer_for(
+    model: nn.Module, settings: OptimizerSettings, rate_of: RateOf | None = None
+) -> Adam:
     """Return Adam with one parameter tensor per group, so that surgery can exchange single tensors.
 
     Args:

@@ -1,4 +1,6 @@
-"""The linear read-out of emissions, solved again after an edit so that the field renders what it did."""
+"""The linear read-out of emissions, solved again after an edit so
+that the field renders what it did.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from gsparc.field.response import ArrayResponse
 from gsparc.ops import Pose
 from gsparc.processes.factor import Factor
 
-RIDGE = 1e-3  # of the mean energy of a view: footprints overlap, and less lets weights cancel each other
+# Of the mean energy of a view: footprints overlap, and less lets weights cancel each other
+RIDGE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -35,7 +38,8 @@ class SolvedReadout:
 
 @torch.no_grad()
 def solve_readout(model: GaussianModel, change: edit.Edit, batch: Batch) -> SolvedReadout | None:
-    """Return the read-out with which an edited field renders what it does now; the field stays as it is.
+    """Return the read-out with which an edited field renders what it does now;
+    the field stays as it is.
 
     Weights of the edited field are corrected by least squares, for all features at once.
 
@@ -63,7 +67,9 @@ def solve_readout(model: GaussianModel, change: edit.Edit, batch: Batch) -> Solv
     trial.emission.weight2.add_(correction[:-1].transpose(0, 1))
     trial.emission.bias2.add_(correction[-1])
     error = trial(batch.tx, batch.rx).mean - model(batch.tx, batch.rx).mean
-    return SolvedReadout(trial.emission.weight2, trial.emission.bias2, batch.share * error.square().mean())
+    return SolvedReadout(
+        trial.emission.weight2, trial.emission.bias2, batch.share * error.square().mean()
+    )
 
 
 def _feature_weights(model: GaussianModel) -> Tensor:
@@ -75,14 +81,19 @@ def _feature_weights(model: GaussianModel) -> Tensor:
 def _unit_views(model: GaussianModel, rx: Pose) -> Tensor:
     """What unit emissions of all Gaussians look like (N, P), or (N, M) complex to the array.
 
-    Attenuation is that of the middle of the moving end's box: it hardly differs between a Gaussian and what
-    it is split into.
+    Attenuation is that of the middle of the moving end's box: it hardly differs between a Gaussian
+    and what it is split into.
     """
     if isinstance(model.response, ArrayResponse):
         view = gaussian_vectors(model, rx)
     else:
         each = torch.eye(len(model.gaussians), device=model.gaussians.means.device)
         view = model.freeze(rx).render(each, int(model.gaussians.version)).flatten(1)
-    middle = torch.as_tensor(model.site.box).float().mean(0, keepdim=True).to(model.gaussians.means.device)
+    middle = (
+        torch.as_tensor(model.site.box)
+        .float()
+        .mean(0, keepdim=True)
+        .to(model.gaussians.means.device)
+    )
     attenuation = model.attenuation(model.relative_distances(middle))
     return view if attenuation is None else view * attenuation[0, :, None]

@@ -1,7 +1,7 @@
 """From emissions of rasterized Gaussians to measurements: channels, an array's spectra.
 
-Each response is one term of the model, with its own gradients; the model holds the one that site and
-settings require.
+Each response is one term of the model, with its own gradients; the model holds the one that site
+and settings require.
 """
 
 from __future__ import annotations
@@ -16,7 +16,12 @@ from torch import Tensor, nn
 from gsparc.base.limits import Checked, choice, internal, number, setting
 from gsparc.data.schema import Site
 from gsparc.ops import SphereGrid
-from gsparc.physics.array_response import array_output, element_pattern, normalise_spectrum, steering_matrix
+from gsparc.physics.array_response import (
+    array_output,
+    element_pattern,
+    normalise_spectrum,
+    steering_matrix,
+)
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.physics.waves import LIGHT
 
@@ -28,25 +33,29 @@ class ResponseSettings(Checked):
     """From rendered Gaussians to targets; a coherent term that is off is not computed.
 
     Attributes:
-        array: spectra arise in the static array: complex emissions are composited per direction to z, the
-            elements measure `h = A z`, and the spectrum is `sqrt(|A^H h|^2 + f^2 mean^2)` with the share f^2
-            of the field that training positions leave unknown; where emissions tell none (not started in
-            closed form), `|A^H h|` normalised as the dataset is.
+        array: spectra arise in the static array: complex emissions are composited per direction to
+            z, the elements measure `h = A z`, and the spectrum is `sqrt(|A^H h|^2 + f^2 mean^2)`
+            with the share f^2 of the field that training positions leave unknown; where emissions
+            tell none (not started in closed form), `|A^H h|` normalised as the dataset is.
         pattern: element amplitude, cos^pattern of the angle off boresight; 0 is isotropic.
-        image: what of an image is a spectrum: `power`, of one emission a Gaussian; of complex ones, `modulus`
-            or `real` part.
-        channel: `sources`, gains of Gaussians through their steering and delays (`ChannelResponse`); `mean`,
-            the mean over all directions of an image of emissions, one a channel (paper, eq. 2).
+        image: what of an image is a spectrum: `power`, of one emission a Gaussian; of complex ones,
+            `modulus` or `real` part.
+        channel: `sources`, gains of Gaussians through their steering and delays
+            (`ChannelResponse`); `mean`, the mean over all directions of an image of emissions,
+            one a channel (paper, eq. 2).
     """
 
     array: bool = internal(False)
     pattern: float = setting(0.0, number(0))
-    image: Literal["power", "modulus", "real"] = setting("power", choice("power", "modulus", "real"))
+    image: Literal["power", "modulus", "real"] = setting(
+        "power", choice("power", "modulus", "real")
+    )
     channel: Literal["sources", "mean"] = setting("sources", choice("sources", "mean"))
 
 
 class MeanResponse(nn.Module):
-    """Channels as means over directions of an image: `h = sum_i (mean_u alpha_i T_i) s_i` (paper, eq. 2).
+    """Channels as means over directions of an image:
+    `h = sum_i (mean_u alpha_i T_i) s_i` (paper, eq. 2).
 
     Args:
         antennas, subcarriers: A and K; emissions are A K complex numbers of each Gaussian.
@@ -57,16 +66,19 @@ class MeanResponse(nn.Module):
         self.shape = antennas, subcarriers
 
     def forward(self, weights: Tensor, features: Tensor) -> Tensor:
-        """Return channels (B, A, K) complex of weights (P, N), P of 1 or B, and emissions (B, N, 2 A K)."""
+        """Return channels (B, A, K) complex of weights (P, N), P of 1 or B,
+        and emissions (B, N, 2 A K).
+        """
         total = torch.bmm(weights.expand(len(features), -1).unsqueeze(1), features)
         return torch.view_as_complex(total.view(len(features), *self.shape, 2))
 
 
 class ChannelResponse(nn.Module):
-    """Factored channels: each Gaussian has a steering vector over antennas and a delay over subcarriers.
+    """Factored channels: each Gaussian has a steering vector over antennas
+    and a delay over subcarriers.
 
-    `H = A diag(w g) F^T`: 2 A + 1 numbers per Gaussian however many channels there are, and one pass for all
-    of them. Steering starts at one, delays at the initial path lengths.
+    `H = A diag(w g) F^T`: 2 A + 1 numbers per Gaussian however many channels there are, and one
+    pass for all of them. Steering starts at one, delays at the initial path lengths.
 
     Args:
         antennas, subcarriers: A and K.
@@ -77,7 +89,9 @@ class ChannelResponse(nn.Module):
     per_gaussian = True
     numbers: Tensor
 
-    def __init__(self, antennas: int, subcarriers: int, tones_hz: Tensor | None, lengths: Tensor) -> None:
+    def __init__(
+        self, antennas: int, subcarriers: int, tones_hz: Tensor | None, lengths: Tensor
+    ) -> None:
         super().__init__()
         self.subcarriers = subcarriers
         self.steering = nn.Parameter(torch.tensor([1.0, 0.0]).repeat(len(lengths), antennas, 1))
@@ -98,7 +112,8 @@ class ChannelResponse(nn.Module):
         phase = -2 * math.pi * torch.outer(delays, self.numbers).to(weighted.real.dtype)
         parts = {"bn": weighted, "na": torch.view_as_complex(self.steering)}
         parts["nk"] = torch.polar(torch.ones_like(phase), phase)
-        # The longest last: PyTorch multiplies from left to right, and stores the product of the first two.
+        # The longest last: PyTorch multiplies from left to right,
+        # and stores the product of the first two.
         order = sorted(parts, key=lambda name: parts[name].numel())
         return torch.einsum(",".join(order) + "->bak", *(parts[name] for name in order))
 
@@ -131,7 +146,9 @@ class ArrayResponse(nn.Module):
         self.renderer = SpectrumRenderer(self.array, self.grid, self.wavelength, no_background)
 
     def array_vectors(self, image: Tensor) -> Tensor:
-        """Return array vectors h = A z (B, M) complex64 of composited fields (B, 2, H, W) per steradian."""
+        """Return array vectors h = A z (B, M) complex64 of composited fields (B, 2, H, W)
+        per steradian.
+        """
         waves = torch.complex(image[:, 0], image[:, 1])
         return array_output(waves, self.matrix, self.grid, self.pattern)
 
@@ -146,22 +163,31 @@ class ArrayResponse(nn.Module):
 
     def coarse_renderer(self, stride: int, grid: SphereGrid) -> SpectrumRenderer:
         """Return the renderer on `grid`, every `stride`-th row and column of its own."""
-        return SpectrumRenderer(self.array, grid, self.wavelength, self.background[::stride, ::stride])
+        return SpectrumRenderer(
+            self.array, grid, self.wavelength, self.background[::stride, ::stride]
+        )
 
     def spectra(self, vectors: Tensor, unknown: Tensor | None = None) -> Tensor:
-        """Return published spectra (B, H, W) of array vectors (B, M) and unknown shares f^2 (B,), if any.
+        """Return published spectra (B, H, W) of array vectors (B, M) and unknown shares f^2 (B,),
+        if any.
 
-        Vectors beside a share have the scale of published spectra: the mean of an uncertain one has no
-        maximum of 1 to be divided by.
+        Vectors beside a share have the scale of published spectra: the mean of an uncertain one has
+        no maximum of 1 to be divided by.
         """
         if unknown is not None:
             share = unknown.clamp_min(SLOPE_ENDS).sqrt()
             return self.renderer(torch.cat([vectors, share[:, None].to(vectors.dtype)], 1))
-        inputs = torch.cat([vectors, torch.zeros_like(vectors[:, :1])], 1)  # no incoherent background
-        if self.normalisation != "none":  # scaled first: the slope is cut off below a fixed amplitude
-            inputs = inputs / torch.linalg.vector_norm(vectors.detach(), dim=1, keepdim=True).clamp_min(1e-20)
+        # No incoherent background
+        inputs = torch.cat([vectors, torch.zeros_like(vectors[:, :1])], 1)
+        # Scaled first: the slope is cut off below a fixed amplitude
+        if self.normalisation != "none":
+            inputs = inputs / torch.linalg.vector_norm(
+                vectors.detach(), dim=1, keepdim=True
+            ).clamp_min(1e-20)
         image = self.renderer(inputs).flatten(1)
-        return normalise_spectrum(image, self.normalisation).unflatten(1, (self.grid.height, self.grid.width))
+        return normalise_spectrum(image, self.normalisation).unflatten(
+            1, (self.grid.height, self.grid.width)
+        )
 
     def forward(self, image: Tensor, unknown: Tensor | None = None) -> Tensor:
         """Return spectra (B, H, W) of composited fields (B, 2, H, W) and unknown shares (B,)."""

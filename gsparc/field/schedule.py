@@ -1,4 +1,6 @@
-"""Schedules written as numbers of steps, or as shares of a training whose length is not yet known."""
+"""Schedules written as numbers of steps,
+or as shares of a training whose length is not yet known.
+"""
 
 from __future__ import annotations
 
@@ -17,15 +19,19 @@ INTERVAL = Limit(
 
 
 def to_steps(given: int | float, total: int) -> int:
-    """Return the step that `given` means in a training of `total` steps; a share is of one step at least."""
+    """Return the step that `given` means in a training of `total` steps;
+    a share is of one step at least.
+    """
     return given if isinstance(given, int) else max(1, round(given * total))
 
 
-def acts_at_step(step: int, start: int | float, stop: int | float, interval: int | float, total: int) -> bool:
+def acts_at_step(
+    step: int, start: int | float, stop: int | float, interval: int | float, total: int
+) -> bool:
     """Tell whether a callback acts at a step: on a multiple of `interval` from `start` to `stop`.
 
-    Where the interval is a share, not before `FIRST` steps were taken: a training that short has gradients of
-    its initial weights alone, and would not recover.
+    Where the interval is a share, not before `FIRST` steps were taken: a training that short has
+    gradients of its initial weights alone, and would not recover.
 
     Args:
         step: of gradient so far.

@@ -19,10 +19,14 @@ if TYPE_CHECKING:
 
 @runtime_checkable
 class Reconditions(Protocol):
-    """Learns from other rows with its settings as they are: what is left out is forgotten but by these."""
+    """Learns from other rows with its settings as they are:
+    what is left out is forgotten but by these.
+    """
 
     def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
-        """Return a method of rows (n,) alone; None where more than settings would remember the others."""
+        """Return a method of rows (n,) alone; None where more
+        than settings would remember the others.
+        """
 
 
 @runtime_checkable
@@ -104,7 +108,8 @@ class HasPaths(Protocol):
     """Its channels are sums of propagation paths."""
 
     def paths(self, query: Query) -> QueryPaths:
-        """Return gains (B, A, N), delays (B, A, N) [s], directions (B, N, 3) of arrival, the carrier [Hz].
+        """Return gains (B, A, N), delays (B, A, N) [s], directions (B, N, 3) of arrival,
+        the carrier [Hz].
 
         Raises:
             ValueError: what was fitted here has none.

@@ -1,10 +1,12 @@
-"""Channels whose rows have phases, delays and gains of their own, turned until they fit their neighbours.
+"""Channels whose rows have phases, delays and gains of their own,
+turned until they fit their neighbours.
 
-With one unknown factor a row, what rows share is their shape. Rows are turned along a spanning tree of
-near places, then each to what a process of all other rows says of it, in turns with the process's settings.
-Many phases fit: those that vary slowly over places ("neighbours") are as good as the carrier's, unless
-several antennas at known places see the same factor: then only phases of waves ("carrier") fit all of them.
-What predicts rows left out better, after the same unknown factor, is taken.
+With one unknown factor a row, what rows share is their shape. Rows are turned along a spanning tree
+of near places, then each to what a process of all other rows says of it, in turns with the
+process's settings. Many phases fit: those that vary slowly over places ("neighbours") are as good
+as the carrier's, unless several antennas at known places see the same factor: then only phases of
+waves ("carrier") fit all of them. What predicts rows left out better,
+after the same unknown factor, is taken.
 """
 
 from __future__ import annotations
@@ -54,7 +56,8 @@ class Alignment:
 
     Attributes:
         factors: (n, K) complex128.
-        error: of rows predicted from the others after the same unknown factor, relative to their power.
+        error: of rows predicted from the others after the same unknown factor, relative to their
+            power.
         phase_reference: see `Site`.
     """
 
@@ -64,10 +67,12 @@ class Alignment:
 
 
 def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
-    """Return measurements with training and validation rows turned to each other, and rows to learn from.
+    """Return measurements with training and validation rows turned to each other,
+    and rows to learn from.
 
-    Several packets of one place and station become one, the first of them, whose channel is their mean. Rows
-    keep what `site.unknown_factor` leaves them; test rows are not looked at. Without one nothing is done.
+    Several packets of one place and station become one, the first of them, whose channel is their
+    mean. Rows keep what `site.unknown_factor` leaves them; test rows are not looked at.
+    Without one nothing is done.
     """
     site = data.site
     if site.unknown_factor == "none" or site.phase_reference is not None:
@@ -94,12 +99,19 @@ def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
         "carrier" if all(one.phase_reference == "carrier" for one in found) else "neighbours"
     )
     log.info(
-        "aligned %d rows by %s: each is predicted by the others to NMSE %.3g; phases over places are %s",
-        len(fit_rows), describe_factor(site.unknown_factor), float(np.mean([one.error for one in found])),
+        "aligned %d rows by %s: each is predicted by the others to NMSE %.3g; phases over places "
+        "are %s",
+        len(fit_rows),
+        describe_factor(site.unknown_factor),
+        float(np.mean([one.error for one in found])),
         "the carrier's" if reference == "carrier" else "relative to neighbours",
-    )  # fmt: skip
+    )
     turned = replace(
-        data, target=target, noise_variance=noise, run=None, site=replace(site, phase_reference=reference)
+        data,
+        target=target,
+        noise_variance=noise,
+        run=None,
+        site=replace(site, phase_reference=reference),
     )
     train, turned = average_packets(turned, fold.train)
     val, turned = average_packets(turned, fold.val)
@@ -109,9 +121,14 @@ def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
 
 
 def average_packets(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, Measurements]:
-    """Return the first of `rows` at each place and station, and measurements where these are the means."""
+    """Return the first of `rows` at each place and station,
+    and measurements where these are the means.
+    """
     station = data.stations_of(rows)
-    packets, seen = np.c_[data.moving[rows], station], None if data.mask is None else data.mask[rows]
+    packets, seen = (
+        np.c_[data.moving[rows], station],
+        None if data.mask is None else data.mask[rows],
+    )
     first, mean, count = mean_at_places(packets, data.target[rows], seen)
     if len(first) == len(rows):
         return rows, data
@@ -127,7 +144,9 @@ def average_packets(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, M
 
 
 def _group_snapshots(data: Measurements, rows: np.ndarray) -> list[Snapshots]:
-    """Rows (n,) of all stations where most are heard at each moment, else those of each station alone."""
+    """Rows (n,) of all stations where most are heard at each moment,
+    else those of each station alone.
+    """
     numbers = data.stations_of(rows)
     stations = np.unique(numbers)
     if len(rows) >= SHARED * len(stations) * (number_moments(data, rows).max() + 1):
@@ -141,12 +160,15 @@ def _rms_of_rows(values: np.ndarray) -> np.ndarray:
     return np.maximum(np.sqrt((np.abs(values) ** 2).sum((1, 2)) / count), TINY_POWER)
 
 
-# Of the last alignment the measurements, what else it depends on, and its result: baselines share it.
+# Of the last alignment the measurements, what else it depends on, and its result:
+# baselines share it.
 _LAST: list[tuple[weakref.ref[Measurements], tuple[bytes, ...], tuple[Measurements, Fold]]] = []
 
 
 def align_rows(rows: Snapshots, unknown_factor: UnknownFactor, site: Site) -> Alignment:
-    """Return the better of phases relative to neighbours and, where several antennas tell, the carrier's."""
+    """Return the better of phases relative to neighbours and, where several antennas tell,
+    the carrier's.
+    """
     if len(rows.values) == 1:  # a row alone has no other to be turned to
         return Alignment(np.ones((1, len(rows.tones)), np.complex128), 1.0, "neighbours")
     power = np.sqrt((np.abs(rows.values) ** 2).mean((0, 2), keepdims=True))
@@ -199,7 +221,9 @@ class _Rows:
         return "phase" if self.unknown_factor == "phase" else "phase+delay"
 
     def refine_by_neighbours(self, factors: np.ndarray) -> Alignment:
-        """Go on from these factors by a process of two lengths; return the round that tells rows best."""
+        """Go on from these factors by a process of two lengths;
+        return the round that tells rows best.
+        """
         kernel, found = initial_kernel(self.length, neighbour_distance(self.places)), []
         for _ in range(ROUNDS):
             factors = self._sweep_factors(factors, self._neighbour_weights(kernel), SWEEPS)
@@ -222,7 +246,10 @@ class _Rows:
         near = rows_with_nearest(self.places, np.arange(len(self.places)), NEIGHBOURS)[:, 1:]
         weight = np.empty(near.shape)
         for part in np.array_split(np.arange(len(near)), -(-len(near) // AT_ONCE)):
-            at, around = torch.from_numpy(self.places[part]), torch.from_numpy(self.places[near[part]])
+            at, around = (
+                torch.from_numpy(self.places[part]),
+                torch.from_numpy(self.places[near[part]]),
+            )
             noise = torch.full(around.shape[:2], float(kernel.noise), dtype=torch.float64)
             weight[part] = neighbour_weights(kernel, at, around, noise)[0].numpy()
         count, starts = len(near), np.arange(len(near) + 1) * near.shape[1]
@@ -242,14 +269,17 @@ class _Rows:
     def _left_out_error(self, factors: np.ndarray, weights: csr_array) -> float:
         predictions = self._predict_left_out(factors, weights)
         predictions = (
-            predictions * align_factors(predictions, self.values, self.tones, self.unknown_factor)[:, None]
+            predictions
+            * align_factors(predictions, self.values, self.tones, self.unknown_factor)[:, None]
         )
         missed = np.abs(self.values - predictions) ** 2 * (self.values != 0)
         return float(missed.sum() / (np.abs(self.values) ** 2).sum())
 
 
 def _direct_wave(rows: Snapshots, site: Site) -> np.ndarray | None:
-    """The direct wave (n, A, 1) where enough antennas at known places see one factor; None elsewhere."""
+    """The direct wave (n, A, 1) where enough antennas at known places see one factor;
+    None elsewhere.
+    """
     if site.wavelength is None or rows.values.shape[1] < ANTENNAS or rows.places.shape[1] != 3:
         return None
     if site.stations is not None:

@@ -1,4 +1,6 @@
-"""One file per trained method: everything needed to predict again, written atomically, read without code."""
+"""One file per trained method: everything needed to predict again, written atomically,
+read without code.
+"""
 
 from __future__ import annotations
 
@@ -29,13 +31,16 @@ FORMAT = "gsparc-checkpoint"
 PARTS = {"format", "version", "config", "method", "target", "site", "state", "extra", "sha256"}
 DEEPEST = 50  # of containers in containers
 RENAMED = {"freedom": "unknown_factor"}  # facts of sites in older checkpoints
-MOVED = ("gsparc.data.datasets.", "gsparc.datasets.")  # classes in configurations of older checkpoints
+# Classes in configurations of older checkpoints
+MOVED = ("gsparc.data.datasets.", "gsparc.datasets.")
 MODEL = "model.ckpt"  # of a run's folder
 WAIT_S = 60.0  # for others who write a file: a large file of later rows takes seconds
 
 
 class CheckpointError(ValueError):
-    """A file that is no readable checkpoint, or a state that cannot be written; one line, with the file."""
+    """A file that is no readable checkpoint, or a state that cannot be written; one line,
+    with the file.
+    """
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,8 @@ class StoredModel:
         config: the run's configuration, YAML text ("" when there was none).
         site: the dataset's fixed facts (normalisation, grid, origin, box, array, carrier).
         state: what `Method.restore` needs.
-        extra: what a trainer or harness added (optimizer, random states, position in the data order, split).
+        extra: what a trainer or harness added (optimizer, random states, position in the data
+            order, split).
         path: the file.
         sha256: of all that it holds; "" of older files.
     """
@@ -72,7 +78,9 @@ class StoredModel:
         if (
             "${" in self.config
         ):  # ours are resolved; another's would fetch what the reader's environment holds
-            raise CheckpointError(f"{self.path}: its configuration has ${{...}}, which gsparc never writes")
+            raise CheckpointError(
+                f"{self.path}: its configuration has ${{...}}, which gsparc never writes"
+            )
         try:
             loaded = load_yaml(self.config.replace(*MOVED), self.path)
         except DataError as error:
@@ -87,8 +95,11 @@ class StoredModel:
         return loaded
 
 
-def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str, Any] | None = None) -> None:
-    """Write `method` and its site; the file appears whole or not at all, also under a kill or a full disk.
+def save(
+    path: str | Path, method: Method, config: str = "", extra: Mapping[str, Any] | None = None
+) -> None:
+    """Write `method` and its site; the file appears whole or not at all,
+    also under a kill or a full disk.
 
     Args:
         path: file to write or replace.
@@ -97,17 +108,23 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
         extra: tensors, numbers, strings, None, nested dicts and lists.
 
     Raises:
-        CheckpointError: something in the state is of another type or not finite, its place is named; there is
-            no room; or another process writes the file.
+        CheckpointError: something in the state is of another type or not finite, its place is
+            named; there is no room; or another process writes the file.
     """
     if method.site is None:
-        raise CheckpointError(f"{path}: {method.name} has not been fitted, there is nothing to store")
+        raise CheckpointError(
+            f"{path}: {method.name} has not been fitted, there is nothing to store"
+        )
     content = {
-        "format": FORMAT, "version": VERSION, "config": config,
-        "method": method.name, "target": import_path(method.stored_class),
-        "site": _to_plain(asdict(method.site), "site"), "state": _to_plain(method.state(), "state"),
+        "format": FORMAT,
+        "version": VERSION,
+        "config": config,
+        "method": method.name,
+        "target": import_path(method.stored_class),
+        "site": _to_plain(asdict(method.site), "site"),
+        "state": _to_plain(method.state(), "state"),
         "extra": _to_plain(dict(extra or {}), "extra"),
-    }  # fmt: skip
+    }
     with _one_writer(Path(path), WAIT_S):
         _write(Path(path), content)
 
@@ -138,8 +155,11 @@ class Rewriting:
 
 
 @contextmanager
-def rewriting(path: str | Path, out: str | Path | None = None, wait_s: float = WAIT_S) -> Iterator[Rewriting]:
-    """Hold a checkpoint from reading to writing: of two who add to it at once, one waits for the other.
+def rewriting(
+    path: str | Path, out: str | Path | None = None, wait_s: float = WAIT_S
+) -> Iterator[Rewriting]:
+    """Hold a checkpoint from reading to writing: of two who add to it at once,
+    one waits for the other.
 
     With `out` the result is another file, and `path` stays.
 
@@ -171,12 +191,16 @@ def _one_writer(path: Path, wait_s: float) -> Iterator[None]:
             raise CheckpointError(f"{path}: {busy}") from error
         except OSError as error:
             why = error.strerror or error
-            raise CheckpointError(f"{path}: cannot be locked ({why}); what was there is kept") from error
+            raise CheckpointError(
+                f"{path}: cannot be locked ({why}); what was there is kept"
+            ) from error
         yield
 
 
 def _write(path: Path, content: dict[str, Any]) -> StoredModel:
-    """Write what passes as it would when it is read: what nobody could read takes no file's place."""
+    """Write what passes as it would when it is read:
+    what nobody could read takes no file's place.
+    """
     content.pop("sha256", None)
     _check_content(content, path)
     content["sha256"] = _content_digest(content)
@@ -186,9 +210,13 @@ def _write(path: Path, content: dict[str, Any]) -> StoredModel:
             torch.save(content, file)
     except (OSError, RuntimeError) as error:  # torch's writer makes the second of the first
         # What the system said, under whatever a library wrapped around it.
-        reason = next((one.strerror for one in list_causes(error) if isinstance(one, OSError)), None)
+        reason = next(
+            (one.strerror for one in list_causes(error) if isinstance(one, OSError)), None
+        )
         why = reason or "is the disk full?"
-        raise CheckpointError(f"{path}: cannot be written ({why}); what was there is kept") from error
+        raise CheckpointError(
+            f"{path}: cannot be written ({why}); what was there is kept"
+        ) from error
     return stored
 
 
@@ -196,8 +224,8 @@ def read(path: str | Path) -> StoredModel:
     """Read a checkpoint onto the CPU; runs no code from the file.
 
     Raises:
-        CheckpointError: missing, not a checkpoint, damaged, hostile, of another version, or holding numbers
-            that are NaN or infinite.
+        CheckpointError: missing, not a checkpoint, damaged, hostile, of another version, or holding
+            numbers that are NaN or infinite.
     """
     path = Path(path)
     return _stored_from_content(_read_content(path), path)
@@ -205,13 +233,17 @@ def read(path: str | Path) -> StoredModel:
 
 def _content_digest(content: Mapping[str, Any]) -> str:
     """SHA-256 of all that a checkpoint holds, of tensors type, shape and bytes."""
-    digest, stack = hashlib.sha256(), [value for name, value in sorted(content.items()) if name != "sha256"]
+    digest, stack = (
+        hashlib.sha256(),
+        [value for name, value in sorted(content.items()) if name != "sha256"],
+    )
     while stack:
         value = stack.pop()
         if isinstance(value, Tensor):
             digest.update(f"{value.dtype} {tuple(value.shape)}".encode())
             packed = torch.empty(value.numel(), dtype=value.dtype).copy_(value.detach().flatten())
-            digest.update(packed.view(torch.uint8).numpy().tobytes())  # one number may have strides of 0
+            # One number may have strides of 0
+            digest.update(packed.view(torch.uint8).numpy().tobytes())
         elif isinstance(value, Mapping):
             digest.update(f"{len(value)} {list(value)}".encode())
             stack += value.values()
@@ -239,7 +271,8 @@ def _read_content(path: Path) -> dict[str, Any]:
         content = torch.load(archive, map_location="cpu", weights_only=True)
     except pickle.UnpicklingError:
         raise CheckpointError(
-            f"{path}: holds Python objects that a checkpoint never holds; not loaded, it could run code"
+            f"{path}: holds Python objects that a checkpoint never holds; not loaded, it could "
+            "run code"
         ) from None
     except Exception as error:  # whatever a damaged archive raises
         reason = str(error).strip().splitlines()
@@ -249,7 +282,9 @@ def _read_content(path: Path) -> dict[str, Any]:
 
 
 def _check_content(content: Any, path: Path) -> dict[str, Any]:
-    """Return what a file holds, or is to hold, if it is of our format, whole and of finite numbers."""
+    """Return what a file holds, or is to hold, if it is of our format,
+    whole and of finite numbers.
+    """
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError(f"{path}: not a gsparc checkpoint (weights of another program?)")
     version = content.get("version")
@@ -258,15 +293,23 @@ def _check_content(content: Any, path: Path) -> dict[str, Any]:
             f"{path}: of version {version}, this gsparc reads {VERSION}; train again with it"
         )
     if _exceeds_limits(content):  # what walks over it would not end
-        raise CheckpointError(f"{path}: damaged (a part of it is there many times, too deep, or not there)")
-    # An archive's own sums are right of whatever was put in it. Older files have no sum of their own: where
-    # its name is damaged there is a part too many.
-    if content.keys() - PARTS or ("sha256" in content and content["sha256"] != _content_digest(content)):
-        raise CheckpointError(f"{path}: damaged, or changed by another program; take another copy of it")
+        raise CheckpointError(
+            f"{path}: damaged (a part of it is there many times, too deep, or not there)"
+        )
+    # An archive's own sums are right of whatever was put in it. Older files have no sum of their
+    # own: where its name is damaged there is a part too many.
+    if content.keys() - PARTS or (
+        "sha256" in content and content["sha256"] != _content_digest(content)
+    ):
+        raise CheckpointError(
+            f"{path}: damaged, or changed by another program; take another copy of it"
+        )
     for part in ("site", "state"):
         where = find_non_finite(_drop_unknown_places(content.get(part)), part)
         if where is not None:  # its sum is right: it was written like this
-            raise CheckpointError(f"{path}: {where} is NaN or infinite; train again, or take an earlier file")
+            raise CheckpointError(
+                f"{path}: {where} is NaN or infinite; train again, or take an earlier file"
+            )
     return content
 
 
@@ -287,12 +330,19 @@ def _drop_unknown_places(part: Any) -> Any:
 def _stored_from_content(content: Mapping[str, Any], path: Path) -> StoredModel:
     try:
         return StoredModel(
-            method=str(content["method"]), target=str(content["target"]), config=str(content["config"]),
-            site=_site_from(content["site"]), state=dict(content["state"]), extra=dict(content["extra"]),
-            path=path, sha256=str(content.get("sha256", "")),
-        )  # fmt: skip
+            method=str(content["method"]),
+            target=str(content["target"]),
+            config=str(content["config"]),
+            site=_site_from(content["site"]),
+            state=dict(content["state"]),
+            extra=dict(content["extra"]),
+            path=path,
+            sha256=str(content.get("sha256", "")),
+        )
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        raise CheckpointError(f"{path}: incomplete checkpoint ({type(error).__name__}: {error})") from None
+        raise CheckpointError(
+            f"{path}: incomplete checkpoint ({type(error).__name__}: {error})"
+        ) from None
 
 
 def _site_from(facts: Mapping[str, Any]) -> Site:
@@ -313,19 +363,29 @@ def _site_from(facts: Mapping[str, Any]) -> Site:
 
 def _tensors_to_numpy(facts: Mapping[str, Any]) -> dict[str, Any]:
     return {
-        k: v.numpy() if isinstance(v, Tensor) else _tensors_to_numpy(v) if isinstance(v, Mapping) else v
+        k: v.numpy()
+        if isinstance(v, Tensor)
+        else _tensors_to_numpy(v)
+        if isinstance(v, Mapping)
+        else v
         for k, v in facts.items()
     }
 
 
 def _exceeds_limits(content: Any) -> bool:
-    """Whether a container is in it twice or too deep, or a tensor has not as many numbers as are stored."""
+    """Whether a container is in it twice or too deep,
+    or a tensor has not as many numbers as are stored.
+    """
     stack, seen = [(content, 0)], set[int]()
     while stack:
         value, depth = stack.pop()
         if isinstance(value, Tensor):
             other = value.is_meta or value.is_quantized or value.is_nested
-            if other or value.layout != torch.strided or value.nbytes > value.untyped_storage().nbytes():
+            if (
+                other
+                or value.layout != torch.strided
+                or value.nbytes > value.untyped_storage().nbytes()
+            ):
                 return True
         elif isinstance(value, (Mapping, list, tuple)) and value:
             if id(value) in seen or depth > DEEPEST:
@@ -337,7 +397,9 @@ def _exceeds_limits(content: Any) -> bool:
 
 
 def find_non_finite(value: Any, where: str, *, infinite: bool = False) -> str | None:
-    """Return where the first NaN is, or infinity unless it may be `infinite`; None: all are finite."""
+    """Return where the first NaN is, or infinity unless it may be `infinite`; None:
+    all are finite.
+    """
     if isinstance(value, Tensor):
         wrong = torch.isnan(value) if infinite else ~torch.isfinite(value)
         return f"{where}{wrong.nonzero()[0].tolist()}" if wrong.any() else None
@@ -353,7 +415,9 @@ def find_non_finite(value: Any, where: str, *, infinite: bool = False) -> str | 
 
 
 def _to_plain(value: Any, where: str) -> Any:
-    """The same value in types that weights-only unpickling accepts; views do not drag their storage along."""
+    """The same value in types that weights-only unpickling accepts;
+    views do not drag their storage along.
+    """
     if value is None or type(value) in (bool, int, float, str, bytes):
         return value
     if isinstance(value, Tensor):

@@ -1,8 +1,10 @@
-"""Methods whose weights are known in closed form once Gaussians and covariances are: conditioned on rows.
+"""Methods whose weights are known in closed form once Gaussians and covariances are:
+conditioned on rows.
 
-Searches and likelihoods find places, sizes and covariance parameters; the weights follow from the training
-rows as in a Gaussian process (Rasmussen and Williams 2006, section 2.2), of which such a method is one: its
-covariance is a sum of terms, one of them the Gaussians'. Without Gaussians it is the plain process.
+Searches and likelihoods find places, sizes and covariance parameters; the weights follow from the
+training rows as in a Gaussian process (Rasmussen and Williams 2006, section 2.2), of which such a
+method is one: its covariance is a sum of terms, one of them the Gaussians'.
+Without Gaussians it is the plain process.
 """
 
 from __future__ import annotations
@@ -73,7 +75,9 @@ class ClosedForm(Method):
 
     @property
     def terms(self) -> tuple[str, ...]:
-        """Terms that are computed, as in `model.effects`: `phase`, `power`, `residual` and so on."""
+        """Terms that are computed, as in `model.effects`: `phase`, `power`,
+        `residual` and so on.
+        """
         return ("residual",)
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
@@ -84,7 +88,8 @@ class ClosedForm(Method):
         """Return the rows it was conditioned on, each predicted from the others.
 
         Args:
-            rows: (m,) that are asked for, of which it knows some; others may come with them. None: all.
+            rows: (m,) that are asked for, of which it knows some; others may come with them. None:
+                all.
 
         Raises:
             ValueError: not conditioned yet, or they are not kept.
@@ -137,7 +142,8 @@ def from_containers(kind: type[T], stored: dict[str, Any]) -> T:
     2.0
 
     Raises:
-        TypeError: a field without a default is missing, or there is one that the kind does not have.
+        TypeError: a field without a default is missing, or there is one that the kind does not
+            have.
     """
     hints = get_type_hints(kind)
     return kind(**{name: _from_container(hints.get(name), value) for name, value in stored.items()})
@@ -146,4 +152,6 @@ def from_containers(kind: type[T], stored: dict[str, Any]) -> T:
 def _from_container(hint: Any, value: Any) -> Any:
     if isinstance(hint, type) and is_dataclass(hint):
         return from_containers(hint, value)
-    return tuple(_from_container(None, each) for each in value) if isinstance(value, list) else value
+    return (
+        tuple(_from_container(None, each) for each in value) if isinstance(value, list) else value
+    )

@@ -1,8 +1,9 @@
-"""Offsets of the devices that measured: estimated from training rows, taken off before any method learns.
+"""Offsets of the devices that measured: estimated from training rows,
+taken off before any method learns.
 
-Two phones at one place read levels that differ by a constant. One number for each device over all stations is
-estimated beside a field of levels at each, and belongs to the site: what methods learn and answer is the mean
-device's level, to which that of a named device is added.
+Two phones at one place read levels that differ by a constant. One number for each device over all
+stations is estimated beside a field of levels at each, and belongs to the site: what methods learn
+and answer is the mean device's level, to which that of a named device is added.
 """
 
 from __future__ import annotations
@@ -21,19 +22,23 @@ from gsparc.processes.level_field import fit_level_field
 
 log = logging.getLogger(__name__)
 
-MOST_ROWS, MOST_OF_STATION, LEAST_OF_STATION = 6000, 1000, 60  # that tell; the cost is a station's cube
+# That tell; the cost is a station's cube
+MOST_ROWS, MOST_OF_STATION, LEAST_OF_STATION = 6000, 1000, 60
 
 
 def take_off_devices(data: Measurements, fold: Fold) -> Measurements:
-    """Return levels as the mean device would read them, and a site that knows the offset of each device.
+    """Return levels as the mean device would read them,
+    and a site that knows the offset of each device.
 
-    Only training rows tell. A device that has none there is taken for the mean one. Measurements whose rows
-    name no devices are returned as they are.
+    Only training rows tell. A device that has none there is taken for the mean one. Measurements
+    whose rows name no devices are returned as they are.
     """
     if data.device is None or data.site.device_names is None:
         return data
     names, rows = data.site.device_names, fold.train[data.censored_side(fold.train) == 0]
-    level = to_decibels(np.maximum(data.target[rows, 0].astype(np.float64), np.finfo(np.float32).tiny))
+    level = to_decibels(
+        np.maximum(data.target[rows, 0].astype(np.float64), np.finfo(np.float32).tiny)
+    )
     station = data.stations_of(rows)
     most = int(np.clip(MOST_ROWS / len(np.unique(station)), LEAST_OF_STATION, MOST_OF_STATION))
     order = np.random.default_rng(0).permutation(len(rows))
@@ -53,12 +58,18 @@ def take_off_devices(data: Measurements, fold: Fold) -> Measurements:
 
 
 def without_devices(data: Measurements, site: Site) -> Measurements:
-    """Return rows less the offsets that a site knows, and as its; as they are where they name no devices."""
+    """Return rows less the offsets that a site knows, and as its;
+    as they are where they name no devices.
+    """
     if data.device is None or site.device_levels is None:
         return data
     factor = from_decibels(-site.device_levels[data.device, 0])
     target = (data.target * factor[:, None]).astype(data.target.dtype)
-    noise = None if data.noise_variance is None else data.noise_variance * (factor**2).astype(np.float32)
+    noise = (
+        None
+        if data.noise_variance is None
+        else data.noise_variance * (factor**2).astype(np.float32)
+    )
     levels = replace(data.site, device_levels=site.device_levels)
     return replace(data, target=target, noise_variance=noise, device=None, site=levels)
 

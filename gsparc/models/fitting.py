@@ -42,9 +42,17 @@ DECIDING = ("model", "dataset.batch_size", "init_from", "stations")
 CHANGEABLE = ("trainer", "callbacks", "effort", "model.refit")
 """Settings that may change on the way, and are then named."""
 UNHASHED = (
-    "kind", "static_end", "grid", "normalisation", "origin", "target_scale",
-    "uplink_array", "uplink_hz", "antennas", "unknown_factor",
-)  # fmt: skip
+    "kind",
+    "static_end",
+    "grid",
+    "normalisation",
+    "origin",
+    "target_scale",
+    "uplink_array",
+    "uplink_hz",
+    "antennas",
+    "unknown_factor",
+)
 """Facts of a site that the content hash of its measurements leaves out."""
 
 # What is hashed, the group of settings that names it, in words.
@@ -61,13 +69,14 @@ def fit_or_resume(
     """Make the method of these measurements and fit it, go on with it, or take what was finished.
 
     Args:
-        factory: decides what the method is, once rows have a phase in common where that is possible.
+        factory: decides what the method is, once rows have a phase in common where that is
+            possible.
         data, fold: that it learns from.
         context: its `resume` may be a folder in which the part was finished.
 
     Raises:
-        ValueError: the folder holds a part of other data, rows, seed or settings, or there are weights to
-            start from (`init_from`), and the method has none.
+        ValueError: the folder holds a part of other data, rows, seed or settings, or there are
+            weights to start from (`init_from`), and the method has none.
     """
     watch = Stopwatch()
     # Before the method is made, as another may be called for once rows share a phase.
@@ -79,7 +88,8 @@ def fit_or_resume(
         context = replace(context, datamodule=module)
     (ordered, rows), resume_path = align_phases(ordered, rows), context.resume
     aligning = watch.seconds if ordered.site.unknown_factor != "none" else 0.0
-    if resume_path is not None and not resume_path.exists():  # the interrupted run had not begun this part
+    # The interrupted run had not begun this part
+    if resume_path is not None and not resume_path.exists():
         context = replace(context, resume=None)
     elif resume_path is not None and resume_path.is_dir():
         if (resume_path / checkpoint.MODEL).exists():
@@ -87,7 +97,9 @@ def fit_or_resume(
             return _restore_fit(factory, whole, fold, context, resume_path / checkpoint.MODEL)
         # What has parts looks for each of them in the folder itself.
         if not factory.has_parts:
-            resume = next((resume_path / name for name in LAST if (resume_path / name).exists()), None)
+            resume = next(
+                (resume_path / name for name in LAST if (resume_path / name).exists()), None
+            )
             context = replace(context, resume=resume)
     method = factory.create_for(ordered)
     if context.init_from is not None and not (method.has_parts or method.takes_weights):
@@ -96,7 +108,9 @@ def fit_or_resume(
     report = method.fit(ordered, rows, replace(context, fold=fold))
     method, report = judge_fit(method, report, ordered, rows)
     if 0 < (places := len(np.unique(ordered.moving[rows.train], axis=0))) < FEW_PLACES:
-        few = Caution(f"{places} places to learn from are too few to tell errors: deviations are guesses")
+        few = Caution(
+            f"{places} places to learn from are too few to tell errors: deviations are guesses"
+        )
         report = replace(report, notes=(*report.notes, few))
     if aligning:
         cost = Cost({"alignment": aligning}) + report.cost
@@ -104,19 +118,31 @@ def fit_or_resume(
     return method, replace(report, cpu_s=report.cpu_s + watch.cpu_seconds)
 
 
-def run_extra(report: FitReport, data: Measurements, fold: Fold, context: FitContext) -> dict[str, Any]:
-    """Return what the checkpoint of a finished part has as `extra`: what `fit` compares, and the report."""
-    report_fields = {"train_s": report.seconds, "train_cpu_s": report.cpu_s, "notes": list(report.notes)}
+def run_extra(
+    report: FitReport, data: Measurements, fold: Fold, context: FitContext
+) -> dict[str, Any]:
+    """Return what the checkpoint of a finished part has as `extra`: what `fit` compares,
+    and the report.
+    """
+    report_fields = {
+        "train_s": report.seconds,
+        "train_cpu_s": report.cpu_s,
+        "notes": list(report.notes),
+    }
     report_fields |= {"stages": dict(report.cost.stages), "unused": dict(report.cost.unused)}
     return {**report_fields, **Origin.from_fit(data, fold, context).to_extra()}
 
 
 def run_folder(path: Path, parts: str) -> Path:
-    """Return the folder of a run of `parts` (a pattern of names), given as that or by what is in a part."""
+    """Return the folder of a run of `parts` (a pattern of names),
+    given as that or by what is in a part.
+    """
     inside = path if path.is_dir() else path.parent
     if any(re.fullmatch(parts, one.name) for one in inside.glob("*")):
         return inside
-    return next((one.parent for one in (inside, *inside.parents) if re.fullmatch(parts, one.name)), inside)
+    return next(
+        (one.parent for one in (inside, *inside.parents) if re.fullmatch(parts, one.name)), inside
+    )
 
 
 def _restore_fit(
@@ -128,17 +154,25 @@ def _restore_fit(
     method.restore(data.site, stored.state)
     cost = Cost(extra.get("stages", {}), extra.get("unused", {}))
     notes = tuple(extra.get("notes", ()))
-    return method, FitReport(float(extra["train_s"]), notes, cost, float(extra.get("train_cpu_s", 0.0)))
+    return method, FitReport(
+        float(extra["train_s"]), notes, cost, float(extra.get("train_cpu_s", 0.0))
+    )
 
 
 def common_label(name: str, methods: Sequence[Method]) -> str:
-    """Return their label where they share one, else the most frequent: `gp (Vecchia 30 in 3 of 5)`."""
+    """Return their label where they share one, else the most frequent:
+    `gp (Vecchia 30 in 3 of 5)`.
+    """
     result = Counter(method.label for method in methods)
     if not result:
         return name
     label, count = result.most_common(1)[0]
     inner = label.removeprefix(name).strip(" ()")
-    return label if count == len(methods) or not inner else f"{name} ({inner} in {count} of {len(methods)})"
+    return (
+        label
+        if count == len(methods) or not inner
+        else (f"{name} ({inner} in {count} of {len(methods)})")
+    )
 
 
 @dataclass(frozen=True)
@@ -173,7 +207,8 @@ class Origin:
         return {"data": self.site.sha256, "auxiliary": self.auxiliary, "rows": self.rows}
 
     def require_same(self, stored: StoredModel) -> None:
-        """Tell whether training may go on from `stored`; settings of its schedule that changed are logged.
+        """Tell whether training may go on from `stored`;
+        settings of its schedule that changed are logged.
 
         Raises:
             ValueError: it is of other data, rows, seed or settings, which are named.
@@ -182,13 +217,19 @@ class Origin:
         hashes, differing = self._hashes(), []
         origin = stored.extra.get("origin")
         if origin is None:
-            raise ValueError(f"ckpt_path={stored.path}: does not say what it learned from; start without it")
+            raise ValueError(
+                f"ckpt_path={stored.path}: does not say what it learned from; start without it"
+            )
         for name, group, what in _HASHED:
             if origin[name] != hashes[name]:
                 differing += _list_differences(before, now, (group,)) or [f"other {what}"]
         if stored.site.sha256 == self.site.sha256:  # of other data, all of it may differ
-            facts = {name: (getattr(stored.site, name), getattr(self.site, name)) for name in UNHASHED}
-            differing += [f"other {name}" for name, both in facts.items() if not np.array_equal(*both)]
+            facts = {
+                name: (getattr(stored.site, name), getattr(self.site, name)) for name in UNHASHED
+            }
+            differing += [
+                f"other {name}" for name, both in facts.items() if not np.array_equal(*both)
+            ]
         if origin["seed"] != self.seed:
             differing.append(f"seed={origin['seed']} (here {self.seed})")
         differing += _list_differences(before, now, DECIDING)
@@ -202,8 +243,12 @@ class Origin:
             log.warning("continuing from %s, which had %s", stored.path, list_first(changed))
 
 
-def _list_differences(before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[str, ...]) -> list[str]:
-    """`key=value (here other)` for every setting under `keys` that differs; none without a configuration."""
+def _list_differences(
+    before: Mapping[str, Any], now: Mapping[str, Any], keys: tuple[str, ...]
+) -> list[str]:
+    """`key=value (here other)` for every setting under `keys` that differs;
+    none without a configuration.
+    """
     if not before or not now:
         return []
     one, two = dict(dotted_settings(before)), dict(dotted_settings(now))

@@ -42,7 +42,12 @@ def choose(data: Measurements, settings: Gsparc, quiet: bool = False) -> Method:
     Raises:
         ValueError: a term that is asked for means nothing here.
     """
-    switches, init, model, site = settings.switches, settings.init, settings.rendered.settings, data.site
+    switches, init, model, site = (
+        settings.switches,
+        settings.init,
+        settings.rendered.settings,
+        data.site,
+    )
     count, falls = model.field.count, model.attenuation.inverse_distance
     terms = resolve_terms(switches, init, data, model.emission.hidden, count, falls)
     plain, hides = switches.residual is not False, switches.visibility
@@ -72,7 +77,11 @@ def choose(data: Measurements, settings: Gsparc, quiet: bool = False) -> Method:
         raise ValueError(f"model.effects.visibility={str(hides).lower()} is not possible: {why}")
     reasons = [*terms.reasons]
     if method_class is Channels and site.phase_reference != "neighbours":
-        why = "no Gaussians are asked for" if terms.phase else terms.obstacle or "no phase is asked for"
+        why = (
+            "no Gaussians are asked for"
+            if terms.phase
+            else terms.obstacle or ("no phase is asked for")
+        )
         reasons.append(f"the residual is all there is: {why}")
     method = settings.create_as(import_path(method_class))
     if quiet:
@@ -97,9 +106,14 @@ class Gsparc(LearnsTogether):
     resumable = uses_censored = True
 
     def __init__(
-        self, effects: EffectSettings = EffectSettings(), position_std: float | None = None,
-        terms: Sequence[Any] = (), prior: Files | None = None, name: str = "gsparc", **field: Any,
-    ) -> None:  # fmt: skip
+        self,
+        effects: EffectSettings = EffectSettings(),
+        position_std: float | None = None,
+        terms: Sequence[Any] = (),
+        prior: Files | None = None,
+        name: str = "gsparc",
+        **field: Any,
+    ) -> None:
         check_arguments(locals(), position_std=or_null(number(0)))
         self.rendered = ImageProcess(effects.residual is not False, **field)  # checks what it takes
         self.name, self.guesses, self.init = name, self.rendered.guesses, self.rendered.init
@@ -143,7 +157,9 @@ class Gsparc(LearnsTogether):
         elif target in rendered:
             # `ArrayProcess` sets it again.
             images = replace(self.rendered.settings.response, array=False)
-            method = rendered[target](plain=self.rendered.plain, **{**self._field, "response": images})
+            method = rendered[target](
+                plain=self.rendered.plain, **{**self._field, "response": images}
+            )
         else:
             raise ValueError(f"model=gsparc makes no {target}: train again")
         method.further_settings = ("effects", "field") if alone else ("effects",)  # they choose

@@ -1,4 +1,6 @@
-"""The model in a checkpoint: of whatever class it is, with its stations, or as a module of Lightning's."""
+"""The model in a checkpoint: of whatever class it is, with its stations,
+or as a module of Lightning's.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,9 @@ def method_from_checkpoint(stored: checkpoint.StoredModel) -> Method:
 
 
 def rebuild_method(factory: MethodFactory, stored: checkpoint.StoredModel) -> Method:
-    """Return what `factory` makes of the stored class, or one for each station, with a stored state."""
+    """Return what `factory` makes of the stored class, or one for each station,
+    with a stored state.
+    """
     several = "per_station" in stored.state
     method = PerStation(factory) if several else make_stored(factory, stored.target)
     method.restore(stored.site, stored.state)
@@ -55,13 +59,16 @@ def rebuild_method(factory: MethodFactory, stored: checkpoint.StoredModel) -> Me
 
 
 def load(path: str | Path | checkpoint.StoredModel) -> tuple[Method, checkpoint.StoredModel]:
-    """Return the model of a file, or of what was read of it, with later rows, and what else it holds.
+    """Return the model of a file, or of what was read of it, with later rows,
+    and what else it holds.
 
     Raises:
         CheckpointError: as these two.
     """
     stored = path if isinstance(path, checkpoint.StoredModel) else checkpoint.read(path)
-    return with_changes(method_from_checkpoint(stored), stored_changes(stored.extra, stored.path)), stored
+    return with_changes(
+        method_from_checkpoint(stored), stored_changes(stored.extra, stored.path)
+    ), stored
 
 
 def load_module(path: str | Path) -> GaussianModule:

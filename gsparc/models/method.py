@@ -1,4 +1,6 @@
-"""What every method is (`Method`), what some can do besides, and what they predict (`Prediction`)."""
+"""What every method is (`Method`), what some can do besides,
+and what they predict (`Prediction`).
+"""
 
 from __future__ import annotations
 
@@ -42,12 +44,15 @@ class Prediction:
     """What is said about B queries, in the units of the stored targets.
 
     Attributes:
-        mean: (B, H, W) float32 in [0, 1], (B, antennas, subcarriers) complex64, or (B, 1) float32; all of it
-            in double precision where positions are float64, see `Method.gradient_problem`.
+        mean: (B, H, W) float32 in [0, 1], (B, antennas, subcarriers) complex64, or (B, 1) float32;
+            all of it in double precision where positions are float64, see
+            `Method.gradient_problem`.
         variance: (B,) float32, expected squared error per entry; None when the method has none.
-        unknown: (B,) float32 in [0, 1], share of the prior variance that training left: near 0 at training
-            rows, 1 far from all of them; None when the method does not say. Confidence is 1 minus it.
-        explained: like the mean, its share that Gaussians predict; None where that is not told apart.
+        unknown: (B,) float32 in [0, 1], share of the prior variance that training left: near 0 at
+            training rows, 1 far from all of them; None when the method does not say. Confidence is
+            1 minus it.
+        explained: like the mean, its share that Gaussians predict; None where that is not told
+            apart.
     """
 
     mean: Tensor
@@ -61,18 +66,28 @@ class Prediction:
         return None if self.unknown is None else (1 - self.unknown).clamp(0, 1)
 
     def of_devices(self, site: Site, device: Tensor | int = MEAN_DEVICE) -> Prediction:
-        """Return what devices (B,), or one, would read, where this is the mean one's; variances add."""
+        """Return what devices (B,), or one, would read, where this is the mean one's;
+        variances add.
+        """
         if site.device_levels is None:
             return self
-        levels, shape = torch.from_numpy(site.device_levels)[torch.as_tensor(device)].reshape(-1, 2), [1] * 3
-        factor, spread = from_decibels(levels[:, 0]).to(self.mean.dtype), levels[:, 1].to(self.mean.dtype)
+        levels, shape = (
+            torch.from_numpy(site.device_levels)[torch.as_tensor(device)].reshape(-1, 2),
+            [1] * 3,
+        )
+        factor, spread = (
+            from_decibels(levels[:, 0]).to(self.mean.dtype),
+            levels[:, 1].to(self.mean.dtype),
+        )
         many = factor.reshape(-1, *shape[: self.mean.ndim - 1])
         mean, variance, explained = self.mean * many, self.variance, self.explained
         if variance is not None:
             device_variance = (mean / RELATIVE_DB).square() * spread.reshape(many.shape)
             scale = factor.square().reshape(-1, *shape[: variance.ndim - 1])
             variance = variance * scale + device_variance.reshape(variance.shape)
-        return Prediction(mean, variance, self.unknown, None if explained is None else explained * many)
+        return Prediction(
+            mean, variance, self.unknown, None if explained is None else explained * many
+        )
 
     @staticmethod
     def joined(parts: Sequence[Prediction], order: Tensor | None = None) -> Prediction:
@@ -90,19 +105,24 @@ class Prediction:
 
 
 class MethodFactory(ABC):
-    """Makes unfitted methods, and says what holds for all of them before any measurements are seen."""
+    """Makes unfitted methods, and says what holds for all
+    of them before any measurements are seen.
+    """
 
     name: str  # of its methods, as it appears in tables
     guesses: tuple[str, ...] = ()  # settings that the source of a configuration does not give
     both_ends = False  # whether both ends may move: its query is then (tx, rx)
-    uses_censored = False  # whether it learns from rows where nothing was heard (`Measurements.censored`)
+    # Whether it learns from rows where nothing was heard (`Measurements.censored`)
+    uses_censored = False
     resumable = False  # whether it goes on from what an interrupted run left (`FitContext.resume`)
     has_parts = False  # whether it resumes parts in folders of their own
     takes_effort = False  # whether `FitContext.effort` changes its fit
-    takes_weights = False  # whether its training may start from another model's (`FitContext.init_from`)
+    # Whether its training may start from another model's (`FitContext.init_from`)
+    takes_weights = False
     # Place in tables of a baseline, which a reader could have without gsparc; of this class alone.
     baseline_order: ClassVar[int | None] = None
-    kinds: ClassVar[tuple[Kind, ...]] = ()  # of data beside whose other methods it stands; empty for all
+    # Of data beside whose other methods it stands; empty for all
+    kinds: ClassVar[tuple[Kind, ...]] = ()
 
     @abstractmethod
     def create_for(self, data: Measurements) -> Method:
@@ -139,13 +159,17 @@ class MethodFactory(ABC):
         return ""
 
     def learns_jointly(self, site: Site) -> bool:
-        """Tell whether it learns several stations of this site at once, told which by `Query.station`."""
+        """Tell whether it learns several stations of this site at once,
+        told which by `Query.station`.
+        """
         return False
 
     def choose_stations(
         self, data: Measurements, fold: Fold, context: FitContext
     ) -> tuple[Literal["each", "together"], str]:
-        """Return how several stations are best learned, and why, one line; "" if nothing was to decide."""
+        """Return how several stations are best learned, and why, one line;
+        "" if nothing was to decide.
+        """
         return "each", ""
 
 
@@ -155,24 +179,30 @@ def import_path(kind: type) -> str:
 
 
 class Method(MethodFactory):
-    """fit, predict, save, load; nothing else is asked of a method. Unfitted, it makes copies of itself."""
+    """fit, predict, save, load; nothing else is asked of a method. Unfitted,
+    it makes copies of itself.
+    """
 
     site: Site | None = None  # what was learned from; None before `fit` or `restore`
-    stored: ClassVar[tuple[str, ...]] = ()  # attributes that a fit finds, by their names in a checkpoint
+    # Attributes that a fit finds, by their names in a checkpoint
+    stored: ClassVar[tuple[str, ...]] = ()
     effects: str | None = None  # the propagation effects that are computed, for `summary.json`
-    has_gaussians = False  # whether what it learns are Gaussians, which `count_components` then counts
+    # Whether what it learns are Gaussians, which `count_components` then counts
+    has_gaussians = False
     # See `gradient_problem`, which others say as they are fitted.
     no_gradient: str | None = "the method does not say that its operations are differentiable"
     threads_pay: bool = (
         False  # whether several threads answer a single place sooner than one: where it renders
     )
 
-    # Groups of settings that its fit follows beside the arguments of its class; `trainer` and `callbacks`
-    # among them where it takes steps.
+    # Groups of settings that its fit follows beside the arguments of its class; `trainer` and
+    # `callbacks` among them where it takes steps.
     further_settings: tuple[str, ...] = ()
 
     def settings_read(self) -> frozenset[str]:
-        """Return settings and groups that its fit follows: names below `model`, and groups of the run."""
+        """Return settings and groups that its fit follows: names below `model`,
+        and groups of the run.
+        """
         return frozenset((*accepted_arguments(type(self)), *self.further_settings))
 
     def create_for(self, data: Measurements) -> Method:
@@ -187,7 +217,9 @@ class Method(MethodFactory):
 
     @property
     def is_yardstick(self) -> bool:
-        """Whether others are held against it, so that it answers however bad it is: plain methods here."""
+        """Whether others are held against it, so that it answers however bad it is:
+        plain methods here.
+        """
         return vars(type(self)).get("baseline_order") is not None
 
     @property
@@ -197,11 +229,15 @@ class Method(MethodFactory):
 
     @property
     def description(self) -> str:
-        """What was fitted, in words: under one name a method may be one thing here and another there."""
+        """What was fitted, in words: under one name a method may be one thing here
+        and another there.
+        """
         return self.label
 
     def without_process(self) -> Method | None:
-        """Return its Gaussians without the process that they are mixed with; None where nothing is mixed."""
+        """Return its Gaussians without the process that they are mixed with;
+        None where nothing is mixed.
+        """
         return None
 
     @property
@@ -222,7 +258,9 @@ class Method(MethodFactory):
 
     @abstractmethod
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Learn from `fold.train` (and choose settings on `fold.val`); `fold.test` is not looked at."""
+        """Learn from `fold.train` (and choose settings on `fold.val`);
+        `fold.test` is not looked at.
+        """
 
     @abstractmethod
     def predict(self, query: Query) -> Prediction:
@@ -235,13 +273,16 @@ class Method(MethodFactory):
     def gradient_problem(self) -> str | None:
         """Return why predictions have no gradients by position; None where they have.
 
-        Then autograd in either mode and `torch.func` follow `predict` at float64 positions of what moves, for
-        mean, variance and confidence, in double precision. What float32 positions get is not changed by it.
+        Then autograd in either mode and `torch.func` follow `predict` at float64 positions of what
+        moves, for mean, variance and confidence, in double precision.
+        What float32 positions get is not changed by it.
         """
         return self.no_gradient
 
     def state(self) -> dict[str, Any]:
-        """Return what `restore` needs, as weights-only unpickling accepts; here the attributes `stored`."""
+        """Return what `restore` needs, as weights-only unpickling accepts;
+        here the attributes `stored`.
+        """
         return {name: to_plain(getattr(self, name, None)) for name in self.stored}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
@@ -252,7 +293,8 @@ class Method(MethodFactory):
     def _relearn(self, state: dict[str, Any]) -> None:
         """Set what `stored` names; what cannot be stored is made again by who overrides this."""
         for name in self.stored:
-            if name in state or not hasattr(type(self), name):  # older checkpoints lack what has a default
+            # Older checkpoints lack what has a default
+            if name in state or not hasattr(type(self), name):
                 setattr(self, name, from_plain(state[name]))
 
     def count_components(self) -> int:
@@ -261,11 +303,15 @@ class Method(MethodFactory):
 
     @property
     def reducible(self) -> Method | None:
-        """The part of it that answers faster and less accurately when asked to; None: it does so itself."""
+        """The part of it that answers faster and less accurately when asked to; None:
+        it does so itself.
+        """
         return None
 
     def reduction_settings(self) -> tuple[str, ...]:
-        """Return names of the settings of `reduce` that mean something to what was fitted; here none."""
+        """Return names of the settings of `reduce` that mean something to what was fitted;
+        here none.
+        """
         return () if self.reducible is None else self.reducible.reduction_settings()
 
     def reduction_inputs(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
@@ -306,10 +352,12 @@ class Method(MethodFactory):
 def predict_in_batches(
     method: Method, data: Measurements, rows: np.ndarray, size: int = 64
 ) -> Iterator[tuple[np.ndarray, Batch, Prediction]]:
-    """Yield which of rows (n,) were asked together, as numbers (b,) into these, their batch, and the answer.
+    """Yield which of rows (n,) were asked together, as numbers (b,) into these, their batch,
+    and the answer.
 
-    One station after the other: each may have a model of its own, whose matrices are read for every batch.
-    Where rows have factors of their own (`Site.unknown_factor`), answers are turned to what was measured.
+    One station after the other: each may have a model of its own, whose matrices are read for every
+    batch. Where rows have factors of their own (`Site.unknown_factor`),
+    answers are turned to what was measured.
     """
     order = np.argsort(data.stations_of(rows), kind="stable")
 
@@ -318,8 +366,13 @@ def predict_in_batches(
             chosen = order[start : start + size]
             batch = data.batch(rows[chosen])
             answer = method.predict(batch)
-            if method.site is not None and data.site.device_levels is None:  # else rows are the mean device's
-                device = MEAN_DEVICE if data.device is None else torch.from_numpy(data.device[rows[chosen]])
+            # Else rows are the mean device's
+            if method.site is not None and data.site.device_levels is None:
+                device = (
+                    MEAN_DEVICE
+                    if data.device is None
+                    else torch.from_numpy(data.device[rows[chosen]])
+                )
                 answer = answer.of_devices(method.site, device)
             yield chosen, batch, answer
 
@@ -332,12 +385,18 @@ def predict_in_batches(
     )
     for chosen, batch, answer in answers:
         factor = factors[chosen]
-        variance = None if answer.variance is None else answer.variance * factor[:, 0].abs().square().mean(1)
+        variance = (
+            None
+            if answer.variance is None
+            else answer.variance * factor[:, 0].abs().square().mean(1)
+        )
         yield chosen, batch, replace(answer, mean=answer.mean * factor, variance=variance)
 
 
 def factors_to_measured(means: Tensor, data: Measurements, rows: np.ndarray) -> Tensor:
-    """Return factors (n, 1, K) complex64 that turn means (n, A, K) to rows (n,) by what is free of these."""
+    """Return factors (n, 1, K) complex64 that turn means (n, A, K) to rows (n,)
+    by what is free of these.
+    """
     moments = Snapshots.from_rows(data, rows)
     answers = moments.arrange(means.numpy())
     turns = align_factors(

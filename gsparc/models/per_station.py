@@ -1,8 +1,8 @@
 """One copy of a method for each station, and one over all stations for those that it never heard.
 
-Methods know one static end. Measurements with several are several such sites that share their places: a copy
-is fitted to the rows of each. A station without training rows is answered by a copy that takes both ends for
-moving, so that its query is (tx, rx), where the method can do that.
+Methods know one static end. Measurements with several are several such sites that share their
+places: a copy is fitted to the rows of each. A station without training rows is answered by a copy
+that takes both ends for moving, so that its query is (tx, rx), where the method can do that.
 """
 
 from __future__ import annotations
@@ -61,7 +61,9 @@ def wrap_per_station(factory: MethodFactory, data: Measurements) -> MethodFactor
 
 
 class StationsOfFold(NamedTuple):
-    """Stations (T,) bool: with training rows enough for a method, and with test rows but without those."""
+    """Stations (T,) bool: with training rows enough for a method,
+    and with test rows but without those.
+    """
 
     learnable: np.ndarray
     only_tested: np.ndarray
@@ -72,7 +74,9 @@ def stations_of_fold(method: MethodFactory, data: Measurements, fold: Fold) -> S
     count = len(data.site.every_station)
     # Rows where nothing was heard count for a method that learns from their level.
     rows = fold.train if method.uses_censored else heard_rows(data, fold.train)
-    n_train, n_test = (np.bincount(data.stations_of(some), minlength=count) for some in (rows, fold.test))
+    n_train, n_test = (
+        np.bincount(data.stations_of(some), minlength=count) for some in (rows, fold.test)
+    )
     return StationsOfFold(n_train >= LEAST_ROWS, (n_test > 0) & (n_train < LEAST_ROWS))
 
 
@@ -89,10 +93,14 @@ def station_site(site: Site, number: int) -> Site:
     place = stations.position[number]
     array = site.array if stations.array is None else stations.array[number]
     return replace(
-        site, name=f"{site.name}{OF_STATION}{stations.shown[number]}", stations=None, array=array,
+        site,
+        name=f"{site.name}{OF_STATION}{stations.shown[number]}",
+        stations=None,
+        array=array,
         carrier_hz=None if np.isnan(hertz) else hertz,
-        static_position=place if np.isfinite(place).all() else None, rx_rotation=rotation,
-    )  # fmt: skip
+        static_position=place if np.isfinite(place).all() else None,
+        rx_rotation=rotation,
+    )
 
 
 class PerStation(Method):
@@ -129,17 +137,19 @@ class PerStation(Method):
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Fit every station that is asked for, or all together.
 
-        Together, a method that shares stations learns them as they are, any other as if both ends moved.
-        What an interrupted run finished is taken from its folder (`FitContext.resume`).
+        Together, a method that shares stations learns them as they are, any other as if both ends
+        moved. What an interrupted run finished is taken from its folder (`FitContext.resume`).
 
         Raises:
-            ValueError: a station of the test rows has too few training rows, or all are learned together, and
-                the method cannot take both ends for moving.
+            ValueError: a station of the test rows has too few training rows, or all are learned
+                together, and the method cannot take both ends for moving.
         """
         watch = Stopwatch()
         numbers = self._station_numbers(data, fold, context)
         self.site, notes = data.site, list[str]()
-        resume_dir = None if context.resume is None else fitting.run_folder(context.resume, fitting.STATIONS)
+        resume_dir = (
+            None if context.resume is None else fitting.run_folder(context.resume, fitting.STATIONS)
+        )
         resumable = self.factory.resumable and context.run_dir != Path()
         if resumable and resume_dir is None:  # of an earlier run in this folder
             for file in context.run_dir.glob("station*/**/*.ckpt"):
@@ -149,7 +159,8 @@ class PerStation(Method):
             number = numbers[turn]
             folder = "unheard" if number == UNHEARD else f"station{number}"
             resume = None if resume_dir is None else resume_dir / folder
-            # The run's `datamodule` loads rows of all stations: a station's fit makes loaders of its own.
+            # The run's `datamodule` loads rows of all stations:
+            # a station's fit makes loaders of its own.
             part_context = context.for_part(folder, datamodule=None, resume=resume)
             if len(numbers) > 1:
                 # Others take a second each: `run_all` says how far they are.
@@ -166,30 +177,46 @@ class PerStation(Method):
                 # A single station's own message already names the file to go on from.
                 if not resumable or len(numbers) == 1:
                     raise
-                progress = f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
-                raise KeyboardInterrupt(f"{progress}; go on with ckpt_path={context.run_dir}") from None
+                progress = (
+                    f"station {turn + 1} of {len(numbers)} was interrupted, {turn} are finished"
+                )
+                raise KeyboardInterrupt(
+                    f"{progress}; go on with ckpt_path={context.run_dir}"
+                ) from None
             if resumable and len(numbers) > 1:
                 extra = fitting.run_extra(report, part, inner, part_context)
-                checkpoint.save(part_context.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra)
+                checkpoint.save(
+                    part_context.run_dir / checkpoint.MODEL, copy, context.config_yaml, extra
+                )
             return copy, report, watch.seconds - before, watch.cpu_seconds - cpu_before
 
         fits = run_all(fit_station, range(len(numbers)), f"stations of {self.name}")
         reports = [fit[1] for fit in fits]
-        for _, report, took_s, took_cpu_s in fits:  # the rest by the interrupted run, or another process
+        # The rest by the interrupted run, or another process
+        for _, report, took_s, took_cpu_s in fits:
             here = 0.0 if uses_other_processes() else took_cpu_s
             watch.charge(max(report.seconds - took_s, 0.0), max(report.cpu_s - here, 0.0))
         heard = [one for one, number in zip(reports, numbers, strict=True) if number != UNHEARD]
         learned = pool_station_weights([note for one in heard for note in one.notes])
         notes += dict.fromkeys(learned.values())
-        nan_stations = [t for t in range(len(data.site.every_station)) if not {t, UNHEARD} & {*numbers}]
+        nan_stations = [
+            t for t in range(len(data.site.every_station)) if not {t, UNHEARD} & {*numbers}
+        ]
         if who := list_first([self._station_name(number) for number in nan_stations]):
-            notes.append(Caution(f"answers are NaN, of fewer than {LEAST_ROWS} rows: station {who}"))
+            notes.append(
+                Caution(f"answers are NaN, of fewer than {LEAST_ROWS} rows: station {who}")
+            )
         for turn, number in enumerate(numbers):
             self._copies[number] = fits[turn][0]
             name = "all stations" if numbers == [UNHEARD] else self._station_name(number)
-            notes += [type(note)(f"{name}: {note}") for note in reports[turn].notes if note not in learned]
+            notes += [
+                type(note)(f"{name}: {note}") for note in reports[turn].notes if note not in learned
+            ]
         cautions = group_warnings([note for note in notes if isinstance(note, Caution)])
-        notes = [*(note for note in notes if not isinstance(note, Caution)), *map(Caution, cautions)]
+        notes = [
+            *(note for note in notes if not isinstance(note, Caution)),
+            *map(Caution, cautions),
+        ]
         cost = sum((one.cost for one in reports), Cost())
         return FitReport(watch.seconds, tuple(notes), cost, watch.cpu_elsewhere)
 
@@ -213,11 +240,15 @@ class PerStation(Method):
         numbers = [UNHEARD] if together else [int(t) for t in np.flatnonzero(learnable)]
         if not together and only_tested.any():
             if not self.factory.both_ends and not joint:
-                raise ValueError(f"{self.name}: cannot predict stations that it never heard ({names})")
+                raise ValueError(
+                    f"{self.name}: cannot predict stations that it never heard ({names})"
+                )
             numbers.append(UNHEARD)
         no_position = np.isnan(stations.position).any(1)
         if joint:  # it seeks those that have rows
-            no_position &= only_tested & ~np.isin(np.arange(len(stations)), data.stations_of(fold.train))
+            no_position &= only_tested & ~np.isin(
+                np.arange(len(stations)), data.stations_of(fold.train)
+            )
         if UNHEARD in numbers and no_position.any():
             needs = f"{self.name}: places of stations are unknown, it needs them"
             others = f" for those without training rows ({names}); give them, or split otherwise"
@@ -225,9 +256,15 @@ class PerStation(Method):
         return numbers
 
     def _station_name(self, number: int) -> str:
-        return self.fitted_site.every_station.shown[number] if number != UNHEARD else "stations never heard"
+        return (
+            self.fitted_site.every_station.shown[number]
+            if number != UNHEARD
+            else "stations never heard"
+        )
 
-    def _rows_and_measurements(self, data: Measurements, number: int) -> tuple[np.ndarray, Measurements]:
+    def _rows_and_measurements(
+        self, data: Measurements, number: int
+    ) -> tuple[np.ndarray, Measurements]:
         """Rows of the copy of a station, and the measurements as it sees them."""
         rows = np.flatnonzero((data.stations_of() == number) | (number == UNHEARD))
         return rows, data.subset(rows, self._site_of_copy(data.site, number))
@@ -241,7 +278,9 @@ class PerStation(Method):
             chosen = np.flatnonzero(np.isin(station_rows, rows))
             if len(chosen) < LEAST_ROWS:
                 continue
-            learned = copy.copy_conditioned(part, chosen) if isinstance(copy, Reconditions) else None
+            learned = (
+                copy.copy_conditioned(part, chosen) if isinstance(copy, Reconditions) else None
+            )
             # One copy that cannot, and the whole would answer from rows that were to be forgotten.
             if learned is None:
                 return None
@@ -256,7 +295,9 @@ class PerStation(Method):
         answers: list[tuple[Tensor, Prediction]] = []
         for number in stations.unique().tolist():
             chosen, copy = (stations == number).nonzero()[:, 0], self.station_method(number)
-            answers.append((chosen, copy.predict(_to_station_query(copy.fitted_site, query.rows(chosen)))))
+            answers.append(
+                (chosen, copy.predict(_to_station_query(copy.fitted_site, query.rows(chosen))))
+            )
         # Answers come station by station; `joined` puts them back in the query's order.
         rows, parts = zip(*answers, strict=True)
         return Prediction.joined(parts, torch.argsort(torch.cat(rows)))
@@ -273,11 +314,15 @@ class PerStation(Method):
         """
         copy = self._copies.get(number, self._copies.get(UNHEARD))
         if copy is None:
-            raise ValueError(f"{self.name}: station {self._station_name(number)} had too few training rows")
+            raise ValueError(
+                f"{self.name}: station {self._station_name(number)} had too few training rows"
+            )
         return OneStationView(copy, number) if self._shared else copy
 
     def all_stations(self) -> AllStationsView | None:
-        """Return one that answers for all stations at once (B, T); None: each has a copy of its own."""
+        """Return one that answers for all stations at once (B, T); None:
+        each has a copy of its own.
+        """
         if not self._shared:
             return None
         return AllStationsView(self._copies[UNHEARD], len(self.fitted_site.every_station))
@@ -291,7 +336,9 @@ class PerStation(Method):
         """See `AddsCarriers`."""
         copy, site = self._copies.get(UNHEARD), self.fitted_site
         if not self._shared or not isinstance(copy, AddsCarriers):
-            reason = "knows its own carriers alone" if self._shared else "learned each carrier alone"
+            reason = (
+                "knows its own carriers alone" if self._shared else ("learned each carrier alone")
+            )
             raise ValueError(f"{self.name} {reason}; model=carriers answers at others")
         result = PerStation(self.factory)
         result._copies, result._shared = {UNHEARD: copy.add_carrier(frequency_hz)}, True
@@ -300,18 +347,28 @@ class PerStation(Method):
 
     def _site_of_copy(self, site: Site, number: int) -> Site:
         """The site as a copy sees it: whole, where one learns several stations as such."""
-        return site if number == UNHEARD and self.factory.learns_jointly(site) else station_site(site, number)
+        return (
+            site
+            if number == UNHEARD and self.factory.learns_jointly(site)
+            else station_site(site, number)
+        )
 
     def _stations_of_query(self, query: Query) -> Tensor:
-        """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands, or two."""
+        """Numbers (B,) of the stations that the static ends are; `ValueError` where none stands,
+        or two.
+        """
         ends, stations = Ends.from_query(self.fitted_site, query), self.fitted_site.every_station
         here = station_distances(torch.from_numpy(stations.position), ends.still) <= SAME_PLACE_M
         for shared in here[here.sum(1) > 1][:1] if set(self._copies) != {UNHEARD} else ():
             # Sectors of one mast, or carriers.
             names = " and ".join(stations.shown[t] for t in shared.nonzero()[:, 0].tolist())
-            raise ValueError(f"{self.name}: {names} stand at one place, which does not tell them apart")
+            raise ValueError(
+                f"{self.name}: {names} stand at one place, which does not tell them apart"
+            )
         for row in (~here.any(1)).nonzero()[:1, 0].tolist() if UNHEARD not in self._copies else ():
-            raise ValueError(f"{self.name}: no station stands within {SAME_PLACE_M:g} m of row {row}")
+            raise ValueError(
+                f"{self.name}: no station stands within {SAME_PLACE_M:g} m of row {row}"
+            )
         return ends.station
 
     def state(self) -> dict[str, Any]:
@@ -330,7 +387,9 @@ class PerStation(Method):
     def objects(self) -> SiteObjects:
         """Return those of all copies: what stands in a site stands there for all its stations."""
         return reduce(
-            SiteObjects.joined, (copy.objects() for copy in self._copies.values()), SiteObjects.from_arrays()
+            SiteObjects.joined,
+            (copy.objects() for copy in self._copies.values()),
+            SiteObjects.from_arrays(),
         )
 
     def count_components(self) -> int:
@@ -338,7 +397,9 @@ class PerStation(Method):
         return sum(copy.count_components() for copy in self._copies.values())
 
     def facts(self) -> dict[str, float | int | str | None]:
-        """Sum over copies what counts or costs, and average other numbers; initialisers of all are named."""
+        """Sum over copies what counts or costs, and average other numbers;
+        initialisers of all are named.
+        """
         result = [copy.facts() for copy in self._copies.values()]
         if not result:
             return super().facts()
@@ -359,7 +420,9 @@ def _combine_facts(facts: list[Any], name: str) -> float | int | str | None:
 
 
 def _to_station_query(site: Site, query: Query) -> Query:
-    """Rows of one station as its copy sees them: one pose where the receiver is the station, no number."""
+    """Rows of one station as its copy sees them: one pose where the receiver is the station,
+    no number.
+    """
     if site.stations is not None:
         return query
     # One pose instead of B equal ones: what depends on the receiver alone is computed once.

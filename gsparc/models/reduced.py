@@ -28,7 +28,9 @@ def with_reduction(method: Method, settings: Settings, inputs: ReductionInputs) 
     return method.reduce(settings, inputs) if settings else method
 
 
-def list_settings(method: Method, grid: Mapping[str, Sequence[Any] | None]) -> Iterator[dict[str, Any]]:
+def list_settings(
+    method: Method, grid: Mapping[str, Sequence[Any] | None]
+) -> Iterator[dict[str, Any]]:
     """Yield settings: none, then all combinations in `grid` of knobs the method has.
 
     Strides must divide the columns, others are left out with a warning.
@@ -38,7 +40,8 @@ def list_settings(method: Method, grid: Mapping[str, Sequence[Any] | None]) -> I
     if "stride" in axes:
         axes["stride"] = _dividing_strides(axes["stride"], method)
     together = [
-        # A setting as trained changes nothing: dropped, so that equal combinations are seen to be equal.
+        # A setting as trained changes nothing: dropped,
+        # so that equal combinations are seen to be equal.
         {k: v for k, v in zip(axes, chosen, strict=True) if AS_TRAINED.get(k) != v}
         for chosen in product(*axes.values())
     ]
@@ -56,7 +59,9 @@ def _dividing_strides(strides: Sequence[int], method: Method) -> list[int]:
     fitting = [stride for stride in strides if grid.width % stride == 0]
     if len(fitting) < len(strides):
         none = ", ".join(str(stride) for stride in strides if stride not in fitting)
-        log.warning("stride=%s: does not divide the %d columns of the grid, left out", none, grid.width)
+        log.warning(
+            "stride=%s: does not divide the %d columns of the grid, left out", none, grid.width
+        )
     # An empty axis would leave no combination at all.
     return fitting or [1]
 
@@ -121,7 +126,10 @@ def coarsen_grid(grid: SphereGrid, stride: int) -> SphereGrid:
     if grid.width % stride:
         raise ValueError(f"stride={stride} does not divide the {grid.width} columns of the grid")
     height, width = (grid.height - 1) // stride + 1, grid.width // stride
-    steps = {"elevation_step": grid.elevation_step * stride, "azimuth_step": grid.azimuth_step * stride}
+    steps = {
+        "elevation_step": grid.elevation_step * stride,
+        "azimuth_step": grid.azimuth_step * stride,
+    }
     return replace(grid, height=height, width=width, **steps)
 
 
@@ -139,7 +147,8 @@ class Interpolated(View):
         self.grid, self.stride = grid, stride
         self._height, few = grid.height, coarsen_grid(grid, stride)
         height, width = few.height, few.width
-        self._below = torch.arange(1, height + 1).clamp_max(height - 1)  # rows past the last repeat it
+        # Rows past the last repeat it
+        self._below = torch.arange(1, height + 1).clamp_max(height - 1)
         self._next = torch.arange(1, width + 1)
         # Across the seam of a full circle the first column follows the last.
         self._next[-1] = 0 if grid.periodic else width - 1
@@ -172,7 +181,10 @@ class Blended(View):
     """
 
     def __init__(
-        self, inner: Method, other: Callable[[Query], Prediction], blend: Callable[[Tensor, Tensor], Tensor]
+        self,
+        inner: Method,
+        other: Callable[[Query], Prediction],
+        blend: Callable[[Tensor, Tensor], Tensor],
     ) -> None:
         super().__init__(inner)
         self.other, self.blend = other, blend
@@ -185,7 +197,9 @@ class Blended(View):
         return Prediction(mean, result.variance, result.unknown)
 
 
-def average_with_process(own: Method, process: Method, blend: Callable[[Tensor, Tensor], Tensor]) -> Method:
+def average_with_process(
+    own: Method, process: Method, blend: Callable[[Tensor, Tensor], Tensor]
+) -> Method:
     """Return a reduced field averaged with as many pixels of the process.
 
     Interpolation is linear: the mean is taken on the coarse grid, and filled in once.

@@ -1,9 +1,10 @@
 """Positions of known errors, refined by what a field says of each row from all others.
 
-A row measured at an error d ~ N(0, s^2) has y = m + J d + e: m is predicted from all other rows, J its slope
-by the place, e ~ N(0, c v) with v the prediction's variance. The posterior of d is a Gauss-Newton step
-towards the marginal likelihood's maximum over places; McHutchon and Rasmussen ("Gaussian process training
-with input noise", NeurIPS 2011) leave J d as noise instead. Rows measured at one place share d.
+A row measured at an error d ~ N(0, s^2) has y = m + J d + e: m is predicted from all other rows, J
+its slope by the place, e ~ N(0, c v) with v the prediction's variance. The posterior of d is a
+Gauss-Newton step towards the marginal likelihood's maximum over places; McHutchon and Rasmussen
+("Gaussian process training with input noise", NeurIPS 2011) leave J d as noise instead.
+Rows measured at one place share d.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ class Linearised:
 def position_errors(
     data: Measurements, rows: np.ndarray, position_std: float | None, can_refine: bool
 ) -> np.ndarray | None:
-    """Return errors (n,) of all rows' coordinates [m]; None where no known row has one, or none is used.
+    """Return errors (n,) of all rows' coordinates [m]; None where no known row has one,
+    or none is used.
 
     Args:
         data: says errors where nobody asks.
@@ -98,7 +100,8 @@ def refine_places(
     """Return rows (n,), what to add to their places (n, 3) [m], 0 where it does not pay, and why.
 
     Args:
-        field: conditioned on these rows at the places of `data`, channels or powers of one moving end.
+        field: conditioned on these rows at the places of `data`, channels or powers of one moving
+            end.
         std: (S,) [m] standard deviations of each coordinate.
     """
     try:
@@ -108,11 +111,20 @@ def refine_places(
         return none, data.moving[none], f"position_std is not used: {error}"
     _, first, place = np.unique(data.moving[rows], axis=0, return_index=True, return_inverse=True)
     place = place.reshape(-1)
-    moved, gain = estimate_place_errors(seen, torch.from_numpy(place), torch.from_numpy(std[rows][first]))
-    note = f"log likelihood of rows left out {gain:+.0f} with errors of places (position_std): positions "
+    moved, gain = estimate_place_errors(
+        seen, torch.from_numpy(place), torch.from_numpy(std[rows][first])
+    )
+    note = (
+        f"log likelihood of rows left out {gain:+.0f} with errors of places (position_std): "
+        "positions "
+    )
     if gain <= 0:
         return rows, np.zeros_like(data.moving[rows]), f"{note}stay as measured"
-    return rows, moved.numpy()[place], f"{note}moved by {float(moved.square().mean().sqrt()):.2g} m (rms)"
+    return (
+        rows,
+        moved.numpy()[place],
+        (f"{note}moved by {float(moved.square().mean().sqrt()):.2g} m (rms)"),
+    )
 
 
 def _linearise(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Linearised]:
@@ -133,12 +145,15 @@ def _linearise(field: ClosedForm, data: Measurements) -> tuple[np.ndarray, Linea
         return to_real_entries(site.target.in_error_unit(field.predict(batch_at(places)).mean))
 
     with torch.no_grad():
-        result = field.predict(batch_at(moving))  # what is computed once and kept must not be so inside `jvp`
+        # What is computed once and kept must not be so inside `jvp`
+        result = field.predict(batch_at(moving))
     assert result.variance is not None
     variance = torch.where(left_out.variance.isnan(), result.variance, left_out.variance).double()
     target = site.target
     answers, variance = target.moments_in_error_unit(left_out.mean, variance)
-    true, mean = (to_real_entries(values) for values in (target.in_error_unit(batch.target), answers))
+    true, mean = (
+        to_real_entries(values) for values in (target.in_error_unit(batch.target), answers)
+    )
     residual = true - mean
     parts = 2 if batch.target.is_complex() else 1
     # Half of a circular variance is in either part.

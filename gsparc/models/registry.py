@@ -1,4 +1,6 @@
-"""Methods by name: `conf/model` says which class each is; types and defaults of settings are the class's."""
+"""Methods by name: `conf/model` says which class each is;
+types and defaults of settings are the class's.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,11 @@ if TYPE_CHECKING:  # brings torch, which a list of choices does not need
 @cache
 def built_in_methods() -> dict[str, str]:
     """Return import paths of the methods of `conf/model`, by name."""
-    files = (file for file in resources.files("gsparc.conf").joinpath("model").iterdir() if file.is_file())
+    files = (
+        file
+        for file in resources.files("gsparc.conf").joinpath("model").iterdir()
+        if file.is_file()
+    )
     nodes = {file.name: yaml.safe_load(file.read_text(encoding="utf-8")) for file in files}
     return {name.removesuffix(".yaml"): nodes[name]["_target_"] for name in sorted(nodes)}
 
@@ -41,7 +47,9 @@ def all_methods() -> dict[str, str]:
 
 
 def method_class(name: str) -> type[MethodFactory]:
-    """Return what makes the method `name`; `ValueError` with the nearest right name if there is none."""
+    """Return what makes the method `name`; `ValueError` with the nearest right name
+    if there is none.
+    """
     if name in built_in_methods():  # before plugins, whose entry points take milliseconds to read
         return get_class(built_in_methods()[name])
     there = all_methods()
@@ -55,18 +63,21 @@ def plain_methods() -> tuple[str, ...]:
     """Return names of plain methods, which others are shown beside, in the order of tables."""
     classes = ((name, import_target(path)) for name, path in all_methods().items())
     # A class of its own: what derives from a plain method is none.
-    found = {name: vars(method).get("baseline_order") for name, method in classes if method is not None}
+    found = {
+        name: vars(method).get("baseline_order") for name, method in classes if method is not None
+    }
     places = {name: place for name, place in found.items() if place is not None}
     return tuple(sorted(places, key=places.__getitem__))
 
 
 def build(config: Mapping[str, Any], *, trusted: bool = True) -> MethodFactory:
-    """Return the method that a config of the group `model` describes (unfitted), or what chooses it.
+    """Return the method that a config of the group `model` describes (unfitted),
+    or what chooses it.
 
     Args:
         config: `_target_` and its arguments.
-        trusted: False for text out of a file: then every `_target_` must be a class of gsparc or of an
-            installed plugin, or a term that was imported.
+        trusted: False for text out of a file: then every `_target_` must be a class of gsparc or of
+            an installed plugin, or a term that was imported.
 
     Raises:
         ValueError: no or wrong `_target_`, or settings it does not take.
@@ -104,7 +115,9 @@ def _import_term(path: str) -> None:
         raise ValueError(f"model.terms: {path} cannot be imported ({why}); {say}") from None
 
 
-def fill_defaults(node: DictConfig, own: Mapping[str, Any] | None = None, group: str = "model") -> DictConfig:
+def fill_defaults(
+    node: DictConfig, own: Mapping[str, Any] | None = None, group: str = "model"
+) -> DictConfig:
     """Return a node, completed in place at any depth by what its class takes with defaults.
 
     Args:
@@ -113,7 +126,8 @@ def fill_defaults(node: DictConfig, own: Mapping[str, Any] | None = None, group:
         group: name of the node, for errors.
 
     Raises:
-        SettingError: a setting that the class does not have, or a group of settings given as one value.
+        SettingError: a setting that the class does not have, or a group of settings given as one
+            value.
     """
     kind = import_target(str(node.get("_target_", (own or {}).get("_target_"))))
     if not isinstance(kind, type):  # refused where it is built
@@ -122,7 +136,9 @@ def fill_defaults(node: DictConfig, own: Mapping[str, Any] | None = None, group:
     keys, names = set(node), {*own, *accepted_arguments(kind)} - {"_target_"}
     for name in (name for name in keys - names if not name.startswith("_")):
         hint = (
-            suggest_or_list(name, names).replace("mean '", f"mean '{group}.") if names else ", which has none"
+            suggest_or_list(name, names).replace("mean '", f"mean '{group}.")
+            if names
+            else ", which has none"
         )
         raise SettingError(f"{group}.{name}: no such setting of {kind.__name__}{hint}")
     with open_dict(node):
@@ -131,10 +147,12 @@ def fill_defaults(node: DictConfig, own: Mapping[str, Any] | None = None, group:
         if OmegaConf.is_interpolation(node, name):
             continue
         value, default = node.get(name), own[name]
-        if name == "init" and isinstance(value, str):  # a group of the run, which the method's follows
+        # A group of the run, which the method's follows
+        if name == "init" and isinstance(value, str):
             raise SettingError(f"{group}.{name}={value}: say {name}={value}")
         if isinstance(default, Mapping) and not isinstance(value, DictConfig):
-            some = "=..., ".join(f"{group}.{name}.{key}" for key in list(default)[1:3])  # after `_target_`
+            # After `_target_`
+            some = "=..., ".join(f"{group}.{name}.{key}" for key in list(default)[1:3])
             fault = f"{group}.{name}={value}: is a group of settings"
             raise SettingError(f"{fault}, given one by one: {some}=...")
         if isinstance(default, Mapping):

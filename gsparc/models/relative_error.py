@@ -1,12 +1,12 @@
 """Expected relative error of a prediction, regressed on what is known of it without a measurement.
 
-One regression for all methods whose own variance is not their error: that of a process on images depends on
-the sampling density alone, that of sources in a snapshot on the sources that were found. The error of rows
-that a fit did not see is a positive number over decades: its logarithm is regressed, and the mean of the
-error itself is what is answered.
+One regression for all methods whose own variance is not their error: that of a process on images
+depends on the sampling density alone, that of sources in a snapshot on the sources that were found.
+The error of rows that a fit did not see is a positive number over decades: its logarithm is
+regressed, and the mean of the error itself is what is answered.
 
-`gsparc.field.confidence.ErrorModel` is none of these: one variable, the unknown share, of which the error is
-a power law up to places where nothing is known, beyond the range of any row.
+`gsparc.field.confidence.ErrorModel` is none of these: one variable, the unknown share, of which the
+error is a power law up to places where nothing is known, beyond the range of any row.
 """
 
 from __future__ import annotations
@@ -36,7 +36,8 @@ class RelativeErrorRegression(Stored):
         weights: (F,) of the standardised columns, then of their products.
         intercept: mean of the logarithm.
         least, largest: bounds of the logarithm.
-        smearing: mean of the errors over that of the exponentials of their expected logarithms (Duan 1983).
+        smearing: mean of the errors over that of the exponentials of their expected logarithms
+            (Duan 1983).
     """
 
     centre: Tensor
@@ -68,9 +69,16 @@ class RelativeErrorRegression(Stored):
         expected = np.exp(model.predict(terms).clip(least, largest))
         smearing = np.exp(target.clip(max=largest)).mean() / expected.mean()
         return cls(
-            centre, scale, columns.amin(0), columns.amax(0), torch.from_numpy(model.coef_).float(),
-            float(model.intercept_), float(least), float(largest), float(smearing),
-        )  # fmt: skip
+            centre,
+            scale,
+            columns.amin(0),
+            columns.amax(0),
+            torch.from_numpy(model.coef_).float(),
+            float(model.intercept_),
+            float(least),
+            float(largest),
+            float(smearing),
+        )
 
 
 def _add_products(x: Tensor) -> Tensor:

@@ -1,8 +1,9 @@
-"""Complex factors of runs: each run of measurements is the channel times one unknown complex number.
+"""Complex factors of runs: each run of measurements is the channel times one unknown complex
+number.
 
-With aligned rows `u_i y_i` a circular Gaussian process of covariance `P C`, the likelihood of the factors
-needs the data only as `M_rs = sum over i in r, j in s of conj(y_i) C^-1_ij y_j`: quadratic in u but for the
-logarithm of its size, so that each factor has a closed form given the others.
+With aligned rows `u_i y_i` a circular Gaussian process of covariance `P C`, the likelihood of the
+factors needs the data only as `M_rs = sum over i in r, j in s of conj(y_i) C^-1_ij y_j`: quadratic
+in u but for the logarithm of its size, so that each factor has a closed form given the others.
 """
 
 from __future__ import annotations
@@ -47,7 +48,9 @@ class RunFactors(Stored):
         return len(self.runs)
 
     def look_up(self, run: Tensor | None) -> Tensor:
-        """Return factors (B,) complex128 of rows of runs (B,); 1 of runs that were not learned from."""
+        """Return factors (B,) complex128 of rows of runs (B,);
+        1 of runs that were not learned from.
+        """
         if run is None or len(self) == 1:
             return torch.ones(1, dtype=torch.complex128)
         same = run.cpu()[:, None] == torch.from_numpy(self.runs)
@@ -86,15 +89,19 @@ def factor_matrix(inverse: np.ndarray, target: np.ndarray, run: np.ndarray) -> n
 
 
 def best_run_factors(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Return what runs are to be multiplied by (runs,), from M (runs, runs) of one process or of many summed.
+    """Return what runs are to be multiplied by (runs,), from M (runs, runs)
+    of one process or of many summed.
 
     Args:
         size: (runs,) complex numbers measured in each, above 0; the largest has factor 1.
     """
     scale = np.sqrt(size)
-    # The eigenvector of least residual power is right but for the logarithm, and near enough to start from.
+    # The eigenvector of least residual power is right but for the logarithm,
+    # and near enough to start from.
     factors = np.linalg.eigh(quadratic / np.outer(scale, scale))[1][:, 0] / scale
-    factors = np.where(np.abs(factors) > 1e-6 * np.abs(factors).max(), factors, np.abs(factors).max())
+    factors = np.where(
+        np.abs(factors) > 1e-6 * np.abs(factors).max(), factors, np.abs(factors).max()
+    )
     diagonal = quadratic.diagonal().real
     for _ in range(SWEEPS):
         before = factors.copy()
@@ -102,7 +109,8 @@ def best_run_factors(quadratic: np.ndarray, size: np.ndarray) -> np.ndarray:
         for r in range(len(size)):
             others = diagonal[r] * factors[r] - quadratic[r] @ factors
             pull = abs(others)
-            # Positive root of diagonal x^2 - pull x - power size = 0, the likelihood's slope by its size.
+            # Positive root of diagonal x^2 - pull x - power size = 0,
+            # the likelihood's slope by its size.
             twice = max(2 * diagonal[r], np.finfo(float).tiny)
             length = (pull + np.sqrt(pull**2 + 2 * twice * power * size[r])) / twice
             factors[r] = length * (others / pull if pull > 0 else 1.0)

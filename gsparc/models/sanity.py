@@ -1,8 +1,9 @@
-"""Whether what was fitted may answer: each member against the next simpler one, the plain mean the last.
+"""Whether what was fitted may answer: each member against the next simpler one,
+the plain mean the last.
 
-A fit goes wrong in ways that nobody thought of. Rows predicted without their own values tell, whatever they
-are: a member that misses them by more than what is simpler does answers nothing. Asked once for each fit,
-before anything is printed or saved.
+A fit goes wrong in ways that nobody thought of. Rows predicted without their own values tell,
+whatever they are: a member that misses them by more than what is simpler does answers nothing.
+Asked once for each fit, before anything is printed or saved.
 """
 
 from __future__ import annotations
@@ -46,12 +47,14 @@ LEAST = 4  # rows: fewer tell nothing
 MEAN = "the plain mean"
 
 
-def judge_fit(method: Method, report: FitReport, data: Measurements, fold: Fold) -> tuple[Method, FitReport]:
+def judge_fit(
+    method: Method, report: FitReport, data: Measurements, fold: Fold
+) -> tuple[Method, FitReport]:
     """Return what may answer after a fit, and the report with a sentence of what may not.
 
-    Members in closed form are judged by their training rows, each predicted from the others; what trains by
-    gradient by validation rows, as it is in the end. Plain and published methods are what others are held
-    against: their figures are their own. Of copies by station each was judged.
+    Members in closed form are judged by their training rows, each predicted from the others; what
+    trains by gradient by validation rows, as it is in the end. Plain and published methods are what
+    others are held against: their figures are their own. Of copies by station each was judged.
 
     Args:
         method: fitted; members of it may be taken out.
@@ -75,13 +78,16 @@ def judge_fit(method: Method, report: FitReport, data: Measurements, fold: Fold)
             method.name = name
     who = " and ".join(one.name for one in kept) or MEAN
     texts = [f"{text}; {who} answers" for text in texts]
-    cost = report.cost + Cost({"rows left out": watch.seconds}) if report.cost.stages else report.cost
+    cost = (
+        report.cost + Cost({"rows left out": watch.seconds}) if report.cost.stages else report.cost
+    )
     notes = (*map(Severe, texts), *report.notes)
     return method, replace(report, seconds=report.seconds + watch.seconds, notes=notes, cost=cost)
 
 
 def make_stored(factory: MethodFactory, target: str) -> Method:
-    """Return an unfitted method of the class that a checkpoint names: of `factory`, or what answers for it.
+    """Return an unfitted method of the class that a checkpoint names: of `factory`,
+    or what answers for it.
 
     Raises:
         ValueError: see `MethodFactory.create_as`.
@@ -94,8 +100,9 @@ def _refuse_members(
 ) -> tuple[list[Method], list[str]]:
     """Members that may answer, of such with their weights, and why others do not.
 
-    Plain processes are held against the mean, and what they answer together with those that have Gaussians
-    against that. Together, as a mean of two gains where they err apart; the worst goes until it does.
+    Plain processes are held against the mean, and what they answer together with those that have
+    Gaussians against that. Together, as a mean of two gains where they err apart;
+    the worst goes until it does.
     """
     asked = _draw_over_stations(rows := heard_rows(data, fold.learned()), data.stations_of(rows))
     answers = {id(one): _rows_left_out(one, data, fold, asked) for _, one in members}
@@ -105,7 +112,9 @@ def _refuse_members(
     kept, texts = list[tuple[float, Method]](), list[str]()
     groups: dict[bool, list[tuple[float, Method]]] = {False: [], True: []}
     for weight, one in members:
-        wrong = find_non_finite(one.state(), "state") or find_non_finite(means[id(one)], "row left out ")
+        wrong = find_non_finite(one.state(), "state") or find_non_finite(
+            means[id(one)], "row left out "
+        )
         if wrong:
             texts.append(f"{one.name} answers nothing: {wrong} is NaN or infinite")
         else:
@@ -135,14 +144,18 @@ def _refuse_members(
             ratio = np.sqrt(error.mean() / max(least.mean(), TINY))
             why = f"its rms error is {ratio:.3g} times that of {simpler}"
             if wild := np.count_nonzero(error > most):
-                why += f", and {wild} are missed by more than {WILD} times what {MEAN} misses any by"
+                why += (
+                    f", and {wild} are missed by more than {WILD} times what {MEAN} misses any by"
+                )
             texts.append(f"{worst[1].name} answers nothing: {at} {why}")
     return [one for _, one in kept], texts
 
 
 def _has_gaussians(method: Method) -> bool:
     """Whether it is more than a plain process."""
-    return bool(method.count_gaussians if isinstance(method, ClosedForm) else method.count_components())
+    return bool(
+        method.count_gaussians if isinstance(method, ClosedForm) else method.count_components()
+    )
 
 
 def _select_rows(answer: LeftOutRows, rows: np.ndarray) -> Tensor:
@@ -171,7 +184,8 @@ def _rows_left_out(method: Method, data: Measurements, fold: Fold, rows: np.ndar
 def _draw_over_stations(rows: np.ndarray, station: np.ndarray) -> np.ndarray:
     """At most `JUDGED` of rows (n,), sorted: as many of each station, of small ones all.
 
-    Fewer where a covariance of many has to be solved for each, so that it takes no time beside the fit.
+    Fewer where a covariance of many has to be solved for each,
+    so that it takes no time beside the fit.
     """
     many = np.bincount(station).max(initial=1)
     most = JUDGED if many > MOST_ROWS else int(np.clip(WORK / many**2, FEWEST, JUDGED))
@@ -182,15 +196,21 @@ def _draw_over_stations(rows: np.ndarray, station: np.ndarray) -> np.ndarray:
     return np.sort(rows[order[np.argsort(turn, kind="stable")[:most]]])
 
 
-def _errors_of_mean(data: Measurements, fold: Fold, rows: np.ndarray, held: LeftOutRows) -> np.ndarray:
-    """Squared errors (n,) of what others of its station say of each of rows (n,), of few of them all rows.
+def _errors_of_mean(
+    data: Measurements, fold: Fold, rows: np.ndarray, held: LeftOutRows
+) -> np.ndarray:
+    """Squared errors (n,) of what others of its station say of each of rows (n,),
+    of few of them all rows.
 
     Others are those that a member had, which `held` tells.
     """
     if held.group is not None:
         error = np.zeros(len(rows))
         for number in np.unique(held.group):
-            here, others = np.isin(rows, held.rows[held.group == number]), held.rows[held.group != number]
+            here, others = (
+                np.isin(rows, held.rows[held.group == number]),
+                held.rows[held.group != number],
+            )
             error[here] = _squared_errors(_mean_at(data, others, rows[here]), data, rows[here])
         return error
     known = heard_rows(data, fold.learned())

@@ -12,9 +12,11 @@ from gsparc.processes.powers import PowerRows
 
 
 def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Return targets of `rows` in stored type and units; unmeasured entries are means of other rows.
+    """Return targets of `rows` in stored type and units;
+    unmeasured entries are means of other rows.
 
-    Many large ones of a file stay on disk. Rows of which only a level is known (`data.censored`) keep it.
+    Many large ones of a file stay on disk. Rows of which only a level is known (`data.censored`)
+    keep it.
 
     Returns:
         (n, ...) like `data.target`; an entry measured in no row is 0.
@@ -30,13 +32,17 @@ def training_targets(data: Measurements, rows: np.ndarray) -> np.ndarray:
 
 
 def linear_moments(level: Tensor, variance: Tensor) -> tuple[Tensor, Tensor]:
-    """Return levels (B,) [dB] as linear targets (B, 1), and variances (B,) [dB^2] as those of targets."""
+    """Return levels (B,) [dB] as linear targets (B, 1), and variances (B,)
+    [dB^2] as those of targets.
+    """
     power = TARGETS["rssi"].to_targets(level[:, None], (1,))
     return power, TARGETS["rssi"].entry_variance(variance, power)
 
 
 def heard_rows(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Return those of rows (n,) that were heard, in their order; a saturated one counts as its level."""
+    """Return those of rows (n,) that were heard, in their order;
+    a saturated one counts as its level.
+    """
     return rows[data.censored_side(rows) <= 0]
 
 
@@ -44,7 +50,9 @@ def unheard_note(data: Measurements, rows: np.ndarray, method: str) -> tuple[str
     """Say what a fit of `method` to `heard_rows(data, rows)`, rows (n,), left out, if anything."""
     side, notes = data.censored_side(rows), {1: "where nothing was heard are not learned from"}
     notes[-1] = "in saturation are learned from as if measured at that level"
-    return tuple(f"{method}: {n} rows {text}" for s, text in notes.items() if (n := int((side == s).sum())))
+    return tuple(
+        f"{method}: {n} rows {text}" for s, text in notes.items() if (n := int((side == s).sum()))
+    )
 
 
 def power_rows(data: Measurements, rows: np.ndarray) -> PowerRows:

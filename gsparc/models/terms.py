@@ -19,13 +19,15 @@ class EffectSettings(Checked):
 
     Attributes:
         image: rasterized Gaussians emit what arrives, without phase.
-        array: spectra arise in the static receiver's array: Gaussians emit fields, the array images them.
-        moving_array: the same of a receiver that moves, in powers: sources seen through the array's lags.
+        array: spectra arise in the static receiver's array: Gaussians emit fields, the array images
+            them.
+        moving_array: the same of a receiver that moves, in powers: sources seen through the array's
+            lags.
         phase: carrier phase from places of sources, for channels.
         power: distance law in decibels and known walls along the path, for received powers.
-        visibility: what hides: occluding boxes and finite mirrors of sources, which receivers measured
-            directions point to, known walls of powers and, of stations never heard, shadowing of a place;
-            rasterized Gaussians always occlude each other.
+        visibility: what hides: occluding boxes and finite mirrors of sources, which receivers
+            measured directions point to, known walls of powers and, of stations never heard,
+            shadowing of a place; rasterized Gaussians always occlude each other.
         residual: a process in the target's own correlation on what Gaussians leave.
     """
 
@@ -59,11 +61,18 @@ class Terms:
 
 
 def resolve_terms(
-    switches: EffectSettings, init: InitSettings, data: Measurements, hidden: int, count: int, falls: bool
+    switches: EffectSettings,
+    init: InitSettings,
+    data: Measurements,
+    hidden: int,
+    count: int,
+    falls: bool,
 ) -> Terms:
-    """Return the terms that mean something here and are not switched off; see `gsparc.models.gsparc.choose`.
+    """Return the terms that mean something here and are not switched off;
+    see `gsparc.models.gsparc.choose`.
 
-    `falls`: whether emissions fall with the distance, which makes them no linear read-out of an array.
+    `falls`: whether emissions fall with the distance,
+    which makes them no linear read-out of an array.
 
     Raises:
         ValueError: a term that is asked for means nothing here.
@@ -91,7 +100,9 @@ def resolve_terms(
         on[name] = switch is not False and obstacle is None
         if obstacle is None or "=" in obstacle:  # other settings decide, not the data
             why = obstacle if switch == "auto" else "as configured"
-            reasons.append(f"effects.{name} -> {str(on[name]).lower()}" + (f": {why}" if why else ""))
+            reasons.append(
+                f"effects.{name} -> {str(on[name]).lower()}" + (f": {why}" if why else "")
+            )
     if init.name == "scene":
         _refuse_scene(data, switches, obstacles, on, count)
     rendered = request is not None or switches.image is True
@@ -99,14 +110,20 @@ def resolve_terms(
 
 
 def _refuse_scene(
-    data: Measurements, switches: EffectSettings, obstacles: dict[str, str | None], on: dict[str, bool],
-    count: int
-) -> None:  # fmt: skip
+    data: Measurements,
+    switches: EffectSettings,
+    obstacles: dict[str, str | None],
+    on: dict[str, bool],
+    count: int,
+) -> None:
     """`ValueError` where known walls explain nothing."""
     site, why = data.site, None
     term = {"csi": "phase", "rssi": "power"}.get(site.kind)
     if term is None:
-        why = f"the target is {site.kind}; walls mirror channels and stand in the way of received powers"
+        why = (
+            f"the target is {site.kind}; walls mirror channels and stand in the way of "
+            "received powers"
+        )
     elif not on[term]:
         why = obstacles[term] or f"model.effects.{term}=false"
     elif not count:

@@ -29,7 +29,8 @@ from gsparc.processes.stored import Stored, from_plain
 NOW = 2**62  # number after those of all rows
 STORED = "updates"  # in what a checkpoint holds besides
 UNSAID = 1.0  # variance of powers, of their square, where a method states none
-SIGNAL = 0.2  # share of a stated variance that counts as the map's own error where nothing tells it apart
+# Share of a stated variance that counts as the map's own error where nothing tells it apart
+SIGNAL = 0.2
 
 
 @dataclass(frozen=True)
@@ -61,20 +62,27 @@ class Changes(Stored):
             if len(set(sizes.values())) > 1 or rows.places.shape[1:] != (3,):
                 raise ValueError(f"rows of station {station}: {sizes}")
         if self.belief.names and len(self.belief.weight) != len(self.belief.names):
-            raise ValueError(f"{len(self.belief.weight)} weights of {len(self.belief.names)} stations")
+            raise ValueError(
+                f"{len(self.belief.weight)} weights of {len(self.belief.names)} stations"
+            )
 
     def shift(self, station: int | np.ndarray, number: int | np.ndarray = NOW) -> Any:
-        """Return what was said of stations () or (n,) before the rows of these numbers came [dB]."""
+        """Return what was said of stations () or (n,)
+        before the rows of these numbers came [dB].
+        """
         # Older files do not say when.
         parts = [(change * (station == name), since) for name, change, *since in self.shifts]
         return sum(
-            (change * (number >= (*since, 0)[0]) for change, since in parts), 0.0 * np.asarray(station)
+            (change * (number >= (*since, 0)[0]) for change, since in parts),
+            0.0 * np.asarray(station),
         )
 
 
 @dataclass(frozen=True)
 class Level:
-    """A map's level (B,) [dB], the variance of its error, and that of a measurement's noise [dB^2]."""
+    """A map's level (B,) [dB], the variance of its error,
+    and that of a measurement's noise [dB^2].
+    """
 
     mean: Tensor
     doubt: Tensor
@@ -86,7 +94,9 @@ class Level:
 
 
 def map_level(method: Method, said: Prediction, site: Site) -> Level:
-    """Return what a map of powers of a site said, its variance told apart into its error and noise."""
+    """Return what a map of powers of a site said,
+    its variance told apart into its error and noise.
+    """
     spread = torch.full((len(said.mean),), UNSAID) * said.mean[:, 0].square()
     spread = spread if said.variance is None else said.variance
     moments = site.target.moments_in_error_unit(said.mean[:, 0], spread)
@@ -107,7 +117,9 @@ class Updated(View):
         own: the station that it answers for; None: as a query says.
     """
 
-    no_gradient = "later rows were told to it: gradients are those of the map before, from its first file"
+    no_gradient = (
+        "later rows were told to it: gradients are those of the map before, from its first file"
+    )
 
     def __init__(self, inner: Method, changes: Changes, own: int | None) -> None:
         super().__init__(inner)
@@ -137,7 +149,9 @@ class Updated(View):
         return Prediction(power.to(kind), variance.to(kind), unknown)
 
     def change(self, query: Query) -> MeanVariance:
-        """Return what changed since the map was learned: mean (B,) [dB] and variance (B,) [dB^2]."""
+        """Return what changed since the map was learned: mean (B,) [dB] and variance (B,)
+        [dB^2].
+        """
         before = map_level(self.inner, self.inner.predict(query), self.fitted_site)
         # Of a map that is taken for true only a change is not known.
         now = self._level_now(query, replace(before, doubt=0 * before.doubt))
@@ -173,7 +187,10 @@ def sound_updates(path: Path | str = "the checkpoint") -> Iterator[None]:
     try:
         yield
     except (TypeError, ValueError, LookupError, AttributeError, RuntimeError) as error:
-        fault = f"its later rows ({STORED}) are damaged ({error}); take another copy, or the one before them"
+        fault = (
+            f"its later rows ({STORED}) are damaged ({error}); take another copy, or the one "
+            "before them"
+        )
         raise CheckpointError(f"{path}: {fault}") from None
 
 
@@ -194,7 +211,8 @@ def stored_changes(extra: Mapping[str, Any], path: Path | str = "the checkpoint"
 
 
 def with_changes(method: Method, changes: Changes | None, own: int | None = None) -> Method:
-    """Return a method with later rows in place of what it had of them; None, or none: as it was learned.
+    """Return a method with later rows in place of what it had of them; None, or none:
+    as it was learned.
 
     `own` is the number of the station that the method alone answers for; None: it knows all.
     """
@@ -213,4 +231,8 @@ def with_changes(method: Method, changes: Changes | None, own: int | None = None
 
 def _with_own(method: Method, changes: Changes | None, own: int | None) -> Method:
     inner = method.inner if isinstance(method, Updated) else method
-    return inner if changes is None else Updated(inner, changes, None if own is not None and own < 0 else own)
+    return (
+        inner
+        if changes is None
+        else Updated(inner, changes, None if own is not None and own < 0 else own)
+    )

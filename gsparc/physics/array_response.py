@@ -1,9 +1,10 @@
-"""Response of a static antenna array to arriving waves: `h = A z`, the Bartlett spectrum `|A^H h|`, its lags.
+"""Response of a static antenna array to arriving waves: `h = A z`,
+the Bartlett spectrum `|A^H h|`, its lags.
 
-The squared spectrum of M elements is a trigonometric polynomial: `|A^H h|^2 = B r`, where the columns of B
-are the cosines and sines of the array's distinct element differences (its co-array; 49 columns for a 4 x 4
-grid) and r the sums of `h_m conj(h_n)` over the pairs with that difference. Van Trees 2002, "Optimum array
-processing", ch. 2 and 3.
+The squared spectrum of M elements is a trigonometric polynomial: `|A^H h|^2 = B r`, where the
+columns of B are the cosines and sines of the array's distinct element differences (its co-array; 49
+columns for a 4 x 4 grid) and r the sums of `h_m conj(h_n)` over the pairs with that difference. Van
+Trees 2002, "Optimum array processing", ch. 2 and 3.
 """
 
 from __future__ import annotations
@@ -32,17 +33,24 @@ def steering_matrix(array: np.ndarray, grid: SphereGrid, wavelength: float) -> T
         grid: directions u.
         wavelength: [m].
     """
-    turns = torch.from_numpy(np.asarray(array, dtype=np.float64)) @ grid.directions().reshape(-1, 3).T
+    turns = (
+        torch.from_numpy(np.asarray(array, dtype=np.float64)) @ grid.directions().reshape(-1, 3).T
+    )
     return torch.exp(2j * math.pi / wavelength * turns)
 
 
 def element_pattern(grid: SphereGrid, exponent: float) -> Tensor:
-    """Return an element's amplitude (H, W) float64: cos^exponent of the angle off boresight, 0 behind."""
+    """Return an element's amplitude (H, W) float64: cos^exponent of the angle off boresight,
+    0 behind.
+    """
     return grid.directions()[..., 2].clamp_min(0) ** exponent
 
 
-def array_output(waves: Tensor, matrix: Tensor, grid: SphereGrid, pattern: Tensor | None = None) -> Tensor:
-    """Return `h = A z` (B, M): what the elements measure of complex amplitudes z (B, H, W) per steradian.
+def array_output(
+    waves: Tensor, matrix: Tensor, grid: SphereGrid, pattern: Tensor | None = None
+) -> Tensor:
+    """Return `h = A z` (B, M): what the elements measure of complex amplitudes z (B, H, W)
+    per steradian.
 
     Args:
         waves: arriving field per direction, complex.
@@ -60,14 +68,18 @@ def bartlett_spectrum(vectors: Tensor, matrix: Tensor) -> Tensor:
 
     >>> array, grid = np.array([[0.0, 0.0, 0.0], [0.05, 0.0, 0.0]]), SphereGrid.hemisphere(1, 4)
     >>> matrix = steering_matrix(array, grid, 0.1)
-    >>> bartlett_spectrum(matrix[:, 1][None], matrix).round(decimals=3)  # a wave along y interferes at x
+
+    A wave along y interferes at x:
+
+    >>> bartlett_spectrum(matrix[:, 1][None], matrix).round(decimals=3)
     tensor([[0., 2., 0., 2.]], dtype=torch.float64)
     """
     return (vectors @ matrix.conj()).abs()  # torch takes the slope at 0 as 0
 
 
 def normalise_spectrum(image: Tensor, how: str) -> Tensor:
-    """Scale spectra (B, P) as a dataset publishes them: `max`, `minmax`, `power` (mean square 1) or `none`.
+    """Scale spectra (B, P) as a dataset publishes them: `max`, `minmax`, `power` (mean square 1)
+    or `none`.
 
     >>> normalise_spectrum(torch.tensor([[1.0, 2.0, 5.0]]), "minmax")
     tensor([[0.0000, 0.2500, 1.0000]])
@@ -94,8 +106,8 @@ class CoArray:
 
     Attributes:
         difference: (L, 3) [m], `difference[0]` is 0.
-        real_pairs, imag_pairs: (M * M, 2 L - 1) float64, which lag numbers the real and imaginary parts of
-            the products `h_m conj(h_n)` add to.
+        real_pairs, imag_pairs: (M * M, 2 L - 1) float64, which lag numbers the real and imaginary
+            parts of the products `h_m conj(h_n)` add to.
         elements: M.
     """
 
@@ -105,13 +117,19 @@ class CoArray:
     elements: int
 
     def spectrum_basis(self, grid: SphereGrid, wavelength: float) -> Tensor:
-        """Return B (H * W, 2 L - 1) float64: `|A^H h|^2 = B r`, r the zero lag, real and imaginary parts."""
+        """Return B (H * W, 2 L - 1) float64: `|A^H h|^2 = B r`, r the zero lag,
+        real and imaginary parts.
+        """
         phase = grid.directions().reshape(-1, 3) @ torch.from_numpy(self.difference[1:].T)
         phase = 2 * math.pi / wavelength * phase
-        return torch.cat([torch.ones(len(phase), 1, dtype=torch.float64), phase.cos(), phase.sin()], 1)
+        return torch.cat(
+            [torch.ones(len(phase), 1, dtype=torch.float64), phase.cos(), phase.sin()], 1
+        )
 
     def quadratic_forms(self) -> Tensor:
-        """Return symmetric S (2 L - 1, 2 M, 2 M) float64 with `r_i = v^T S_i v`, v = (Re h, Im h)."""
+        """Return symmetric S (2 L - 1, 2 M, 2 M) float64 with `r_i = v^T S_i v`,
+        v = (Re h, Im h).
+        """
         m = self.elements
         real = self.real_pairs.T.reshape(-1, m, m)
         imag = self.imag_pairs.T.reshape(-1, m, m)
@@ -121,9 +139,11 @@ class CoArray:
 
 
 def make_co_array(array: np.ndarray, wavelength: float) -> CoArray:
-    """Return the co-array of element positions (M, 3) [m]; differences within 1e-4 wavelengths are one.
+    """Return the co-array of element positions (M, 3) [m];
+    differences within 1e-4 wavelengths are one.
 
-    >>> square = np.stack([*np.meshgrid(np.arange(4), np.arange(4)), np.zeros((4, 4))], -1).reshape(-1, 3)
+    >>> axes = *np.meshgrid(np.arange(4), np.arange(4)), np.zeros((4, 4))
+    >>> square = np.stack(axes, -1).reshape(-1, 3)
     >>> make_co_array(0.16 * square, 0.32).difference.shape  # 24 pairs +-d, and zero
     (25, 3)
     """
@@ -135,7 +155,9 @@ def make_co_array(array: np.ndarray, wavelength: float) -> CoArray:
     # One half-space of differences: the first nonzero coordinate is positive.
     lead = np.where(cell[:, 0] != 0, cell[:, 0], np.where(cell[:, 1] != 0, cell[:, 1], cell[:, 2]))
     sign = np.sign(lead)
-    unique, which = np.unique(cell * np.where(sign == 0, 1, sign)[:, None], axis=0, return_inverse=True)
+    unique, which = np.unique(
+        cell * np.where(sign == 0, 1, sign)[:, None], axis=0, return_inverse=True
+    )
     which = which.reshape(-1)
     zero = int(np.flatnonzero((unique == 0).all(1))[0])
     # The zero lag is the first, as it alone has no sine.

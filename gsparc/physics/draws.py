@@ -18,7 +18,9 @@ def draw_in_box(low: Tensor, high: Tensor, count: int, generator: torch.Generato
     return low + (high - low) * share
 
 
-def draw_lengths(shortest: float, longest: float, like: Tensor, generator: torch.Generator) -> Tensor:
+def draw_lengths(
+    shortest: float, longest: float, like: Tensor, generator: torch.Generator
+) -> Tensor:
     """Draw log-uniform lengths of the shape and dtype of `like`, as sizes of things are.
 
     >>> sides = draw_lengths(0.1, 1.0, torch.zeros(5, 3), torch.Generator())

@@ -1,7 +1,8 @@
 """A Bartlett spectrum as its lags: one complex number per difference of array elements.
 
-`P(u) = a(u)^H R a(u) = sum_d r_d exp(-j k u.d)` over the differences d of the elements; a plane wave of unit
-power from v has `r_d = c_d / M^2 exp(+j k v.d)`, c_d being how many pairs of elements are d apart.
+`P(u) = a(u)^H R a(u) = sum_d r_d exp(-j k u.d)` over the differences d of the elements; a plane
+wave of unit power from v has `r_d = c_d / M^2 exp(+j k v.d)`,
+c_d being how many pairs of elements are d apart.
 """
 
 from __future__ import annotations
@@ -35,7 +36,8 @@ class SpectrumLags:
 
     def __init__(self, array: np.ndarray, grid: SphereGrid, wavelength: float) -> None:
         lags = make_co_array(array, wavelength)
-        differences = 2 * np.pi * np.round(lags.difference / wavelength, 6)  # radians per unit of direction
+        # Radians per unit of direction
+        differences = 2 * np.pi * np.round(lags.difference / wavelength, 6)
         self._differences = torch.from_numpy(differences.T).float()
         # Of the pairs that are d apart, half are so the other way round.
         pairs = lags.real_pairs.sum(0)[: len(differences)]
@@ -59,21 +61,29 @@ class SpectrumLags:
         return self.pixels.image_shape
 
     def plane_wave_lags(self, directions: Tensor) -> Tensor:
-        """Return lags (..., count) float32 of plane waves of unit power from unit vectors (..., 3)."""
+        """Return lags (..., count) float32 of plane waves of unit power
+        from unit vectors (..., 3).
+        """
         angle = directions @ self._differences
-        return torch.cat([self._share * angle.cos(), self._share[1:] * angle[..., 1:].sin()], dim=-1)
+        return torch.cat(
+            [self._share * angle.cos(), self._share[1:] * angle[..., 1:].sin()], dim=-1
+        )
 
     def to_lags(self, power: Tensor) -> Tensor:
         """Return lags (n, count) of spectra (n, H, W) in power, by least squares."""
         return (self.pixels.project(power).double() @ self._inverse).float()
 
     def spectrum(self, lags: Tensor, pixels: Separable | None = None) -> Tensor:
-        """Return power (n, H, W), at least 0, of lags (n, count); on `pixels`, thinned ones, if given."""
+        """Return power (n, H, W), at least 0, of lags (n, count); on `pixels`, thinned ones,
+        if given.
+        """
         return (pixels or self.pixels).images(lags @ self._basis).clamp_min(0)
 
 
 def pixel_exponent(space: SpectrumLags, images: Tensor) -> tuple[int, float]:
-    """Return 2 if images (n, H, W) are amplitudes, 1 if powers, and the energy share outside the lags."""
+    """Return 2 if images (n, H, W) are amplitudes, 1 if powers,
+    and the energy share outside the lags.
+    """
     residual = {}
     for exponent in (2, 1):
         power = images**exponent

@@ -1,8 +1,8 @@
 """Mirror planes and the images they make of a transmitter.
 
 A plane is (n, b): all p with n.p = b, n normalised on use. A reflection sequence (i, j, ...) is the
-transmitter mirrored in plane i, then in plane j, and so on: a plane costs three numbers and gives many
-sources.
+transmitter mirrored in plane i, then in plane j, and so on: a plane costs three numbers and gives
+many sources.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ Reflections = tuple[int, ...]  # indices of planes, in the order in which they m
 
 
 def hesse_form(planes: Tensor) -> tuple[Tensor, Tensor]:
-    """Return unit normals (..., 3) and offsets (..., 1) [m] of planes (..., 4), Hesse's normal form.
+    """Return unit normals (..., 3) and offsets (..., 1) [m] of planes (..., 4),
+    Hesse's normal form.
 
     >>> hesse_form(torch.tensor([0.0, 0.0, 2.0, 3.0]))
     (tensor([0., 0., 1.]), tensor([3.]))
@@ -30,7 +31,9 @@ def hesse_form(planes: Tensor) -> tuple[Tensor, Tensor]:
 def reflect(points: Tensor, planes: Tensor) -> Tensor:
     """Mirror points (..., 3) [m] in planes (..., 4), broadcast against each other.
 
-    >>> reflect(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.0, 0.0, 1.0, 0.0]))  # in the floor z = 0
+    In the floor z = 0:
+
+    >>> reflect(torch.tensor([1.0, 2.0, 3.0]), torch.tensor([0.0, 0.0, 1.0, 0.0]))
     tensor([ 1.,  2., -3.])
     """
     normal, offset = hesse_form(planes)
@@ -51,9 +54,12 @@ def bisector(first: Tensor, second: Tensor) -> Tensor:
 def images(
     transmitter: Tensor, planes: Tensor, sequences: tuple[Reflections, ...] | list[Reflections]
 ) -> Tensor:
-    """Return positions (..., K, 3) [m] of sequences, differentiable in transmitter (..., 3), planes (P, 4).
+    """Return positions (..., K, 3) [m] of sequences, differentiable in transmitter (..., 3),
+    planes (P, 4).
 
-    >>> planes = torch.tensor([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 5.0]])  # the floor, and a wall x = 5
+    The floor, and a wall x = 5:
+
+    >>> planes = torch.tensor([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 5.0]])
     >>> images(torch.tensor([1.0, 2.0, 3.0]), planes, [(0,), (0, 1)])
     tensor([[ 1.,  2., -3.],
             [ 9.,  2., -3.]])
@@ -69,11 +75,14 @@ def images(
     return place
 
 
-def image_rotations(planes: Tensor, sequences: tuple[Reflections, ...] | list[Reflections]) -> Tensor:
-    """Return orthogonal parts Q (K, 3, 3) of the sequences: the image of t + a is that of t, plus Q a.
+def image_rotations(
+    planes: Tensor, sequences: tuple[Reflections, ...] | list[Reflections]
+) -> Tensor:
+    """Return orthogonal parts Q (K, 3, 3) of the sequences: the image of t + a is that of t,
+    plus Q a.
 
-    One reflection in a plane of unit normal n is `I - 2 n n^T` (J. B. Allen and D. A. Berkley, J. Acoust.
-    Soc. Am. 65 (1979)); a sequence is their product, the first plane rightmost.
+    One reflection in a plane of unit normal n is `I - 2 n n^T` (J. B. Allen and D. A. Berkley, J.
+    Acoust. Soc. Am. 65 (1979)); a sequence is their product, the first plane rightmost.
 
     >>> image_rotations(torch.tensor([[0.0, 0.0, 1.0, 2.0]]), [(0,)])[0].diagonal()  # z turns round
     tensor([ 1.,  1., -1.])
@@ -84,7 +93,8 @@ def image_rotations(planes: Tensor, sequences: tuple[Reflections, ...] | list[Re
 
 
 def all_sequences(indices: list[int], order: int) -> list[Reflections]:
-    """Return sequences of 1 to `order` planes in which none follows itself (a mirror twice is no mirror).
+    """Return sequences of 1 to `order` planes in which none follows itself (a mirror twice is no
+    mirror).
 
     >>> all_sequences([0, 1], order=2)
     [(0,), (1,), (0, 1), (1, 0)]

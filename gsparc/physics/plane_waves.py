@@ -1,9 +1,10 @@
 """Plane waves with a delay: response of one source at every antenna and tone.
 
-h[a, k] = sum_n g_n exp(+j 2 pi q_a . w_n) exp(-j 2 pi k t_n), with q_a the antenna's place in the array's
-plane in wavelengths, w_n the source's direction cosines in that plane, k the tone's number and t_n its delay
-in turns per tone. An atom and its slopes by both cosines and the delay are products of one vector over
-antennas and one over tones, and so are their inner products: every matrix of the search is cut from one.
+h[a, k] = sum_n g_n exp(+j 2 pi q_a . w_n) exp(-j 2 pi k t_n), with q_a the antenna's place in the
+array's plane in wavelengths, w_n the source's direction cosines in that plane, k the tone's number
+and t_n its delay in turns per tone. An atom and its slopes by both cosines and the delay are
+products of one vector over antennas and one over tones, and so are their inner products: every
+matrix of the search is cut from one.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ class Aperture:
 
     Attributes:
         places: (A, 2) float32 antennas in the array's plane, in wavelengths about their middle.
-        tones: (K,) float32 numbers of the tones, in spacings about the middle of the band they belong to.
+        tones: (K,) float32 numbers of the tones, in spacings about the middle of the band they
+            belong to.
     """
 
     places: Tensor
@@ -43,7 +45,9 @@ class Aperture:
 def planar_places(array: np.ndarray, wavelength: float) -> Tensor:
     """Return antennas (A, 3) [m] as (A, 2) float32 wavelengths along their two widest axes.
 
-    >>> planar_places(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]]), 0.5)[:, 0].abs()  # about the middle
+    About the middle:
+
+    >>> planar_places(np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 2.0]]), 0.5)[:, 0].abs()
     tensor([1., 1.])
     """
     centred = (array - array.mean(axis=0)) / wavelength
@@ -54,9 +58,11 @@ def planar_places(array: np.ndarray, wavelength: float) -> Tensor:
 
 @dataclass(frozen=True)
 class SourceColumns:
-    """Responses of N sources and their derivatives on an aperture: 4 N columns, each antennas times tones.
+    """Responses of N sources and their derivatives on an aperture: 4 N columns,
+    each antennas times tones.
 
-    The slopes are of an atom of gain 1, by its first cosine, its second and its delay, in that order.
+    The slopes are of an atom of gain 1, by its first cosine, its second and its delay,
+    in that order.
 
     Attributes:
         antennas: (B, 3, N, A) complex64: the atoms, and them by both cosines.
@@ -73,7 +79,9 @@ class SourceColumns:
         over_tones = tone_responses(delay, aperture)[:, None]
         by_cosine = over_antennas * aperture.cosine_slope
         by_delay = over_tones * aperture.delay_slope
-        return SourceColumns(torch.cat([over_antennas, by_cosine], 1), torch.cat([over_tones, by_delay], 1))
+        return SourceColumns(
+            torch.cat([over_antennas, by_cosine], 1), torch.cat([over_tones, by_delay], 1)
+        )
 
     def gram(self) -> Tensor:
         """Return inner products (B, 4 N, 4 N) of all columns."""
@@ -121,11 +129,13 @@ def tone_responses(delay: Tensor, aperture: Aperture) -> Tensor:
 
 
 def mean_delay(snapshot: Tensor) -> Tensor:
-    """Return the mean delay (B,) [turns per tone], by power, of snapshots (B, A, K), from neighbouring tones.
+    """Return the mean delay (B,) [turns per tone], by power, of snapshots (B, A, K),
+    from neighbouring tones.
 
     >>> aperture = Aperture(torch.zeros(1, 2), torch.arange(4.0))
     >>> mean_delay(tone_responses(torch.tensor([[0.1]]), aperture))  # one path, as (B, 1, K)
     tensor([0.1000])
     """
-    # From one tone to the next a path turns by -2 pi times its delay; the sum weighs paths by their power.
+    # From one tone to the next a path turns by -2 pi times its delay;
+    # the sum weighs paths by their power.
     return -torch.angle((snapshot[..., 1:] * snapshot[..., :-1].conj()).sum((1, 2))) / (2 * math.pi)

@@ -1,8 +1,9 @@
 """What a receiver multiplies all of one packet by: a phase, a delay, a gain that nobody knows.
 
-Wi-Fi cards start a packet at a sample of their own (a delay, a slope of the phase over subcarriers), with an
-oscillator of their own (a phase) and a gain of their own (S. Sen et al., "You are facing the Mona Lisa: spot
-localization using PHY layer information", MobiSys 2012; M. Kotaru et al., "SpotFi", SIGCOMM 2015).
+Wi-Fi cards start a packet at a sample of their own (a delay, a slope of the phase over
+subcarriers), with an oscillator of their own (a phase) and a gain of their own (S. Sen et al., "You
+are facing the Mona Lisa: spot localization using PHY layer information", MobiSys 2012; M.
+Kotaru et al., "SpotFi", SIGCOMM 2015).
 """
 
 from __future__ import annotations
@@ -78,14 +79,19 @@ def align_factors(
         size = np.abs(product @ steering.T)
         rows, best = np.arange(len(size)), size.argmax(1).clip(1, len(delays) - 2)
         before, peak, after = (size[rows, best + by] for by in (-1, 0, 1))
-        # The vertex of a parabola through the largest and both neighbours; never flat, so that it exists.
+        # The vertex of a parabola through the largest and both neighbours; never flat,
+        # so that it exists.
         curvature = np.minimum(before - 2 * peak + after, -np.finfo(float).tiny)
-        slope = delays[best] + (0.5 * (before - after) / curvature).clip(-1, 1) * (delays[1] - delays[0])
+        slope = delays[best] + (0.5 * (before - after) / curvature).clip(-1, 1) * (
+            delays[1] - delays[0]
+        )
     turned = np.exp(2j * np.pi * slope[:, None] * (tones - tones.mean()))
     overlap = (product * turned).sum(1)
     factor = turned * np.exp(-1j * np.angle(overlap))[:, None]
     if unknown_factor == "phase+delay+gain":
         power = (np.abs(values) ** 2).sum((1, 2))
         # The gain of least squares; a row of zeros keeps 1.
-        factor *= np.divide(np.abs(overlap), power, out=np.ones_like(power), where=power > 0)[:, None]
+        factor *= np.divide(np.abs(overlap), power, out=np.ones_like(power), where=power > 0)[
+            :, None
+        ]
     return factor

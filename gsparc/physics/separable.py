@@ -1,8 +1,8 @@
 """Smooth images by few numbers: what an array resolves is of low rank in rows and in columns.
 
 An image is `rows @ coefficients @ columns` with orthonormal factors, the two-mode case of Tucker's
-decomposition by principal vectors of each mode (De Lathauwer, De Moor and Vandewalle 2000). An 8 x 8 array
-sees 90 x 360 pixels through 19 x 80 numbers.
+decomposition by principal vectors of each mode (De Lathauwer, De Moor and Vandewalle 2000). An 8 x
+8 array sees 90 x 360 pixels through 19 x 80 numbers.
 """
 
 from __future__ import annotations
@@ -40,7 +40,9 @@ class Separable:
         return self.rows @ (coefficients.unflatten(1, (-1, len(self.columns))) @ self.columns)
 
     def subsample_pixels(self, stride: int) -> Separable:
-        """Return the basis of every `stride`-th pixel; coefficients stay, `project` means nothing then."""
+        """Return the basis of every `stride`-th pixel; coefficients stay,
+        `project` means nothing then.
+        """
         return Separable(self.rows[::stride].contiguous(), self.columns[:, ::stride].contiguous())
 
 
@@ -62,10 +64,15 @@ def fit_separable(blocks: Iterable[Tensor], lost: float) -> Separable:
     for block in blocks:
         flat = block.flatten(0, 1)
         sides = block.transpose(1, 2).flatten(0, 1)
-        row_gram, column_gram = row_gram + (sides.T @ sides).double(), column_gram + (flat.T @ flat).double()
+        row_gram, column_gram = (
+            row_gram + (sides.T @ sides).double(),
+            column_gram + (flat.T @ flat).double(),
+        )
     if row_gram.ndim == 0:
         raise ValueError("a basis of images needs images")
-    return Separable(_main_axes(row_gram, lost).contiguous(), _main_axes(column_gram, lost).T.contiguous())
+    return Separable(
+        _main_axes(row_gram, lost).contiguous(), _main_axes(column_gram, lost).T.contiguous()
+    )
 
 
 def separate_axes(
@@ -86,7 +93,9 @@ def separate_axes(
 
 
 def _main_axes(gram: Tensor, lost: float) -> Tensor:
-    """Eigenvectors (P, K) float32 of the largest eigenvalues; the others hold at most the share `lost`."""
+    """Eigenvectors (P, K) float32 of the largest eigenvalues;
+    the others hold at most the share `lost`.
+    """
     values, vectors = torch.linalg.eigh(gram)
     # `eigh` sorts upwards: the first whose sum stays below the share are the ones that go.
     tail = values.clamp_min(0).cumsum(0)

@@ -1,8 +1,8 @@
 """Spherical waves `exp(-j 2 pi f r / c) / r` whose phase is right at any range and carrier.
 
 A phase is a range in wavelengths without its whole part. Ten kilometres at 60 GHz are two million
-wavelengths: float32 keeps no fraction of them, float64 keeps nine digits. So ranges stay float64 until the
-whole part is gone, and only then become float32.
+wavelengths: float32 keeps no fraction of them, float64 keeps nine digits. So ranges stay float64
+until the whole part is gone, and only then become float32.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ NEAR_M = 0.001  # no receiver comes closer to a source; keeps 1/r and its slope 
 
 
 def ranges(observers: Tensor, sources: Tensor) -> Tensor:
-    """Return ranges (n, K) float64 [m] between observers (n, 3) and sources (K, 3) [m], at least `NEAR_M`.
+    """Return ranges (n, K) float64 [m] between observers (n, 3) and sources (K, 3) [m],
+    at least `NEAR_M`.
 
     Sources (n, K, 3) are each observer's own.
 
@@ -33,7 +34,9 @@ def reduced_phase(
 ) -> Tensor:
     """Return `-2 pi f r / c` brought into [-pi, pi] in float64, then cast.
 
-    >>> reduced_phase(torch.tensor(2.25, dtype=torch.float64), LIGHT)  # two wavelengths of 1 m and a quarter
+    Two wavelengths of 1 m and a quarter:
+
+    >>> reduced_phase(torch.tensor(2.25, dtype=torch.float64), LIGHT)
     tensor(-1.5708)
 
     Args:
@@ -49,8 +52,11 @@ def reduced_phase(
     return ((cycles.detach().round() - cycles) * (2 * math.pi)).to(dtype)
 
 
-def point_wave(distance: Tensor, frequency_hz: Tensor | float, dtype: torch.dtype = torch.float32) -> Tensor:
-    """Return `exp(-j 2 pi f r / c) / r` of parts `dtype`; distances [m] and frequencies [Hz] broadcast.
+def point_wave(
+    distance: Tensor, frequency_hz: Tensor | float, dtype: torch.dtype = torch.float32
+) -> Tensor:
+    """Return `exp(-j 2 pi f r / c) / r` of parts `dtype`;
+    distances [m] and frequencies [Hz] broadcast.
 
     >>> point_wave(torch.tensor([2.0, 4.0]), LIGHT).real  # whole wavelengths of 1 m
     tensor([0.5000, 0.2500])
@@ -58,11 +64,14 @@ def point_wave(distance: Tensor, frequency_hz: Tensor | float, dtype: torch.dtyp
     return torch.polar((1 / distance).to(dtype), reduced_phase(distance, frequency_hz, dtype))
 
 
-def wave_over_band(distance: Tensor, frequency_hz: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+def wave_over_band(
+    distance: Tensor, frequency_hz: Tensor, dtype: torch.dtype = torch.float32
+) -> Tensor:
     """Return the same at every one of F frequencies: (...) [m], (F,) [Hz] -> (..., F).
 
     Evenly spaced tones are factored into a coarse and a fine comb, `f = f_0 + (q M + p) df`: about
-    2 sqrt(F) sines and cosines instead of F, and one product per tone; 1/r enters with the coarse comb.
+    2 sqrt(F) sines and cosines instead of F, and one product per tone;
+    1/r enters with the coarse comb.
 
     >>> wave_over_band(torch.tensor([3.0, 5.0]), torch.linspace(2.40e9, 2.42e9, 64)).shape
     torch.Size([2, 64])

@@ -1,4 +1,6 @@
-"""What a confidence is worth, drawn from per-sample figures: over losses, what it accepts, by brackets."""
+"""What a confidence is worth, drawn from per-sample figures: over losses, what it accepts,
+by brackets.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +27,10 @@ WIDE, TALL = 3.6, 3.2  # inches of a panel
 
 def draw_confidences(
     names: Iterable[str], rows: pd.DataFrame, title: str, folder: Path, end: str = ""
-) -> None:  # fmt: skip
-    """Save pictures of `PICTURES` by name, of the runs of a frame that state a confidence, if any."""
+) -> None:
+    """Save pictures of `PICTURES` by name, of the runs of a frame that state a confidence,
+    if any.
+    """
     every: list[Row] = own_rows(rows).to_dict("records")  # type: ignore[assignment]
     runs = [row for row in every if _states(row)]
     for name in names if runs else ():
@@ -46,7 +50,9 @@ def _label(row: Row) -> str:
 
 
 def _loss(row: Row) -> np.ndarray:
-    """What a test row costs (n,): the paper's of spectra, |e|^2 / |h|^2 of channels, |decibels| of powers."""
+    """What a test row costs (n,): the paper's of spectra, |e|^2 / |h|^2 of channels,
+    |decibels| of powers.
+    """
     samples = row["run"].samples
     if "error_db" in samples:
         return np.abs(samples["error_db"])
@@ -68,7 +74,9 @@ def _draw_over_loss(runs: list[Row]) -> Figure:
         for name, part, colour in (("low", ~high, PALETTE[2]), ("high", high, PALETTE[1])):
             both.hist(sure[part], bins, density=True, alpha=0.6, color=colour, label=f"{name} loss")
         both.set(
-            xlabel="confidence C", ylabel="density of test rows", title=f"{_label(row)}, {len(loss)} rows"
+            xlabel="confidence C",
+            ylabel="density of test rows",
+            title=f"{_label(row)}, {len(loss)} rows",
         )
         both.legend()
         part = np.searchsorted(np.quantile(loss, (0.2, 0.4, 0.6, 0.8)), loss)
@@ -78,7 +86,9 @@ def _draw_over_loss(runs: list[Row]) -> Figure:
         spectra = "ssim_gauss" in row["run"].samples
         error = row["run"].samples["mae"][finite] if spectra else loss
         scatter.plot(error, sure, ".", markersize=4, alpha=0.5, color=PALETTE[0])
-        scatter.set(xlabel="MAE of a test row" if spectra else "loss of a test row", ylabel="confidence C")
+        scatter.set(
+            xlabel="MAE of a test row" if spectra else "loss of a test row", ylabel="confidence C"
+        )
         alike = rank_correlation(sure, error)
         scatter.set_title(f"rank correlation {np.nan if alike is None else alike:.2f}")
     return figure
@@ -91,9 +101,13 @@ def _draw_accepted(runs: list[Row]) -> Figure:
     for number, row in enumerate(runs):
         samples = row["run"].samples
         sure, style = samples["confidence"], numbered_style(number)
-        # The paper's normalisation is relative to the rows that are tested: nowhere else is it used.
+        # The paper's normalisation is relative to the rows that are tested:
+        # nowhere else is it used.
         relative = (sure - sure.min()) / max(np.ptp(sure), 1e-30)
-        for values, line, end in ((sure, "-", ""), (relative, "--", " (paper: min-max over the test rows)")):
+        for values, line, end in (
+            (sure, "-", ""),
+            (relative, "--", " (paper: min-max over the test rows)"),
+        ):
             share = (values[:, None] >= taus).mean(0)
             curve.plot(taus, share, **{**style, "linestyle": line}, label=_label(row) + end)
         if number == 0:
@@ -101,25 +115,41 @@ def _draw_accepted(runs: list[Row]) -> Figure:
             for part, colour, what in ((above, PALETTE[2], "above"), (~above, GREY, "below")):
                 label = f"{what} {PAPER_TAU} (paper), {part.mean():.0%}"
                 places.plot(
-                    samples["x_m"][part], samples["y_m"][part], ".", color=colour, markersize=4, label=label
+                    samples["x_m"][part],
+                    samples["y_m"][part],
+                    ".",
+                    color=colour,
+                    markersize=4,
+                    label=label,
                 )
     places.set(
-        xlabel="x [m]", ylabel="y [m]", aspect="equal", title="test rows, confidence by min-max over them"
+        xlabel="x [m]",
+        ylabel="y [m]",
+        aspect="equal",
+        title="test rows, confidence by min-max over them",
     )
     places.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18))
     curve.axvline(PAPER_TAU, color=GREY, linestyle=":", label=f"threshold {PAPER_TAU}")
-    curve.set(xlabel="threshold τ", ylabel="share of test rows with C ≥ τ", xlim=(0, 1), ylim=(0, 1.02))
+    curve.set(
+        xlabel="threshold τ", ylabel="share of test rows with C ≥ τ", xlim=(0, 1), ylim=(0, 1.02)
+    )
     curve.legend()
     return figure
 
 
 def _draw_brackets(runs: list[Row]) -> Figure:
-    """Boxes of rows' ratios to their error, methods beside each other, and the confidence by bracket."""
+    """Boxes of rows' ratios to their error, methods beside each other,
+    and the confidence by bracket.
+    """
     figure, grid = panels(2.2 * WIDE, TALL * len(runs) + 0.3, len(runs), 2)
     for (left, right), row in zip(grid, runs, strict=True):
         data, name = row["run"].samples, OF_KIND[row["kind"]].of_sample
         stem, end = "baseline/", f"/{name}"
-        beside = {k[len(stem) : -len(end)]: data[k] for k in data if k.startswith(stem) and k.endswith(end)}
+        beside = {
+            k[len(stem) : -len(end)]: data[k]
+            for k in data
+            if k.startswith(stem) and k.endswith(end)
+        }
         every = {k: v[np.isfinite(v)] for k, v in {**beside, _label(row): data[name]}.items()}
         how = {"tick_labels": list(every), "showfliers": False, "patch_artist": True}
         boxes = left.boxplot(list(every.values()), **how)
@@ -129,7 +159,8 @@ def _draw_brackets(runs: list[Row]) -> Figure:
         left.set(ylabel=f"{axis_of(name)} of a test row")
         mask = np.isfinite(data[name])
         low, high = np.quantile(data[name][mask], OUTER)
-        begin = BRACKET_DB * np.floor(np.clip(data[name][mask], low, high) / BRACKET_DB)  # outermost are open
+        # Outermost are open
+        begin = BRACKET_DB * np.floor(np.clip(data[name][mask], low, high) / BRACKET_DB)
         starts, counts = np.unique(begin, return_counts=True)
         sure = [data["confidence"][mask][begin == start].mean() for start in starts]
         names = [f"{a:.0f}–{a + BRACKET_DB:.0f}" for a in starts]
@@ -138,9 +169,17 @@ def _draw_brackets(runs: list[Row]) -> Figure:
         right.tick_params(axis="x", labelsize=7)
         right.bar(names, sure, color=PALETTE[0], alpha=0.7)
         right.axhline(PAPER_TAU, color=GREY, linestyle="--", label=f"threshold {PAPER_TAU}")
-        right.set(xlabel=f"{axis_of(name)}, and the number of rows", ylabel="mean confidence", ylim=(0, 1.15))
+        right.set(
+            xlabel=f"{axis_of(name)}, and the number of rows",
+            ylabel="mean confidence",
+            ylim=(0, 1.15),
+        )
         right.legend(loc="upper left")
     return figure
 
 
-PICTURES = {"confidence": _draw_over_loss, "accepted": _draw_accepted, "snr_brackets": _draw_brackets}
+PICTURES = {
+    "confidence": _draw_over_loss,
+    "accepted": _draw_accepted,
+    "snr_brackets": _draw_brackets,
+}

@@ -18,11 +18,20 @@ from gsparc.base.files import whole_file
 from gsparc.base.limits import choice
 from gsparc.evaluation.metric_formats import axis_of, lower_is_better
 
-# Colours that are told apart with any colour vision (Okabe and Ito 2008, the yellow darker; Tol 2021).
+# Colours that are told apart with any colour vision (Okabe
+# and Ito 2008, the yellow darker; Tol 2021).
 PALETTE = (
-    "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00",
-    "#56B4E9", "#4B5320", "#000000", "#882255", "#332288",
-)  # fmt: skip
+    "#0072B2",
+    "#D55E00",
+    "#009E73",
+    "#CC79A7",
+    "#E69F00",
+    "#56B4E9",
+    "#4B5320",
+    "#000000",
+    "#882255",
+    "#332288",
+)
 STROKES = ("-", "--", ":", "-.")  # where there are more lines than colours
 GREY = "#6E6E6E"
 STYLE: dict[Any, Any] = {
@@ -43,7 +52,9 @@ PRINTED = choice("pdf", "svg")  # formats beside PNG
 
 
 class MethodStyle(NamedTuple):
-    """How a method is drawn: colour, mark, whether it is the second of its colour (open, dashed)."""
+    """How a method is drawn: colour, mark, whether it is the second
+    of its colour (open, dashed).
+    """
 
     colour: str
     mark: str
@@ -52,7 +63,11 @@ class MethodStyle(NamedTuple):
     @property
     def marked(self) -> dict[str, Any]:
         """For points joined by a line."""
-        return {"marker": self.mark, "markerfacecolor": "w" if self.second else self.colour, **self.line}
+        return {
+            "marker": self.mark,
+            "markerfacecolor": "w" if self.second else self.colour,
+            **self.line,
+        }
 
     @property
     def line(self) -> dict[str, Any]:
@@ -62,19 +77,30 @@ class MethodStyle(NamedTuple):
 
 # The same method looks the same everywhere; of two drawn together in one colour one is the second.
 METHODS = {
-    "gsparc": MethodStyle("#D55E00", "*"), "blind": MethodStyle("#D55E00", "P", True),
-    "gp": MethodStyle("#0072B2", "s"), "complex_gp": MethodStyle("#0072B2", "D", True),
-    "idw": MethodStyle("#009E73", "o"), "calibrated_raytracer": MethodStyle("#009E73", "v", True),
-    "swiftwrf": MethodStyle("#CC79A7", "X"), "distance_law": MethodStyle("#CC79A7", "v"),
-    "newrf": MethodStyle("#CC79A7", "^", True), "paper": MethodStyle("#E69F00", "s"),
-    "gaussians": MethodStyle("#E69F00", "o", True), "kriging": MethodStyle("#56B4E9", "p"),
-    "residual": MethodStyle("#56B4E9", "h", True), "wrfgs": MethodStyle("#4B5320", "D"),
-    "array": MethodStyle("#4B5320", "X", True), "nerf2": MethodStyle("#000000", "o"),
-    "image_source_gp": MethodStyle("#000000", "v"), "nearest": MethodStyle("#332288", "^"),
+    "gsparc": MethodStyle("#D55E00", "*"),
+    "blind": MethodStyle("#D55E00", "P", True),
+    "gp": MethodStyle("#0072B2", "s"),
+    "complex_gp": MethodStyle("#0072B2", "D", True),
+    "idw": MethodStyle("#009E73", "o"),
+    "calibrated_raytracer": MethodStyle("#009E73", "v", True),
+    "swiftwrf": MethodStyle("#CC79A7", "X"),
+    "distance_law": MethodStyle("#CC79A7", "v"),
+    "newrf": MethodStyle("#CC79A7", "^", True),
+    "paper": MethodStyle("#E69F00", "s"),
+    "gaussians": MethodStyle("#E69F00", "o", True),
+    "kriging": MethodStyle("#56B4E9", "p"),
+    "residual": MethodStyle("#56B4E9", "h", True),
+    "wrfgs": MethodStyle("#4B5320", "D"),
+    "array": MethodStyle("#4B5320", "X", True),
+    "nerf2": MethodStyle("#000000", "o"),
+    "image_source_gp": MethodStyle("#000000", "v"),
+    "nearest": MethodStyle("#332288", "^"),
     "wideband": MethodStyle("#332288", "D", True),
-    "gsrf": MethodStyle("#882255", "P"), "ngrf": MethodStyle("#882255", "s", True),
-    "mean": MethodStyle(GREY, "o"), "zero": MethodStyle(GREY, "X", True),
-}  # fmt: skip
+    "gsrf": MethodStyle("#882255", "P"),
+    "ngrf": MethodStyle("#882255", "s", True),
+    "mean": MethodStyle(GREY, "o"),
+    "zero": MethodStyle(GREY, "X", True),
+}
 OTHERS = "<>8H"  # marks of methods without an entry
 TOGETHER = "_together"  # ends the name of a method that serves all stations at once
 PUBLISHED = "full_size_"  # begins the name of one at its published size
@@ -91,7 +117,9 @@ def style_of(method: str) -> MethodStyle:
 
 
 def numbered_style(number: int) -> dict[str, Any]:
-    """Colour and line style of the setting with this number, where settings are drawn and not methods."""
+    """Colour and line style of the setting with this number,
+    where settings are drawn and not methods.
+    """
     turn, colour = divmod(number, len(PALETTE))
     return {"color": PALETTE[colour], "linestyle": STROKES[turn % len(STROKES)]}
 
@@ -99,7 +127,8 @@ def numbered_style(number: int) -> dict[str, Any]:
 def panels(
     width: float, height: float, rows: int = 1, columns: int = 1, *, grid: bool = True, **how: Any
 ) -> tuple[Figure, np.ndarray]:
-    """Return a figure of `width` x `height` inches in our style and axes (rows, columns) with grid lines.
+    """Return a figure of `width` x `height` inches in our style and axes (rows, columns)
+    with grid lines.
 
     At most 9 inches of width stay readable at 600 pixels.
     """
@@ -113,7 +142,8 @@ def panels(
 
 
 def set_log_axis(axes: Any, decades: float = 3.0) -> None:
-    """Set the horizontal axis in decades, with plain numbers also between them where it has fewer `decades`.
+    """Set the horizontal axis in decades, with plain numbers also between them
+    where it has fewer `decades`.
 
     Linear where nothing is above zero.
     """
@@ -140,7 +170,9 @@ def set_latency_axes(
         where = {"textcoords": "offset points", "fontsize": 7, "color": look.colour}
         axes.annotate(name, (ms, value), (5, -3), annotation_clip=True, **where)
     set_log_axis(axes)
-    axes.set(xlabel="one query [ms], median; whisker to the 95th percentile", ylabel=axis_of(figure_name))
+    axes.set(
+        xlabel="one query [ms], median; whisker to the 95th percentile", ylabel=axis_of(figure_name)
+    )
     if lower_is_better(figure_name):
         if np.isfinite(axes.dataLim.minposy):  # errors span decades
             axes.set_yscale("log")
@@ -151,7 +183,9 @@ def set_latency_axes(
 
 
 def save(figure: Figure, path: Path, dpi: float = 110, also: Iterable[str] = ()) -> None:
-    """Write a figure in the format of its ending, atomically, and beside it in others: `pdf`, `svg`."""
+    """Write a figure in the format of its ending, atomically, and beside it in others: `pdf`,
+    `svg`.
+    """
     for file in (path, *(path.with_suffix(f".{form}") for form in also)):
         with whole_file(file) as partial:
             figure.savefig(partial, dpi=dpi, format=file.suffix[1:].lower() or "png")

@@ -1,4 +1,6 @@
-"""A site from above, as all plans draw it: equal scales, walls, stations, measured places, a scale bar."""
+"""A site from above, as all plans draw it: equal scales, walls, stations, measured places,
+a scale bar.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ DART = Path([(-0.22, 0.75), (0.0, 0.0), (0.22, 0.75), (0.0, 1.0), (-0.22, 0.75)]
 OUTLINE = [withStroke(linewidth=2.5, foreground="white")]
 
 
-def set_bounds(axis: Any, low: ArrayLike, high: ArrayLike, origin: Any = None, **labels: str) -> None:
+def set_bounds(
+    axis: Any, low: ArrayLike, high: ArrayLike, origin: Any = None, **labels: str
+) -> None:
     """Set equal scales from corner (2,) to corner (2,) [m],
     in plain numbers about an `origin` that axes name.
     """
@@ -34,7 +38,8 @@ def set_bounds(axis: Any, low: ArrayLike, high: ArrayLike, origin: Any = None, *
     axis.set(xlim=across, ylim=up, aspect="equal", **names | labels)
     # UTM northings, 5e6 m, would be shown as small numbers beside an offset at the axis' end.
     axis.ticklabel_format(useOffset=False, style="plain")
-    axis.figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)  # equal scales take more than their share
+    # Equal scales take more than their share
+    axis.figure.get_layout_engine().set(w_pad=0.12, h_pad=0.1)
 
 
 def frame_of(places: np.ndarray, share: float = 0.06) -> tuple[np.ndarray, np.ndarray]:
@@ -50,7 +55,13 @@ def frame_of(places: np.ndarray, share: float = 0.06) -> tuple[np.ndarray, np.nd
 
 def draw_stations(axis: Any, places: np.ndarray, label: str | None = "station", **how: Any) -> None:
     """Mark places (n, 2) [m], black unless `how` says another colour."""
-    marks = {"marker": "^", "color": "k", "markersize": 9, "markeredgecolor": "white", "linestyle": ""}
+    marks = {
+        "marker": "^",
+        "color": "k",
+        "markersize": 9,
+        "markeredgecolor": "white",
+        "linestyle": "",
+    }
     axis.plot(*places.T, label=label, **{**marks, "zorder": 4, **how})
 
 
@@ -69,7 +80,11 @@ def draw_measured(axis: Any, places: np.ndarray) -> None:
         few = places[evenly_spaced(len(places), MOST_POINTS)]
         # By the root of their number, so that the area that marks hide stays the same.
         size = float(np.clip(60 / np.sqrt(len(few)), 2.5, 6.0))
-        rim = {"markerfacecolor": "black", "markeredgecolor": "white", "markeredgewidth": 0.2 * size}
+        rim = {
+            "markerfacecolor": "black",
+            "markeredgecolor": "white",
+            "markeredgewidth": 0.2 * size,
+        }
         axis.plot(*few.T, "o", markersize=size, label="measured", zorder=3, linestyle="", **rim)
 
 
@@ -78,7 +93,8 @@ def draw_values(
 ) -> None:
     """Mark places (n, 2) [m] in the colours of values (n,), told by a `bar`.
 
-    A share `clipped` of the values has the colour at either end: a few outliers would leave one for the rest.
+    A share `clipped` of the values has the colour at either end:
+    a few outliers would leave one for the rest.
     """
     low, high = np.quantile(values, [clipped, 1 - clipped])
     dots = axis.scatter(*places.T, c=values, s=size, vmin=low, vmax=high, linewidths=0)
@@ -89,7 +105,9 @@ def draw_walls(axis: Any, triangles: np.ndarray) -> None:
     """Draw upright triangles (n, 3, 3) [m] as lines; at most `MOST_WALLS`, the longest."""
     normal = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     # .1 = sin 6 degrees from upright; 1e-12 m^2 keeps triangles without area from dividing by 0.
-    upright = triangles[np.abs(normal[:, 2]) < 0.1 * np.linalg.norm(normal, axis=1).clip(1e-12)][:, :, :2]
+    upright = triangles[np.abs(normal[:, 2]) < 0.1 * np.linalg.norm(normal, axis=1).clip(1e-12)][
+        :, :, :2
+    ]
     ends = np.stack([upright, np.roll(upright, -1, axis=1)], axis=2)  # three sides of each
     length = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=-1)
     longest = ends[np.arange(len(ends)), length.argmax(1)]
@@ -97,14 +115,25 @@ def draw_walls(axis: Any, triangles: np.ndarray) -> None:
     axis.add_collection(LineCollection(longest[rows], colors="0.45", linewidths=0.5, zorder=0))
 
 
-def annotate(axis: Any, text: str, where: np.ndarray, colour: str = "black", above: bool = True) -> None:
-    """Write beside a point: above to its right, or below to its left, where the map does not end there."""
+def annotate(
+    axis: Any, text: str, where: np.ndarray, colour: str = "black", above: bool = True
+) -> None:
+    """Write beside a point: above to its right, or below to its left,
+    where the map does not end there.
+    """
     low, high = axis.get_xlim()
     to_left = where[0] > low + (0.75 if above else 0.25) * (high - low)
     note = axis.annotate(
-        text, where, xytext=(-7 if to_left else 7, 5 if above else -12), textcoords="offset points",
-        ha="right" if to_left else "left", fontsize="small", color=colour, path_effects=OUTLINE, zorder=5,
-    )  # fmt: skip
+        text,
+        where,
+        xytext=(-7 if to_left else 7, 5 if above else -12),
+        textcoords="offset points",
+        ha="right" if to_left else "left",
+        fontsize="small",
+        color=colour,
+        path_effects=OUTLINE,
+        zorder=5,
+    )
     # Text at the rim would otherwise take width from the axes, whose scales are equal.
     note.set_in_layout(False)
 
@@ -115,13 +144,28 @@ def scale_bar(axis: Any) -> None:
     decade = 10.0 ** np.floor(np.log10((right - left) / 5))
     length = max(one for one in (1, 2, 5) if one * decade <= (right - left) / 5) * decade
     x, y = left + 0.04 * (right - left), low + 0.05 * (high - low)
-    axis.plot([x, x + length], [y, y], color="black", linewidth=4, solid_capstyle="butt", zorder=6,
-              path_effects=[withStroke(linewidth=6, foreground="white")])  # fmt: skip
+    axis.plot(
+        [x, x + length],
+        [y, y],
+        color="black",
+        linewidth=4,
+        solid_capstyle="butt",
+        zorder=6,
+        path_effects=[withStroke(linewidth=6, foreground="white")],
+    )
     unit, metres = next(
         one for one in (("km", 1000), ("m", 1), ("cm", 0.01)) if length >= one[1] or one[1] < 1
     )
-    axis.annotate(f"{length / metres:g} {unit}", (x + length / 2, y), xytext=(0, 5), ha="center",
-                  textcoords="offset points", fontsize="small", path_effects=OUTLINE, zorder=6)  # fmt: skip
+    axis.annotate(
+        f"{length / metres:g} {unit}",
+        (x + length / 2, y),
+        xytext=(0, 5),
+        ha="center",
+        textcoords="offset points",
+        fontsize="small",
+        path_effects=OUTLINE,
+        zorder=6,
+    )
 
 
 def legend_below(figure: Any, columns: int = 3) -> Any:

@@ -1,4 +1,6 @@
-"""Pictures of a run: measured beside predicted targets, levels of sectors beside patterns, confidences."""
+"""Pictures of a run: measured beside predicted targets, levels of sectors beside patterns,
+confidences.
+"""
 
 from __future__ import annotations
 
@@ -32,10 +34,19 @@ from gsparc.training import tracking
 
 
 def draw_run(
-    method: Method, data: Measurements, split: Split, walls: SceneWalls | None, facts: Mapping[str, Any],
-    examples: Examples | None, eval_on: str, run_dir: Path, loggers: Sequence[Any],
-) -> None:  # fmt: skip
-    """Draw predictions and what was found; give loggers the pictures, figures and the table of a run."""
+    method: Method,
+    data: Measurements,
+    split: Split,
+    walls: SceneWalls | None,
+    facts: Mapping[str, Any],
+    examples: Examples | None,
+    eval_on: str,
+    run_dir: Path,
+    loggers: Sequence[Any],
+) -> None:
+    """Draw predictions and what was found; give loggers the pictures,
+    figures and the table of a run.
+    """
     # Under other names, as `time/train_s` would cut off its curve; of the baselines a table.
     numbers = {name: value for name, value in facts.items() if isinstance(value, (int, float))}
     finals = {f"final/{name}": v for name, v in numbers.items() if not name.startswith("baseline/")}
@@ -55,9 +66,16 @@ def draw_run(
 
 
 def draw_predictions(
-    method: Method, data: Measurements, rows: np.ndarray, examples: Examples | None, title: str, path: Path
+    method: Method,
+    data: Measurements,
+    rows: np.ndarray,
+    examples: Examples | None,
+    title: str,
+    path: Path,
 ) -> None:
-    """Draw test rows (n,) as a fitted method predicts them: `examples` where there are some, else points."""
+    """Draw test rows (n,) as a fitted method predicts them: `examples` where there are some,
+    else points.
+    """
     if examples is not None:
         return save(draw_spectra(examples, title), path, 100)
     predicted, true = predict_rows(method, data, rows).mean.numpy(), data.targets(rows).numpy()
@@ -67,16 +85,22 @@ def draw_predictions(
     draw_points(true[measured] * scale, predicted[measured] * scale, title, path, unit)
 
 
-def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Path, unit: str = "dB") -> None:
-    """Save predicted against measured strength as PNG, and the error of the phase where there is one.
+def draw_points(
+    target: np.ndarray, predicted: np.ndarray, title: str, path: Path, unit: str = "dB"
+) -> None:
+    """Save predicted against measured strength as PNG,
+    and the error of the phase where there is one.
 
-    `target` and `predicted`: (B, ...) complex channels or real powers, in physical units; `unit` of levels.
+    `target` and `predicted`: (B, ...) complex channels or real powers, in physical units;
+    `unit` of levels.
     """
     channels = np.iscomplexobj(target)
     figure, (axes,) = panels(8 if channels else 4.6, 4.2, 1, 2 if channels else 1)
     # The least float32 above 0: a power of 0 has no decibels, and would end the axis at -inf.
     tiny, factor = np.finfo(np.float32).tiny, 20 if channels else 10
-    true_db, guess_db = (factor * np.log10(np.maximum(np.abs(x).ravel(), tiny)) for x in (target, predicted))
+    true_db, guess_db = (
+        factor * np.log10(np.maximum(np.abs(x).ravel(), tiny)) for x in (target, predicted)
+    )
     # The faintest half percent are outliers of the logarithm; the strongest are what matters.
     low, high = np.percentile(true_db, [0.5, 100])
     what = "channel gain" if channels else "received power"
@@ -99,7 +123,8 @@ def draw_points(target: np.ndarray, predicted: np.ndarray, title: str, path: Pat
 
 
 def draw_spectra(examples: Examples, title: str) -> Figure:
-    """Return a line per row: measured, predicted by each method on one scale, and what the last one misses.
+    """Return a line per row: measured, predicted by each method on one scale,
+    and what the last one misses.
 
     Under each prediction stand its PSNR and SSIM, and the confidence of the last one.
     """
@@ -112,12 +137,18 @@ def draw_spectra(examples: Examples, title: str) -> Figure:
     for values in every.values():
         metric.update(torch.from_numpy(values), torch.from_numpy(examples.truth))
     figures = {name: values.reshape(len(every), count) for name, values in metric.compute().items()}
-    for number, (line, true, row) in enumerate(zip(axes, examples.truth, examples.rows, strict=True)):
-        for axis, image in zip(line, (true, *(values[number] for values in every.values())), strict=False):
+    for number, (line, true, row) in enumerate(
+        zip(axes, examples.truth, examples.rows, strict=True)
+    ):
+        for axis, image in zip(
+            line, (true, *(values[number] for values in every.values())), strict=False
+        ):
             power = axis.imshow(image, vmin=0, vmax=1, cmap="inferno", **options)
         for place, axis in enumerate(line[1:-1]):
             psnr, ssim = (figures[name][place, number] for name in ("psnr_db", "ssim_gauss"))
-            axis.set_xlabel(f"{psnr:.1f} dB" + f", SSIM {ssim:.3f}" * bool(np.isfinite(ssim)), fontsize=8)
+            axis.set_xlabel(
+                f"{psnr:.1f} dB" + f", SSIM {ssim:.3f}" * bool(np.isfinite(ssim)), fontsize=8
+            )
         # Half of full scale, saturating: at +-1 usual errors of a few hundredths would be white.
         error = line[-1].imshow(image - true, vmin=-0.5, vmax=0.5, cmap="RdBu_r", **options)
         if np.isfinite(examples.confidence[number]):
@@ -131,7 +162,9 @@ def draw_spectra(examples: Examples, title: str) -> Figure:
         axis.tick_params(labelsize=7)
     figure.supylabel("elevation [°]", fontsize=9)
     below: dict[str, Any] = {"location": "bottom", "shrink": 0.8, "aspect": 40}
-    figure.colorbar(power, ax=axes[:, :-1], label="relative strength; azimuth [°] runs across", **below)
+    figure.colorbar(
+        power, ax=axes[:, :-1], label="relative strength; azimuth [°] runs across", **below
+    )
     figure.colorbar(error, ax=axes[:, -1], label="difference", **{**below, "aspect": 10})
     figure.suptitle(title)
     figure.set_label("The same test rows, measured and predicted")
@@ -139,9 +172,11 @@ def draw_spectra(examples: Examples, title: str) -> Figure:
 
 
 NAMES = {
-    "learned": "learned", "expected": "expected error", "distance": "distance to the nearest",
+    "learned": "learned",
+    "expected": "expected error",
+    "distance": "distance to the nearest",
     "gp_variance": "GP variance",
-}  # fmt: skip
+}
 
 
 def draw_calibration(
@@ -157,7 +192,9 @@ def draw_calibration(
     # Ordered by the errors themselves: no score can be below this curve.
     risk = risk_coverage(-loss, loss)
     left.plot(coverage, risk, "k:", label=f"knowing the errors, area {risk.mean():.3g}")
-    left.set(xlabel="share of positions accepted", ylabel="mean error among them (|e|²/|h|², at most 1)")
+    left.set(
+        xlabel="share of positions accepted", ylabel="mean error among them (|e|²/|h|², at most 1)"
+    )
     left.set_title(title)
     for trial, colour in zip(trials, PALETTE, strict=False):
         broken = trial.summarise()["broken_of_all"]
@@ -169,19 +206,26 @@ def draw_calibration(
     if not any(trial.coverage.any() for trial in trials):
         right.text(0.5, 0.5 * worst, "no draw accepted anybody", ha="center")
     right.axhline(guarantee.alpha, color="black", linewidth=1)
-    right.set_title(f"promise: at most {guarantee.alpha:.0%} bad, broken in at most {guarantee.delta:.0%}")
-    right.set(xlabel="share of test positions accepted", ylabel="realised share of bad ones among them")
+    right.set_title(
+        f"promise: at most {guarantee.alpha:.0%} bad, broken in at most {guarantee.delta:.0%}"
+    )
+    right.set(
+        xlabel="share of test positions accepted", ylabel="realised share of bad ones among them"
+    )
     for axis in (left, right):
         axis.legend(fontsize=8)
     save(figure, path)
 
 
-MOST, ACROSS = 12, 4  # sectors drawn, contradicted azimuths and then most rows first; beside each other
+# Sectors drawn, contradicted azimuths and then most rows first; beside each other
+MOST, ACROSS = 12, 4
 LEAST = 10  # rows that were heard of a sector, whose azimuth is not contradicted
 
 
 def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Path) -> None:
-    """Draw rows of sectors that were learned from, less the law of distance, where there are patterns."""
+    """Draw rows of sectors that were learned from, less the law of distance,
+    where there are patterns.
+    """
     field = method.joint_method()
     if not isinstance(field, JointPowerField) or field.network is None:
         return
@@ -202,22 +246,32 @@ def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Pat
     for axis, t in zip(axes.flat, chosen, strict=False):
         at = torch.from_numpy(np.c_[heard.select_station(t).places, np.full(count[t], t)])
         angle, distance = _about(at, azimuth[t])
-        rest = torch.from_numpy(heard.select_station(t).decibels) - trend.mean(at) - trend.pattern_loss(at)
+        rest = (
+            torch.from_numpy(heard.select_station(t).decibels)
+            - trend.mean(at)
+            - trend.pattern_loss(at)
+        )
         axis.plot(angle, rest, ".", color=PALETTE[0], markersize=3, alpha=0.5)
         turn = np.linspace(-180, 180, 181)
         # Bearings from north, clockwise: east = sin, north = cos.
         bearing = np.radians(turn + azimuth[t])
         ring = np.median(distance) * np.c_[np.sin(bearing), np.cos(bearing)]
         height = np.full((len(ring), 1), float(at[:, 2].median()))
-        around = np.c_[ring + field.places[t, :2], height, np.tile(np.r_[field.places[t], t], (len(ring), 1))]
+        around = np.c_[
+            ring + field.places[t, :2], height, np.tile(np.r_[field.places[t], t], (len(ring), 1))
+        ]
         # A median: rows behind buildings are far below the pattern, and would lower a mean.
         gain = float((rest + trend.pattern_loss(at)).median())
         axis.plot(turn, gain - trend.pattern_loss(torch.from_numpy(around)), color=PALETTE[1])
-        title = f"{stations.shown[t]}, {azimuth[t]:.0f} deg" + f" (given {nominal[t]:.0f})" * int(turned[t])
+        title = f"{stations.shown[t]}, {azimuth[t]:.0f} deg" + f" (given {nominal[t]:.0f})" * int(
+            turned[t]
+        )
         axis.set(title=title, xlim=(-180, 180), xticks=range(-180, 181, 90))
     few = [stations.shown[t] for t in np.flatnonzero((azimuth != NO_AZIMUTH) & ~enough)]
     note = f"; too few rows to draw: {list_first(few, 6)}" if few else ""
-    figure.suptitle(fill(f"{len(chosen)} of {len(count)} sectors, contradicted azimuths first{note}", 90))
+    figure.suptitle(
+        fill(f"{len(chosen)} of {len(count)} sectors, contradicted azimuths first{note}", 90)
+    )
     for axis in axes.flat[len(chosen) :]:
         axis.set_visible(False)
     figure.supxlabel("angle from the azimuth that is used [deg]")

@@ -1,4 +1,6 @@
-"""Frames of results drawn: runs, comparisons, studies, trade-offs; accuracy beside what it costs."""
+"""Frames of results drawn: runs, comparisons, studies, trade-offs;
+accuracy beside what it costs.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,14 @@ from gsparc.evaluation.metric_formats import (
 )
 from gsparc.evaluation.results import Run, average, distinct_baselines, own_rows
 from gsparc.evaluation.table import Row
-from gsparc.pictures.drawing import numbered_style, panels, save, set_latency_axes, set_log_axis, style_of
+from gsparc.pictures.drawing import (
+    numbered_style,
+    panels,
+    save,
+    set_latency_axes,
+    set_log_axis,
+    style_of,
+)
 from gsparc.pictures.report.tables import groups_of, interval_of_figure
 from gsparc.prediction.pareto import pareto_front
 from gsparc.runs.experiment.table import methods_by_mean_behind, shown
@@ -48,7 +57,9 @@ def to_svg(figure: Figure) -> str:
 
 
 def draw_pareto(rows: pd.DataFrame, fronts: Sequence[dict[str, np.ndarray]] = ()) -> Figure:
-    """Test accuracy against latency: runs with intervals, baselines, swept fronts, and the Pareto front."""
+    """Test accuracy against latency: runs with intervals, baselines, swept fronts,
+    and the Pareto front.
+    """
     figure, ((axes,),) = panels(WIDE, TALL)
     name = rows.figure.iloc[0]
     points: list[tuple[float, float]] = []
@@ -59,9 +70,16 @@ def draw_pareto(rows: pd.DataFrame, fronts: Sequence[dict[str, np.ndarray]] = ()
             if p50 is None or estimate is None:
                 continue
             axes.errorbar(
-                [p50], [estimate.value], xerr=[[0.0], [max((p95 or p50) - p50, 0.0)]], yerr=estimate.bars,
-                fmt="o", ms=4, lw=0.7, color=style["color"], label=None if number else setting,
-            )  # fmt: skip
+                [p50],
+                [estimate.value],
+                xerr=[[0.0], [max((p95 or p50) - p50, 0.0)]],
+                yerr=estimate.bars,
+                fmt="o",
+                ms=4,
+                lw=0.7,
+                color=style["color"],
+                label=None if number else setting,
+            )
             points.append((p50, estimate.value))
     others = [(base["method"], base["query_ms"], base["value"]) for base in _rivals(rows)]
     others = [other for other in others if other[1] is not None]
@@ -83,11 +101,12 @@ def draw_pareto(rows: pd.DataFrame, fronts: Sequence[dict[str, np.ndarray]] = ()
 def draw_distributions(
     rows: pd.DataFrame, names: Sequence[str], labels: Mapping[str, str] = MappingProxyType({})
 ) -> Figure:
-    """Draw the shares of test samples that are at most so good, per setting over its seeds, a panel a figure.
+    """Draw the shares of test samples that are at most so good, per setting over its seeds,
+    a panel a figure.
 
-    Dashed lines are medians. With the band that the whole curve lies in at 95 % (Dvoretzky, Kiefer and
-    Wolfowitz 1956; Massart): seeds share their test samples, whose number counts once. `TIMES` among `names`
-    are single queries.
+    Dashed lines are medians. With the band that the whole curve lies in at 95 % (Dvoretzky, Kiefer
+    and Wolfowitz 1956; Massart): seeds share their test samples, whose number counts once. `TIMES`
+    among `names` are single queries.
     """
     figure, ((*line,),) = panels(max(4.2 * len(names), WIDE), TALL, 1, len(names))
     for axes, name in zip(line, names, strict=True):
@@ -98,36 +117,53 @@ def draw_distributions(
             values, share = _shares(every)
             # DKW: P(sup |F_n - F| > e) <= 2 exp(-2 n e^2), Massart 1990 for the constant 2.
             half = np.sqrt(np.log(2 / (1 - BAND)) / (2 * max(count, 1)))
-            axes.step(values, share, where="post", lw=1.2, label=labels.get(setting, setting), **style)
+            axes.step(
+                values, share, where="post", lw=1.2, label=labels.get(setting, setting), **style
+            )
             low, high = np.clip(share - half, 0, 1), np.clip(share + half, 0, 1)
-            axes.fill_between(values, low, high, step="post", color=style["color"], alpha=0.08, lw=0)
-            axes.axvline(np.median(values) if len(values) else np.nan, lw=0.8, ls="--", color=style["color"])
+            axes.fill_between(
+                values, low, high, step="post", color=style["color"], alpha=0.08, lw=0
+            )
+            axes.axvline(
+                np.median(values) if len(values) else np.nan, lw=0.8, ls="--", color=style["color"]
+            )
         for method, draws in _samples_of_rivals(rows, name).items():
             line_of = style_of(method).line
             axes.step(*_shares(draws), lw=0.8, label=method, **line_of)
             axes.axvline(np.median(np.concatenate(draws)), lw=0.6, ls="--", color=line_of["color"])
-        axes.set_xlabel("one query, alone [ms]" if name == TIMES else f"{heading_of(name)} of a test sample")
+        axes.set_xlabel(
+            "one query, alone [ms]" if name == TIMES else f"{heading_of(name)} of a test sample"
+        )
         if name == TIMES or is_ratio(name):
             set_log_axis(axes, np.inf if name == TIMES else 0.0)
     line[0].set_ylabel("share of samples")
     handles, texts = line[0].get_legend_handles_labels()
-    figure.legend(handles, [shorten_setting(one, 90) for one in texts], loc="outside lower center", ncols=2)
+    figure.legend(
+        handles, [shorten_setting(one, 90) for one in texts], loc="outside lower center", ncols=2
+    )
     figure.set_label("How the accuracy is distributed (95 % bands, dashed: medians)")
     return figure
 
 
 def draw_sweep(rows: pd.DataFrame, title: str, path: Path, also: Sequence[str] = ()) -> None:
-    """Save the figure that ends a sweep: distributions over test samples and of single queries, see `save`.
+    """Save the figure that ends a sweep: distributions over test samples and of single queries,
+    see `save`.
 
     The paper's ablations draw the same: SSIM, PSNR, squared error, render time.
     """
     fits = own_rows(rows)
-    names = [name for name in OF_KIND[fits.kind.iloc[0]].distributions if name in fits.run.iloc[0].samples]
+    names = [
+        name
+        for name in OF_KIND[fits.kind.iloc[0]].distributions
+        if name in fits.run.iloc[0].samples
+    ]
     names += [TIMES] if any(len(run.render_ms) for run in fits.run) else []
     if not names:  # nothing was tested
         return
     labels = {}
-    for setting, seconds, ms in average(fits, ["setting"], ["train_s", "query_ms"])["mean"].itertuples():
+    for setting, seconds, ms in average(fits, ["setting"], ["train_s", "query_ms"])[
+        "mean"
+    ].itertuples():
         labels[setting] = f"{shorten_setting(setting, 40)}: training {seconds:.3g} s"
         labels[setting] += f", one query {ms:.3g} ms" * bool(np.isfinite(ms))
     figure = draw_distributions(rows, names, labels)
@@ -164,7 +200,9 @@ def _rivals(rows: pd.DataFrame) -> list[Row]:
 
 
 def _styled(rows: pd.DataFrame) -> list[tuple[str, list[Row], dict[str, Any]]]:
-    """Settings, their rows, colour and line: a method's own where each has one setting, else one by one."""
+    """Settings, their rows, colour and line: a method's own where each has one setting,
+    else one by one.
+    """
     groups = groups_of(own_rows(rows))
     names = [str(group.method.iloc[0]) for group in groups.values()]
     unique = len(set(names)) == len(names)
@@ -188,7 +226,13 @@ def draw_front(points: pd.DataFrame, others: pd.DataFrame, method: str, title: s
     figure, ((axes,),) = panels(7.5, 4.2)
     axes.scatter(beaten.render_ms_p50, beaten.value, s=9, c="0.75", label="beaten")
     reach = [np.zeros(len(best)), best.render_ms_p95 - best.render_ms_p50]
-    how: dict[str, Any] = {"fmt": "o-", "color": style_of(method).colour, "capsize": 2, "lw": 1, "ms": 4}
+    how: dict[str, Any] = {
+        "fmt": "o-",
+        "color": style_of(method).colour,
+        "capsize": 2,
+        "lw": 1,
+        "ms": 4,
+    }
     axes.errorbar(best.render_ms_p50, best.value, xerr=reach, label="not beaten", **how)
     beside = zip(others.label, others.render_ms_p50, others.value, strict=True)
     set_latency_axes(axes, best.figure.iloc[0], best.value, beside)
@@ -212,9 +256,14 @@ def draw_efforts(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] 
     size = (max(PANEL * columns, 6.0), 0.9 * PANEL * len(groups) + 0.9)
     figure, grid = panels(*size, len(groups), columns, sharey="row")
     for line, here in zip(grid, groups, strict=True):
-        splits = [(cells, "train_cpu_s", split) for split, cells in here.groupby("split", sort=False)]
+        splits = [
+            (cells, "train_cpu_s", split) for split, cells in here.groupby("split", sort=False)
+        ]
         first = splits[0][0]
-        wanted = [*splits, *([(first, "query_ms", "queries")] if first.query_ms.notna().any() else [])]
+        wanted = [
+            *splits,
+            *([(first, "query_ms", "queries")] if first.query_ms.notna().any() else []),
+        ]
         for axis, (cells, horizontal, shows) in zip(line, wanted, strict=False):
             _panel(axis, cells, horizontal, ours)
             label = "training, CPU [s]" if horizontal == "train_cpu_s" else "one query [ms]"
@@ -244,11 +293,16 @@ LINE = 0.34  # height of a method [inch]
 
 
 def draw_splits(rows: pd.DataFrame, path: Path, also: Sequence[str] = ()) -> None:
-    """Save a panel per split: mean and standard error over draws, of `average_cells` of one dataset."""
+    """Save a panel per split: mean and standard error over draws,
+    of `average_cells` of one dataset.
+    """
     splits, names = list(rows.split.unique()), list(methods_by_mean_behind(rows))
-    figure, grid = panels(2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True)
+    figure, grid = panels(
+        2.2 + 3.1 * len(splits), 1.3 + LINE * len(names), 1, len(splits), sharey=True
+    )
     for axis, split in zip(grid[0], splits, strict=True):
-        here = rows[rows.split == split].drop_duplicates("method", keep="last")  # the largest effort
+        # The largest effort
+        here = rows[rows.split == split].drop_duplicates("method", keep="last")
         here = here.fillna({"value_error": 0.0}).set_index("method")
         most = (here.value + here.value_error).max()
         best = here.score_db.idxmax()
@@ -257,12 +311,19 @@ def draw_splits(rows: pd.DataFrame, path: Path, also: Sequence[str] = ()) -> Non
                 axis.text(0.02 * most, number, "not possible", va="center", fontsize=8, color="0.5")
                 continue
             row = here.loc[name]
-            bar = {"color": style_of(name).colour, "alpha": 1.0 if name == best else 0.45, "capsize": 2.5}
+            bar = {
+                "color": style_of(name).colour,
+                "alpha": 1.0 if name == best else 0.45,
+                "capsize": 2.5,
+            }
             axis.barh(number, row.value, xerr=row.value_error, **bar)
             axis.text(
-                min(row.value + row.value_error + 0.02 * most, 1.02 * most), number,
-                f"{row.value:.3g}, fit {_seconds(row.train_s)}", va="center", fontsize=7.5,
-            )  # fmt: skip
+                min(row.value + row.value_error + 0.02 * most, 1.02 * most),
+                number,
+                f"{row.value:.3g}, fit {_seconds(row.train_s)}",
+                va="center",
+                fontsize=7.5,
+            )
         draws = int(here.seeds.max())
         axis.set(title=f"{split}, {draws} draw{'s' * (draws > 1)}", xlim=(0, 1.5 * most))
         axis.set_xlabel(axis_of(here.figure.iloc[0]))
@@ -282,7 +343,8 @@ def _seconds(value: float) -> str:
 
 TRAINING = "training of one model [s]"
 ACCURACY = "value"
-# Condition whose rows are drawn, label of the horizontal axis, its column and factor, column of the vertical.
+# Condition whose rows are drawn, label of the horizontal axis, its column and factor,
+# column of the vertical.
 PANELS = (
     ("query", "position error in queries [cm]", "amount", 100, ACCURACY),
     ("train", "position error in training [cm]", "amount", 100, ACCURACY),
@@ -308,9 +370,13 @@ def draw_study(rows: pd.DataFrame, title: str, path: Path) -> None:
             if part.empty:
                 continue
             spread = part.spread.fillna(0.0) if y == ACCURACY else None
-            line, *_ = axes.errorbar(factor * part[x], part[y], spread, marker="o", capsize=2, label=variant)
+            line, *_ = axes.errorbar(
+                factor * part[x], part[y], spread, marker="o", capsize=2, label=variant
+            )
             if len(clean) and what != "none" and y == ACCURACY:
-                axes.axhline(clean.value.iloc[0], color=line.get_color(), linestyle=":", linewidth=1)
+                axes.axhline(
+                    clean.value.iloc[0], color=line.get_color(), linestyle=":", linewidth=1
+                )
         set_log_axis(axes)
         axes.set(xlabel=label, ylabel=name if y == ACCURACY else TRAINING)
         if y != ACCURACY:

@@ -10,7 +10,13 @@ import numpy as np
 from gsparc.evaluation.table import Column, Table
 from gsparc.physics.decibels import to_decibels
 from gsparc.pictures.drawing import panels, save
-from gsparc.pictures.from_above import draw_stations, draw_values, draw_walls, legend_below, set_bounds
+from gsparc.pictures.from_above import (
+    draw_stations,
+    draw_values,
+    draw_walls,
+    legend_below,
+    set_bounds,
+)
 from gsparc.simulate.campaign import Outcome
 from gsparc.simulate.raytracer import RayTracer
 from gsparc.simulate.scenes.shipped import list_shipped_scenes
@@ -20,7 +26,8 @@ CARRIER_HZ = 3.5e9  # for looking at scenes: materials need one
 
 
 def draw_floor_plan(outcome: Outcome, path: Path) -> None:
-    """Draw from above: received power, delay spread and, after `auto`, where a dropped effect mattered.
+    """Draw from above: received power, delay spread and, after `auto`,
+    where a dropped effect mattered.
 
     Of several transmitters, the strongest at each place.
     """
@@ -36,7 +43,8 @@ def draw_floor_plan(outcome: Outcome, path: Path) -> None:
     high = float(np.clip(4.6 * extent[1] / extent[0], 2.5, 6.0)) + 1.3
     figure, (axes,) = panels(5.4 * count, high, 1, count, grid=False)
     reached, triangles = heard > 0, survey.engine.triangles()
-    # A mark's area [points^2] shrinks with the number of places, within what is seen and not hidden.
+    # A mark's area [points^2] shrinks with the number of places,
+    # within what is seen and not hidden.
     size = float(np.clip(6000 / len(places), 2, 40))
     bar: dict[str, Any] = {"location": "bottom", "shrink": 0.8}
     at, level = places[reached, :2], to_decibels(heard[reached])

@@ -1,4 +1,6 @@
-"""A site from above: where was measured, what looks wrong, and what a field found beside what is known."""
+"""A site from above: where was measured, what looks wrong,
+and what a field found beside what is known.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,12 @@ from gsparc.pictures.from_above import (
     legend_below,
     set_bounds,
 )
-from gsparc.tables.checks.describe import distinct_places, held_out_block_rows, propose_side, spacing_words
+from gsparc.tables.checks.describe import (
+    distinct_places,
+    held_out_block_rows,
+    propose_side,
+    spacing_words,
+)
 from gsparc.tables.checks.level_steps import LevelStep
 from gsparc.tables.checks.link_levels import LinkLevels
 from gsparc.tables.checks.plausibility import find_outlier_rows
@@ -61,7 +68,9 @@ class Spots:
 
 
 def find_spots(data: Measurements, levels: LinkLevels | None) -> Spots:
-    """Return places of the moving end, levels there and what looks wrong; of the receiver where both move."""
+    """Return places of the moving end, levels there and what looks wrong;
+    of the receiver where both move.
+    """
     site = data.site
     of_row = data.moving[:, -3:]
     # np.unique sorts by coordinate; `first` leads back to the order of measuring.
@@ -95,16 +104,29 @@ def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarr
     # Powers of channels are averaged linearly, levels of a station in decibels.
     value = to_decibels(value) if in_decibels else value
     each = [which[row], data.stations_of(row) if in_decibels else which[row]]
-    level = pd.Series(value).groupby(each).mean().groupby(level=0).max().reindex(range(count)).to_numpy()
+    level = (
+        pd.Series(value)
+        .groupby(each)
+        .mean()
+        .groupby(level=0)
+        .max()
+        .reindex(range(count))
+        .to_numpy()
+    )
     if in_decibels:
         of = " of the strongest station" if several else ""
         return level, f"received power{of} [{data.site.level_unit}]"
     with np.errstate(divide="ignore"):
-        return to_decibels(level), "mean channel power" + (" of all stations" if several else "") + " [dB]"
+        return to_decibels(level), "mean channel power" + (
+            " of all stations" if several else ""
+        ) + " [dB]"
 
 
 def draw_site(
-    data: Measurements, path: Path, levels: LinkLevels | None, steps: Sequence[tuple[int, LevelStep]] = ()
+    data: Measurements,
+    path: Path,
+    levels: LinkLevels | None,
+    steps: Sequence[tuple[int, LevelStep]] = (),
 ) -> None:
     """Save a map of places and stations as PNG and, beside it, the levels of stations that jump.
 
@@ -116,7 +138,9 @@ def draw_site(
     low, high = frame_of(np.concatenate(points))
     width, height = (high - low) / (high - low).max() * INCHES
     width, height = max(width, 0.45 * INCHES) + 1.9, max(height, 0.35 * INCHES) + 1.6
-    jumping = sorted({t for t, _ in steps}, key=lambda t: -max(abs(s.change_db) for u, s in steps if u == t))
+    jumping = sorted(
+        {t for t, _ in steps}, key=lambda t: -max(abs(s.change_db) for u, s in steps if u == t)
+    )
     jumping = jumping[:MOST_JUMPS]
     if not jumping or levels is None:
         figure, axes = panels(width, height)
@@ -151,7 +175,12 @@ def static_positions(data: Measurements) -> np.ndarray:
 
 
 def _draw_map(
-    axis: Any, data: Measurements, places: Spots, low: np.ndarray, high: np.ndarray, jumping: Sequence[int]
+    axis: Any,
+    data: Measurements,
+    places: Spots,
+    low: np.ndarray,
+    high: np.ndarray,
+    jumping: Sequence[int],
 ) -> None:
     site, inside = data.site, ~places.far
     size = _size(places.place[inside], float((high - low).max()))
@@ -174,7 +203,9 @@ def _draw_map(
     if len(test):
         ring = np.unique(data.moving[test, -3:-1], axis=0) + site.origin[:2]
         how: dict[str, Any] = {"facecolors": "none", "edgecolors": "black", "linewidths": 0.7}
-        axis.scatter(*ring.T, s=size, label=f"held out by split=blocks split.side_m={side:g}", **how)
+        axis.scatter(
+            *ring.T, s=size, label=f"held out by split=blocks split.side_m={side:g}", **how
+        )
     set_bounds(axis, low, high, site.georeference)
     _draw_stations(axis, data, jumping)
     _draw_suspicious(axis, places, low, high)
@@ -182,7 +213,9 @@ def _draw_map(
 
 def _size(place: np.ndarray, extent: float) -> float:
     """Area [points^2] of a mark as large as the distance between neighbours."""
-    spacing = float(np.median(cKDTree(place).query(place, k=2)[0][:, 1])) if len(place) > 1 else extent
+    spacing = (
+        float(np.median(cKDTree(place).query(place, k=2)[0][:, 1])) if len(place) > 1 else extent
+    )
     # 72 points are an inch; clipped to what is seen (2.5) and hides no neighbours (9).
     return float(np.clip(72 * INCHES * spacing / extent, 2.5, 9.0)) ** 2
 
@@ -217,10 +250,16 @@ def _draw_suspicious(axis: Any, places: Spots, low: np.ndarray, high: np.ndarray
     if len(far):
         # At the edge, 2 % inside: at its place it would shrink the site to a point.
         edge = np.clip(
-            places.place[far], *(corner + s * 0.02 * (high - low) for corner, s in ((low, 1), (high, -1)))
+            places.place[far],
+            *(corner + s * 0.02 * (high - low) for corner, s in ((low, 1), (high, -1))),
         )
         axis.scatter(
-            *edge.T, c="red", marker="x", s=60, zorder=3, label=f"far outside, at the edge ({len(far)})"
+            *edge.T,
+            c="red",
+            marker="x",
+            s=60,
+            zorder=3,
+            label=f"far outside, at the edge ({len(far)})",
         )
         for row, where in zip(far[:MOST_MARKS], edge, strict=False):
             at = ", ".join(f"{v:.4g}" for v in places.place[row])
@@ -229,7 +268,9 @@ def _draw_suspicious(axis: Any, places: Spots, low: np.ndarray, high: np.ndarray
         annotate(axis, places.rows[row], places.place[row], "red", above=False)
 
 
-def _draw_level(axis: Any, levels: LinkLevels, station: int, steps: Sequence[LevelStep], unit: str) -> None:
+def _draw_level(
+    axis: Any, levels: LinkLevels, station: int, steps: Sequence[LevelStep], unit: str
+) -> None:
     """Levels of a station by row; those between two steps in one colour."""
     rows = np.flatnonzero(levels.station == station)
     level = levels.level_db[rows]
@@ -244,16 +285,27 @@ def _draw_level(axis: Any, levels: LinkLevels, station: int, steps: Sequence[Lev
         # At least one place wide, or a step between neighbours would not be seen.
         axis.axvspan(last, max(first, last + 1), facecolor="red", alpha=0.2)
         axis.axvline(first, color="red", linewidth=1.2)
-        note = f" {step.change_db:+.0f} dB from {levels.rows[step.last]} to {levels.rows[step.first]} "
+        note = (
+            f" {step.change_db:+.0f} dB from {levels.rows[step.last]} to {levels.rows[step.first]} "
+        )
         axis.text(
-            first, 0.97 - 0.1 * k, note, color="red", fontsize="small", va="top",
-            ha="left" if first < len(rows) / 2 else "right", transform=axis.get_xaxis_transform(),
+            first,
+            0.97 - 0.1 * k,
+            note,
+            color="red",
+            fontsize="small",
+            va="top",
+            ha="left" if first < len(rows) / 2 else "right",
+            transform=axis.get_xaxis_transform(),
             path_effects=OUTLINE,
-        )  # fmt: skip
+        )
     wild = [bad for t, bad, _ in find_outlier_rows(levels) if t == station]
     for row in np.concatenate([np.zeros(0, np.int64), *wild]):
         axis.plot(np.searchsorted(rows, row), levels.level_db[row], "o", mec="red", mfc="none")
-    axis.set(title=f"{levels.names[station]}: steps that the places do not explain", ylabel=f"level [{unit}]")
+    axis.set(
+        title=f"{levels.names[station]}: steps that the places do not explain",
+        ylabel=f"level [{unit}]",
+    )
     axis.set_xlabel("place, in the order of measuring")
 
 
@@ -262,7 +314,9 @@ FARTHEST = 4.0  # extents of the places, at which a wall is on the map
 AROUND, MARGIN = 0.5, 0.06  # of the extent of the places, drawn around them with walls and without
 
 
-def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: SceneWalls | None = None) -> None:
+def draw_found(
+    data: Measurements, objects: SiteObjects, path: Path, known: SceneWalls | None = None
+) -> None:
     """Save a map of mirror planes and boxes over the measured places as PNG.
 
     `objects` are in local coordinates, `known` walls and boxes in those of the measurements.
@@ -271,10 +325,13 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
     places = np.unique(data.moving[:, -3:], axis=0) + origin
     ends = static_positions(data)
     points = np.concatenate([places[:, :2], ends])
-    # Walls that stand apart from all places are on the map, too; those far away would make it a dot.
+    # Walls that stand apart from all places are on the map, too;
+    # those far away would make it a dot.
     middle, extent = points.mean(0), np.linalg.norm(np.ptp(points, axis=0))
     feet = np.array([foot for _, foot in _upright(objects.planes, origin, middle)]).reshape(-1, 2)
-    points = np.concatenate([points, feet[np.linalg.norm(feet - middle, axis=1) <= FARTHEST * extent]])
+    points = np.concatenate(
+        [points, feet[np.linalg.norm(feet - middle, axis=1) <= FARTHEST * extent]]
+    )
     low, high = frame_of(points, AROUND if len(objects.planes) else MARGIN)
     width, height = (high - low) / (high - low).max() * INCHES
     figure, axes = panels(max(width, 3.0) + 1.9, max(height, 2.3) + 1.6)
@@ -285,7 +342,14 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
     for number, box in enumerate(objects.boxes + origin):
         label = f"boxes found ({len(objects.boxes)})" if not number else None
         axis.add_patch(
-            Rectangle(box[0, :2], *(box[1] - box[0])[:2], fill=False, hatch="///", ec=PALETTE[0], label=label)
+            Rectangle(
+                box[0, :2],
+                *(box[1] - box[0])[:2],
+                fill=False,
+                hatch="///",
+                ec=PALETTE[0],
+                label=label,
+            )
         )
     level = _draw_planes(axis, objects.planes, origin, low, high)
     if len(ends):
@@ -297,7 +361,9 @@ def draw_found(data: Measurements, objects: SiteObjects, path: Path, known: Scen
     save(figure, path)
 
 
-def _draw_planes(axis: Any, planes: np.ndarray, origin: np.ndarray, low: np.ndarray, high: np.ndarray) -> str:
+def _draw_planes(
+    axis: Any, planes: np.ndarray, origin: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> str:
     """Upright planes as lines; returns where the others are, in words."""
     middle, reach = (low + high) / 2, float(np.linalg.norm(high - low))
     label: str | None = "mirror planes found"
@@ -315,7 +381,9 @@ def _draw_planes(axis: Any, planes: np.ndarray, origin: np.ndarray, low: np.ndar
 def _upright(
     planes: np.ndarray, origin: np.ndarray, middle: np.ndarray
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Yield the direction (2,) across each upright plane, and its point nearest to `middle` (2,) [m]."""
+    """Yield the direction (2,) across each upright plane, and its point nearest to `middle` (2,)
+    [m].
+    """
     for normal, offset in zip(planes[:, :3], planes[:, 3] + planes[:, :3] @ origin, strict=True):
         # .3 = sin 17.5 degrees from upright: a plane that leans more is no line from above.
         if abs(normal[2]) <= UPRIGHT:
@@ -337,10 +405,13 @@ def _draw_known(axis: Any, known: SceneWalls, height: float) -> None:
     for number, box in enumerate(known.boxes):
         axis.add_patch(
             Polygon(
-                [box[0, :2], (box[1, 0], box[0, 1]), box[1, :2], (box[0, 0], box[1, 1])], fc="0.8", ec="0.5",
-                label=None if number else "known boxes", zorder=0,
+                [box[0, :2], (box[1, 0], box[0, 1]), box[1, :2], (box[0, 0], box[1, 1])],
+                fc="0.8",
+                ec="0.5",
+                label=None if number else "known boxes",
+                zorder=0,
             )
-        )  # fmt: skip
+        )
 
 
 def _cut(face: np.ndarray, height: float) -> np.ndarray:

@@ -1,4 +1,6 @@
-"""The kernels as `gsparc bench` times them: a room of N Gaussians around a receiver, beside plain PyTorch."""
+"""The kernels as `gsparc bench` times them: a room of N Gaussians around a receiver,
+beside plain PyTorch.
+"""
 
 from __future__ import annotations
 
@@ -17,21 +19,36 @@ from gsparc.field.gaussians import FieldSettings
 from gsparc.field.losses import spectrum_loss
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
 from gsparc.field.optimizer import OptimizerSettings, optimizer_for
-from gsparc.ops import Cutoff, Plan, Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
+from gsparc.ops import (
+    Cutoff,
+    Plan,
+    Pose,
+    SphereGrid,
+    composite,
+    freeze,
+    make_plan,
+    mean_weights,
+    rasterize,
+)
 from gsparc.ops.projection import Projection
 
 Call = Callable[[], object]
 ROOM = np.array([[-8.0, -6.0, -3.0], [8.0, 6.0, 3.0]])  # [m]
 GRID = SphereGrid.hemisphere()
-EMISSION = EmissionSettings(EncodingSettings("raw"), 16, "sigmoid", log_distance=True, init_bias=0.0)
-# Dense tensors of one forward pass of 1,000 Gaussians are 1.6 GB: the reference of more is not called.
+EMISSION = EmissionSettings(
+    EncodingSettings("raw"), 16, "sigmoid", log_distance=True, init_bias=0.0
+)
+# Dense tensors of one forward pass of 1,000 Gaussians are 1.6 GB:
+# the reference of more is not called.
 MOST_DENSE = 1000
 STEPPED, BATCH = 100, 16  # Gaussians and spectra of a training step
 
 
 @dataclass(frozen=True)
 class Case:
-    """A kernel at one size, and the same in plain PyTorch; None where its dense tensors are too large."""
+    """A kernel at one size, and the same in plain PyTorch;
+    None where its dense tensors are too large.
+    """
 
     name: str
     size: str
@@ -42,15 +59,28 @@ class Case:
 def random_model(
     count: int, projection: Projection, backend: str | None = None, device: str = "cpu"
 ) -> GaussianModel:
-    """Return a room of `count` Gaussians of all shapes, from nearly transparent to nearly opaque (seeded)."""
+    """Return a room of `count` Gaussians of all shapes,
+    from nearly transparent to nearly opaque (seeded).
+    """
     site = Site(
-        name="bench", kind="spectrum", static_end="tx", grid=GRID, array=None, carrier_hz=None,
-        subcarriers_hz=None, origin=np.zeros(3), box=ROOM, moving_box=ROOM, sha256="",
-    )  # fmt: skip
+        name="bench",
+        kind="spectrum",
+        static_end="tx",
+        grid=GRID,
+        array=None,
+        carrier_hz=None,
+        subcarriers_hz=None,
+        origin=np.zeros(3),
+        box=ROOM,
+        moving_box=ROOM,
+        sha256="",
+    )
     settings = ModelSettings(
-        FieldSettings(count=count, placement="uniform", margin=0.0), EMISSION,
-        AttenuationSettings(inverse_distance=True), raster=RasterSettings(projection, backend=backend),
-    )  # fmt: skip
+        FieldSettings(count=count, placement="uniform", margin=0.0),
+        EMISSION,
+        AttenuationSettings(inverse_distance=True),
+        raster=RasterSettings(projection, backend=backend),
+    )
     # Seeded without touching the draws of whoever calls.
     with torch.random.fork_rng(), torch.no_grad():
         torch.manual_seed(count)
@@ -75,11 +105,14 @@ def kernel_cases(count: int, projection: Projection, device: str = "cpu") -> Ite
 
     def make_case(name: str, call: Callable[[str | None], object]) -> Case:
         return Case(
-            *(name, size, lambda: call(None)), (lambda: call("reference")) if count <= MOST_DENSE else None
+            *(name, size, lambda: call(None)),
+            (lambda: call("reference")) if count <= MOST_DENSE else None,
         )
 
     def forward(backend: str | None) -> Tensor:
-        return rasterize(*geometry, features, pose, GRID, projection=projection, backend=backend).image
+        return rasterize(
+            *geometry, features, pose, GRID, projection=projection, backend=backend
+        ).image
 
     def backward(backend: str | None) -> object:
         leaves = [tensor.clone().requires_grad_() for tensor in (*geometry, features)]
@@ -91,7 +124,9 @@ def kernel_cases(count: int, projection: Projection, device: str = "cpu") -> Ite
     def weights(backend: str | None) -> Tensor:
         # Channels sum over all directions, at half the resolution of images.
         sphere, cutoff = SphereGrid.full_sphere(90, 180), Cutoff(1e-3, relative=True)
-        seen = make_plan(*geometry, pose, sphere, projection=projection, cutoff=cutoff, backend=backend)
+        seen = make_plan(
+            *geometry, pose, sphere, projection=projection, cutoff=cutoff, backend=backend
+        )
         return mean_weights(seen, *geometry).share
 
     def plan(backend: str | None) -> Plan:
@@ -108,7 +143,9 @@ def kernel_cases(count: int, projection: Projection, device: str = "cpu") -> Ite
         return composite(dense, *geometry, features).image
 
     reference = None if dense is None else again
-    yield Case("blend, static receiver", size, lambda: frozen.render(features, version=0), reference)
+    yield Case(
+        "blend, static receiver", size, lambda: frozen.render(features, version=0), reference
+    )
     yield make_case("forward and gradients", backward)
     yield make_case("weights of channels", weights)
 
@@ -129,14 +166,19 @@ def loss_case(device: str = "cpu") -> Case:
     def gradient(of: Callable[[], Tensor]) -> Call:
         return lambda: torch.autograd.grad(of(), image)
 
-    return Case("loss of spectra", str(BATCH), gradient(lambda: spectrum_loss(image, target).sum()),
-                gradient(convolved))  # fmt: skip
+    return Case(
+        "loss of spectra",
+        str(BATCH),
+        gradient(lambda: spectrum_loss(image, target).sum()),
+        gradient(convolved),
+    )
 
 
 def training_step_case(projection: Projection, count: int = STEPPED, device: str = "cpu") -> Case:
     """Return a training step: emission, plan, blending, loss, gradients and Adam."""
     ours, plain = (
-        _make_step(random_model(count, projection, backend, device)) for backend in (None, "reference")
+        _make_step(random_model(count, projection, backend, device))
+        for backend in (None, "reference")
     )
     return Case("training step", f"{count} {projection} x {BATCH}", ours, plain)
 

@@ -16,7 +16,8 @@ from gsparc.models.method import Method
 from gsparc.models.uplink.interface import SeparatesPaths, UplinkMethod
 from gsparc.ops import Pose
 
-WINDOW_S = 1.5e-6  # channels are taken to lie within this long a delay window about their mean delay
+# Channels are taken to lie within this long a delay window about their mean delay
+WINDOW_S = 1.5e-6
 REGULARISED = 1e-4
 SUBCARRIERS_PER_BLOCK = 12
 
@@ -31,13 +32,15 @@ def centred_grid(middle_hz: float, spacing_hz: float, count: int) -> np.ndarray:
 
 
 def interpolate_tones(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarray) -> Tensor:
-    """Return channels (..., K) at tones (K,) [Hz] as (..., W) at other frequencies of the same band.
+    """Return channels (..., K) at tones (K,) [Hz] as (..., W)
+    at other frequencies of the same band.
 
-    The best linear interpolation of channels whose delays fill `WINDOW_S` evenly about their mean; a single
-    tone is repeated.
+    The best linear interpolation of channels whose delays fill `WINDOW_S` evenly about their mean;
+    a single tone is repeated.
 
     >>> tones = centred_grid(2.4e9, 1e6, 16)
-    >>> between = interpolate_tones(torch.ones(1, 16, dtype=torch.complex64), tones, tones[:-1] + 0.5e6)
+    >>> channels = torch.ones(1, 16, dtype=torch.complex64)
+    >>> between = interpolate_tones(channels, tones, tones[:-1] + 0.5e6)
     >>> between.shape, bool((between[0, 5:10] - 1).abs().max() < 0.05)  # of a channel without delay
     (torch.Size([1, 15]), True)
 
@@ -49,7 +52,8 @@ def interpolate_tones(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarr
     step = float(np.diff(np.sort(tones_hz)).min())
     if wanted_hz.min() < tones_hz.min() - step or wanted_hz.max() > tones_hz.max() + step:
         raise ValueError(
-            f"the grid spans {wanted_hz.min() / 1e6:.3f} to {wanted_hz.max() / 1e6:.3f} MHz, the tones "
+            f"the grid spans {wanted_hz.min() / 1e6:.3f} to {wanted_hz.max() / 1e6:.3f} MHz, the "
+            "tones "
             f"{tones_hz.min() / 1e6:.3f} to {tones_hz.max() / 1e6:.3f} MHz: take fewer blocks"
         )
     # Tones a step apart tell delays within 1 / step alone from each other.
@@ -61,7 +65,8 @@ def interpolate_tones(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarr
     straight = channel * torch.polar(
         torch.ones(()), -turn[..., None] * torch.from_numpy((tones_hz - middle) / step).float()
     )
-    # Delays spread evenly over a window correlate over frequency as a sinc: this is the Wiener filter.
+    # Delays spread evenly over a window correlate over frequency as a sinc:
+    # this is the Wiener filter.
     gram = np.sinc(window * (tones_hz[:, None] - tones_hz)) + REGULARISED * np.eye(len(tones_hz))
     cross = np.sinc(window * (wanted_hz[:, None] - tones_hz))
     matrix = torch.from_numpy(np.linalg.solve(gram, cross.T)).to(channel.dtype)
@@ -72,12 +77,14 @@ def interpolate_tones(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarr
 
 
 def resource_grid(channel: Tensor, symbols: int, moving_end: str) -> Tensor:
-    """Return channels (B, A, K) as Sionna's [rx, rx_ant, tx, tx_ant, symbols, K], constant within a slot.
+    """Return channels (B, A, K) as Sionna's [rx, rx_ant, tx, tx_ant, symbols, K],
+    constant within a slot.
 
-    B receivers hear one transmitter of A antennas where the receiver moves; else one receiver of A antennas
-    hears B transmitters.
+    B receivers hear one transmitter of A antennas where the receiver moves; else one receiver of A
+    antennas hears B transmitters.
 
-    >>> resource_grid(torch.ones(5, 4, 12, dtype=torch.complex64), symbols=14, moving_end="rx").shape
+    >>> channels = torch.ones(5, 4, 12, dtype=torch.complex64)
+    >>> resource_grid(channels, symbols=14, moving_end="rx").shape
     torch.Size([5, 1, 1, 4, 14, 12])
     """
     slots = channel.unsqueeze(-2).expand(*channel.shape[:2], symbols, channel.shape[2])
@@ -93,16 +100,17 @@ WITH_PATHS = "(model=image_source_gp and directional_gp are, or uplink with upli
 class Paths:
     """Plane waves at the array: N for each of B snapshots or positions.
 
-    The channel at f is the sum of `gain exp(-j 2 pi (f - reference_hz) delay_s)`, at positions times
-    `reference_hz / f`.
+    The channel at f is the sum of `gain exp(-j 2 pi (f - reference_hz) delay_s)`, at positions
+    times `reference_hz / f`.
 
     Attributes:
-        gain: complex64, physical units, at `reference_hz`: (B, N) at the array's middle for snapshots,
-            (B, A, N) at every antenna for positions.
+        gain: complex64, physical units, at `reference_hz`: (B, N) at the array's middle for
+            snapshots, (B, A, N) at every antenna for positions.
         delay_s: like `gain` [s]; of snapshots up to their own timing.
         reference_hz: the middle of the uplink's band, or the carrier [Hz].
         cosines: (B, N, 2) direction cosines along the array's two widest axes; None for positions.
-        direction: (B, N, 3) unit vectors in the world towards where a path comes from; None for snapshots.
+        direction: (B, N, 3) unit vectors in the world towards where a path comes from; None for
+            snapshots.
     """
 
     gain: np.ndarray
@@ -112,9 +120,11 @@ class Paths:
     direction: np.ndarray | None = None
 
     def channel(self, frequency_hz: np.ndarray) -> np.ndarray:
-        """Return the sum of the paths (B, A, K) complex64 at tones (K,) [Hz], of paths at positions.
+        """Return the sum of the paths (B, A, K) complex64 at tones (K,) [Hz],
+        of paths at positions.
 
-        `csi` less this is what the model adds to channels that are no paths: a residual, or other solutions.
+        `csi` less this is what the model adds to channels that are no paths: a residual,
+        or other solutions.
         """
         tones = np.atleast_1d(np.asarray(frequency_hz, np.float64))
         turns = ((tone - self.reference_hz) * self.delay_s for tone in tones)
@@ -144,14 +154,18 @@ def uplink_paths(method: Method, site: Site, uplink: Any) -> Paths:
     sources = _require_paths(method).find_sources(query.uplink)
     # Delays of sources are in turns per tone: over the spacing they are seconds.
     spacing = float(np.diff(np.sort(site.uplink_hz)).min())
-    gain, delay = (sources.gain * site.target_scale).numpy(), (sources.delay.double() / spacing).numpy()
+    gain, delay = (
+        (sources.gain * site.target_scale).numpy(),
+        (sources.delay.double() / spacing).numpy(),
+    )
     return Paths(gain, delay, float(site.uplink_hz.mean()), cosines=sources.direction.numpy())
 
 
 def paths_at(method: Method, site: Site, query: Query) -> Paths:
     """Return the paths of a coherent field at positions in local coordinates.
 
-    Of several solutions that are averaged these are those of each that is made of paths, by its weight.
+    Of several solutions that are averaged these are those of each that is made of paths,
+    by its weight.
 
     Raises:
         ValueError: the model's channels are not made of paths.
@@ -162,14 +176,17 @@ def paths_at(method: Method, site: Site, query: Query) -> Paths:
         gain, delay, direction, carrier_hz = method.paths(query)
     except ValueError as error:
         raise ValueError(f"paths: {method.name}: {error} {WITH_PATHS}") from error
-    return Paths((gain * site.target_scale).numpy(), delay.numpy(), carrier_hz, direction=direction.numpy())
+    return Paths(
+        (gain * site.target_scale).numpy(), delay.numpy(), carrier_hz, direction=direction.numpy()
+    )
 
 
 def to_resource_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: int | None) -> Tensor:
     """Return channels (B, A, K) at other frequencies, and with `symbols` as `resource_grid` does.
 
     Raises:
-        ValueError: the model does not know its own frequencies, or those wanted lie outside its band.
+        ValueError: the model does not know its own frequencies, or those wanted lie outside its
+            band.
     """
     if frequency_hz is not None:
         if site.subcarriers_hz is None:
@@ -179,7 +196,8 @@ def to_resource_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: in
         if len(site.subcarriers_hz) == 1 and not np.allclose(wanted, tone, rtol=1e-9, atol=0):
             raise ValueError(
                 f"frequency_hz=: {site.name} was measured at {tone / 1e6:.3f} MHz alone and tells "
-                "nothing of others; where a field is made of sources, .paths(...) has their gains and delays"
+                "nothing of others; where a field is made of sources, .paths(...) has their "
+                "gains and delays"
             )
         channel = interpolate_tones(channel, site.subcarriers_hz, wanted)
     return channel if symbols is None else resource_grid(channel, symbols, site.moving_end)
@@ -202,7 +220,9 @@ def uplink_query(method: Method, site: Site, uplink: Any) -> Query:
     values = torch.as_tensor(uplink).to(torch.complex64)
     values = values[None] if values.ndim == 2 else values
     if values.ndim != 3 or values.shape[1:] != shape:
-        raise ValueError(f"uplink=: expected (B, {shape[0]}, {shape[1]}) complex, got {tuple(values.shape)}")
+        raise ValueError(
+            f"uplink=: expected (B, {shape[0]}, {shape[1]}) complex, got {tuple(values.shape)}"
+        )
     if not torch.isfinite(torch.view_as_real(values)).all():
         raise ValueError("uplink=: holds NaN or Inf")
     nowhere = torch.full((len(values), 3), torch.nan)

@@ -1,4 +1,6 @@
-"""How sure predictions are: several confidences, which one a model is trusted with, and from when on."""
+"""How sure predictions are: several confidences, which one a model is trusted with,
+and from when on.
+"""
 
 from __future__ import annotations
 
@@ -29,12 +31,14 @@ from gsparc.processes.uncertainty import Threshold
 
 RIVALS = ("distance", "gp_variance")
 KINDS = ("learned", "expected", *RIVALS)
-KERNEL_ROWS, COMPONENTS = 600, 64  # that length and noise are chosen on; the variance rests on all rows
+# That length and noise are chosen on; the variance rests on all rows
+KERNEL_ROWS, COMPONENTS = 600, 64
 MARGIN = 0.1  # of the longest side, around the places that a threshold is for
 
 
 def calibrated_box(*places: np.ndarray) -> np.ndarray:
-    """Return the corners (2, 3) [m] around places (n, 3) each, grown by a tenth of the longest side.
+    """Return the corners (2, 3) [m] around places (n, 3) each,
+    grown by a tenth of the longest side.
 
     >>> calibrated_box(np.zeros((1, 3)), np.array([[10.0, 5.0, 0.0]]))
     array([[-1., -1., -1.],
@@ -46,9 +50,13 @@ def calibrated_box(*places: np.ndarray) -> np.ndarray:
 
 
 def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return what a process of positions `known` (n, 3) leaves unknown of (B, 3), share of the prior."""
+    """Return what a process of positions `known` (n, 3) leaves unknown of (B, 3),
+    share of the prior.
+    """
     rows = torch.from_numpy(known)
-    white = Factor.from_gram(kernel.gram(rows)).whiten(kernel.correlations(rows, torch.from_numpy(places)))
+    white = Factor.from_gram(kernel.gram(rows)).whiten(
+        kernel.correlations(rows, torch.from_numpy(places))
+    )
     # Predictive variance by the whitened covariances (Rasmussen and Williams 2006, eq. 2.26).
     return (1 + kernel.noise - white.square().sum(0)).numpy()
 
@@ -88,7 +96,8 @@ class Trusted(Stored):
         promise: what the threshold promises; None where none was asked for.
         known: (n, 3) local positions of the moving end that the method learned from [m].
         kernel: of the process whose variance is a rival; None where no rival was stored.
-        box: `calibrated_box` of local places that the threshold is for; None (older files): not known.
+        box: `calibrated_box` of local places that the threshold is for; None (older files): not
+            known.
     """
 
     kind: str | None = None
@@ -110,7 +119,9 @@ class Trusted(Stored):
         return Trusted(known=data.moving[rows], kernel=kernel)
 
     def covers(self, places: np.ndarray) -> np.ndarray:
-        """Tell whether local places (B, 3) [m] lie in the box, (B,) bool; all where none is known."""
+        """Tell whether local places (B, 3) [m] lie in the box, (B,) bool;
+        all where none is known.
+        """
         if self.box is None:
             return np.ones(len(places), bool)
         return np.all((places >= self.box[0]) & (places <= self.box[1]), axis=1)
@@ -129,16 +140,21 @@ class Trusted(Stored):
         if kind in RIVALS and places is None:
             raise ValueError(f"confidence={kind}: needs a position, and an uplink has none")
         if (score := self.score(kind, prediction, places)) is None:
-            what = "has no confidence of its own" if kind == "learned" else "states no error variance"
+            what = (
+                "has no confidence of its own"
+                if kind == "learned"
+                else ("states no error variance")
+            )
             raise ValueError(f"confidence={kind}: this model {what}")
         return as_confidence(kind, score).astype(np.float32)
 
     def score(self, kind: str, said: Prediction, places: np.ndarray | None) -> np.ndarray | None:
         """Return the scores (B,) of a kind, larger is surer; None where the method states none.
 
-        `learned` is the method's own confidence, `expected` minus its error variance over the power it
-        predicts (in a fade the same variance is a larger relative error), `distance` minus that of places
-        (B, 3) to the nearest of those `known` [m], `gp_variance` minus `process_variance`.
+        `learned` is the method's own confidence, `expected` minus its error variance over the power
+        it predicts (in a fade the same variance is a larger relative error), `distance` minus that
+        of places (B, 3) to the nearest of those `known` [m],
+        `gp_variance` minus `process_variance`.
         """
         if kind == "distance":
             return -cKDTree(self.known).query(places)[0]
@@ -146,7 +162,8 @@ class Trusted(Stored):
             return -process_variance(self.kernel, self.known, places)
         scores = said.confidence
         if kind == "expected" and (scores := said.variance) is not None:
-            # A predicted silence counts as -300 dB, as a power of 0 would make every score of it infinite.
+            # A predicted silence counts as -300 dB, as a power
+            # of 0 would make every score of it infinite.
             scores = -scores / said.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
         return None if scores is None else scores.double().numpy()
 
@@ -169,17 +186,22 @@ def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
     """
     if kind == "learned":
         return score
-    # An expected error, a variance in the prior's, or a distance in metres, of 1 is a confidence of a half.
+    # An expected error, a variance in the prior's, or a distance in metres,
+    # of 1 is a confidence of a half.
     return 1 / (1 - np.minimum(score, 0))
 
 
 def store_trusted(path: str | Path, trusted: Trusted) -> None:
-    """Store in a checkpoint, replacing what was there; the file is rewritten whole or not at all."""
+    """Store in a checkpoint, replacing what was there;
+    the file is rewritten whole or not at all.
+    """
     checkpoint.update_extra(path, {KEY: to_plain(trusted)})
 
 
 def read_trusted(extra: Mapping[str, Any]) -> Trusted:
-    """Return what a checkpoint's `extra` holds; the method's own confidence where it was never calibrated."""
+    """Return what a checkpoint's `extra` holds;
+    the method's own confidence where it was never calibrated.
+    """
     return from_plain(extra[KEY]) if KEY in extra else Trusted()
 
 
@@ -216,22 +238,25 @@ class ConfidenceMixin:
         return match_input(*self._query_confidence(tx, rx, uplink))
 
     def accepts(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
-        """Tell whether predictions (B,) bool are among those of which at most `alpha` are promised to be bad.
+        """Tell whether predictions (B,) bool are among those of which
+        at most `alpha` are promised to be bad.
 
-        False beyond the places learned from and calibrated on (their box, grown by a tenth of its longest
-        side), and where no threshold keeps the promise (`Predictor.trusted.threshold` is infinite).
+        False beyond the places learned from and calibrated on (their box, grown by a tenth of its
+        longest side), and where no threshold keeps the promise (`Predictor.trusted.threshold` is
+        infinite).
 
-        >>> predictor.accepts(rx=[2.0, 1.0, 1.5])
+        >>> predictor.accepts(rx=[2.0, 1.0, 1.5])  # doctest: +ELLIPSIS
         Traceback (most recent call last):
             ...
-        ValueError: accepts: no threshold is stored; gsparc calibrate ckpt=FILE seeks one, or says why not
+        ValueError: accepts: no threshold is stored; gsparc calibrate ckpt=FILE seeks one, ...
 
         Raises:
             ValueError: the model was never calibrated, or for another kind of confidence.
         """
         if self.trusted.promise is None:
             raise ValueError(
-                "accepts: no threshold is stored; gsparc calibrate ckpt=FILE seeks one, or says why not"
+                "accepts: no threshold is stored; gsparc calibrate ckpt=FILE seeks one, or says "
+                "why not"
             )
         if self.kind not in (None, self.trusted.kind):
             raise ValueError(
@@ -262,7 +287,9 @@ class ConfidenceMixin:
         return sure, single, as_torch
 
     def _method_confidence(self, prediction: Prediction, query: Query | None) -> Tensor | None:
-        """Of the method's own predictions (B,), of the kind that is wanted; None where it has none."""
+        """Of the method's own predictions (B,), of the kind that is wanted;
+        None where it has none.
+        """
         if prediction.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
             return None
         places = None if query is None else query.places(self.site).numpy()

@@ -1,10 +1,12 @@
-"""Whether the world still is as a map says: a sequential test of each station, of parts of the place, of all.
+"""Whether the world still is as a map says: a sequential test of each station,
+of parts of the place, of all.
 
-What a row misses, given the map and earlier rows, is independent and of a known variance while nothing
-changes. For each stream of rows an e-detector sums likelihood ratios over all times of change (the recursion
-of Shiryaev and Roberts; J. Shin, A. Ramdas, A. Rinaldo, arXiv:2203.03532), averaged over sizes. Alarms stand
-where one exceeds the stated number of rows over the stream's share, so that without change the mean number of
-rows to an alarm of any stream is no less than stated.
+What a row misses, given the map and earlier rows, is independent and of a known variance while
+nothing changes. For each stream of rows an e-detector sums likelihood ratios over all times of
+change (the recursion of Shiryaev and Roberts; J. Shin, A. Ramdas, A. Rinaldo, arXiv:2203.03532),
+averaged over sizes. Alarms stand where one exceeds the stated number of rows over the stream's
+share, so that without change the mean number of rows to an alarm
+of any stream is no less than stated.
 """
 
 from __future__ import annotations
@@ -30,14 +32,17 @@ SIZES = np.array([-4.0, -2.0, -1.0, -0.5, 0.5, 1.0, 2.0, 4.0])  # of changes [de
 CLIP = 4.0  # deviations that count of a row: a single outlier raises no alarm
 MIXED = 0.5  # share of rows that a change is sought in: of a local one not all miss
 SIDES = 4  # cells along each side of the place
-AS_ALL = 20.0  # evidence that all stations miss alike, from which on an alarm of one is called theirs
+# Evidence that all stations miss alike, from which on an alarm of one is called theirs
+AS_ALL = 20.0
 DEVICE = 2  # of KINDS: the offset that is expected after an alarm of all stations
 LOUD = 2.0  # deviations of a row that lies in a local change
 SPREAD = 3  # cells that rows must be of to tell an offset from a local change
 SILENT = 0.5  # share of rows since a change in which a station is not heard any more: it is gone
 MIXING = 1e6  # [m] between updates, further than any place is away
 RETURNED = "returned"  # the kind of an alarm with which a station is as the map says again
-ROW = [(n, int) for n in ("number", "station", "cell")] + [(n, float) for n in ("surprise", "back", "place")]
+ROW = [(n, int) for n in ("number", "station", "cell")] + [
+    (n, float) for n in ("surprise", "back", "place")
+]
 
 
 @dataclass(frozen=True)
@@ -49,7 +54,8 @@ class Alarm(Stored):
         kind: `device`, `offset`, `local`, `moved` or `gone`; `returned`: as the map says again.
         since, at: numbers of the rows it seems to have begun with, and that raised the alarm.
         change_db: mean that was missed since [dB].
-        place: (2,) middle of the part of the place, local [m]; of other kinds the middle of the rows since.
+        place: (2,) middle of the part of the place, local [m]; of other kinds the middle of the
+            rows since.
     """
 
     station: int
@@ -66,11 +72,13 @@ class Watch(Stored):
 
     Attributes:
         low, side: corner (2,) and side (2,) of cells [m].
-        detector: (T + T cells + 1 + T, sizes) logarithms of detectors: of stations, of their cells, of all,
-            of what changed at a station being as the map says again.
-        total: the same, sums of log ratios since these were last below 0 (E. S. Page, Biometrika 41 (1954)).
+        detector: (T + T cells + 1 + T, sizes) logarithms of detectors: of stations, of their cells,
+            of all, of what changed at a station being as the map says again.
+        total: the same, sums of log ratios since these were last below 0 (E. S. Page, Biometrika 41
+            (1954)).
         since: the same, number of the row with which that sum began: the change is dated to it.
-        kind: (T,) of the change that is expected since the last alarm, see `gsparc.processes.changes.KINDS`.
+        kind: (T,) of the change that is expected since the last alarm, see
+            `gsparc.processes.changes.KINDS`.
         begun: (T,) number of the first row that counts; what came before is of another world.
         alarms: all.
     """
@@ -101,7 +109,8 @@ class Watch(Stored):
     def look(
         self, stations: Mapping[int, LaterRows], first: int, extent: float, rows: float = ROWS
     ) -> tuple[Watch, np.ndarray]:
-        """Return the state after rows from number `first` on, and these rows' surprises (n,) [deviations].
+        """Return the state after rows from number `first` on, and these rows' surprises (n,)
+        [deviations].
 
         Args:
             stations: later rows of each, the new ones among them.
@@ -118,12 +127,15 @@ class Watch(Stored):
                 name, base = int(row["station"]), len(result.begun) + int(row["station"]) * SIDES**2
                 ratio, number = _ratio(row["surprise"]), int(row["number"])
                 each = {name: ratio, base + int(row["cell"]): ratio}
-                if last[turn] and len(result.begun) >= COMMON:  # mean over stations heard at one place
+                # Mean over stations heard at one place
+                if last[turn] and len(result.begun) >= COMMON:
                     each[result.every] = _ratio(table["surprise"][begin : turn + 1].mean())
                 begin = turn + 1 if last[turn] else begin
                 if result.kind[name]:
                     each[result.every + 1 + name] = row["back"]
-                raised = [key for key, one in each.items() if result._advance(key, number, one, rows)]
+                raised = [
+                    key for key, one in each.items() if result._advance(key, number, one, rows)
+                ]
                 if raised:
                     result = result._note(row, raised[-1], stations, extent)
                     first, alarmed, table = number + 1, True, table[: turn + 1]
@@ -131,7 +143,9 @@ class Watch(Stored):
             surprises.append(table["surprise"])
         return result._named(stations, extent), np.concatenate(surprises)
 
-    def _surprises(self, stations: Mapping[int, LaterRows], first: int, extent: float) -> np.ndarray:
+    def _surprises(
+        self, stations: Mapping[int, LaterRows], first: int, extent: float
+    ) -> np.ndarray:
         """Rows from number `first` on in their order, with what each misses in deviations."""
         parts = [np.zeros(0, ROW)]
         for station, every in stations.items():
@@ -168,14 +182,22 @@ class Watch(Stored):
         total[:] = np.maximum(total, 0) + ratio
         detector[:] = np.logaddexp(detector, 0) + ratio
         # A third of all alarms for each family of streams, in equal shares.
-        family = 1 if stream == self.every else count * SIDES**2 if count <= stream < self.every else count
+        family = (
+            1
+            if stream == self.every
+            else count * SIDES**2
+            if count <= stream < self.every
+            else count
+        )
         return self._evidence(stream) >= math.log(3 * family * rows)
 
     def _evidence(self, stream: int) -> float:
         """Logarithm of a stream's detector."""
         return float(np.logaddexp.reduce(self.detector[stream])) - math.log(len(SIZES))
 
-    def _note(self, row: np.ndarray, stream: int, stations: Mapping[int, LaterRows], extent: float) -> Watch:
+    def _note(
+        self, row: np.ndarray, stream: int, stations: Mapping[int, LaterRows], extent: float
+    ) -> Watch:
         """The state after an alarm: a change since it was dated is from now on expected."""
         alike = self._evidence(self.every) > math.log(AS_ALL)
         stream = self.every if alike and stream < self.every else stream
@@ -211,12 +233,16 @@ class Watch(Stored):
             called = "device" if who < 0 else "gone" if silent else KINDS[kind].name
             called = called if kind else RETURNED
             self.kind[names] = kind
-            alarms[turn] = replace(alarm, kind=called, change_db=float(group.missed.mean()), place=where)
+            alarms[turn] = replace(
+                alarm, kind=called, change_db=float(group.missed.mean()), place=where
+            )
         return replace(self, alarms=tuple(alarms))
 
 
 def _find_kind(alarm: Alarm, rows: LaterRows, extent: float, cells: int) -> int:
-    """Number of the kind of change that makes rows since it likeliest, which lie in so many cells."""
+    """Number of the kind of change that makes rows since it likeliest,
+    which lie in so many cells.
+    """
     if alarm.kind == RETURNED or alarm.station < 0:
         return 0 if alarm.kind == RETURNED else DEVICE
     likely = evidence([rows], extent, 0.0)[0, 0] + SHARE.log()

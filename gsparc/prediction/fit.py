@@ -34,12 +34,24 @@ VALIDATED = SplitSettings().val_fraction
 
 
 def fit(
-    rx: Any = None, tx: Any = None, *, rssi: Any = None, csi: Any = None, spectrum: Any = None,
-    unit: str = "dBm", model: str = "gsparc", effort: float = 1.0,
-    seed: int = 0, save: str | Path | None = None, settings: dict[str, Any] | None = None,
-    terms: Sequence[Any] | Any = (), align: str = "auto", **arrays: Any,
-) -> Predictor:  # fmt: skip
-    """Fit a model to all rows, ready to be asked; checks and messages are those of a file of one's own.
+    rx: Any = None,
+    tx: Any = None,
+    *,
+    rssi: Any = None,
+    csi: Any = None,
+    spectrum: Any = None,
+    unit: str = "dBm",
+    model: str = "gsparc",
+    effort: float = 1.0,
+    seed: int = 0,
+    save: str | Path | None = None,
+    settings: dict[str, Any] | None = None,
+    terms: Sequence[Any] | Any = (),
+    align: str = "auto",
+    **arrays: Any,
+) -> Predictor:
+    """Fit a model to all rows, ready to be asked;
+    checks and messages are those of a file of one's own.
 
     >>> predictor = gsparc.fit(rx=places, tx=[12.0, 30.0, 2.6], rssi=powers_dbm)
     >>> predictor.rssi(rx=[[3.0, 4.0, 1.5]]).shape
@@ -48,11 +60,13 @@ def fit(
     ('dBm', (1, 1))
 
     Args:
-        rx, tx: (n, 3) places of the receiver and of the transmitter [m], (3,) of the one that stands still.
+        rx, tx: (n, 3) places of the receiver and of the transmitter [m], (3,) of the one that
+            stands still.
         rssi: (n,) received powers in `unit`; (n, T) of T stations.
         csi: (n,), (n, subcarriers) or (n, antennas, subcarriers) complex channels.
         spectrum: (n, elevations, azimuths) directional spectra.
-        unit: of `rssi`, and of what is answered: dBm, dBW, dB (of a reference nobody knows), W, mW, ...
+        unit: of `rssi`, and of what is answered: dBm, dBW, dB (of a reference nobody knows), W, mW,
+            ...
         model: a name of `gsparc train --help`.
         effort: that searches, rows and steps are multiplied by: .3 is quick, 3 thorough.
         seed: of whatever is random.
@@ -61,12 +75,13 @@ def fit(
         terms: further terms of one station's powers, see `docs/terms.md`; of gsparc and powers.
         align: what of each row's factor is free in channels: `none`, `phase`, `phase+delay` or
             `phase+delay+gain`; `auto`: as neighbouring rows say.
-        **arrays: anything else of the schema of `docs/reference/schema.md`: `carrier_hz`, `frequency_hz`,
-            `array_position`, `station_position`, ...
+        **arrays: anything else of the schema of `docs/reference/schema.md`: `carrier_hz`,
+            `frequency_hz`, `array_position`, `station_position`, ...
 
     Raises:
         DataError: arrays that `gsparc check` would refuse, all problems with array and row.
-        ValueError: no such model or setting, one that cannot learn these measurements, or no unit of powers.
+        ValueError: no such model or setting, one that cannot learn these measurements, or no unit
+            of powers.
     """
     refuse_seconds(arrays)
     inputs = {"rx_position": rx, "tx_position": tx, "csi": csi, "spectrum": spectrum, **arrays}
@@ -76,16 +91,21 @@ def fit(
     try:
         reading = interpret(raw, "gsparc.fit")
     except DataError as refused:
-        text = "; ".join(refused.problems).replace("dataset.frequency_hz", "frequency_hz")  # an array here
+        # An array here
+        text = "; ".join(refused.problems).replace("dataset.frequency_hz", "frequency_hz")
         raise DataError(text) from None
     none = np.zeros(0, np.int64)
     data, _ = order_rows(set_unknown_factor(reading.data, align), Fold(none, none, none))
     for note in [*reading.notes, *find_implausible(reading.data, reading.file_row)[0]]:
         log.warning("%s", note)
-    kind, options = method_class(model), {**(settings or {}), **({} if terms == () else {"terms": terms})}
+    kind, options = (
+        method_class(model),
+        {**(settings or {}), **({} if terms == () else {"terms": terms})},
+    )
     for name in options.keys() - accepted_arguments(kind):
         raise ValueError(
-            f"settings: model={model!r} has no {name!r}{suggest_or_list(name, accepted_arguments(kind))}"
+            f"settings: model={model!r} has no "
+            f"{name!r}{suggest_or_list(name, accepted_arguments(kind))}"
         )
     factory = wrap_per_station(kind(**options), data)
     fold = _split_validation(data, VALIDATED if factory.takes_effort else 0.0, seed)
@@ -113,7 +133,10 @@ def _raw_powers(arrays: dict[str, np.ndarray], powers: np.ndarray, unit: str) ->
     for end in ("rx", "tx"):
         shape = arrays.get(f"{end}_position", np.zeros(0)).shape
         if 1 < stations != len(powers) and shape[:1] == (stations,) and len(shape) == 2:
-            text = f"{end} and rssi are of {stations} stations: say station_position= in place of {end}="
+            text = (
+                f"{end} and rssi are of {stations} stations: say station_position= in place "
+                f"of {end}="
+            )
             raise DataError(f"gsparc.fit: {text}")
     unknown = unit in ("dB", LINEAR)  # what they refer to
     power_unit = PowerUnit.from_name(str(unit), "dB" if unknown else "dBW")

@@ -16,7 +16,9 @@ from gsparc.prediction.query import Queries
 
 
 class FollowedPrediction(NamedTuple):
-    """Moments in stored units, in float64, the precision of the positions, and whether one was given."""
+    """Moments in stored units, in float64, the precision of the positions,
+    and whether one was given.
+    """
 
     moments: Prediction
     dtype: torch.dtype
@@ -48,17 +50,26 @@ def predict_with_gradients(
     fixed += [ends.pop(end) for end in {*ends} - {*site.moving_ends}]
     for end, value in ends.items():
         if value is not None and not isinstance(value, Tensor):
-            raise ValueError(f"grad=True: {end}= must be a torch tensor, got {type(value).__name__}")
+            raise ValueError(
+                f"grad=True: {end}= must be a torch tensor, got {type(value).__name__}"
+            )
     if has_vmap_axis(*ends.values()):
-        raise ValueError("grad=True: torch.vmap is not followed; give all positions at once, (B, 3)")
-    if any(isinstance(one, Tensor) and (one.requires_grad or carries_tangent(one)) for one in fixed):
+        raise ValueError(
+            "grad=True: torch.vmap is not followed; give all positions at once, (B, 3)"
+        )
+    if any(
+        isinstance(one, Tensor) and (one.requires_grad or carries_tangent(one)) for one in fixed
+    ):
         raise ValueError(f"grad=True: gradients are by the position of {' and '.join(ends)} alone")
     query, single, _ = queries.query(tx, rx, torch.float64)
     origin = torch.from_numpy(np.asarray(site.origin, np.float64))
     # The origin goes in float64: in UTM coordinates float32 has no centimetres.
-    local = {end: (value.cpu().double() - origin).expand(len(query), 3) for end, value in ends.items()}
+    local = {
+        end: (value.cpu().double() - origin).expand(len(query), 3) for end, value in ends.items()
+    }
     with suitable_threads(method, len(query)):
-        if transform_is_active() and method not in prepared:  # what it keeps must not be a transform's
+        # What it keeps must not be a transform's
+        if transform_is_active() and method not in prepared:
             prepared.append(method)
             with torch._C._DisableFuncTorch(), torch.no_grad():
                 method.predict(query)

@@ -22,7 +22,8 @@ from gsparc.tables.links.strongest import StrongestLists, levels_db, strongest_l
 
 KEY = "hearing"  # of a checkpoint's `extra`
 NEAREST = 30  # silent rows of a station
-NODES = np.linspace(-4.5, 4.5, 33)  # deviations at which a level's probability of being listed is asked
+# Deviations at which a level's probability of being listed is asked
+NODES = np.linspace(-4.5, 4.5, 33)
 FARTHEST = -8.0  # deviations below its limit that a predicted level is clamped at
 TINY_DB = 1e-6  # deviation of a level that a method states none of
 RARE = 1e-12  # probability of being listed
@@ -31,7 +32,8 @@ BLOCK = 512  # places that are asked about at a time
 
 @dataclass(frozen=True)
 class Hearing(Stored):
-    """What was not heard among the rows that a model learned from; its length is the number of these.
+    """What was not heard among the rows that a model learned from;
+    its length is the number of these.
 
     Attributes:
         place: (n, D) [m, local] of silent rows.
@@ -70,16 +72,23 @@ class Hearing(Stored):
         return replace(self, lists=replace(self.lists, level=level))
 
     def given_heard(
-        self, method: Method, places: np.ndarray, mine: np.ndarray, mean_db: np.ndarray,
-        spread_db: np.ndarray, device: np.ndarray | None = None,
-    ) -> dict[str, np.ndarray]:  # fmt: skip
-        """Return the probability (n,) of being heard, mean and deviation (n,) [dB] of levels that are.
+        self,
+        method: Method,
+        places: np.ndarray,
+        mine: np.ndarray,
+        mean_db: np.ndarray,
+        spread_db: np.ndarray,
+        device: np.ndarray | None = None,
+    ) -> dict[str, np.ndarray]:
+        """Return the probability (n,) of being heard, mean and deviation (n,)
+        [dB] of levels that are.
 
-        What a level must exceed: in lists of the N strongest, where the method learned from unlisted rows,
-        the N-th strongest of the other stations as the method predicts them; elsewhere levels of the
-        station's nearest silent rows. Levels are normal, and those that are heard the part above (J. Heckman,
-        "Sample selection bias as a specification error", Econometrica 47 (1979)). Where a station was never
-        silent levels stay as they are, and the probability is NaN.
+        What a level must exceed: in lists of the N strongest, where the method learned from
+        unlisted rows, the N-th strongest of the other stations as the method predicts them;
+        elsewhere levels of the station's nearest silent rows. Levels are normal, and those that are
+        heard the part above (J. Heckman, "Sample selection bias as a specification error",
+        Econometrica 47 (1979)). Where a station was never silent levels stay as they are,
+        and the probability is NaN.
 
         Args:
             method: fitted.
@@ -92,29 +101,38 @@ class Hearing(Stored):
         if self.lists is not None and method.uses_censored:
             device = np.full(len(mine), MEAN_DEVICE) if device is None else device
             moments, which = np.unique(np.c_[places, device][asked], axis=0, return_inverse=True)
-            levels = levels_near(method, self.lists, moments[:, :-1], moments[:, -1].astype(np.int64))
+            levels = levels_near(
+                method, self.lists, moments[:, :-1], moments[:, -1].astype(np.int64)
+            )
             own = np.stack([mean_db, spread_db])[:, asked]
             answers = self.given_listed(levels, own, which.reshape(-1), mine[asked])
             chance[asked], mean[asked], spread[asked] = answers
             return {"heard_share": chance, "heard_db": mean, "heard_std_db": spread}
         for station in np.unique(mine[asked]):
             at, rows = asked[mine[asked] == station], np.flatnonzero(self.station == station)
-            near = cKDTree(self.place[rows]).query(places[at], range(1, min(NEAREST, len(rows)) + 1))[1]
+            near = cKDTree(self.place[rows]).query(
+                places[at], range(1, min(NEAREST, len(rows)) + 1)
+            )[1]
             limit = self.level_db[rows[near]]
-            above = torch.from_numpy((mean_db[at, None] - limit) / spread_db[at, None]).clamp_min(FARTHEST)
+            above = torch.from_numpy((mean_db[at, None] - limit) / spread_db[at, None]).clamp_min(
+                FARTHEST
+            )
             chance[at] = torch.special.ndtr(above).mean(1)
             # Each limit counts by how probable it makes that the row is heard.
             weight = torch.softmax(torch.special.log_ndtr(above), 1)
             shift, variance_loss = truncated_moments(above)
             middle = (weight * shift).sum(1)
             mean[at] += spread[at] * middle.numpy()
-            spread[at] *= ((weight * (1 - variance_loss + shift**2)).sum(1) - middle**2).sqrt().numpy()
+            spread[at] *= (
+                ((weight * (1 - variance_loss + shift**2)).sum(1) - middle**2).sqrt().numpy()
+            )
         return {"heard_share": chance, "heard_db": mean, "heard_std_db": spread}
 
     def given_listed(
         self, levels: np.ndarray, own: np.ndarray, moment: np.ndarray, station: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the probability (n,) that lists hold a station, its mean and deviation (n,) [dB] if they do.
+        """Return the probability (n,) that lists hold a station, its mean and deviation (n,)
+        [dB] if they do.
 
         Args:
             levels: (2, M, T) means and deviations [dB] at M moments, as `levels_near` has them.
@@ -131,10 +149,13 @@ class Hearing(Stored):
         for some in np.split(np.arange(len(station)), range(BLOCK, len(station), BLOCK)):
             who, (mean, spread) = station[some], own[:, some, None]
             level = mean + spread * NODES
-            # Probabilities (b, nodes, N) that so many others are stronger, of independent normal levels.
+            # Probabilities (b, nodes, N) that so many others are stronger,
+            # of independent normal levels.
             stronger = np.zeros((*level.shape, length))
             stronger[..., 0] = np.clip((level - floor[who, None]) / (step * spread) + 0.5, 0, 1)
-            for other, (there, doubt) in enumerate(zip(*levels[:, moment[some]].swapaxes(1, 2), strict=True)):
+            for other, (there, doubt) in enumerate(
+                zip(*levels[:, moment[some]].swapaxes(1, 2), strict=True)
+            ):
                 if not np.isfinite(there).any():
                     continue
                 away = (there[:, None] - level) / np.maximum(doubt, TINY_DB)[:, None]
@@ -162,7 +183,8 @@ def read_hearing(extra: Mapping[str, Any]) -> Hearing:
 def levels_near(
     method: Method, lists: StrongestLists, places: np.ndarray, device: np.ndarray | None = None
 ) -> np.ndarray:
-    """Return levels and deviations (2, M, T) [dB] of stations listed near places (M, 3); -inf of others.
+    """Return levels and deviations (2, M, T) [dB] of stations listed near places (M, 3);
+    -inf of others.
 
     `device` (M,) is which measures there; None: the mean one, exactly.
     """
@@ -174,7 +196,9 @@ def levels_near(
     level = np.full((2, len(places), len(answered)), -np.inf)
     for block in np.split(np.arange(len(at)), range(BLOCK, len(at), BLOCK)) if len(at) else ():
         moment, who = at[block], station[block]
-        query = Query.from_places(site, torch.from_numpy(places[moment]).float(), torch.from_numpy(who))
+        query = Query.from_places(
+            site, torch.from_numpy(places[moment]).float(), torch.from_numpy(who)
+        )
         prediction = method.predict(query)
         if device is not None:
             prediction = prediction.of_devices(site, torch.from_numpy(device[moment]))

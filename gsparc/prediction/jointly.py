@@ -27,26 +27,31 @@ class JointMixin:
     def predict_joint(self, places: Any, stations: Any) -> JointLevels | None:
         """Return levels with the covariances of their errors, float64.
 
-        Levels are in decibels of `site.level_unit`, the rest [dB^2]. None: nothing is known of how levels of
-        stations go together.
+        Levels are in decibels of `site.level_unit`, the rest [dB^2]. None: nothing is known of how
+        levels of stations go together.
 
         Args:
             places: (G, 3) of the moving end, world [m]; (G, k, 3): one for each of `stations`.
             stations: (k,) numbers.
         """
         method = self.method.joint_method()
-        return None if method is None else self._predict_levels(method, places, torch.as_tensor(stations))
+        return (
+            None
+            if method is None
+            else self._predict_levels(method, places, torch.as_tensor(stations))
+        )
 
     def predict_new(
         self, places: Any, station: Any, sectors: Any, like: int | None = None
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return levels (G, k) and deviations [dB] of k sectors that are not there yet, see `predict_joint`.
+        """Return levels (G, k) and deviations [dB] of k sectors that are not there yet,
+        see `predict_joint`.
 
         Args:
             places: (G, 3) of the moving end, world [m].
             station: (3,) where they are to stand, world [m].
-            sectors: (k, 5) azimuth from north, -1 without a pattern, tilt, widths across and in height
-                [deg], and power over the mean of those that stand [dB].
+            sectors: (k, 5) azimuth from north, -1 without a pattern, tilt, widths across and in
+                height [deg], and power over the mean of those that stand [dB].
             like: number of a station of their band; None: of the first.
         """
         if (joint_method := self.method.joint_method()) is None:
@@ -58,9 +63,11 @@ class JointMixin:
         return level, np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
     def noise_by_others(self, places: Any, stations: Any, listed: np.ndarray) -> np.ndarray:
-        """Return variances (G, k) that a measured place lacks of what measuring each station tells [dB^2].
+        """Return variances (G, k) that a measured place lacks
+        of what measuring each station tells [dB^2].
 
-        Infinite of a station that neither the place lists nor others tell of; below 0 where others tell more.
+        Infinite of a station that neither the place lists nor others tell of;
+        below 0 where others tell more.
 
         Args:
             places, stations: see `predict_joint`.
@@ -70,7 +77,10 @@ class JointMixin:
         for part in np.array_split(np.arange(len(places)), len(places) // TOGETHER + 1):
             if (joint := self.predict_joint(places[part], stations)) is not None:
                 field = joint.covariance - np.diag(joint.noise)
-                read = field + np.eye(len(stations)) * np.where(listed[part], joint.noise, UNREAD)[:, None]
+                read = (
+                    field
+                    + np.eye(len(stations)) * np.where(listed[part], joint.noise, UNREAD)[:, None]
+                )
                 reduction = field @ np.linalg.solve(read, field)
                 variance, reduction = (one.diagonal(axis1=1, axis2=2) for one in (field, reduction))
                 noise = variance * (variance - reduction) / np.maximum(reduction, 1 / UNREAD)
@@ -86,7 +96,8 @@ class JointMixin:
         return JointLevels(level + to_decibels(self.site.target_scale), covariance, noise)
 
     def covariance(self, tx: Any = None, rx: Any = None) -> tuple[np.ndarray, float]:
-        """Return the covariance (B, B) of the power's errors at B places, and a measurement's noise [dB^2].
+        """Return the covariance (B, B) of the power's errors at B places,
+        and a measurement's noise [dB^2].
 
         Of several stations of one of them, see `Predictor.select_station`.
 
@@ -112,8 +123,11 @@ class JointMixin:
             return (covariance[0] - noise.diag()).numpy(), float(noise[0])
         process = self.method.process() if isinstance(self.method, HasProcess) else None
         if process is None:
-            raise ValueError(f"covariance: {self.method.name} states none of errors; model=gp of powers does")
-        # Who learned all stations together tells them by their places: there both ends are a query's.
+            raise ValueError(
+                f"covariance: {self.method.name} states none of errors; model=gp of powers does"
+            )
+        # Who learned all stations together tells them by their places:
+        # there both ends are a query's.
         places = query.places(getattr(self.method, "site", None) or self.site)
         covariance = process.posterior.covariance(places)  # type: ignore[attr-defined]
         return covariance.numpy(), process.kernel.amplitude * process.kernel.noise

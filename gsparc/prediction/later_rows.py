@@ -1,4 +1,6 @@
-"""Rows that come later, checked as the first rows are, and against the model that is told of them."""
+"""Rows that come later, checked as the first rows are,
+and against the model that is told of them.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,8 @@ ABOVE_DB = 120.0  # over the mean power of a site: more than receivers' levels s
 
 @dataclass(frozen=True)
 class LevelRows(PowerRows):
-    """Levels of stored powers that were measured, as they came, at local places of the end that moves.
+    """Levels of stored powers that were measured, as they came,
+    at local places of the end that moves.
 
     Attributes:
         station: (n,) int64.
@@ -46,33 +49,43 @@ class LevelRows(PowerRows):
 
 
 def check_updatable(site: Site) -> None:
-    """Raise `ValueError` where a site's models learn no later rows: not powers, or both ends move."""
+    """Raise `ValueError` where a site's models learn no later rows: not powers,
+    or both ends move.
+    """
     if not site.maps_levels:
         what = f"{site.target.called}{' of two moving ends' * site.target.is_level}"
         raise ValueError(f"update: models of {what} cannot be updated: train again on all rows")
 
 
 def read_level_rows(data: Measurements, site: Site) -> LevelRows:
-    """Return measurements of powers, in a model's coordinates, as `update` takes them, in their order.
+    """Return measurements of powers, in a model's coordinates, as `update` takes them,
+    in their order.
 
     Raises:
         ValueError: lists of the strongest, or what no row of this model can be.
     """
     if strongest_lists(data) is not None:
         raise ValueError(
-            "update: lists of the strongest hold what is strong, and would raise all levels; train on all "
+            "update: lists of the strongest hold what is strong, and would raise all levels; "
+            "train on all "
             "drives, gsparc evaluate names cells that are gone"
         )
     data = without_devices(data, site)
-    rows = np.arange(len(data)) if data.sequence is None else np.argsort(data.sequence, kind="stable")
+    rows = (
+        np.arange(len(data)) if data.sequence is None else np.argsort(data.sequence, kind="stable")
+    )
     if data.mask is not None:
         rows = rows[data.mask[rows].reshape(len(rows)) | (data.censored_side(rows) != 0)]
     level = data.site.target.to_real(data.target[rows])[:, 0].astype(np.float64)
     station, name = data.stations_of(rows), np.array(data.row_names)[rows]
-    return _checked(LevelRows(data.moving[rows], level, data.censored_side(rows), station, name), site)
+    return _checked(
+        LevelRows(data.moving[rows], level, data.censored_side(rows), station, name), site
+    )
 
 
-def read_level_arrays(site: Site, places: Any, levels: Any, unit: PowerUnit) -> tuple[LevelRows, int]:
+def read_level_arrays(
+    site: Site, places: Any, levels: Any, unit: PowerUnit
+) -> tuple[LevelRows, int]:
     """Return rows of arrays, NaN of which is not measured, and how many were not heard at all.
 
     Args:
@@ -115,7 +128,9 @@ def read_level_arrays(site: Site, places: Any, levels: Any, unit: PowerUnit) -> 
 
 
 def _numbers(name: str, value: Any) -> np.ndarray:
-    """An array as it was given; None is NaN. `DataError` where rows have different lengths, or hold text."""
+    """An array as it was given; None is NaN. `DataError` where rows have different lengths,
+    or hold text.
+    """
     try:
         array = to_numpy(value) if isinstance(value, torch.Tensor) else np.asarray(value)
         array = array.astype(np.float64) if array.dtype == object else array
@@ -123,10 +138,14 @@ def _numbers(name: str, value: Any) -> np.ndarray:
         lengths = [np.size(part) for part in value] if isinstance(value, list | tuple) else []
         usual = max(lengths, key=lengths.count, default=0)
         odd = next((i for i, length in enumerate(lengths) if length != usual), None)
-        fault = "expected numbers" if odd is None else f"holds {lengths[odd]} numbers, others {usual}"
+        fault = (
+            "expected numbers" if odd is None else (f"holds {lengths[odd]} numbers, others {usual}")
+        )
         raise DataError(f"update, {name}{'' if odd is None else f', row {odd}'}: {fault}") from None
     if not array.size:
-        raise DataError(f"update, {name}: shape {array.shape} holds nothing; expected a row or more")
+        raise DataError(
+            f"update, {name}: shape {array.shape} holds nothing; expected a row or more"
+        )
     return array
 
 
@@ -141,7 +160,10 @@ def _checked(rows: LevelRows, site: Site) -> LevelRows:
             raise DataError(f"update, {names}: {say(int(numbers[0]))}")
 
     kilometres = len(rows) > 0 and are_kilometres(world, box)
-    inside = "and all others lie within the site when they are multiplied by 1000: in kilometres? give metres"
+    inside = (
+        "and all others lie within the site when they are multiplied by 1000: in "
+        "kilometres? give metres"
+    )
     refuse(np.full(len(rows), kilometres), lambda i: f"{world[i].round(6).tolist()} {inside}")
     away, width = np.linalg.norm(world - box.mean(0), axis=1) / 1e3, np.ptp(box, axis=0).max()
     reach = f"km from the middle of the model's rows, which reach over {width:.4g} m"

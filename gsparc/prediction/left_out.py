@@ -1,4 +1,6 @@
-"""Rows that a method did not learn from, and what it says of them: what tells how sure it may be."""
+"""Rows that a method did not learn from, and what it says of them:
+what tells how sure it may be.
+"""
 
 from __future__ import annotations
 
@@ -42,10 +44,16 @@ class Evidence:
 
     @staticmethod
     def join(parts: Sequence[Evidence]) -> Evidence:
-        """Join folds, a row of several of them by the first; scores that not every part has are dropped."""
-        first = np.sort(np.unique(np.concatenate([part.row for part in parts]), return_index=True)[1])
+        """Join folds, a row of several of them by the first;
+        scores that not every part has are dropped.
+        """
+        first = np.sort(
+            np.unique(np.concatenate([part.row for part in parts]), return_index=True)[1]
+        )
         kinds = [kind for kind in KINDS if all(kind in part.scores for part in parts)]
-        scores = {kind: np.concatenate([part.scores[kind] for part in parts])[first] for kind in kinds}
+        scores = {
+            kind: np.concatenate([part.scores[kind] for part in parts])[first] for kind in kinds
+        }
         facts = zip(*((part.row, part.position, part.error) for part in parts), strict=True)
         row, position, error = (np.concatenate(values)[first] for values in facts)
         return Evidence(row, position, error, scores)
@@ -57,8 +65,12 @@ def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> Predic
     return Prediction.joined(answers, torch.from_numpy(np.argsort(np.concatenate(order))))
 
 
-def gather_evidence(method: Method, data: Measurements, rows: np.ndarray, rivals: Trusted) -> Evidence:
-    """Return the errors of what `method` predicts of rows (n,), its confidence and those of rivals."""
+def gather_evidence(
+    method: Method, data: Measurements, rows: np.ndarray, rivals: Trusted
+) -> Evidence:
+    """Return the errors of what `method` predicts of rows (n,),
+    its confidence and those of rivals.
+    """
     return score_answers(
         predict_rows(method, data, rows), data.targets(rows), rows, data.moving[rows], rivals
     )
@@ -67,7 +79,8 @@ def gather_evidence(method: Method, data: Measurements, rows: np.ndarray, rivals
 def score_answers(
     said: Prediction, true: Tensor, rows: np.ndarray, places: np.ndarray, rivals: Trusted
 ) -> Evidence:
-    """Return relative errors of predictions of `true` (n, ...) at local places (n, D) [m], and their scores.
+    """Return relative errors of predictions of `true` (n, ...) at local places (n, D) [m],
+    and their scores.
 
     A method that does not state a kind of score has none of it.
     """
@@ -76,7 +89,11 @@ def score_answers(
     error = (miss / power.clamp_min(1e-30)).double().numpy()
     every = {kind: rivals.score(kind, said, places) for kind in KINDS}
     # Scores with a NaN rank nothing.
-    scores = {kind: score for kind, score in every.items() if score is not None and not np.isnan(score).any()}
+    scores = {
+        kind: score
+        for kind, score in every.items()
+        if score is not None and not np.isnan(score).any()
+    }
     return Evidence(rows, places, error, scores)
 
 
@@ -90,7 +107,8 @@ class HeldOutLevels:
         distance: (n,) to the nearest place that was learned from [m].
         block: (n,) int64, rows of one were held out together.
         station: (n,) int64; 0 where there is one.
-        side: (n,) int8, 1 where the power lies below its level, -1 where above, 0 where it was measured.
+        side: (n,) int8, 1 where the power lies below its level, -1 where above, 0 where it was
+            measured.
     """
 
     level_db: np.ndarray
@@ -112,7 +130,9 @@ class HeldOutLevels:
     def join(parts: Sequence[HeldOutLevels]) -> HeldOutLevels:
         """Return the rows of all."""
         names = [field.name for field in fields(HeldOutLevels)]
-        return HeldOutLevels(*(np.concatenate([getattr(one, name) for one in parts]) for name in names))
+        return HeldOutLevels(
+            *(np.concatenate([getattr(one, name) for one in parts]) for name in names)
+        )
 
     @property
     def heard(self) -> np.ndarray:
@@ -132,22 +152,31 @@ class HeldOutLevels:
 def leave_out(
     learned: Learned, fold: Fold, block: np.ndarray, split: SplitSettings | None = None
 ) -> HeldOutLevels:
-    """Return the test rows of a fold cut by `split` as its other rows predict them, see `held_out_levels`."""
+    """Return the test rows of a fold cut by `split` as its other rows predict them,
+    see `held_out_levels`.
+    """
     return held_out_levels(learned.unlearn(fold, split), learned.data, fold, block)
 
 
-def held_out_levels(method: Method, data: Measurements, fold: Fold, block: np.ndarray) -> HeldOutLevels:
-    """Return evidence of a fold's test rows, by the `method` fitted to it; a `block` (n,) goes together.
+def held_out_levels(
+    method: Method, data: Measurements, fold: Fold, block: np.ndarray
+) -> HeldOutLevels:
+    """Return evidence of a fold's test rows, by the `method` fitted to it; a `block` (n,)
+    goes together.
 
     Without rows that have no level, or of which the method predicts none.
     """
     rows, train_rows = fold.test, fold.learned()
     mean, spread = np.full((2, len(rows)), np.nan)
     for chosen, _, prediction in predict_in_batches(method, data, rows, CHUNK):
-        mean[chosen], spread[chosen] = predicted_levels(prediction, data.site.kind, data.site.target_scale)
+        mean[chosen], spread[chosen] = predicted_levels(
+            prediction, data.site.kind, data.site.target_scale
+        )
     level, side = measured_levels(data, rows)
     station = data.stations_of(rows)
-    far = nearest_distances(data.moving[train_rows], data.stations_of(train_rows), data.moving[rows], station)
+    far = nearest_distances(
+        data.moving[train_rows], data.stations_of(train_rows), data.moving[rows], station
+    )
     every = HeldOutLevels(level, mean, spread, far, block, station, side)
     return every.subset(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread))
 
@@ -155,10 +184,14 @@ def held_out_levels(method: Method, data: Measurements, fold: Fold, block: np.nd
 def nearest_distances(
     known: np.ndarray, known_station: np.ndarray, places: np.ndarray, station: np.ndarray
 ) -> np.ndarray:
-    """Return how far places (n, D) are from the nearest `known` one (m, D) of their station, else any [m]."""
+    """Return how far places (n, D) are from the nearest `known` one (m, D) of their station,
+    else any [m].
+    """
     distance = np.full(len(places), np.inf)
     for number in np.unique(station):
         candidates = known[known_station == number]
         chosen = station == number
-        distance[chosen] = cKDTree(candidates if len(candidates) else known).query(places[chosen])[0]
+        distance[chosen] = cKDTree(candidates if len(candidates) else known).query(places[chosen])[
+            0
+        ]
     return distance

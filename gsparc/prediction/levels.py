@@ -14,11 +14,15 @@ from gsparc.prediction.predictor import Predictor
 MAPPED: tuple[Kind, ...] = ("rssi", "csi")
 
 
-def predicted_levels(prediction: Prediction, kind: Kind, scale: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """Return the level and its standard deviation (B,) float64 [dB]; NaN where no power is predicted.
+def predicted_levels(
+    prediction: Prediction, kind: Kind, scale: float = 1.0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the level and its standard deviation (B,) float64 [dB];
+    NaN where no power is predicted.
 
-    The power of a channel is its mean over antennas and subcarriers, expected: |mean|^2 + error variance.
-    Its deviation takes the error for one complex normal variable shared by all entries, which overstates it.
+    The power of a channel is its mean over antennas and subcarriers, expected: |mean|^2 + error
+    variance. Its deviation takes the error for one complex normal variable shared by all entries,
+    which overstates it.
 
     Args:
         prediction: a prediction; its variance is of the entries.
@@ -62,9 +66,11 @@ def measured_levels(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, n
     return level, side
 
 
-def joint_levels(predictor: Predictor, places: np.ndarray, stations: np.ndarray) -> np.ndarray | None:
-    """Return levels, deviations [dB] and correlations with the strongest, (n, 3, T), at world places
-    (n, 3) [m].
+def joint_levels(
+    predictor: Predictor, places: np.ndarray, stations: np.ndarray
+) -> np.ndarray | None:
+    """Return levels, deviations [dB] and correlations with the strongest, (n, 3, T), at world
+    places (n, 3) [m].
 
     Args:
         predictor: see `Predictor.joint`.

@@ -46,14 +46,20 @@ class Operating(Stored):
 
 
 def store_points(path: Path, points: Sequence[Mapping[str, Any]], inputs: ReductionInputs) -> None:
-    """Store points, rows of a trade-off, in a checkpoint, replacing earlier ones; see `update_extra`."""
+    """Store points, rows of a trade-off, in a checkpoint, replacing earlier ones;
+    see `update_extra`.
+    """
     found = [
         Operating(
-            p["label"], dict(p["settings"]), p["threads"], p["closeness_db"], (p["figure"], p["value"]),
+            p["label"],
+            dict(p["settings"]),
+            p["threads"],
+            p["closeness_db"],
+            (p["figure"], p["value"]),
             p["render_ms_p50"],
         )
         for p in points
-    ]  # fmt: skip
+    ]
     checkpoint.update_extra(path, {KEY: {"points": to_plain(found), "measured": inputs}})
 
 
@@ -73,7 +79,8 @@ QUERIES = 16  # at places drawn in the scene's box
 def choose_within_budget(
     method: Method, stored: checkpoint.StoredModel, budget_ms: float
 ) -> tuple[Method, Operating]:
-    """Choose the most accurate stored operating point that takes at most `budget_ms` on this machine.
+    """Choose the most accurate stored operating point that takes
+    at most `budget_ms` on this machine.
 
     Sets torch's number of threads to the point's.
 
@@ -86,7 +93,9 @@ def choose_within_budget(
     advice = "" if points else f"; `gsparc tradeoff ckpt={stored.path}` finds faster ways to answer"
     if not points:
         # A model that was never swept has one point, itself.
-        points = [Operating("as trained", {}, torch.get_num_threads(), 0.0, ("", math.nan), math.nan)]
+        points = [
+            Operating("as trained", {}, torch.get_num_threads(), 0.0, ("", math.nan), math.nan)
+        ]
     # More threads than cores wait for each other: such points are of another machine.
     points = [point for point in points if point.threads <= (os.cpu_count() or 1)] or points[:1]
     ways = [with_reduction(method, point.settings, inputs) for point in points]
@@ -100,7 +109,8 @@ def choose_within_budget(
     if not fitting:
         fastest = min(here, key=lambda i: here[i])
         raise ValueError(
-            f"budget_ms={budget_ms:g}: no operating point of {stored.path} is that fast on this machine; the "
+            f"budget_ms={budget_ms:g}: no operating point of {stored.path} is that fast on this "
+            "machine; the "
             f"fastest ({points[fastest].label}) takes {here[fastest]:.3g} ms{advice}"
         )
     # The most accurate of those that fit; of equally accurate ones the fastest.
@@ -111,9 +121,11 @@ def choose_within_budget(
 
 
 def load(
-    path: str | Path | checkpoint.StoredModel, budget_ms: float | None = None, confidence: str | None = None,
+    path: str | Path | checkpoint.StoredModel,
+    budget_ms: float | None = None,
+    confidence: str | None = None,
     unit: str | None = None,
-) -> Predictor:  # fmt: skip
+) -> Predictor:
     """Load the model in a checkpoint, ready to be asked.
 
     >>> gsparc.load("model.ckpt").rssi(rx=[2.0, 1.0, 1.5]).shape
@@ -124,8 +136,8 @@ def load(
 
     Args:
         path: the file, or what `checkpoint.read` read of it.
-        budget_ms: what one query may take on this machine, end to end [ms]. The operating points that
-            `gsparc tradeoff` stored with the model are timed here (a few seconds), the most
+        budget_ms: what one query may take on this machine, end to end [ms]. The operating points
+            that `gsparc tradeoff` stored with the model are timed here (a few seconds), the most
             accurate that fits answers, and torch's number of threads becomes that point's.
         confidence: `learned`, `expected`, `distance` or `gp_variance`; None takes the one that
             `gsparc calibrate` found best on positions set aside and stored with the model, and
@@ -134,11 +146,14 @@ def load(
 
     Raises:
         gsparc.models.checkpoint.CheckpointError: missing, damaged, hostile or newer file.
-        ValueError: nothing is as fast as `budget_ms` (the fastest is named), or no such confidence or unit.
+        ValueError: nothing is as fast as `budget_ms` (the fastest is named), or no such confidence
+            or unit.
     """
     method, stored = loading.load(path)
     trusted = read_trusted(stored.extra)
     if confidence is not None:
         trusted.check_kind(confidence)
-    chosen, point = (method, None) if budget_ms is None else choose_within_budget(method, stored, budget_ms)
+    chosen, point = (
+        (method, None) if budget_ms is None else choose_within_budget(method, stored, budget_ms)
+    )
     return Predictor(chosen, stored.site, method, point, trusted, confidence, stored.extra, unit)

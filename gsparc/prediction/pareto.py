@@ -21,20 +21,26 @@ def defined_figure(figures: Mapping[str, float | None], name: str) -> float:
         ValueError: the rows that were scored do not define it.
     """
     if (value := figures[name]) is None:
-        raise ValueError(f"{name} is not defined on these test rows (all silent?): say another split=")
+        raise ValueError(
+            f"{name} is not defined on these test rows (all silent?): say another split="
+        )
     return value
 
 
 def describe_point(settings: Settings) -> str:
     """Return `25% kept, 1 of 3 x 3 pixels`; `as trained` when nothing is spared."""
-    words = [WORDS.get(knob, lambda value, k=knob: f"{k} {value}")(value) for knob, value in settings.items()]
+    words = [
+        WORDS.get(knob, lambda value, k=knob: f"{k} {value}")(value)
+        for knob, value in settings.items()
+    ]
     return ", ".join(word for word in words if word) or "as trained"
 
 
 def pareto_front(latency: Sequence[float], score: Sequence[float]) -> list[int]:
     """Return indices of the points that no other beats, fastest first.
 
-    A point is on the front if every point at most as slow is less accurate than it (ties: the first wins).
+    A point is on the front if every point at most as slow is less accurate
+    than it (ties: the first wins).
 
     Args:
         latency: (n,) [ms].

@@ -1,4 +1,6 @@
-"""From places as they were given to world coordinates of a model, and which station each row is about."""
+"""From places as they were given to world coordinates of a model,
+and which station each row is about.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ from gsparc.data.station_names import all_names, find_station
 from gsparc.prediction.query import usual_heights
 from gsparc.tables.query_places import QueryPlaces
 
-MARGIN = 0.1  # of the largest side of the box of training places: what lies farther out is far outside
+# Of the largest side of the box of training places: what lies farther out is far outside
+MARGIN = 0.1
 SPECK = 1e-3  # of that side: in degrees a site is 1e-5 as wide as in metres, in kilometres 1e-3
 
 
@@ -32,11 +35,16 @@ def fill_heights(queries: QueryPlaces, site: Site) -> QueryPlaces:
         if end not in heights:
             low, high = site.moving_box[:, 2::3][:, -1 if end == "rx" else 0] + site.origin[2]
             several = f"the {ENDS[end]} was measured at heights from {low:g} to {high:g} m"
-            say = f"say columns.{'' if len(ends) == 1 else end + '_'}height=NUMBER, or give it in the file"
+            say = (
+                f"say columns.{'' if len(ends) == 1 else end + '_'}height=NUMBER, or give it "
+                "in the file"
+            )
             raise DataError(f"{queries.source}: no height, and {several}; {say}")
         height = np.full(len(queries), heights[end])
         ends[end] = replace(where, height=height)
-        notes.append(f"no height of the {ENDS[end]}: taken as {heights[end]:g} m, as when it was measured")
+        notes.append(
+            f"no height of the {ENDS[end]}: taken as {heights[end]:g} m, as when it was measured"
+        )
     return replace(queries, ends=ends, notes=tuple(notes))
 
 
@@ -44,12 +52,15 @@ def to_world(queries: QueryPlaces, site: Site) -> dict[End, np.ndarray]:
     """Return world positions (n, 3) [m] by end of places with heights.
 
     Raises:
-        DataError: degrees where the model knows none, or a place that no measurement in metres can have.
+        DataError: degrees where the model knows none, or a place that no measurement in metres can
+            have.
     """
     origin, world = site.georeference, dict[End, np.ndarray]()
     for end, where in queries.ends.items():
         if where.degrees and origin is None:
-            fault = f"places in degrees, but {site.name} was measured in metres about an unknown origin"
+            fault = (
+                f"places in degrees, but {site.name} was measured in metres about an unknown origin"
+            )
             raise DataError(f"{queries.source}: {fault}; give x, y and z [m]")
         across = where.across
         if where.degrees and origin is not None:
@@ -59,13 +70,16 @@ def to_world(queries: QueryPlaces, site: Site) -> dict[End, np.ndarray]:
         wrong = np.flatnonzero((np.abs(world[end]) > FARTHEST).any(axis=1))
         if len(wrong):
             place = ", ".join(f"{value:g}" for value in where.all()[wrong[0]])
-            fault = f"({place}) is more than {FARTHEST / 1e3:.0f} km from the origin; expected metres"
+            fault = (
+                f"({place}) is more than {FARTHEST / 1e3:.0f} km from the origin; expected metres"
+            )
             raise DataError(f"{queries.source}, {queries.rows[wrong[0]]}: {fault}, or degrees")
     return world
 
 
 def far_outside_and_margin(world: dict[End, np.ndarray], site: Site) -> tuple[np.ndarray, float]:
-    """Tell which places (n,) bool lie farther outside the training places' box than a margin, and that [m].
+    """Tell which places (n,) bool lie farther outside the training places' box than a margin,
+    and that [m].
 
     >>> places = {"rx": np.array([[4.0, 4.0, 1.5], [400.0, 4.0, 1.5]])}
     >>> far, margin = far_outside_and_margin(places, predictor.site)
@@ -84,7 +98,10 @@ def say_height_error(world: dict[End, np.ndarray], site: Site, far: np.ndarray) 
     heights = np.column_stack([world[end][:, 2] for end in site.moving_ends])
     # With heights as measured: if these places are inside, height alone is what was wrong.
     inside = np.clip(heights, low, high)
-    flat = {end: np.column_stack([world[end][:, :2], inside[:, i]]) for i, end in enumerate(site.moving_ends)}
+    flat = {
+        end: np.column_stack([world[end][:, :2], inside[:, i]])
+        for i, end in enumerate(site.moving_ends)
+    }
     if far_outside_and_margin(flat, site)[0].any():
         return ""
     beyond = (heights - inside)[far].ravel()
@@ -94,7 +111,9 @@ def say_height_error(world: dict[End, np.ndarray], site: Site, far: np.ndarray) 
 
 
 def say_tiny_extent(queries: QueryPlaces, world: dict[End, np.ndarray], site: Site) -> str | None:
-    """Say that several places (n, 3) [m] lie in a speck of where was measured; None: they do not."""
+    """Say that several places (n, 3) [m] lie in a speck of where was measured; None:
+    they do not.
+    """
     # Places that came in degrees were projected, and have no unit that can be mistaken.
     metres = [world[end] for end, where in queries.ends.items() if not where.degrees]
     low, high = site.moving_box
@@ -106,7 +125,9 @@ def say_tiny_extent(queries: QueryPlaces, world: dict[End, np.ndarray], site: Si
     return f"{here}: degrees or km as x and y?"
 
 
-def rows_and_stations(queries: QueryPlaces, site: Site, wanted: str | None) -> tuple[np.ndarray, np.ndarray]:
+def rows_and_stations(
+    queries: QueryPlaces, site: Site, wanted: str | None
+) -> tuple[np.ndarray, np.ndarray]:
     """Return row of the places and station (N,) int64 of each prediction; 0 without stations.
 
     Args:
@@ -120,7 +141,9 @@ def rows_and_stations(queries: QueryPlaces, site: Site, wanted: str | None) -> t
     rows, stations = np.arange(len(queries)), site.stations
     if stations is None:
         if wanted is not None:
-            raise DataError(f"station={wanted}: the model of {site.name} has no stations; leave it out")
+            raise DataError(
+                f"station={wanted}: the model of {site.name} has no stations; leave it out"
+            )
         return rows, np.zeros_like(rows)
     called = all_names(stations)
     only = None if wanted is None else find_station(wanted, stations)
@@ -143,5 +166,7 @@ def rows_and_stations(queries: QueryPlaces, site: Site, wanted: str | None) -> t
         raise DataError(f"{queries.source}, column of stations, {queries.rows[row]}: {fault}")
     rows = rows if only is None else np.flatnonzero(number == only)
     if not len(rows):
-        raise DataError(f"station={wanted}: no row of {queries.source} is about it; leave out one of the two")
+        raise DataError(
+            f"station={wanted}: no row of {queries.source} is about it; leave out one of the two"
+        )
     return rows, number[rows]

@@ -38,17 +38,19 @@ if TYPE_CHECKING:
 class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
     """A fitted method in world coordinates.
 
-    Positions are (3,) or (B, 3) [m]; a single position gives a result without the leading axis. NumPy (or
-    lists) in gives NumPy out, torch in gives torch out. The static end may be left out: the model knows
-    where it stood.
+    Positions are (3,) or (B, 3) [m]; a single position gives a result without the leading axis.
+    NumPy (or lists) in gives NumPy out, torch in gives torch out. The static end may be left out:
+    the model knows where it stood.
 
-    Powers and their deviations come back in the unit that they were given in (`unit`), or in the one that
-    `unit=` names: dBm, dBW, W, mW, ..., or `linear` where nobody said what decibels refer to.
+    Powers and their deviations come back in the unit that they were given in (`unit`), or in the
+    one that `unit=` names: dBm, dBW, W, mW, ...,
+    or `linear` where nobody said what decibels refer to.
 
-    With `grad=True` predictions are differentiable by the position of what moves, which is then a tensor:
-    autograd in reverse and forward mode and `torch.func` (`grad`, `jacrev`, `jacfwd`, `jvp`, `vjp`) follow
-    them. All is computed in float64 and answered in the precision of the positions; `ValueError` where the
-    model has no gradients. Which rows are nearest and what a clamp cuts off have none.
+    With `grad=True` predictions are differentiable by the position of what moves, which is then a
+    tensor: autograd in reverse and forward mode and `torch.func` (`grad`, `jacrev`, `jacfwd`,
+    `jvp`, `vjp`) follow them. All is computed in float64 and answered in the precision of the
+    positions; `ValueError` where the model has no gradients.
+    Which rows are nearest and what a clamp cuts off have none.
 
     >>> at = torch.tensor([2.0, 1.0, 1.5], dtype=torch.float64, requires_grad=True)
     >>> predictor.rssi(rx=at, grad=True).sum().backward()
@@ -57,27 +59,38 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
 
     Args:
         method: fitted or restored.
-        site: the dataset's fixed facts: `kind`, the `box` of places [m, local] and its `origin`, `stations`.
+        site: the dataset's fixed facts: `kind`, the `box` of places [m, local] and its `origin`,
+            `stations`.
         whole: asked for the confidence, where `method` spares it; None asks `method`.
-        point: the operating point `method` answers at, if one was chosen (`load(budget_ms=...)`), else None.
+        point: the operating point `method` answers at, if one was chosen (`load(budget_ms=...)`),
+            else None.
         extra: what else the checkpoint holds, such as the split's hash.
-        trusted: which confidence is answered, and from when on a prediction is accepted (`gsparc calibrate`).
+        trusted: which confidence is answered, and from when on a prediction is accepted
+            (`gsparc calibrate`).
         kind: of the confidence, as in `load`; None: as `trusted` says.
-        unit: of powers; None: that of the measurements. The attribute is "1" of channels and spectra.
+        unit: of powers; None: that of the measurements. The attribute is "1" of channels and
+            spectra.
 
     Raises:
         ValueError: no unit that these measurements can be turned into.
     """
 
     def __init__(
-        self, method: Method, site: Site, whole: Method | None = None, point: Operating | None = None,
-        trusted: Trusted | None = None, kind: str | None = None, extra: Mapping[str, Any] | None = None,
+        self,
+        method: Method,
+        site: Site,
+        whole: Method | None = None,
+        point: Operating | None = None,
+        trusted: Trusted | None = None,
+        kind: str | None = None,
+        extra: Mapping[str, Any] | None = None,
         unit: str | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.extra = extra or {}
         self.trusted, self.kind = trusted or Trusted(), kind
         self.method, self.site, self.point = method, site, point
-        # A reduced method answers means alone: what states variance or confidence asks the whole one.
+        # A reduced method answers means alone: what states variance
+        # or confidence asks the whole one.
         self._whole = whole or method
         self.versions = read_versions(self.extra)
         self.queries = Queries(site)
@@ -85,7 +98,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         self.unit = self._answer_unit(None).name  # "1" of channels and spectra
         self._device = MEAN_DEVICE
         self._prepared: list[Method] = []  # whose caches were filled outside of transforms
-        # Of the whole model, and which of its stations is asked: later rows are of it in every view.
+        # Of the whole model, and which of its stations is asked:
+        # later rows are of it in every view.
         self._model_site, self._own_station = site, None
 
     def __repr__(self) -> str:
@@ -98,13 +112,16 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
 
     @property
     def known(self) -> str:
-        """Say in words what answers are known up to: `all`, or `up to a phase of each row` of channels."""
+        """Say in words what answers are known up to: `all`,
+        or `up to a phase of each row` of channels.
+        """
         free = self.site.unknown_factor
         return "all" if free == "none" else f"up to {describe_factor(free)} of each row"
 
     @property
     def stations(self) -> list[str]:
-        """Names (T,) of stations, in the order of the columns of `rssi`; empty where there are none.
+        """Names (T,) of stations, in the order of the columns of `rssi`;
+        empty where there are none.
 
         >>> gsparc.load("city.ckpt").stations
         ['roof-2', 'roof-3']
@@ -112,7 +129,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         return [name for name in self.site.every_station.shown if name]
 
     def select_station(self, station: str | int | None) -> Predictor:
-        """Return the same model asked about one station alone, by a name of `stations` or number; None: all.
+        """Return the same model asked about one station alone, by a name of `stations` or number;
+        None: all.
 
         >>> gsparc.load("city.ckpt").select_station("roof-3").rssi(rx=[2.0, 1.0, 1.5]).shape
         (1,)
@@ -124,14 +142,19 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
             return self
         stations = self.site.stations
         if stations is None:
-            raise ValueError(f"select_station: {self.site.name} has one static end, and no stations")
+            raise ValueError(
+                f"select_station: {self.site.name} has one static end, and no stations"
+            )
         number = find_station(station, stations)
         if number is None:
-            raise ValueError(f"select_station: no station {station!r}; there are {', '.join(stations.shown)}")
+            raise ValueError(
+                f"select_station: no station {station!r}; there are {', '.join(stations.shown)}"
+            )
         return self.ask_station(number)
 
     def ask_station(self, number: int) -> Predictor:
-        """Return the same model asked about a station by its number; itself where the one has no name.
+        """Return the same model asked about a station by its number;
+        itself where the one has no name.
 
         Raises:
             ValueError: it had too few training rows.
@@ -147,7 +170,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         return view
 
     def select_carrier(self, frequency_hz: float) -> Predictor:
-        """Return the same model asked about one carrier [Hz], also one that nobody measured if it can.
+        """Return the same model asked about one carrier [Hz],
+        also one that nobody measured if it can.
 
         >>> predictor.select_carrier(28e9)  # of a model of one carrier
         Traceback (most recent call last):
@@ -159,18 +183,24 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         """
         carriers = self.site.every_station.carrier_hz
         if carriers is None:
-            raise ValueError(f"frequency_hz={frequency_hz:g}: {self.site.name} has one carrier alone")
+            raise ValueError(
+                f"frequency_hz={frequency_hz:g}: {self.site.name} has one carrier alone"
+            )
         if not (np.isfinite(frequency_hz) and frequency_hz > 0):
             raise ValueError(f"frequency_hz={frequency_hz}: expected a frequency above 0 [Hz]")
         if len(here := np.flatnonzero(np.isclose(carriers, frequency_hz, rtol=1e-6))) == 1:
             return self.ask_station(int(here[0]))
         both = self.method, self._whole
         if not all(isinstance(one, AddsCarriers) for one in both):
-            raise ValueError(f"frequency_hz={frequency_hz:g}: {self.method.name} has no other carriers")
+            raise ValueError(
+                f"frequency_hz={frequency_hz:g}: {self.method.name} has no other carriers"
+            )
         method, whole = (cast(AddsCarriers, one).add_carrier(frequency_hz) for one in both)
         return self._view(method, whole, method.fitted_site, self._unit).ask_station(len(carriers))
 
-    def _view(self, method: Method, whole: Method | None, site: Site, unit: str | None) -> Predictor:
+    def _view(
+        self, method: Method, whole: Method | None, site: Site, unit: str | None
+    ) -> Predictor:
         """A copy that goes on from here apart: whatever is not given stays, later rows too."""
         view = copy(self)
         view.method, view._whole, view.site, view._unit = method, whole or method, site, unit
@@ -191,7 +221,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         return view
 
     def in_levels(self, unit: str | None) -> Predictor:
-        """Return the same model whose powers and maps are levels in `unit`, dBm or dBW; None: as measured.
+        """Return the same model whose powers and maps are levels in `unit`, dBm or dBW; None:
+        as measured.
 
         Raises:
             ValueError: decibels of a reference that nobody knows.
@@ -203,18 +234,21 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         if self.site.target.is_level:
             return self.site.power_unit(unit or self._unit)
         if unit or self._unit:
-            raise ValueError(f"unit={unit or self._unit}: goes with powers, not with {self.site.kind}")
+            raise ValueError(
+                f"unit={unit or self._unit}: goes with powers, not with {self.site.kind}"
+            )
         # Other kinds have no unit of powers: physical values are stored ones times the scale.
         return PowerUnit("1", False, self.site.target_scale)
 
     def predict(
         self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False
     ) -> Prediction:
-        """Return mean (B, ...), variance and confidence (B,) at once, as tensors, in the measurements' unit.
+        """Return mean (B, ...), variance and confidence (B,) at once, as tensors,
+        in the measurements' unit.
 
         The variance is the expected squared error of an entry, None where the method states none.
-        The confidence is None where the method has none; else the one that `confidence` answers. With `grad`
-        it is the method's own, and None where `confidence` answers another.
+        The confidence is None where the method has none; else the one that `confidence` answers.
+        With `grad` it is the method's own, and None where `confidence` answers another.
 
         >>> said = predictor.predict(rx=[[2.0, 1.0, 1.5], [3.0, 1.0, 1.5]])
         >>> said.mean.shape, bool((said.variance > 0).all())  # dBm, and dBm^2 of a measurement
@@ -229,12 +263,15 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         query = self.queries.query(tx, rx).query
         prediction = predict_with_threads(self._whole, query)
         sure = self._method_confidence(prediction, query)
-        return replace(self._in_unit(prediction, wanted), unknown=None if sure is None else 1 - sure)
+        return replace(
+            self._in_unit(prediction, wanted), unknown=None if sure is None else 1 - sure
+        )
 
     def predict_query(self, query: Query) -> Prediction:
         """Return what the model says of a query, whose places are local (less `site.origin`) [m].
 
-        In stored units: measured ones divided by `site.target_scale`; `predict` answers in measured ones.
+        In stored units: measured ones divided by `site.target_scale`;
+        `predict` answers in measured ones.
         """
         return predict_with_threads(self.method, query)
 
@@ -247,10 +284,12 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         return self.predict(tx, rx, unit=LINEAR if self.site.target.is_level else None)
 
     def std(self, tx: Any = None, rx: Any = None, *, unit: str | None = None) -> Any:
-        """Return the expected root mean square error of an entry, in the unit of the answers and float32.
+        """Return the expected root mean square error of an entry,
+        in the unit of the answers and float32.
 
-        Far from all data it is that of knowing nothing: about 1 of spectra, whose pixels are from 0 to 1.
-        Its shape goes with theirs: (B, 1) of powers, (B, T) of several stations, (B, 1, 1) of other kinds.
+        Far from all data it is that of knowing nothing: about 1 of spectra, whose pixels are from 0
+        to 1. Its shape goes with theirs: (B, 1) of powers, (B, T) of several stations, (B, 1, 1)
+        of other kinds.
 
         >>> predictor.std(rx=[[2.0, 1.0, 1.5], [900.0, 1.0, 1.5]]).shape  # [dB]
         (2, 1)
@@ -261,7 +300,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
 
         def ask(asked: Predictor) -> Any:
             query, single, as_torch = asked.queries.query(tx, rx)
-            prediction = asked._in_unit(predict_with_threads(asked._whole, query), asked._answer_unit(unit))
+            prediction = asked._in_unit(
+                predict_with_threads(asked._whole, query), asked._answer_unit(unit)
+            )
             if prediction.variance is None:
                 raise ValueError(f"{self.method.name} states no deviations")
             spread = prediction.variance.sqrt().float()
@@ -289,7 +330,11 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         answer = next(one for one in answers if one is not None)
         # A station without an answer: NaN in the shape of the others', NumPy or torch alike.
         columns = [answer * np.nan if one is None else one for one in answers]
-        return torch.cat(columns, dim=-1) if isinstance(answer, Tensor) else np.concatenate(columns, axis=-1)
+        return (
+            torch.cat(columns, dim=-1)
+            if isinstance(answer, Tensor)
+            else np.concatenate(columns, axis=-1)
+        )
 
     def _each_station(self) -> list[Predictor | None]:
         """The same model asked about each station; None where that had too few training rows."""
@@ -303,21 +348,28 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
     def cycle_places(self, places: np.ndarray) -> Call:
         """Return a function for a clock, which asks about one of the places each time it is called.
 
-        Places are (n, 3), of both ends (n, 6) [m], local: less `site.origin`. Of several stations the first
-        that the model answers for is asked.
+        Places are (n, 3), of both ends (n, 6) [m], local: less `site.origin`. Of several stations
+        the first that the model answers for is asked.
         """
         predictor = next(filter(None, self._each_station()))
         ask = getattr(predictor, self.site.kind)
         return lambda number: ask(**self.site.world_ends(places[number % len(places)]))
 
     def spectrum(
-        self, tx: Any = None, rx: Any = None, *, frequency_hz: float | None = None, grad: bool = False
+        self,
+        tx: Any = None,
+        rx: Any = None,
+        *,
+        frequency_hz: float | None = None,
+        grad: bool = False,
     ) -> Any:
-        """Return amplitudes by direction at the receiver, (B, H, W) float32 in [0, 1], as they were measured.
+        """Return amplitudes by direction at the receiver, (B, H, W) float32 in [0, 1],
+        as they were measured.
 
         Their square is the power; 1 is the largest of all stored ones or
-        of its own image, as the file was scaled. Row i is an elevation of the receiver, column j an azimuth:
-        i x 90/H and j x 360/W degrees unless the file gives `grid_deg`. (H, W) of a single place.
+        of its own image, as the file was scaled. Row i is an elevation of the receiver, column j an
+        azimuth: i x 90/H and j x 360/W degrees unless the file gives `grid_deg`. (H, W)
+        of a single place.
 
         Args:
             tx, rx: positions [m, world]; `rx` may be a world `Pose`, of a receiver that is turned.
@@ -330,23 +382,31 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         ValueError: this model predicts rssi (dataset arrays), not spectrum: call .rssi(...)
 
         Raises:
-            ValueError: the model predicts something else, a position is missing or not finite, or `grad` as
-                in `predict`.
+            ValueError: the model predicts something else, a position is missing or not finite, or
+                `grad` as in `predict`.
         """
         predictor = self if frequency_hz is None else self.select_carrier(frequency_hz)
         return predictor._predict_mean("spectrum", tx, rx, grad)
 
     def csi(
-        self, tx: Any = None, rx: Any = None, *, uplink: Any = None, frequency_hz: Any = None,
-        symbols: int | None = None, grad: bool = False,
-    ) -> Any:  # fmt: skip
-        """Return the channel (B, antennas, subcarriers) complex64, in the physical units of the measurements.
+        self,
+        tx: Any = None,
+        rx: Any = None,
+        *,
+        uplink: Any = None,
+        frequency_hz: Any = None,
+        symbols: int | None = None,
+        grad: bool = False,
+    ) -> Any:
+        """Return the channel (B, antennas, subcarriers) complex64,
+        in the physical units of the measurements.
 
-        All three axes are there for one antenna or tone, too: of measured channels (B, K) take `[:, 0]`.
-        What was constant in all rows, as null tones are, is NaN.
+        All three axes are there for one antenna or tone, too: of measured channels (B, K) take
+        `[:, 0]`. What was constant in all rows, as null tones are, is NaN.
 
         >>> heard, tones = np.exp(1j * places[:, :1] * [1, 2]), [2.4e9, 2.41e9]  # (60, 2)
-        >>> near = gsparc.fit(rx=places, tx=[9.0, 9.0, 2.6], csi=heard, frequency_hz=tones, model="nearest")
+        >>> known = {"tx": [9.0, 9.0, 2.6], "csi": heard, "frequency_hz": tones}
+        >>> near = gsparc.fit(rx=places, **known, model="nearest")
         >>> near.csi(rx=places).shape, (near.csi(rx=places)[:, 0] - heard).shape
         ((60, 1, 2), (60, 2))
 
@@ -361,7 +421,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         if uplink is None and frequency_hz is None and symbols is None:
             return self.site.in_shape_of_file(self._predict_mean("csi", tx, rx, grad))
         if grad:
-            raise ValueError("grad=True: channels have gradients at positions and the measured tones alone")
+            raise ValueError(
+                "grad=True: channels have gradients at positions and the measured tones alone"
+            )
         from gsparc.prediction import channels
 
         if uplink is not None:
@@ -375,9 +437,11 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         return answer if any(isinstance(end, Tensor) for end in (tx, rx)) else answer.numpy()
 
     def paths(self, uplink: Any = None, *, tx: Any = None, rx: Any = None) -> Paths:
-        """Return gains, delays [s], directions: of what an uplink (B, U, L) holds or of a field at positions.
+        """Return gains, delays [s], directions: of what an uplink (B, U, L)
+        holds or of a field at positions.
 
-        See `gsparc.prediction.channels.Paths` for shapes: gains complex64 in the unit of the channels.
+        See `gsparc.prediction.channels.Paths` for shapes:
+        gains complex64 in the unit of the channels.
 
         Raises:
             ValueError: the model's channels are not made of paths.
@@ -391,8 +455,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
     def gaussians(self, tx: Any = None, rx: Any = None) -> GaussianCloud:
         """Return the N Gaussians that are rendered, with what they emit for these positions.
 
-        Means (N, 3) and standard deviations (N, 3) [m, world], quaternions, opacities (N,) in [0, 1] and
-        strengths (N,) in the unit that `label` says; see `gsparc.data.site_objects.GaussianCloud`.
+        Means (N, 3) and standard deviations (N, 3) [m, world], quaternions, opacities (N,) in [0,
+        1] and strengths (N,) in the unit that `label` says; see
+        `gsparc.data.site_objects.GaussianCloud`.
 
         Raises:
             ValueError: what answers is not rendered of Gaussians.
@@ -402,12 +467,15 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         cloud = self.method.gaussians(self.queries.query(tx, rx).query)
         return replace(cloud, means=cloud.means + self.site.origin)
 
-    def rssi(self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False) -> Any:
-        """Return powers (B, 1) float32 in the unit of the measurements (`Predictor.unit`), or in another.
+    def rssi(
+        self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False
+    ) -> Any:
+        """Return powers (B, 1) float32 in the unit of the measurements (`Predictor.unit`),
+        or in another.
 
-        Of several stations, if neither end says which, of all (B, T), as they were measured: columns in
-        the order of `Predictor.stations`, NaN of those that had too few training rows. A level is -inf where
-        no power is predicted.
+        Of several stations, if neither end says which, of all (B, T), as they were measured:
+        columns in the order of `Predictor.stations`, NaN of those that had too few training rows. A
+        level is -inf where no power is predicted.
 
         >>> gsparc.load("model.ckpt").rssi(rx=[2.0, 1.0, 1.5], unit="mW").shape
         (1,)
@@ -422,7 +490,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         """
         return self._ask_stations(lambda one: one._predict_mean("rssi", tx, rx, grad, unit), tx, rx)
 
-    def _predict_mean(self, kind: Kind, tx: Any, rx: Any, grad: bool = False, unit: str | None = None) -> Any:
+    def _predict_mean(
+        self, kind: Kind, tx: Any, rx: Any, grad: bool = False, unit: str | None = None
+    ) -> Any:
         if self.site.kind != kind:
             raise ValueError(
                 f"this model predicts {self.site.kind} (dataset {self.site.name}), not {kind}: "
@@ -437,10 +507,19 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         mean = self._in_unit(stored, wanted).mean.to(stored.mean.dtype)
         return match_input(mean, single, as_torch)
 
-    def _predict_grad(self, method: Method, tx: Any, rx: Any, wanted: PowerUnit) -> tuple[Prediction, bool]:
-        """Moments in a unit that autograd follows, and whether one position was given; see the class."""
-        moments, dtype, single = predict_with_gradients(method, self.queries, tx, rx, self._prepared)
-        result, is_own = self._in_unit(moments, wanted), (self.kind or self.trusted.kind) in (None, "learned")
+    def _predict_grad(
+        self, method: Method, tx: Any, rx: Any, wanted: PowerUnit
+    ) -> tuple[Prediction, bool]:
+        """Moments in a unit that autograd follows, and whether one position was given;
+        see the class.
+        """
+        moments, dtype, single = predict_with_gradients(
+            method, self.queries, tx, rx, self._prepared
+        )
+        result, is_own = (
+            self._in_unit(moments, wanted),
+            (self.kind or self.trusted.kind) in (None, "learned"),
+        )
         mean = result.mean.to(dtype.to_complex() if result.mean.is_complex() else dtype)
         unknown = None if result.unknown is None or not is_own else result.unknown.to(dtype)
         return Prediction(mean, result.variance, unknown), single
@@ -450,6 +529,10 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         stored = stored.of_devices(self.site, self._device)
         # In decibels a variance depends on the mean too.
         variance = None if stored.variance is None else unit.variance(stored.mean, stored.variance)
-        explained = None if stored.explained is None else unit.values(stored.explained).to(stored.mean.dtype)
+        explained = (
+            None
+            if stored.explained is None
+            else unit.values(stored.explained).to(stored.mean.dtype)
+        )
         mean = unit.values(stored.mean)  # in float64, as levels of -100 dB in float32 lose 1e-5 dB
         return Prediction(mean, variance, stored.unknown, explained)

@@ -21,7 +21,8 @@ from gsparc.ops.transforms import to_numpy
 if TYPE_CHECKING:
     from gsparc.data.georeference import Georeference
 
-COARSE_M = 0.01  # steps of float32 from 131 km from the world's origin on, as in UTM: phases are lost
+# Steps of float32 from 131 km from the world's origin on, as in UTM: phases are lost
+COARSE_M = 0.01
 
 
 class PlacedQuery(NamedTuple):
@@ -44,18 +45,24 @@ class Queries:
         self.station = station
         self.site, still = site, site.static_position if site.static_end == "rx" else None
         # The pose of a receiver that never moved, made once.
-        self._still = None if still is None else Pose(_float(still), _float(self._rx_rotation(None, 1)))
+        self._still = (
+            None if still is None else Pose(_float(still), _float(self._rx_rotation(None, 1)))
+        )
 
     def query(self, tx: Any, rx: Any, dtype: torch.dtype = torch.float32) -> PlacedQuery:
         """Check both ends as they were given, and return what is asked."""
         receiver = rx.position if isinstance(rx, Pose) else rx
         places = {
-            end: read_places(end, value) for end, value in (("tx", tx), ("rx", receiver)) if value is not None
+            end: read_places(end, value)
+            for end, value in (("tx", tx), ("rx", receiver))
+            if value is not None
         }
         moving, static = self.site.moving_end, self.site.still_end
         for needed in sorted(self.site.moving_ends):  # the receiver first
             if needed not in places:
-                raise ValueError(f"{needed}= is needed: it moved when {self.site.name} was measured")
+                raise ValueError(
+                    f"{needed}= is needed: it moved when {self.site.name} was measured"
+                )
         single = all(place.ndim == 1 for place in places.values())
         common = self._still is not None and len(places) == 1 and dtype == torch.float32
         if self._still is not None and common:  # with nothing to look up
@@ -84,19 +91,25 @@ class Queries:
         return None if self.station is None else torch.full((count,), self.station)
 
     def _static_place(self, place: np.ndarray | None) -> np.ndarray:
-        """Local position (3,) or (B, 3) of the static end; a known one must be where it was measured."""
+        """Local position (3,) or (B, 3) of the static end;
+        a known one must be where it was measured.
+        """
         position, end = self.site.static_position, self.site.static_end
         if position is None:
             if place is not None:
                 return place[0] if len(place) == 1 else place
             if self.site.stations is not None:
-                raise ValueError(f"use select_station(name): one of {', '.join(self.site.stations.shown)}")
+                raise ValueError(
+                    f"use select_station(name): one of {', '.join(self.site.stations.shown)}"
+                )
             if self.site.kind in ("rssi", "csi"):  # learned without its transmitter's place
                 return np.full(3, np.nan)
             raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
         if place is not None and (np.linalg.norm(place - position, axis=-1) > SAME_PLACE_M).any():
             stood = np.array2string(position + self.site.origin, precision=3, separator=", ")
-            raise ValueError(f"{end}= differs from where it stood when measured, {stood} m: leave it out")
+            raise ValueError(
+                f"{end}= differs from where it stood when measured, {stood} m: leave it out"
+            )
         return position
 
     def _rx_rotation(self, rx: Any, count: int) -> np.ndarray:
@@ -121,7 +134,8 @@ def usual_heights(site: Site) -> dict[End, float]:
 
 
 def read_places(end: str, value: Any) -> np.ndarray:
-    """Read (3,) or (B, 3) [m] as float64 until the origin is subtracted, or far sites lose millimetres.
+    """Read (3,) or (B, 3) [m] as float64 until the origin is subtracted,
+    or far sites lose millimetres.
 
     >>> read_places("rx", [[0.0, 1.0, 2.0]]).shape
     (1, 3)
@@ -132,19 +146,29 @@ def read_places(end: str, value: Any) -> np.ndarray:
     """
     try:
         array = to_numpy(value) if isinstance(value, Tensor) else np.asarray(value)
-        array = array.astype(np.float64, casting="same_kind" if array.dtype.kind == "c" else "unsafe")
+        array = array.astype(
+            np.float64, casting="same_kind" if array.dtype.kind == "c" else "unsafe"
+        )
     except (TypeError, ValueError):
         raise ValueError(f"{end}= must be real numbers [m], got {type(value).__name__}") from None
     if array.ndim not in (1, 2) or array.shape[-1] != 3 or not array.size:
         raise ValueError(f"{end}= must be (3,) or (B, 3) [m], got shape {array.shape}")
     if not np.isfinite(array).all():
-        row = "" if array.ndim == 1 else f" in row {int(np.flatnonzero(~np.isfinite(array).all(1))[0])}"
+        row = (
+            ""
+            if array.ndim == 1
+            else f" in row {int(np.flatnonzero(~np.isfinite(array).all(1))[0])}"
+        )
         raise ValueError(f"{end}= holds NaN or Inf{row}")
     if np.abs(array).max() > FARTHEST:
-        raise ValueError(f"{end}= holds {np.abs(array).max():.3g}; expected metres, none beyond {FARTHEST:g}")
+        raise ValueError(
+            f"{end}= holds {np.abs(array).max():.3g}; expected metres, none beyond {FARTHEST:g}"
+        )
     step = float(np.spacing(np.float32(np.abs(array).max())))
     if getattr(value, "dtype", None) in (np.float32, torch.float32) and step > COARSE_M:
-        raise ValueError(f"{end}= is float32, which moves in steps of {step:.2g} m there; give float64")
+        raise ValueError(
+            f"{end}= is float32, which moves in steps of {step:.2g} m there; give float64"
+        )
     return array
 
 
@@ -173,14 +197,16 @@ class DegreesMixin:
             height: () or (B,) [m]; None for the one height at which the moving end was measured.
 
         Raises:
-            ValueError: measured in metres about an unknown origin, degrees that are not on Earth, or no
-                height where the moving end had several.
+            ValueError: measured in metres about an unknown origin, degrees that are not on Earth,
+                or no height where the moving end had several.
         """
         origin = self._georeference()
         if height is None:
             height = usual_heights(self.site).get(self.site.moving_end)
         if height is None:
-            raise ValueError(f"height= is needed: the {self.site.moving_end} had several, or none is known")
+            raise ValueError(
+                f"height= is needed: the {self.site.moving_end} had several, or none is known"
+            )
         single = np.ndim(latitude) == 0 and np.ndim(longitude) == 0 and np.ndim(height) == 0
         across = origin.from_degrees(latitude, longitude)
         try:
@@ -191,7 +217,8 @@ class DegreesMixin:
         return places[0] if single else places
 
     def degrees(self, position: Any) -> tuple[Any, Any, Any]:
-        """Return latitude and longitude (B,) [deg] and height (B,) [m] of world positions (B, 3) or (3,) [m].
+        """Return latitude and longitude (B,) [deg] and height (B,) [m] of world positions (B, 3)
+        or (3,) [m].
 
         >>> latitude, longitude, height = gsparc.load("city.ckpt").degrees([0.0, 0.0, 1.5])
         >>> height
@@ -216,18 +243,26 @@ class DegreesMixin:
 
 
 def _float(array: np.ndarray, dtype: torch.dtype = torch.float32) -> Tensor:
-    return torch.from_numpy(np.array(array, dtype=np.float32 if dtype == torch.float32 else np.float64))
+    return torch.from_numpy(
+        np.array(array, dtype=np.float32 if dtype == torch.float32 else np.float64)
+    )
 
 
 def query_ends(
-    site: Site, places: np.ndarray, other_end: Sequence[float] | None, station: np.ndarray | None = None
+    site: Site,
+    places: np.ndarray,
+    other_end: Sequence[float] | None,
+    station: np.ndarray | None = None,
 ) -> dict[End, np.ndarray]:
-    """Return world places [m] of the ends that a predictor needs, the moving one at `places` (n, 3).
+    """Return world places [m] of the ends that a predictor needs,
+    the moving one at `places` (n, 3).
 
-    `other_end` (3,) is the transmitter's place where both moved, `station` (3,) that of one never heard.
+    `other_end` (3,) is the transmitter's place where both moved, `station` (3,)
+    that of one never heard.
 
     Raises:
-        DataError: both ends moved and nobody says where the other is, or it stood still and somebody does.
+        DataError: both ends moved and nobody says where the other is, or it stood still and
+            somebody does.
     """
     moving, other = site.moving_end, site.still_end
     if not site.paired:
@@ -235,20 +270,30 @@ def query_ends(
             raise DataError(f"other_end: the {other} stood still; leave it out")
         return {moving: places} | ({} if station is None else {other: station})
     if other_end is None:
-        raise DataError("other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]")
-    return {moving: places, other: np.broadcast_to(read_place("other_end", other_end), places.shape)}
+        raise DataError(
+            "other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]"
+        )
+    return {
+        moving: places,
+        other: np.broadcast_to(read_place("other_end", other_end), places.shape),
+    }
 
 
 def read_place(name: str, value: Any, axes: int = 3) -> np.ndarray:
-    """Return (3,) [m] of the setting `name`, with 2 `axes` also (2,); `DataError` where it is no place."""
+    """Return (3,) [m] of the setting `name`, with 2 `axes` also (2,);
+    `DataError` where it is no place.
+    """
     place = finite_array(value)
     if place.shape not in ((axes,), (3,)):
-        raise DataError(f"{name}={value}: {('two', 'three')[axes - 2]} finite numbers [m] are needed")
+        raise DataError(
+            f"{name}={value}: {('two', 'three')[axes - 2]} finite numbers [m] are needed"
+        )
     return place
 
 
 def to_local(site: Site, places: np.ndarray, other_end: Sequence[float] | None) -> np.ndarray:
-    """Return world places (n, 3) of the moving end as local ones, (n, 6) of both ends where both moved [m].
+    """Return world places (n, 3) of the moving end as local ones, (n, 6)
+    of both ends where both moved [m].
 
     Raises:
         DataError: both moved, and nobody says where the other end stands.

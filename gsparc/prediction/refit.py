@@ -47,7 +47,9 @@ class Learned:
 
     def refit(self, fold: Fold, context: FitContext) -> Method:
         """Return the method fitted anew on a fold."""
-        return fitting.fit_or_resume(wrap_per_station(self.factory, self.data), self.data, fold, context)[0]
+        return fitting.fit_or_resume(
+            wrap_per_station(self.factory, self.data), self.data, fold, context
+        )[0]
 
     def unlearn(self, fold: Fold, split: SplitSettings | None = None) -> Method:
         """Return a method that knows nothing of the test rows of a fold, which was cut by `split`.
@@ -56,7 +58,9 @@ class Learned:
         """
         if isinstance(self.method, Reconditions):
             rows = np.sort(fold.learned())
-            less = self.method.copy_conditioned(without_devices(self.data, self.method.fitted_site), rows)
+            less = self.method.copy_conditioned(
+                without_devices(self.data, self.method.fitted_site), rows
+            )
             if less is not None:
                 return less
         # Nobody goes on from this fit: its checkpoints and curves go with the folder.

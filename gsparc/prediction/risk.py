@@ -1,8 +1,10 @@
-"""A threshold with a promise: at most a share alpha of accepted positions is bad, with confidence 1 - delta.
+"""A threshold with a promise: at most a share alpha of accepted positions is bad,
+with confidence 1 - delta.
 
-Given who is accepted the bad ones are binomial (`gsparc.processes.uncertainty.choose_threshold`), so the
-promise is about the error *among accepted positions*; plain split conformal promises a share of all positions
-instead. Whether promises hold is told by `run_trials`: thresholds of many draws, tried on other rows.
+Given who is accepted the bad ones are binomial (`gsparc.processes.uncertainty.choose_threshold`),
+so the promise is about the error *among accepted positions*; plain split conformal promises a share
+of all positions instead. Whether promises hold is told by `run_trials`: thresholds of many draws,
+tried on other rows.
 """
 
 from __future__ import annotations
@@ -29,14 +31,17 @@ from gsparc.processes.uncertainty import (
     threshold_levels,
 )
 
-SHARES = (0.2, 0.4)  # of the positions that choose kind and levels, and that calibrate where the rest tests
+# Of the positions that choose kind and levels, and that calibrate where the rest tests
+SHARES = (0.2, 0.4)
 MOST_CALIBRATED = 10_000  # positions that a message may ask for
 MOST_LAX_DB = 6  # limit of an error that a hint may name: twice as large as what is predicted
 CELLS = 6  # along each horizontal side; whole cells are calibrated on or tested
 
 
 def bounded_loss(relative_error: np.ndarray) -> np.ndarray:
-    """Return losses (n,) in [0, 1]: |e|^2 / |h|^2, where 1 (no better than silence) is as bad as it gets."""
+    """Return losses (n,) in [0, 1]: |e|^2 / |h|^2, where 1 (no better than silence)
+    is as bad as it gets.
+    """
     return np.minimum(relative_error, 1.0)
 
 
@@ -47,7 +52,8 @@ class Trial:
     Attributes:
         kind: confidence used.
         how: positions were divided, `random` or `spatial`.
-        realised: (draws,) share of bad ones among accepted test positions; NaN where none was accepted.
+        realised: (draws,) share of bad ones among accepted test positions; NaN where none was
+            accepted.
         coverage: (draws,) share of test positions accepted.
         alpha: largest share of bad ones that was guaranteed.
     """
@@ -61,25 +67,34 @@ class Trial:
     def summarise(self) -> dict[str, Any]:
         """Return figures over the draws; None of those that nothing was accepted in.
 
-        `broken` is the share of draws with more than alpha bad ones, of the draws that accepted anybody, with
-        Clopper and Pearson's 95 % interval as if they were independent (they share their positions: it is the
-        least that chance allows for). Delta bounds the share of *all* draws, `broken_of_all`: where most
-        accept nobody, those that do are the ones that chance flattered. `silent` is the share that did not.
+        `broken` is the share of draws with more than alpha bad ones, of the draws that accepted
+        anybody, with Clopper and Pearson's 95 % interval as if they were independent (they share
+        their positions: it is the least that chance allows for). Delta bounds the share of *all*
+        draws, `broken_of_all`: where most accept nobody, those that do are the ones that chance
+        flattered. `silent` is the share that did not.
         """
         accepting = self.realised[~np.isnan(self.realised)]
         bad = accepting > self.alpha
-        low, high = binomial_interval(int(bad.sum()), len(accepting)) if len(accepting) else (None, None)
+        low, high = (
+            binomial_interval(int(bad.sum()), len(accepting)) if len(accepting) else (None, None)
+        )
         return {
-            "kind": self.kind, "broken": float(bad.mean()) if len(accepting) else None, "broken_low": low,
-            "broken_high": high, "broken_of_all": float(bad.sum() / len(self.realised)),
+            "kind": self.kind,
+            "broken": float(bad.mean()) if len(accepting) else None,
+            "broken_low": low,
+            "broken_high": high,
+            "broken_of_all": float(bad.sum() / len(self.realised)),
             "silent": float(np.isnan(self.realised).mean()),
             "realised": float(accepting.mean()) if len(accepting) else None,
-            "coverage": float(self.coverage.mean()), "draws": len(self.realised),
-        }  # fmt: skip
+            "coverage": float(self.coverage.mean()),
+            "draws": len(self.realised),
+        }
 
 
 class CalibratedThreshold(NamedTuple):
-    """Kind of confidence, its threshold, rows that neither saw, and rows that the kind is chosen on."""
+    """Kind of confidence, its threshold, rows that neither saw,
+    and rows that the kind is chosen on.
+    """
 
     kind: str
     threshold: Threshold
@@ -92,8 +107,8 @@ def split_choose_calibrate_test(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return disjoint rows of the evidence: to choose on, to calibrate on, to test on.
 
-    A `spatial` division deals out whole cells of the plane, so that a test position has no calibrated
-    neighbour but across a cell's border.
+    A `spatial` division deals out whole cells of the plane, so that a test position has no
+    calibrated neighbour but across a cell's border.
 
     Raises:
         ValueError: too few positions, or patches, for three parts.
@@ -104,7 +119,8 @@ def split_choose_calibrate_test(
     if not 0 < first < second < len(order):
         what = "patches of the plane" if spatial else "positions"
         raise ValueError(
-            f"{len(order)} {what} cannot be parted into those to choose on, to calibrate on and to test on: "
+            f"{len(order)} {what} cannot be parted into those to choose on, to calibrate on and "
+            "to test on: "
             f"take more test rows{', or spatial=false' * spatial}"
         )
     parts = order[:first], order[first:second], order[second:]
@@ -112,29 +128,38 @@ def split_choose_calibrate_test(
     return choose_on, calibrate, test
 
 
-def explain_too_few(count: int, guarantee: Guarantee, bad: float = 0.0, effect: float = 1.0) -> str | None:
-    """Say how many test positions a promise needs of which a share `bad` is bad; None: not more than `count`.
+def explain_too_few(
+    count: int, guarantee: Guarantee, bad: float = 0.0, effect: float = 1.0
+) -> str | None:
+    """Say how many test positions a promise needs of which a share `bad` is bad; None:
+    not more than `count`.
 
     `effect` is their `design_effect`.
 
     >>> explain_too_few(32, Guarantee(alpha=0.2))  # enough
-    >>> explain_too_few(32, Guarantee(alpha=0.2), bad=0.1).split(";")[0]
-    '32 test positions are too few: alpha=0.2, delta=0.1 with 10% bad need 35 calibrated on, 44 in all'
+    >>> explain_too_few(32, Guarantee(alpha=0.2), bad=0.1).split(";")[0].partition(": ")[2]
+    'alpha=0.2, delta=0.1 with 10% bad need 35 calibrated on, 44 in all'
     """
     # A share of alpha or more passes with no number: what none bad would need is the least.
     bad = bad if bad < guarantee.alpha else 0.0
     least = np.arange(least_accepted(guarantee.alpha, guarantee.delta), MOST_CALIBRATED)
-    passed = least[binomial_tail(bad * least / effect, least / effect, guarantee.alpha) <= guarantee.delta]
+    passed = least[
+        binomial_tail(bad * least / effect, least / effect, guarantee.alpha) <= guarantee.delta
+    ]
     if not len(passed) or count >= (needed := int(np.ceil(passed[0] / (1 - SHARES[0])))):
         return None
     alike = "" if effect == 1 else f", as neighbours err alike ({effect:.1f} are as one)"
     return (
-        f"{count} test positions are too few: alpha={guarantee.alpha:g}, delta={guarantee.delta:g} with "
-        f"{bad:.0%} bad need {passed[0]} calibrated on{alike}, {needed} in all; measure more, or promise less"
+        f"{count} test positions are too few: alpha={guarantee.alpha:g}, "
+        f"delta={guarantee.delta:g} with "
+        f"{bad:.0%} bad need {passed[0]} calibrated on{alike}, {needed} in all; measure more, or "
+        "promise less"
     )
 
 
-def explain_none(evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int) -> str:
+def explain_none(
+    evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int
+) -> str:
     """Say why no threshold was found, and the least larger limit [whole dB] that is kept by one.
 
     See `calibrate_threshold`.
@@ -148,20 +173,25 @@ def explain_none(evidence: Evidence, guarantee: Guarantee, kind: str, spatial: b
     hint = f"no limit_db= up to {MOST_LAX_DB} is"
     for limit in range(int(np.floor(guarantee.limit_db)) + 1, MOST_LAX_DB + 1):
         other = replace(guarantee, limit_db=float(limit))
-        if calibrate_threshold(evidence, other, kind, spatial, seed, tested=False).threshold.accepted:
+        if calibrate_threshold(
+            evidence, other, kind, spatial, seed, tested=False
+        ).threshold.accepted:
             hint = f"limit_db={limit} would be"
             break
     reason = "no confidence separates the others surely enough"
     if bad < guarantee.alpha:
         reason = f"too few rows to show that at most alpha={guarantee.alpha:g} are"
     return (
-        f"{bad:.0%} of {len(evidence)} test positions are worse than {guarantee.limit_db:g} dB, and "
+        f"{bad:.0%} of {len(evidence)} test positions are worse than {guarantee.limit_db:g} dB, "
+        "and "
         f"{reason}; {hint} kept, more training rows may help"
     )
 
 
 def number_patches(position: np.ndarray) -> np.ndarray:
-    """Number the patch of the plane that each position (n, 3) lies in, (n,); on a plumb line, of it."""
+    """Number the patch of the plane that each position (n, 3) lies in, (n,); on a plumb line,
+    of it.
+    """
     flat = position[:, :2] if np.ptp(position[:, :2], axis=0).any() else position[:, [2, 2]]
     low, extent = flat.min(axis=0), np.ptp(flat, axis=0)
     # The largest coordinate of all would lie in a cell beyond the last.
@@ -170,7 +200,9 @@ def number_patches(position: np.ndarray) -> np.ndarray:
 
 
 def areas_of_kinds(evidence: Evidence, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """Return what each of `rows` (n,) adds to the area under risk-coverage, (n,) by kind of confidence."""
+    """Return what each of `rows` (n,) adds to the area under risk-coverage, (n,)
+    by kind of confidence.
+    """
     # Bounded, so that a few fades do not decide which kind is the best.
     loss = bounded_loss(evidence.error[rows])
     return {kind: area_contributions(score[rows], loss) for kind, score in evidence.scores.items()}
@@ -179,8 +211,8 @@ def areas_of_kinds(evidence: Evidence, rows: np.ndarray) -> dict[str, np.ndarray
 def best_kind(areas: dict[str, np.ndarray]) -> str:
     """Return the confidence of the smallest area under risk-coverage.
 
-    The first, mostly the model's own, stays where another gains no more than the paired standard error (the
-    one-standard-error rule of Breiman, Friedman, Olshen and Stone 1984).
+    The first, mostly the model's own, stays where another gains no more than the paired standard
+    error (the one-standard-error rule of Breiman, Friedman, Olshen and Stone 1984).
     """
     default, best = next(iter(areas)), min(areas, key=lambda kind: areas[kind].mean())
     # Both are of the same rows: their difference scatters less than either.
@@ -192,13 +224,19 @@ def explain_kind(evidence: Evidence, rows: np.ndarray) -> str:
     areas = areas_of_kinds(evidence, rows)
     listed = ", ".join(f"{kind} {area.mean():.3g}" for kind, area in areas.items())
     rule = f"{next(iter(areas))} stays unless one is smaller by more than chance"
-    return f"chosen by the mean error of the surest 1, 2, ... of {len(rows)} rows: {listed} ({rule})"
+    return (
+        f"chosen by the mean error of the surest 1, 2, ... of {len(rows)} rows: {listed} ({rule})"
+    )
 
 
 def calibrate_threshold(
-    evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int | list[int],
+    evidence: Evidence,
+    guarantee: Guarantee,
+    kind: str,
+    spatial: bool,
+    seed: int | list[int],
     tested: bool = True,
-) -> CalibratedThreshold:  # fmt: skip
+) -> CalibratedThreshold:
     """Choose a confidence and its threshold.
 
     Unless `tested`, the unseen positions calibrate, too: a threshold that nobody tries needs none.
@@ -223,7 +261,12 @@ def calibrate_threshold(
 
 
 def run_trials(
-    evidence: Evidence, guarantee: Guarantee, spatial: bool, draws: int, kind: str = "auto", seed: int = 0
+    evidence: Evidence,
+    guarantee: Guarantee,
+    spatial: bool,
+    draws: int,
+    kind: str = "auto",
+    seed: int = 0,
 ) -> Trial:
     """Resample `draws` calibration sets.
 
@@ -238,7 +281,9 @@ def run_trials(
     realised, coverage, kinds = [], [], []
     bad = guarantee.is_bad(evidence.error)
     for draw in range(draws):
-        used, threshold, test, _ = calibrate_threshold(evidence, guarantee, kind, spatial, [seed, draw])
+        used, threshold, test, _ = calibrate_threshold(
+            evidence, guarantee, kind, spatial, [seed, draw]
+        )
         accepted = test[evidence.scores[used][test] >= threshold.value]
         kinds.append(used)
         realised.append(bad[accepted].mean() if len(accepted) else np.nan)
@@ -247,7 +292,9 @@ def run_trials(
     return Trial(most, how, np.array(realised), np.array(coverage), guarantee.alpha)
 
 
-def calibration_facts(evidence: Evidence, trials: Sequence[Trial], guarantee: Guarantee) -> dict[str, Any]:
+def calibration_facts(
+    evidence: Evidence, trials: Sequence[Trial], guarantee: Guarantee
+) -> dict[str, Any]:
     """Return flat figures: `confidence/<kind>/*`, `promise/*`, `trial/<how>/*`."""
     loss = bounded_loss(evidence.error)
     perfect = risk_coverage(-loss, loss).mean()
@@ -257,10 +304,11 @@ def calibration_facts(evidence: Evidence, trials: Sequence[Trial], guarantee: Gu
     for kind, risk in risks.items():
         area = float(risk.mean())
         figures = {
-            "area": area, "risk_at_70": float(risk[max(round(0.7 * len(risk)), 1) - 1]),
+            "area": area,
+            "risk_at_70": float(risk[max(round(0.7 * len(risk)), 1) - 1]),
             "rank_correlation": rank_correlation(evidence.scores[kind], -loss),
             "area_below_distance": 1 - area / bar if bar > 0 else None,  # nothing to save
-        }  # fmt: skip
+        }
         facts |= {f"confidence/{kind}/{name}": value for name, value in figures.items()}
     facts |= {f"promise/{name}": value for name, value in vars(guarantee).items()}
     for trial in trials:

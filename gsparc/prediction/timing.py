@@ -23,7 +23,8 @@ Call = Callable[[int], object]
 
 QUERIES = 64  # different ones, by turns
 COPY = "copy"
-SPEED = ("query_ms", "query_p95_ms", "to_copy", "rounds")  # to_copy: in units of a copy of the same rounds
+# to_copy: in units of a copy of the same rounds
+SPEED = ("query_ms", "query_p95_ms", "to_copy", "rounds")
 # Their names in summaries and in `tradeoff.csv`.
 FACTS = {"query_ms": "render_ms_p50", "query_p95_ms": "render_ms_p95", "to_copy": "ratio_to_copy"}
 COPY_BYTES = 16 * 2**20  # beyond most second-level caches, below a second everywhere
@@ -39,7 +40,8 @@ class ClockSettings(Checked):
         warmup: calls of each contender before the clock starts.
         rounds_s: no new round starts after this many seconds [s].
         calls: timed calls of a visit.
-        untimed: calls at the start of each visit, which bring the contender's data back into the caches.
+        untimed: calls at the start of each visit, which bring the contender's data back into the
+            caches.
     """
 
     rounds: int = setting(60, whole(1))
@@ -55,18 +57,21 @@ BLOCKS = ClockSettings(rounds=40, warmup=0, rounds_s=60.0, calls=4, untimed=1)
 
 
 def time_interleaved(
-    contenders: Mapping[Key, Call], settings: ClockSettings | None = None,
+    contenders: Mapping[Key, Call],
+    settings: ClockSettings | None = None,
     threads: Mapping[Key, int] | None = None,
-) -> dict[Key, np.ndarray]:  # fmt: skip
+) -> dict[Key, np.ndarray]:
     """Measure wall times (rounds * calls,) [ms] of each contender.
 
-    Rounds alternate so that a competing process hits all of them alike; each timed call is given another
-    number (to take another query each time) and the device is synchronised before the clock is read.
+    Rounds alternate so that a competing process hits all of them alike; each timed call is given
+    another number (to take another query each time)
+    and the device is synchronised before the clock is read.
 
     Args:
         contenders: what to call.
         settings: how long to measure.
-        threads: CPU threads of each, in whose order a round visits them; None leaves them as they are.
+        threads: CPU threads of each, in whose order a round visits them; None leaves them as they
+            are.
     """
     settings = settings or ClockSettings()
     before = torch.get_num_threads()
@@ -113,8 +118,11 @@ def query_calls(
 
     There are at most `QUERIES` sets, without targets.
     """
-    where = replace(data, target=np.zeros((len(data), 1), np.uint8), mask=None)  # positions need no images
-    picks = [np.take(rows, np.arange(i, i + size), mode="wrap") for i in range(min(len(rows), QUERIES))]
+    # Positions need no images
+    where = replace(data, target=np.zeros((len(data), 1), np.uint8), mask=None)
+    picks = [
+        np.take(rows, np.arange(i, i + size), mode="wrap") for i in range(min(len(rows), QUERIES))
+    ]
     queries = [where.batch(pick) for pick in picks]
 
     def call(method: Method) -> Call:
@@ -133,19 +141,28 @@ def p50_p95(times: np.ndarray) -> tuple[float, float]:
 
 
 def time_beside_copy(
-    calls: Mapping[Key, Call], clock: ClockSettings | None = None, threads: Mapping[Key, int] | None = None
+    calls: Mapping[Key, Call],
+    clock: ClockSettings | None = None,
+    threads: Mapping[Key, int] | None = None,
 ) -> dict[Key, dict[str, float]]:
-    """Return `SPEED` of calls by name, timed in turns with one another and a copy; see `time_interleaved`."""
+    """Return `SPEED` of calls by name, timed in turns with one another and a copy;
+    see `time_interleaved`.
+    """
     every: dict[Any, Call] = {COPY: reference_copy(), **calls}
     # A copy of memory is made by one thread.
     times = time_interleaved(every, clock, None if threads is None else {COPY: 1} | dict(threads))
     copy_ms = float(np.median(times.pop(COPY)))
     rows = ((name, *p50_p95(ms), len(ms)) for name, ms in times.items())
-    return {name: dict(zip(SPEED, (p50, p95, p50 / copy_ms, n), strict=True)) for name, p50, p95, n in rows}
+    return {
+        name: dict(zip(SPEED, (p50, p95, p50 / copy_ms, n), strict=True))
+        for name, p50, p95, n in rows
+    }
 
 
 def reference_copy() -> Call:
-    """Return a fixed piece of work, a 16 MiB copy, against which times of different machines can be read."""
+    """Return a fixed piece of work, a 16 MiB copy,
+    against which times of different machines can be read.
+    """
     source = torch.ones(COPY_BYTES // 4)
     target = torch.empty_like(source)
     return lambda turn: target.copy_(source)
@@ -164,7 +181,9 @@ def machine_facts() -> dict[str, float | int | str | None]:
 
 
 def peak_memory() -> dict[str, float]:
-    """Return `memory/peak_mb`, the largest resident set so far [MB]; `memory/gpu_peak_mb` with CUDA."""
+    """Return `memory/peak_mb`, the largest resident set so far [MB];
+    `memory/gpu_peak_mb` with CUDA.
+    """
     # Linux says it in KiB.
     facts = {"memory/peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6}
     if torch.cuda.is_available() and torch.cuda.is_initialized():

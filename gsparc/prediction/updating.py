@@ -33,7 +33,12 @@ from gsparc.models.updated import (
 )
 from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.drift import ROWS, Alarm, Watch
-from gsparc.prediction.later_rows import LevelRows, check_updatable, read_level_arrays, read_level_rows
+from gsparc.prediction.later_rows import (
+    LevelRows,
+    check_updatable,
+    read_level_arrays,
+    read_level_rows,
+)
 from gsparc.prediction.query import Queries
 from gsparc.processes.changes import Belief, LaterRows, learn, refit_scale
 from gsparc.processes.stored import Stored, from_plain, to_plain
@@ -43,7 +48,12 @@ WINDOW = 1_000  # later rows of a station that are kept
 FADE_DB = 1.0  # deviation that a hundred later rows of a station add to one of it that came before
 JOURNAL = 1_000  # lines that a version keeps
 VERSIONS = 11  # that are kept, the one that answers among them
-LIMITS = {"window": whole(1), "fade_db": limit_number(0), "false_alarm": POSITIVE, "refit": switch()}
+LIMITS = {
+    "window": whole(1),
+    "fade_db": limit_number(0),
+    "false_alarm": POSITIVE,
+    "refit": switch(),
+}
 LOUD = 2.0  # deviations that a map must be above a level for silence to contradict it
 
 
@@ -76,7 +86,8 @@ class Found:
         rows: (n,) numbers of the new rows, for `forget`.
         deviations: (n,) what each missed of map and earlier rows, over its standard deviation.
         alarms: changes that were noticed with these rows.
-        skipped: rows that tell nothing: silence where little was expected, or of a station without a map.
+        skipped: rows that tell nothing: silence where little was expected, or of a station without
+            a map.
     """
 
     rows: np.ndarray
@@ -104,10 +115,20 @@ class UpdateMixin:
         """See `Predictor`."""
 
     def update(
-        self, rows: Measurements | LevelRows | None = None, *, tx: Any = None, rx: Any = None,
-        rssi: Any = None, unit: str | None = None, window: int = WINDOW, fade_db: float = FADE_DB,
-        false_alarm: float = ROWS, refit: bool = False, key: str | None = None, **others: Any,
-    ) -> Found:  # fmt: skip
+        self,
+        rows: Measurements | LevelRows | None = None,
+        *,
+        tx: Any = None,
+        rx: Any = None,
+        rssi: Any = None,
+        unit: str | None = None,
+        window: int = WINDOW,
+        fade_db: float = FADE_DB,
+        false_alarm: float = ROWS,
+        refit: bool = False,
+        key: str | None = None,
+        **others: Any,
+    ) -> Found:
         """Condition on rows that came later, and tell what changed.
 
         The map that was fitted stays as it is; rows say what to add to it. See `docs/changes.md`.
@@ -121,12 +142,15 @@ class UpdateMixin:
         True
 
         Args:
-            rows: measurements in the model's coordinates (`align_to_site`); None: the arrays that follow.
+            rows: measurements in the model's coordinates (`align_to_site`); None: the arrays that
+                follow.
             tx, rx: (n, 3) places of the end that moves, world [m].
-            rssi: (n,) or (n, T) powers; NaN is not measured, minus infinity (a power of 0) tells nothing.
+            rssi: (n,) or (n, T) powers; NaN is not measured, minus infinity (a power of 0) tells
+                nothing.
             unit: of `rssi`; None: that of the measurements.
             window: later rows of a station that are kept, at least 1; the first ones are dropped.
-            fade_db: deviation that a hundred later rows of a station add to one that came before [dB].
+            fade_db: deviation that a hundred later rows of a station add to one that came before
+                [dB].
             false_alarm: readings to a false alarm without any change, at least, in the mean.
             refit: fit the length over which changes vary to the rows kept, too; tenths of a second.
             key: a name of these rows, which are taken once; None: as often as they are told.
@@ -148,23 +172,36 @@ class UpdateMixin:
             places = tx if self.site.moving_end == "tx" else rx
             rows, silent = read_level_arrays(self.site, places, rssi, self._answer_unit(unit))
         rows = read_level_rows(rows, self.site) if isinstance(rows, Measurements) else rows
-        changes, belief, stations = version.changes, version.changes.belief, version.changes.stations
+        changes, belief, stations = (
+            version.changes,
+            version.changes.belief,
+            version.changes.stations,
+        )
         extent = belief.extent
         new = self._read_rows(rows, changes)
         for name, later in new.items():
             before = stations.get(name, later[:0])
             stations[name] = before.fade(later, extent, fade_db).join(later)[-window:]
         # The test believes what earlier rows said of a station's noise.
-        noisy = {name: replace(one, noise=one.noise + belief.of(name)[1]) for name, one in stations.items()}
+        noisy = {
+            name: replace(one, noise=one.noise + belief.of(name)[1])
+            for name, one in stations.items()
+        }
         watch, deviations = version.watch.look(noisy, first, extent, false_alarm)
         numbers = np.arange(first, first + sum(map(len, new.values())))
-        alarms, skipped = watch.alarms[len(version.watch.alarms) :], silent + len(rows) - len(numbers)
+        alarms, skipped = (
+            watch.alarms[len(version.watch.alarms) :],
+            silent + len(rows) - len(numbers),
+        )
         entry = f"update: {len(numbers)} rows, {skipped} skipped, {len(alarms)} alarms"
         if refit:
             belief = replace(belief, scale=refit_scale(stations, belief))
             entry += f", lengths of changes at {belief.scale:.2g} of the usual"
         changes = replace(
-            changes, belief=belief, next_number=first + len(numbers), next_batch=changes.next_batch + 1
+            changes,
+            belief=belief,
+            next_number=first + len(numbers),
+            next_batch=changes.next_batch + 1,
         )
         self._add_version(stations, entry, changes, watch, key)
         return Found(numbers, deviations, self._in_world(alarms), skipped)
@@ -179,7 +216,9 @@ class UpdateMixin:
         if gone.size and gone.dtype.kind not in "iu":
             raise ValueError(f"forget: rows={rows!r}: whole numbers are needed; see `measured`")
         if len(unknown := np.setdiff1d(gone, self.rows)):
-            raise ValueError(f"forget: no later row that is kept has number {unknown[0]}; see `measured`")
+            raise ValueError(
+                f"forget: no later row that is kept has number {unknown[0]}; see `measured`"
+            )
         remainder = {
             n: one[~torch.isin(one.number, torch.as_tensor(gone, dtype=torch.int64))]
             for n, one in stations.items()
@@ -195,14 +234,18 @@ class UpdateMixin:
         known = self._model_site.every_station
         number = self._own_station if station is None else find_station(station, known)
         if station is not None and number is None:
-            raise ValueError(f"shift: no station {station!r}; there are {', '.join(self.stations) or 'none'}")
+            raise ValueError(
+                f"shift: no station {station!r}; there are {', '.join(self.stations) or 'none'}"
+            )
         limit_number(-MOST_DB, MOST_DB).check("change_db", change_db)
         changes = self._current.changes
         numbers = range(len(known)) if number is None else [number]
         shifts = tuple((n, float(change_db), changes.next_number) for n in numbers)
         whose = "all stations" if number is None else station or known.shown[number]
         entry = f"shift: {change_db:+g} dB of {whose}"
-        self._add_version(changes.stations, entry, replace(changes, shifts=(*changes.shifts, *shifts)))
+        self._add_version(
+            changes.stations, entry, replace(changes, shifts=(*changes.shifts, *shifts))
+        )
 
     def undo(self, count: int = 1) -> None:
         """Go back so many versions, bit for bit; `ValueError` where so many are not kept."""
@@ -212,7 +255,8 @@ class UpdateMixin:
         self._become(self.versions[:-count])
 
     def change(self, tx: Any = None, rx: Any = None) -> tuple[np.ndarray, np.ndarray]:
-        """Return how many decibels a station's level changed since the fit, and the deviation (B,) of that.
+        """Return how many decibels a station's level changed since the fit, and the deviation (B,)
+        of that.
 
         >>> found = predictor.update(rx=[[2.0, 1.0, 1.5]] * 4, rssi=[-90.0] * 4)
         >>> change, deviation = predictor.change(rx=[[2.0, 1.0, 1.5]])
@@ -235,10 +279,11 @@ class UpdateMixin:
 
     @property
     def measured(self) -> dict[str, np.ndarray]:
-        """Later rows that are kept, as they came: `number`, `batch`, `station`, `place`, `level`, `faded_db`.
+        """Later rows that are kept, as they came: `number`, `batch`, `station`, `place`, `level`,
+        `faded_db`.
 
-        Stations by number, places (n, 3) [m, world], levels in `site.level_unit`, and the deviation by which
-        each has faded since [dB].
+        Stations by number, places (n, 3) [m, world], levels in `site.level_unit`, and the deviation
+        by which each has faded since [dB].
         """
         pairs = self._current.changes.rows
         parts = [one for _, one in pairs]
@@ -246,11 +291,15 @@ class UpdateMixin:
         of = np.repeat([name for name, _ in pairs], [len(one) for one in parts]).astype(np.int64)
         raised = torch.from_numpy(self._current.changes.shift(of, joined.number.numpy()))
         result = {
-            "number": joined.number, "batch": joined.batch, "station": torch.from_numpy(of),
-            "place": joined.places + torch.from_numpy(self.site.origin) if len(joined) else joined.places,
+            "number": joined.number,
+            "batch": joined.batch,
+            "station": torch.from_numpy(of),
+            "place": joined.places + torch.from_numpy(self.site.origin)
+            if len(joined)
+            else joined.places,
             "level": joined.level + joined.missed + raised + to_decibels(self.site.target_scale),
             "faded_db": joined.faded.sqrt(),
-        }  # fmt: skip
+        }
         order = joined.number.argsort()
         return {name: value[order].numpy() for name, value in result.items()}
 
@@ -273,7 +322,7 @@ class UpdateMixin:
         """Keys of the rows that were told, the last `JOURNAL`."""
         return self._current.told
 
-    # -- versions --------------------------------------------------------------------------------------
+    # -- versions ----------------------------------------------------------------------------------
 
     @property
     def _current(self) -> Version:
@@ -283,9 +332,13 @@ class UpdateMixin:
         return Version(Changes(Belief(max(extent, 1e-3))), Watch.from_site(self._model_site))
 
     def _add_version(
-        self, stations: dict[int, LaterRows], said: str, changes: Changes | None = None,
-        watch: Watch | None = None, key: str | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        stations: dict[int, LaterRows],
+        said: str,
+        changes: Changes | None = None,
+        watch: Watch | None = None,
+        key: str | None = None,
+    ) -> None:
         """Learn from stations' rows together, and answer by it."""
         now = self._current
         changes = changes or now.changes
@@ -302,14 +355,16 @@ class UpdateMixin:
         self._whole = self.method if whole_is_same else with_changes(self._whole, changes, own)
         self._prepared = []
 
-    # -- rows ------------------------------------------------------------------------------------------
+    # -- rows --------------------------------------------------------------------------------------
 
     def _read_rows(self, rows: LevelRows, changes: Changes) -> dict[int, LaterRows]:
         """New rows of each station that has a map, as they miss it."""
         method, site = with_changes(self.method, None), self.site
         if self._own_station is not None:
             if rows.station.any():
-                raise ValueError("update: rows of several stations; tell them to the model of all of them")
+                raise ValueError(
+                    "update: rows of several stations; tell them to the model of all of them"
+                )
             rows = replace(rows, station=np.full(len(rows), self._own_station))
         number, result = np.full(len(rows), -1), {}
         levels: dict[int, tuple[np.ndarray, Level]] = {}
@@ -332,15 +387,22 @@ class UpdateMixin:
         for name, (index, level) in levels.items():
             missed = torch.from_numpy(rows.decibels[index]) - level.mean - changes.shift(name)
             result[name] = LaterRows(
-                torch.from_numpy(number[index]), torch.full((len(index),), changes.next_batch),
-                torch.from_numpy(rows.places[index]), level.mean, missed, level.doubt, level.noise,
-                torch.zeros_like(missed), torch.from_numpy(rows.side[index] != 0),
-            )  # fmt: skip
+                torch.from_numpy(number[index]),
+                torch.full((len(index),), changes.next_batch),
+                torch.from_numpy(rows.places[index]),
+                level.mean,
+                missed,
+                level.doubt,
+                level.noise,
+                torch.zeros_like(missed),
+                torch.from_numpy(rows.side[index] != 0),
+            )
         return {name: one for name, one in result.items() if len(one)}
 
 
 def read_versions(extra: Mapping[str, Any]) -> tuple[Version, ...]:
-    """Return the versions that a checkpoint holds, the last one last; none where it was never updated.
+    """Return the versions that a checkpoint holds, the last one last;
+    none where it was never updated.
 
     Raises:
         CheckpointError: they are damaged.
@@ -348,7 +410,10 @@ def read_versions(extra: Mapping[str, Any]) -> tuple[Version, ...]:
     stored_changes(extra)
     with sound_updates():
         versions = tuple(map(from_plain, extra.get(STORED, ())))
-        if not all(isinstance(version, Version) and isinstance(version.watch, Watch) for version in versions):
+        if not all(
+            isinstance(version, Version) and isinstance(version.watch, Watch)
+            for version in versions
+        ):
             raise TypeError("of another kind")
     return versions
 

@@ -26,10 +26,14 @@ class MeanVariance(NamedTuple):
     variance: Tensor
 
 
-def mean_at_places(places: np.ndarray, values: np.ndarray, measured: np.ndarray | None = None) -> PlaceMeans:
-    """Average rows over each of their places; rows of places that are all different stay as they are.
+def mean_at_places(
+    places: np.ndarray, values: np.ndarray, measured: np.ndarray | None = None
+) -> PlaceMeans:
+    """Average rows over each of their places;
+    rows of places that are all different stay as they are.
 
-    >>> first, mean, count = mean_at_places(np.array([[5.0], [2.0], [5.0]]), np.array([1.0, 8.0, 3.0]))
+    >>> places, values = np.array([[5.0], [2.0], [5.0]]), np.array([1.0, 8.0, 3.0])
+    >>> first, mean, count = mean_at_places(places, values)
     >>> first, mean, count
     (array([1, 0]), array([8., 2.]), array([1, 2]))
 
@@ -47,15 +51,19 @@ def mean_at_places(places: np.ndarray, values: np.ndarray, measured: np.ndarray 
     flat, kind = values.reshape(len(values), -1), values.real.dtype
     members = csr_array((np.ones(len(places), kind), (place.reshape(-1), np.arange(len(places)))))
     heard = count[:, None] if measured is None else members @ measured.reshape(flat.shape)
-    total = members @ (flat if measured is None else np.where(measured.reshape(flat.shape), flat, 0))
+    total = members @ (
+        flat if measured is None else np.where(measured.reshape(flat.shape), flat, 0)
+    )
     mean = total / np.maximum(heard, 1).astype(kind)
     return PlaceMeans(first, mean.reshape(-1, *values.shape[1:]), count)
 
 
 def mixture_moments(parts: Sequence[tuple[float, Tensor, Tensor]]) -> MeanVariance:
-    """Return mean (n, ...) and variance (n,) of a mixture of shares, means (n, ...) and variances (n,).
+    """Return mean (n, ...) and variance (n,) of a mixture of shares, means (n, ...)
+    and variances (n,).
 
-    What the members disagree about is part of the variance, mean over entries (law of total variance).
+    What the members disagree about is part of the variance,
+    mean over entries (law of total variance).
 
     >>> one, two = torch.tensor([-70.0]), torch.tensor([-80.0])
     >>> mixture_moments([(0.5, one, torch.tensor([4.0])), (0.5, two, torch.tensor([4.0]))])
@@ -65,5 +73,8 @@ def mixture_moments(parts: Sequence[tuple[float, Tensor, Tensor]]) -> MeanVarian
         return MeanVariance(*parts[0][1:])
     mean = torch.stack([share * one for share, one, _ in parts]).sum(0)
     deviations = ((one - mean).abs().square().reshape(len(mean), -1).mean(1) for _, one, _ in parts)
-    spread = [share * (variance + off) for (share, _, variance), off in zip(parts, deviations, strict=True)]
+    spread = [
+        share * (variance + off)
+        for (share, _, variance), off in zip(parts, deviations, strict=True)
+    ]
     return MeanVariance(mean, torch.stack(spread).sum(0))

@@ -1,10 +1,11 @@
 """A Gaussian vector of which some entries are known and others only to lie below or above a level.
 
-Expectation propagation: each factor "beyond the level" is replaced by a Gaussian that gives the same mean
-and variance together with all others (T. Minka, "Expectation propagation for approximate Bayesian inference",
-UAI 2001; Rasmussen and Williams 2006, section 3.6; for truncated Gaussians J. P. Cunningham et al., "Gaussian
-probabilities and expectation propagation", 2011). Noise belongs to the vector's covariance, so the factors
-are steps; with the noise in the factor, Phi((level - f) / sigma), the fixed point is the same.
+Expectation propagation: each factor "beyond the level" is replaced by a Gaussian that gives the
+same mean and variance together with all others (T. Minka, "Expectation propagation for approximate
+Bayesian inference", UAI 2001; Rasmussen and Williams 2006, section 3.6; for truncated Gaussians J.
+P. Cunningham et al., "Gaussian probabilities and expectation propagation", 2011). Noise belongs to
+the vector's covariance, so the factors are steps; with the noise in the factor, Phi((level - f) /
+sigma), the fixed point is the same.
 """
 
 from __future__ import annotations
@@ -20,10 +21,12 @@ from gsparc.processes.averages import MeanVariance
 from gsparc.processes.factor import Factor
 
 FAR = -30.0  # standard deviations below which the ratio of density and distribution is a series
-LEAST = 1e-6  # share of its variance that a factor takes away at least: none at all has no pseudo-value
+# Share of its variance that a factor takes away at least: none at all has no pseudo-value
+LEAST = 1e-6
 DAMPING = 0.8
 MOST_SWEEPS = 50
-SETTLED, NEARLY = 1e-3, 1e-2  # standard deviations that no mean moves by any more; at looks of a search
+# Standard deviations that no mean moves by any more; at looks of a search
+SETTLED, NEARLY = 1e-3, 1e-2
 CERTAIN = 4.0  # standard deviations below its level: being told so changes nothing
 
 
@@ -45,7 +48,9 @@ class PseudoValues:
 
 
 class TruncatedMoments(NamedTuple):
-    """Of a standard normal cut off above a level: minus its mean, and the share of its variance lost."""
+    """Of a standard normal cut off above a level: minus its mean,
+    and the share of its variance lost.
+    """
 
     minus_mean: Tensor
     lost_variance: Tensor
@@ -59,7 +64,9 @@ def truncated_moments(z: Tensor) -> TruncatedMoments:
     """
     inside, t = z.clamp_min(FAR), 1 / z.clamp_max(FAR)
     # In logarithms: density and distribution underflow long before their ratio does.
-    ratio = (-inside.square() / 2 - 0.5 * math.log(2 * math.pi) - torch.special.log_ndtr(inside)).exp()
+    ratio = (
+        -inside.square() / 2 - 0.5 * math.log(2 * math.pi) - torch.special.log_ndtr(inside)
+    ).exp()
     series = -1 / t - t + 2 * t**3  # Abramowitz and Stegun 26.2.12
     remaining = t**2 * (1 - 6 * t**2 + 50 * t**4)
     reduction = torch.where(z < FAR, 1 - remaining, ratio * (inside + ratio))
@@ -75,12 +82,14 @@ def fit_by_ep(
 ) -> PseudoValues:
     """Find stand-ins for "below `level`" (m,), "above" where `side` is -1, of unknown entries.
 
-    Sweeps begin at those of a similar vector where `start` has them: the fixed point is the same. They end
-    when no mean moves by more than `tolerance` deviations.
+    Sweeps begin at those of a similar vector where `start` has them: the fixed point is the same.
+    They end when no mean moves by more than `tolerance` deviations.
     """
     mean, covariance = prior.mean, prior.covariance
     total = covariance.diagonal()
-    value, variance = (start.value, start.variance) if start else _match_sites(mean, total, level, side)
+    value, variance = (
+        (start.value, start.variance) if start else _match_sites(mean, total, level, side)
+    )
     settled, before = False, mean
     for _ in range(MOST_SWEEPS):
         factor = Factor.from_gram(covariance + torch.diag(variance), "raise")
@@ -106,11 +115,17 @@ def fit_by_ep(
     return PseudoValues(value, variance, float(evidence), settled)
 
 
-def _match_sites(mean: Tensor, variance: Tensor, level: Tensor, side: Tensor | float) -> MeanVariance:
-    """Values and variances (m,) that turn Gaussians (m,) into ones with the moments of the parts allowed."""
+def _match_sites(
+    mean: Tensor, variance: Tensor, level: Tensor, side: Tensor | float
+) -> MeanVariance:
+    """Values and variances (m,) that turn Gaussians (m,)
+    into ones with the moments of the parts allowed.
+    """
     deviation = variance.sqrt()
     ratio, reduction = truncated_moments(side * (level - mean) / deviation)
-    return MeanVariance(mean - side * deviation * ratio / reduction, variance * (1 - reduction) / reduction)
+    return MeanVariance(
+        mean - side * deviation * ratio / reduction, variance * (1 - reduction) / reduction
+    )
 
 
 @dataclass(frozen=True)
@@ -140,16 +155,22 @@ class ConditionalGaussian:
         # Cross covariances and values in one solve.
         white = factor.whiten(torch.cat([gram[is_known][:, unknown], values[is_known][:, None]], 1))
         cross, white = white[:, :-1], white[:, -1]
-        evidence = -0.5 * (white @ white + factor.log_determinant + len(white) * math.log(2 * math.pi))
+        evidence = -0.5 * (
+            white @ white + factor.log_determinant + len(white) * math.log(2 * math.pi)
+        )
         return cls(cross.T @ white, gram[unknown][:, unknown] - cross.T @ cross, float(evidence))
 
     def z_score(self, level: Tensor) -> Tensor:
-        """Return deviations (m,) that entries lie below `level` (m,) by: beyond `CERTAIN` nothing is told."""
+        """Return deviations (m,) that entries lie below `level` (m,) by:
+        beyond `CERTAIN` nothing is told.
+        """
         return (level - self.mean) / self.covariance.diagonal().sqrt()
 
     def marginal(self, rows: Tensor) -> ConditionalGaussian:
         """Return the entries `rows` alone."""
-        return ConditionalGaussian(self.mean[rows], self.covariance[rows][:, rows], self.log_evidence)
+        return ConditionalGaussian(
+            self.mean[rows], self.covariance[rows][:, rows], self.log_evidence
+        )
 
 
 def log_evidence(
@@ -164,20 +185,23 @@ def log_evidence(
     Returns:
         It, its slopes by `gram`, and minus its slopes by values and levels.
 
-    At the fixed point the stand-ins' own change has no effect (Rasmussen and Williams 2006, section 5.5.2).
+    At the fixed point the stand-ins' own change has no effect (Rasmussen
+    and Williams 2006, section 5.5.2).
 
     Args:
         gram: (n, n) covariance with noise.
         values: (n,) known values, or levels.
         side: (n,) 0 where known, 1 below the level, -1 above it.
-        last: stand-ins that were found for similar covariances, the first to begin with; those found now
-            take its place.
+        last: stand-ins that were found for similar covariances, the first to begin with; those
+            found now take its place.
     """
     unknown = side != 0
     if not unknown.any():
         factor = Factor.from_gram(gram, "raise")
         weights = factor.solve(values[:, None])[:, 0]
-        value = -0.5 * (values @ weights + factor.log_determinant + len(values) * math.log(2 * math.pi))
+        value = -0.5 * (
+            values @ weights + factor.log_determinant + len(values) * math.log(2 * math.pi)
+        )
         return float(value), 0.5 * (torch.outer(weights, weights) - factor.inverse), weights
     prior = ConditionalGaussian.from_gram(gram, values, unknown)
     begin, within = (last[0] if last else None), SETTLED if last is None else NEARLY
@@ -188,4 +212,8 @@ def log_evidence(
     extra = torch.zeros_like(values).masked_scatter(unknown, sites.variance)
     inverse = Factor.from_gram(gram + torch.diag(extra), "raise").inverse
     weights = inverse @ values.masked_scatter(unknown, sites.value)
-    return prior.log_evidence + sites.log_evidence, 0.5 * (torch.outer(weights, weights) - inverse), weights
+    return (
+        prior.log_evidence + sites.log_evidence,
+        0.5 * (torch.outer(weights, weights) - inverse),
+        weights,
+    )

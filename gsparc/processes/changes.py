@@ -1,10 +1,12 @@
-"""What rows that came later say of a map of levels: a mixture of kinds of change, each a process of its own.
+"""What rows that came later say of a map of levels: a mixture of kinds of change,
+each a process of its own.
 
-A later row misses the map by the map's own error, by what changed, and by noise. What changed is one of
-`KINDS`: nothing, one offset, a part of the place, or all of it. Every kind is a Gaussian process, so that
-what rows say of other places is in closed form; the answer is the mean over kinds, weighed by how likely they
-make the rows of a station (Bayesian model averaging), and shares of kinds follow from all stations together.
-Only systems of a station's nearest rows are solved, never one of all rows that a map was learned from.
+A later row misses the map by the map's own error, by what changed, and by noise. What changed is
+one of `KINDS`: nothing, one offset, a part of the place, or all of it. Every kind is a Gaussian
+process, so that what rows say of other places is in closed form; the answer is the mean over kinds,
+weighed by how likely they make the rows of a station (Bayesian model averaging), and shares of
+kinds follow from all stations together. Only systems of a station's nearest rows are solved, never
+one of all rows that a map was learned from.
 """
 
 from __future__ import annotations
@@ -25,7 +27,8 @@ from gsparc.processes.stored import Stored
 
 ERRORS = 1 / 20  # length of a map's own errors between its rows, as a share of the site
 NEAR, LOOKED = 64, 60  # rows that tell of a place; ones of a station that tell its kind of change
-PART, RADIX = 1 / 5, 1000  # side of the parts of a place that these are of, as a share; more than parts
+# Side of the parts of a place that these are of, as a share; more than parts
+PART, RADIX = 1 / 5, 1000
 BLOCK = 64  # queries at a time where each has neighbours of its own: memory
 NOISES = torch.tensor(
     (0.0, 1.0, 4.0, 12.0, 36.0)
@@ -39,12 +42,14 @@ ALIKE, COUNTS = (
     2,
 )  # prior variance of what all stations of a place miss alike [dB^2]; places it counts as
 WHOLE = 4  # power of the share of the place that rows lie in: whether a lone station was moved
-AWAY = 1 / 10  # length over which rows of a lone station that seems moved void the map: a local change's
+# Length over which rows of a lone station that seems moved void the map: a local change's
+AWAY = 1 / 10
 SURE = 3.0  # deviations by which rows that came before must be contradicted to fade
 CHANGED = 3  # of KINDS: the change that is expected of a station once one was noticed
 UNTOLD = 1e9  # noise of a row that is not there [dB^2]
 REFITTED = 200  # latest rows of a station that tell the lengths of changes
-STEPS, OCTAVES = (1.0, 0.5, 2**-0.5, 2**0.5, 2.0), 2.0  # of a scale that are tried; deviations of an octave
+# Of a scale that are tried; deviations of an octave
+STEPS, OCTAVES = (1.0, 0.5, 2**-0.5, 2**0.5, 2.0), 2.0
 HUNDRED = 100.0  # later rows that a fading is stated for
 TINY = 1e-6  # [dB^2]
 
@@ -124,7 +129,8 @@ class LaterRows(Stored):
         doubt: (n,) variance of the map's error there [dB^2].
         noise: (n,) variance of a measurement [dB^2].
         faded: (n,) variance that was added since, as later rows contradict [dB^2].
-        silent: (n,) bool, where nothing was heard, and the level that it was below stands for the power.
+        silent: (n,) bool, where nothing was heard, and the level that it was below stands for the
+            power.
     """
 
     number: Tensor
@@ -157,12 +163,15 @@ class LaterRows(Stored):
         return LaterRows(*(torch.cat(pair) for pair in pairs))
 
     def spread(self, extent: float, most: int) -> LaterRows:
-        """Return so many rows at most, the latest of each part of a site of this extent before others [m].
+        """Return so many rows at most, the latest of each part of a site
+        of this extent before others [m].
 
         Rows of a walk that ends elsewhere are no reason to forget what was changed.
         """
         places = self.places.flip(0)
-        part = (places / (extent * PART)).floor() @ (RADIX ** torch.arange(places.shape[1])).double()
+        part = (places / (extent * PART)).floor() @ (
+            RADIX ** torch.arange(places.shape[1])
+        ).double()
         parts, order = part.sort(stable=True)
         turn = torch.empty_like(order)
         turn[order] = torch.arange(len(order)) - torch.searchsorted(parts, parts)
@@ -174,10 +183,12 @@ class LaterRows(Stored):
         return self.level.mean()
 
     def fade(self, later: LaterRows, extent: float, fade_db: float) -> LaterRows:
-        """Return the rows with the variance that their age adds, and what later ones contradict of them.
+        """Return the rows with the variance that their age adds,
+        and what later ones contradict of them.
 
-        Of what the means of both miss nearby, first of an offset of all, then of what is left, the square
-        counts beyond `SURE` deviations. Nearby is near: on either side of an edge rows are right.
+        Of what the means of both miss nearby, first of an offset of all, then of what is left, the
+        square counts beyond `SURE` deviations. Nearby is near:
+        on either side of an edge rows are right.
         """
         near = matern32(distances(later.places, self.places), extent * ERRORS) + TINY
         total, spread = near.sum(1), self.doubt + self.noise + self.faded
@@ -187,16 +198,25 @@ class LaterRows(Stored):
         unsure = SURE**2 * (error.mean() + LOCAL[CHANGED].square()) / (len(off) - 1)
         added = (off.mean().square() - unsure).clamp_min(0.0)
         residual, total = off - off.mean() * (added > 0), near.sum(0)
-        local = (residual @ near / total).square() - SURE**2 * (error @ near.square()) / total.square()
+        local = (residual @ near / total).square() - SURE**2 * (
+            error @ near.square()
+        ) / total.square()
         aged = fade_db**2 * len(later) / HUNDRED
         return replace(self, faded=self.faded + aged + added + near.amax(0) * local.clamp_min(0.0))
 
 
 def covariance_by_kind(
-    a: Tensor, b: Tensor, doubt_a: Tensor, doubt_b: Tensor, extent: float, scale: float = 1.0,
+    a: Tensor,
+    b: Tensor,
+    doubt_a: Tensor,
+    doubt_b: Tensor,
+    extent: float,
+    scale: float = 1.0,
     kinds: Tensor | slice = slice(None),
-) -> Tensor:  # fmt: skip
-    """Return covariances (..., K, n, m) of what is missed at places (..., n, D) and (..., m, D), by kind."""
+) -> Tensor:
+    """Return covariances (..., K, n, m) of what is missed at places (..., n, D) and (..., m, D),
+    by kind.
+    """
     distance = distances(a, b)[..., None, :, :]
     doubt = (doubt_a[..., :, None] * doubt_b[..., None, :]).sqrt()[..., None, :, :]
     map_errors = doubt * matern32(distance, extent * ERRORS)
@@ -212,9 +232,14 @@ def _values(rows: LaterRows, common: float) -> Tensor:
 
 
 def evidence(
-    stations: Sequence[LaterRows], extent: float, common: float, scale: float = 1.0, looked: int = LOOKED
+    stations: Sequence[LaterRows],
+    extent: float,
+    common: float,
+    scale: float = 1.0,
+    looked: int = LOOKED,
 ) -> Tensor:
-    """Return log densities (T, len(NOISES), K) of `looked` rows of each station, spread over places [nats].
+    """Return log densities (T, len(NOISES), K) of `looked` rows of each station,
+    spread over places [nats].
 
     Args:
         stations: rows of each.
@@ -225,7 +250,10 @@ def evidence(
     most = max(len(rows) for rows in every)
     # Stations of fewer rows get rows of endless noise, which tell nothing of kinds.
     missed = torch.stack([_padded(_values(rows, common).T, most) for rows in every]).mT
-    parts = (torch.stack([_padded(getattr(rows, n), most) for rows in every]) for n in ("places", "doubt"))
+    parts = (
+        torch.stack([_padded(getattr(rows, n), most) for rows in every])
+        for n in ("places", "doubt")
+    )
     places, doubt = parts
     noise = torch.stack([_padded(rows.noise, most, UNTOLD) for rows in every])[:, None]
     faded = torch.stack([_padded(rows.faded, most) for rows in every])[:, None]
@@ -245,7 +273,8 @@ def _padded(values: Tensor, length: int, filling: float = 0.0) -> Tensor:
 
 
 def learn(stations: Mapping[int, LaterRows], extent: float, scale: float = 1.0) -> Belief:
-    """Return what the stations' rows say together: the common offset, the noise, and kinds of change.
+    """Return what the stations' rows say together: the common offset, the noise,
+    and kinds of change.
 
     Args:
         stations: rows of each.
@@ -267,11 +296,15 @@ def learn(stations: Mapping[int, LaterRows], extent: float, scale: float = 1.0) 
 
 
 def refit_scale(stations: Mapping[int, LaterRows], belief: Belief) -> float:
-    """Return the scale of local changes, among halves and doubles of what it was, that makes rows likeliest.
+    """Return the scale of local changes, among halves and doubles of what it was,
+    that makes rows likeliest.
 
     1 is likeliest before any row, and one an octave off `OCTAVES` deviations away.
     """
-    parts, scales = [rows for rows in stations.values() if len(rows)], [belief.scale * step for step in STEPS]
+    parts, scales = (
+        [rows for rows in stations.values() if len(rows)],
+        [belief.scale * step for step in STEPS],
+    )
     if not parts:
         return belief.scale
     common, before = _common_offset(parts), NOISY.log()[:, None] + SHARE.log()
@@ -281,10 +314,11 @@ def refit_scale(stations: Mapping[int, LaterRows], belief: Belief) -> float:
 
 
 def _common_offset(stations: Sequence[LaterRows]) -> float:
-    """What all stations' latest rows miss alike [dB]: 0 of few stations, shrunk by how unsure it is.
+    """What all stations' latest rows miss alike [dB]: 0 of few stations,
+    shrunk by how unsure it is.
 
-    Either it is 0, or normal with deviation `OFFSETS`. Its error has two parts: stations differ, and so do
-    places, as a phone that is turned misses all stations of a place alike.
+    Either it is 0, or normal with deviation `OFFSETS`. Its error has two parts: stations differ,
+    and so do places, as a phone that is turned misses all stations of a place alike.
     """
     if len(stations) < COMMON:
         return 0.0
@@ -329,14 +363,22 @@ def correct(
         blocks = zip(nearest.split(BLOCK), places.split(BLOCK), doubt.split(BLOCK), strict=True)
         parts = [
             _solve(
-                belief, rows[index], noise[index], values[:, index].movedim(0, 1), kinds,
-                place[:, None], map_doubt[:, None],
+                belief,
+                rows[index],
+                noise[index],
+                values[:, index].movedim(0, 1),
+                kinds,
+                place[:, None],
+                map_doubt[:, None],
             )
             for index, place, map_doubt in blocks
-        ]  # fmt: skip
+        ]
         mean, variance, near = (torch.cat(part)[..., 0].T for part in zip(*parts, strict=True))
-    # Rows in a part of the place cannot tell what was moved elsewhere; of many stations their share does.
-    seen = float(torch.linalg.vector_norm(rows.places.amax(0) - rows.places.amin(0))) / belief.extent
+    # Rows in a part of the place cannot tell what was moved elsewhere;
+    # of many stations their share does.
+    seen = (
+        float(torch.linalg.vector_norm(rows.places.amax(0) - rows.places.amin(0))) / belief.extent
+    )
     seen = 1.0 if len(belief.names) > 1 else min(seen, 1.0) ** WHOLE
     away = (1 - KEEPS[kinds, None]) * (near + (1 - near) * seen)
     mean = belief.common + level + (KEEPS[kinds, None] + away) * mean + away * (rows.middle - level)
@@ -345,9 +387,14 @@ def correct(
 
 
 def _solve(
-    belief: Belief, rows: LaterRows, noise: Tensor, values: Tensor, kept: Tensor, places: Tensor,
+    belief: Belief,
+    rows: LaterRows,
+    noise: Tensor,
+    values: Tensor,
+    kept: Tensor,
+    places: Tensor,
     doubt: Tensor,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
+) -> tuple[Tensor, Tensor, Tensor]:
     """Means, variances and correlations with the nearest row (G, K', B).
 
     Of groups of places (G, B, D) by rows (G or none, n).

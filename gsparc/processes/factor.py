@@ -1,8 +1,8 @@
 """Cholesky factors of covariances, and all that is solved with them.
 
-LAPACK in place factors a single matrix without gradients, and solves for many columns, in .4 to .9 of torch's
-time from some hundred rows on. Few rows, inverses, batches, gradients and matrices worth several threads go
-to torch.
+LAPACK in place factors a single matrix without gradients, and solves for many columns, in .4 to .9
+of torch's time from some hundred rows on. Few rows, inverses, batches, gradients and matrices worth
+several threads go to torch.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from gsparc.ops.transforms import is_differentiated
 from gsparc.processes.worker import raise_if_cancelled
 
 Failing = Literal["mend", "raise", "ignore"]
-# Rounding each entry to float32 moves an eigenvalue by at most `eps trace(K)`, since the Frobenius norm of a
-# covariance is at most its trace; entries that are sums are rounded several times.
+# Rounding each entry to float32 moves an eigenvalue by at most `eps trace(K)`, since the Frobenius
+# norm of a covariance is at most its trace; entries that are sums are rounded several times.
 ROUNDING = torch.finfo(torch.float32).eps
 RIDGES = (0.01, 0.1, 1.0, 16.0)  # of that bound, tried in turn
 ALONE = 2_000  # rows up to which one thread is as good as several
@@ -56,19 +56,23 @@ class Factor:
     lower: Tensor
 
     @classmethod
-    def from_gram(cls, covariance: Tensor, failing: Failing = "mend", overwrite: bool = False) -> Factor:
-        """Factor a Hermitian covariance (..., n, n); in float64 and with a ridge where there is none without.
+    def from_gram(
+        cls, covariance: Tensor, failing: Failing = "mend", overwrite: bool = False
+    ) -> Factor:
+        """Factor a Hermitian covariance (..., n, n);
+        in float64 and with a ridge where there is none without.
 
-        Nearly noise-free rows at neighbouring places are alike to the last digit: a covariance of theirs is
-        positive definite on paper and, rounded, has eigenvalues of either sign up to `ROUNDING trace(K)`. A
-        ridge of that size mends it, and is noise that the data cannot tell from rounding; float64 rounds no
-        more.
+        Nearly noise-free rows at neighbouring places are alike to the last digit: a covariance of
+        theirs is positive definite on paper and, rounded, has eigenvalues of either sign up to
+        `ROUNDING trace(K)`. A ridge of that size mends it, and is noise that the data cannot tell
+        from rounding; float64 rounds no more.
 
         Args:
             covariance: real or complex.
-            failing: what follows where there is none: a ridge, an error, or nothing: of a batch of steps some
-                may fail.
-            overwrite: whether L may take the place of the covariance, which then is not to be mended.
+            failing: what follows where there is none: a ridge, an error, or nothing: of a batch of
+                steps some may fail.
+            overwrite: whether L may take the place of the covariance, which then is not to be
+                mended.
 
         Raises:
             NotDefiniteError: it has no factor, nor with the largest ridge.
@@ -93,7 +97,8 @@ class Factor:
                 return cls(lower.to(covariance.dtype))
         most = RIDGES[-1] * ROUNDING * len(covariance)
         raise NotDefiniteError(
-            f"the covariance of {len(covariance)} rows has no Cholesky factor, nor with {most:.1e} of its "
+            f"the covariance of {len(covariance)} rows has no Cholesky factor, nor with "
+            f"{most:.1e} of its "
             "mean variance as noise, more than rounding explains: "
             "look for rows that are not finite (gsparc check FILE)"
         )
@@ -111,7 +116,9 @@ class Factor:
     def _inverse_in_float32(self) -> list[np.ndarray]:
         root, step = self._invert_lower().float().numpy(), -(-len(self.lower) // BANDS)
         # A band of rows ends at its diagonal: the zeros above are neither stored nor read.
-        return [np.ascontiguousarray(root[i : i + step, : i + step]) for i in range(0, len(root), step)]
+        return [
+            np.ascontiguousarray(root[i : i + step, : i + step]) for i in range(0, len(root), step)
+        ]
 
     def solve(self, values: Tensor) -> Tensor:
         """Return `K^-1 V` of values (..., n, R)."""
@@ -124,11 +131,14 @@ class Factor:
 
     def _solve_triangular(self, values: Tensor, adjoint: bool) -> Tensor:
         """`L^-1 V`, or `L^-H V`."""
-        # The transpose of an array in C's order is one in Fortran's: LAPACK reads it without a copy.
+        # The transpose of an array in C's order is one in Fortran's:
+        # LAPACK reads it without a copy.
         upper, right = _to_numpy(self.lower).T, np.ascontiguousarray(_to_numpy(values))
         trsm = get_blas_funcs("trsm", (upper,))
         with BLAS.limit(limits=1):
-            return torch.from_numpy(trsm(1.0, upper, right.T, side=1, lower=0, trans_a=2 if adjoint else 0).T)
+            return torch.from_numpy(
+                trsm(1.0, upper, right.T, side=1, lower=0, trans_a=2 if adjoint else 0).T
+            )
 
     @cached_property
     def root(self) -> Tensor:
@@ -184,7 +194,9 @@ def whiten_in_float32(factors: Sequence[Factor], values: Sequence[Tensor]) -> li
     # OpenBLAS multiplies few columns in a third of torch's time.
     with BLAS.limit(limits=1):
         for one, part in zip(factors, single, strict=True):
-            result.append(np.concatenate([band @ part[: band.shape[1]] for band in one._inverse_in_float32]))
+            result.append(
+                np.concatenate([band @ part[: band.shape[1]] for band in one._inverse_in_float32])
+            )
     return [torch.from_numpy(part).to(values[0].dtype) for part in result]
 
 

@@ -1,9 +1,10 @@
 """Features of a process whose squared length is the part of it that is known.
 
-A Gaussian process of unit variance and noise s, conditioned on rows X, has at x the mean `phi(x) . w` and the
-variance `1 - |phi(x)|^2` with `phi(x) = C^T k(Z, x)`: C C^T = (K + s)^-1 where Z = X (Rasmussen and Williams
-2006, eq. 2.25 and 2.26). Of many rows, inducing places Z stand for all (Quinonero-Candela and Rasmussen 2005,
-"A unifying view of sparse approximate Gaussian process regression", section 5, with the prior's variance).
+A Gaussian process of unit variance and noise s, conditioned on rows X, has at x the mean
+`phi(x) . w` and the variance `1 - |phi(x)|^2` with `phi(x) = C^T k(Z, x)`: C C^T = (K + s)^-1 where
+Z = X (Rasmussen and Williams 2006, eq. 2.25 and 2.26). Of many rows, inducing places Z stand for
+all (Quinonero-Candela and Rasmussen 2005, "A unifying view of sparse approximate Gaussian process
+regression", section 5, with the prior's variance).
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ def correlation(a: Tensor, b: Tensor, length: float, name: Correlation) -> Tenso
 
 
 def matern_mixture(length: float, name: Correlation) -> tuple[float, float, float, float]:
-    """Return share and length [m] of a correlation's Matern-5/2, share and length of its Matern-3/2."""
+    """Return share and length [m] of a correlation's Matern-5/2,
+    share and length of its Matern-3/2.
+    """
     if name == "matern32":
         return 0.0, length, 1.0, length
     return 1 - ROUGH_SHARE, length, ROUGH_SHARE, ROUGH_RATIO * length
@@ -53,7 +56,8 @@ class Features:
     Attributes:
         places: (E, 3) float64 [m], Z.
         whitening: (E, E) float64, C: `phi(x) = k(x, Z) C`.
-        weigh: (E, n) float64: values V (n, M) at the rows have the posterior mean `phi . (weigh V)`.
+        weigh: (E, n) float64: values V (n, M) at the rows have the posterior mean
+            `phi . (weigh V)`.
     """
 
     places: Tensor
@@ -61,8 +65,11 @@ class Features:
     weigh: Tensor
 
 
-def whitened_features(rows: Tensor, length: float, noise: float, name: Correlation, most: int) -> Features:
-    """Return features of a process conditioned on rows (n, 3) [m], at `most` places; exact up to that many.
+def whitened_features(
+    rows: Tensor, length: float, noise: float, name: Correlation, most: int
+) -> Features:
+    """Return features of a process conditioned on rows (n, 3) [m], at `most` places;
+    exact up to that many.
 
     >>> rows = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], dtype=torch.float64)
     >>> known = whitened_features(rows, length=2.0, noise=0.01, name="matern32", most=10)
@@ -87,8 +94,12 @@ def whitened_features(rows: Tensor, length: float, noise: float, name: Correlati
     )
 
 
-def place_features(places: Tensor, rows: Tensor, length: float, noise: float, name: Correlation) -> Features:
-    """Return features at given places (E, 3) that stand for all rows (n, 3); see `whitened_features`."""
+def place_features(
+    places: Tensor, rows: Tensor, length: float, noise: float, name: Correlation
+) -> Features:
+    """Return features at given places (E, 3) that stand for all rows (n, 3);
+    see `whitened_features`.
+    """
     gram = correlation(places, places, length, name)
     gram.diagonal().add_(JITTER)
     factor = Factor.from_gram(gram)
@@ -102,11 +113,14 @@ def place_features(places: Tensor, rows: Tensor, length: float, noise: float, na
     return Features(places, whitening.contiguous(), weigh)
 
 
-def pivoted_rows(rows: Tensor, length: float, enough: float, name: Correlation, most: int) -> Tensor:
-    """Return indices of up to `most` rows (n, 3), each the one that those before it tell least about.
+def pivoted_rows(
+    rows: Tensor, length: float, enough: float, name: Correlation, most: int
+) -> Tensor:
+    """Return indices of up to `most` rows (n, 3),
+    each the one that those before it tell least about.
 
-    It ends when every row's variance given these is at most `enough`: a pivoted Cholesky factorization (Fine
-    and Scheinberg 2001), n times the square of their number in time.
+    It ends when every row's variance given these is at most `enough`: a pivoted Cholesky
+    factorization (Fine and Scheinberg 2001), n times the square of their number in time.
 
     >>> rows = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [9.0, 0.0, 0.0]])
     >>> pivoted_rows(rows, length=2.0, enough=0.0, name="matern32", most=2)

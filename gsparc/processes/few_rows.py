@@ -1,4 +1,6 @@
-"""Few of many rows, by which settings are chosen: drawn evenly, by groups, over a site, or every so many."""
+"""Few of many rows, by which settings are chosen: drawn evenly, by groups, over a site,
+or every so many.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,8 @@ def draw_rows(count: int, most: int, seed: Seed) -> np.ndarray:
 
 
 def shuffle_groups(group: np.ndarray, seed: Seed) -> np.ndarray:
-    """Return an order of rows (n,): groups, numbered from 0, by chance, and in each the rows as they are.
+    """Return an order of rows (n,): groups, numbered from 0, by chance,
+    and in each the rows as they are.
 
     >>> order = shuffle_groups(np.array([0, 1, 0]), seed=0)
     >>> np.diff(np.flatnonzero(np.isin(order, [0, 2])))  # the first and last follow each other
@@ -31,7 +34,8 @@ def shuffle_groups(group: np.ndarray, seed: Seed) -> np.ndarray:
 
 
 def first_rows(order: np.ndarray, most: int, group: np.ndarray, silent: np.ndarray) -> np.ndarray:
-    """Return of each group the first rows in an order, sorted; at least half were heard where as many were.
+    """Return of each group the first rows in an order, sorted;
+    at least half were heard where as many were.
 
     >>> first_rows(np.arange(5), most=2, group=np.zeros(5), silent=np.arange(5) < 4)
     array([0, 4])
@@ -59,9 +63,11 @@ def evenly_spaced(count: int, most: int) -> np.ndarray:
 
 
 def covering_rows(places: np.ndarray, most: int, seed: int) -> np.ndarray:
-    """Draw at most so many rows, sorted: one in each of as many cubic cells of one side, the rest at random.
+    """Draw at most so many rows, sorted: one in each of as many cubic cells of one side,
+    the rest at random.
 
-    A vehicle that stood for an hour counts no more than a place that it drove by. Time is linear in n.
+    A vehicle that stood for an hour counts no more than a place that it drove by.
+    Time is linear in n.
 
     >>> covering_rows(np.array([[0.0], [0.1], [0.2], [50.0], [100.0]]), most=3, seed=0).shape
     (3,)

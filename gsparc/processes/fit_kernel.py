@@ -27,13 +27,16 @@ from gsparc.processes.few_rows import covering_rows
 from gsparc.processes.kernel import SHARES, Kernel, distances
 
 LOOKS = 40  # of a walk: most evaluations
-# Gain of a step that is the last [nats of all rows]. Over rows a gain of g has a standard error of sqrt(2 g):
-# below 2 none is sure. What remains after such a step is many times as much: at .5 it was 5 % of some errors.
+# Gain of a step that is the last [nats of all rows]. Over rows a gain of g has a standard error of
+# sqrt(2 g): below 2 none is sure. What remains after such a step is many times as much:
+# at .5 it was 5 % of some errors.
 SETTLED = 0.03
-FINEST = 2e-5  # of them per number, of images, whose numbers are not independent: answers move by 1e-4 beyond
+# Of them per number, of images, whose numbers are not independent: answers move by 1e-4 beyond
+FINEST = 2e-5
 BAD = 1e12  # in place of a density where no Cholesky factor exists
 STARTS = np.array([0.01, 0.05, 0.25])  # lengths that a search starts from, of the extent
-AMPLITUDES = (1e-4, 1e3)  # as wide as powers [dB^2] of one station spread; more only where they were heard to
+# As wide as powers [dB^2] of one station spread; more only where they were heard to
+AMPLITUDES = (1e-4, 1e3)
 SHORT, LONG = (0.25, 1.0), (1.0, 300.0)  # wavelengths; next to no field varies within a quarter
 WAVES = (0.37, 2.8)  # of these, that a search starts from
 SPANS = 3.0  # spacings between places, that the longer length starts from at least
@@ -57,7 +60,8 @@ class KernelRows(NamedTuple):
     side: Tensor | None = None
 
     def gram(self, kernel: Kernel) -> Tensor:
-        """Return the covariance (n, n) with noise, of amplitude 1, differentiable in the kernel's numbers.
+        """Return the covariance (n, n) with noise, of amplitude 1,
+        differentiable in the kernel's numbers.
 
         >>> one = torch.zeros(1, 1, dtype=torch.float64)
         >>> KernelRows(one, None, one).gram(Kernel.from_length(length=2.0, noise=0.5))
@@ -70,12 +74,17 @@ class KernelRows(NamedTuple):
 
 
 def minimise(
-    objective: Callable[[Tensor], Tensor], starts: Sequence[np.ndarray],
-    bounds: Sequence[tuple[float, float]], looks: int = LOOKS, settled: float = SETTLED,
-) -> tuple[np.ndarray, float]:  # fmt: skip
-    """Find where an objective is least, by L-BFGS-B from the best of some starts, and its value there.
+    objective: Callable[[Tensor], Tensor],
+    starts: Sequence[np.ndarray],
+    bounds: Sequence[tuple[float, float]],
+    looks: int = LOOKS,
+    settled: float = SETTLED,
+) -> tuple[np.ndarray, float]:
+    """Find where an objective is least, by L-BFGS-B from the best of some starts,
+    and its value there.
 
-    >>> best, value = minimise(lambda at: (at - 3).square().sum(), [np.zeros(1)], [(-5.0, 5.0)], 50, 1e-12)
+    >>> start, bounds = [np.zeros(1)], [(-5.0, 5.0)]
+    >>> best, value = minimise(lambda at: (at - 3).square().sum(), start, bounds, 50, 1e-12)
     >>> best.round(3), round(value, 3)
     (array([3.]), 0.0)
 
@@ -98,7 +107,9 @@ def minimise(
             return BAD, np.zeros(len(point))
         (slope,) = torch.autograd.grad(value, at)
         # A walk by a slope that is none ends in a corner, and says nothing of it.
-        assert torch.cat([value[None], slope]).isfinite().all(), f"no slope at {point}: {value}, {slope}"
+        assert torch.cat([value[None], slope]).isfinite().all(), (
+            f"no slope at {point}: {value}, {slope}"
+        )
         return float(value.detach()), slope.numpy()
 
     def evaluate(point: np.ndarray) -> tuple[float, np.ndarray]:
@@ -107,17 +118,25 @@ def minimise(
     points = [np.clip(start, low, high) for start in starts]
     start = min(points, key=lambda point: evaluate(point)[0]) if len(points) > 1 else points[0]
     result = minimize(
-        evaluate, start, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
+        evaluate,
+        start,
+        jac=True,
+        method="L-BFGS-B",
+        bounds=list(zip(low, high, strict=True)),
         options={"ftol": settled / max(abs(evaluate(start)[0]), 1.0), "maxfun": looks},
-    )  # fmt: skip
+    )
     return result.x, float(result.fun)
 
 
 def fit_kernel(
-    objective: Callable[[Kernel], tuple[Tensor, Tensor]], starts: Sequence[Kernel],
-    bounds: Sequence[tuple[float, float]], looks: int = LOOKS, settled: float = SETTLED,
-) -> tuple[float, Kernel]:  # fmt: skip
-    """Find where an objective of kernels is least, and the kernel there, from the best of `starts` on.
+    objective: Callable[[Kernel], tuple[Tensor, Tensor]],
+    starts: Sequence[Kernel],
+    bounds: Sequence[tuple[float, float]],
+    looks: int = LOOKS,
+    settled: float = SETTLED,
+) -> tuple[float, Kernel]:
+    """Find where an objective of kernels is least, and the kernel there,
+    from the best of `starts` on.
 
     Args:
         objective: its value, with autograd, and the best amplitude.
@@ -125,7 +144,9 @@ def fit_kernel(
         bounds, looks, settled: see `minimise`.
     """
     first, points = starts[0], [one.parameters().numpy() for one in starts]
-    best, _ = minimise(lambda at: objective(first.with_values(at))[0], points, bounds, looks, settled)
+    best, _ = minimise(
+        lambda at: objective(first.with_values(at))[0], points, bounds, looks, settled
+    )
     with torch.no_grad():
         kernel = first.with_values(torch.from_numpy(best))
         value, amplitude = objective(kernel)
@@ -133,17 +154,24 @@ def fit_kernel(
 
 
 def fit_kernel_by_left_out(
-    starts: Sequence[Kernel], views: Sequence[KernelRows], bounds: Sequence[tuple[float, float]] = (),
-    looks: int = LOOKS, entries: int = 1, bounded: bool = True, partitions: Sequence[Iterable[Tensor]] = (),
+    starts: Sequence[Kernel],
+    views: Sequence[KernelRows],
+    bounds: Sequence[tuple[float, float]] = (),
+    looks: int = LOOKS,
+    entries: int = 1,
+    bounded: bool = True,
+    partitions: Sequence[Iterable[Tensor]] = (),
     alike: float = 0.0,
-) -> tuple[float, Kernel]:  # fmt: skip
+) -> tuple[float, Kernel]:
     """Find the least negative density of rows left out [nats per output], and its kernel.
 
-    They are left out one by one, and by `partitions` of the rows of one process where there are any.
+    They are left out one by one, and by `partitions` of the rows of one process
+    where there are any.
 
     Args:
         starts: of terms of one kind.
-        views: rows of independent processes that differ in their amplitudes alone; the mean of these is told.
+        views: rows of independent processes that differ in their amplitudes alone; the mean of
+            these is told.
         bounds: of the parameters; none: those of the first process.
         looks: most evaluations.
         entries, bounded, alike: see `left_out_density`.
@@ -160,11 +188,15 @@ def fit_kernel_by_left_out(
 
     count = float(sizes.sum())
     settled = max(SETTLED / (count * entries), FINEST)
-    value, kernel = fit_kernel(objective, starts, bounds or starts[0].bounds(views[0].apart), looks, settled)
+    value, kernel = fit_kernel(
+        objective, starts, bounds or starts[0].bounds(views[0].apart), looks, settled
+    )
     return value * count, kernel
 
 
-def fit_kernel_by_evidence(start: Kernel, views: Sequence[KernelRows], looks: int) -> tuple[float, Kernel]:
+def fit_kernel_by_evidence(
+    start: Kernel, views: Sequence[KernelRows], looks: int
+) -> tuple[float, Kernel]:
     """Find the kernel of largest evidence, levels among the values; without looks `start` as it is.
 
     Args:
@@ -193,14 +225,18 @@ def fit_kernel_by_evidence(start: Kernel, views: Sequence[KernelRows], looks: in
         best, value = minimise(negative_log_evidence, [best], bounds, looks, SETTLED / count)
     else:
         value = float(negative_log_evidence(torch.from_numpy(best)))
-    return value, replace(start.with_values(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1]))
+    return value, replace(
+        start.with_values(torch.from_numpy(best[:-1])), amplitude=math.exp(best[-1])
+    )
 
 
-def choose_left_out_kernel(positions: np.ndarray, scores: np.ndarray, entries: int, count: int = 2) -> Kernel:
+def choose_left_out_kernel(
+    positions: np.ndarray, scores: np.ndarray, entries: int, count: int = 2
+) -> Kernel:
     """Return the lengths and noise of largest leave-one-out likelihood.
 
-    Two lengths are those of interference and of levels: one that is short enough for interference predicts
-    the mean in every gap.
+    Two lengths are those of interference and of levels: one that is short enough for interference
+    predicts the mean in every gap.
 
     Args:
         positions: (n, 3) [m].
@@ -211,10 +247,13 @@ def choose_left_out_kernel(positions: np.ndarray, scores: np.ndarray, entries: i
     spread = float(np.linalg.norm(np.ptp(positions, axis=0))) or 1.0
     # Two rows, or equal ones, have no likeliest length: the site's extent stands in.
     if len(positions) < 3 or not scores.any():
-        return Kernel.from_length(spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), TINY))
+        return Kernel.from_length(
+            spread, 1e-2, max(float((scores**2).sum()) / (len(scores) * entries), TINY)
+        )
     bounds = [(math.log(spread * 1e-4), math.log(spread * 1e2))] * count
     bounds += [*[(-SHARES, SHARES)] * (count - 1), (math.log(1e-8), math.log(1e2))]
-    # A coarse look picks the valley, the optimiser walks down it: each look factors an n x n matrix.
+    # A coarse look picks the valley, the optimiser walks down it:
+    # each look factors an n x n matrix.
     lengths = combinations(spread * STARTS, count)
     starts = [Kernel.from_lengths(one, [1 / count] * count, 0.01) for one in lengths]
     places, values = torch.from_numpy(positions), torch.from_numpy(scores)
@@ -225,7 +264,8 @@ def choose_left_out_kernel(positions: np.ndarray, scores: np.ndarray, entries: i
 def initial_kernel(length: float, spacing: float = 0.0) -> Kernel:
     """Return the kernel before anything was learned.
 
-    `length` is a wavelength, or what stands for it; `spacing` between places, which the longer one spans [m].
+    `length` is a wavelength, or what stands for it; `spacing` between places,
+    which the longer one spans [m].
 
     >>> [round(length, 3) for length in initial_kernel(0.1).lengths]
     [0.037, 0.28]
@@ -237,8 +277,9 @@ def initial_kernel(length: float, spacing: float = 0.0) -> Kernel:
 def fit_two_lengths(places: np.ndarray, values: np.ndarray, length: float, start: Kernel) -> Kernel:
     """Return the kernel of a short and a long length, of largest evidence near `start`.
 
-    Of channels whose rows were turned to be like their neighbours, the carrier's phase is gone: what is left
-    varies within a fraction of a wavelength where paths interfere, and over many as the strongest does.
+    Of channels whose rows were turned to be like their neighbours, the carrier's phase is gone:
+    what is left varies within a fraction of a wavelength where paths interfere,
+    and over many as the strongest does.
 
     Args:
         places: (n, D) [m].
@@ -252,8 +293,9 @@ def fit_two_lengths(places: np.ndarray, values: np.ndarray, length: float, start
     real = torch.from_numpy(np.concatenate([values[rows].real, values[rows].imag], 1)).double()
     bounds = [
         *((math.log(low * length), math.log(high * length)) for low, high in (SHORT, LONG)),
-        (-SHARES, SHARES), (math.log(NOISES[0]), math.log(NOISES[1])),
-    ]  # fmt: skip
+        (-SHARES, SHARES),
+        (math.log(NOISES[0]), math.log(NOISES[1])),
+    ]
     view = KernelRows(distances(at, at), None, real)
     evidence = lambda kernel: ProfiledDensity.apply(view.gram(kernel), real)  # noqa: E731
     return fit_kernel(evidence, [start], bounds, TWO_LENGTH_LOOKS, SETTLED / real.numel())[1]

@@ -25,12 +25,16 @@ TOLD = 16  # earlier rows that tell of the next one
 
 
 @torch.no_grad()
-def innovations(rows: LaterRows, first: int, extent: float, changed: bool = False) -> tuple[Tensor, Tensor]:
-    """Return surprises (n,) of rows from `first` on [deviations], and log ratios (n,) of a return to the map.
+def innovations(
+    rows: LaterRows, first: int, extent: float, changed: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Return surprises (n,) of rows from `first` on [deviations], and log ratios (n,)
+    of a return to the map.
 
-    Each is told of by its nearest earlier rows; surprises are independent and normal. Where a part of the
-    place has changed, a row is in it or is not, as likely as rows near it are, so that edges surprise little.
-    Ratios are of a world where what lies in it is as the map says, to one where it stays as it is.
+    Each is told of by its nearest earlier rows; surprises are independent and normal. Where a part
+    of the place has changed, a row is in it or is not, as likely as rows near it are, so that edges
+    surprise little. Ratios are of a world where what lies in it is as the map says,
+    to one where it stays as it is.
     """
     kind, count = CHANGED if changed else 0, len(rows)
     new, order = torch.arange(first, count), torch.arange(count)
@@ -46,7 +50,9 @@ def innovations(rows: LaterRows, first: int, extent: float, changed: bool = Fals
     alike = (extent, 1.0, slice(kind, kind + 1))
     gram = covariance_by_kind(past.places, past.places, past.doubt, past.doubt, *alike)[:, 0]
     gram.diagonal(dim1=-2, dim2=-1).add_(noise)
-    cross = covariance_by_kind(at.places[:, None], past.places, at.doubt[:, None], past.doubt, *alike)[:, 0]
+    cross = covariance_by_kind(
+        at.places[:, None], past.places, at.doubt[:, None], past.doubt, *alike
+    )[:, 0]
     weights = Factor.from_gram(gram, "raise").solve(cross.mT)[..., 0]
     off = at.missed - (weights * past.missed).sum(1)
     free = at.doubt + at.noise
@@ -60,7 +66,9 @@ def innovations(rows: LaterRows, first: int, extent: float, changed: bool = Fals
     share = ((close * outside).sum(1) + UNSEEN / 2) / (close.sum(1) + UNSEEN)
     as_mapped, inside = _log_normal(at.missed, free), _log_normal(off, variance)
     density = torch.logaddexp(share.log() + as_mapped, (1 - share).log() + inside)
-    below = share * torch.special.ndtr(at.missed / free.sqrt()) + (1 - share) * torch.special.ndtr(surprise)
+    below = share * torch.special.ndtr(at.missed / free.sqrt()) + (1 - share) * torch.special.ndtr(
+        surprise
+    )
     ratio = (share + (1 - share) * (as_mapped - density).exp()).log()
     return torch.special.ndtri(below.clamp(RARE, 1 - RARE)), ratio
 

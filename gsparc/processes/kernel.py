@@ -1,4 +1,6 @@
-"""Terms that depend on distance, and their sum with noise: differentiable in places, lengths and shares."""
+"""Terms that depend on distance, and their sum with noise: differentiable in places,
+lengths and shares.
+"""
 
 from __future__ import annotations
 
@@ -21,14 +23,16 @@ from gsparc.processes.term import Term
 LENGTH_SPAN = (1e-3, 3.0)  # bounds of a length, of the median distance between rows
 NOISE_SPAN = (1e-6, 1e2)  # bounds of the noise's variance, of the amplitude
 SHARES = 6.0  # bound of the logit of a share
-ROUGH_SHARE = 0.15  # of the variance; minimises the held-out error on training spectra, flat from 0.1 to 0.3
+# Of the variance; minimises the held-out error on training spectra, flat from 0.1 to 0.3
+ROUGH_SHARE = 0.15
 ROUGH_RATIO = 1 / 3  # of the lengths
 COMPILED = 2  # terms that compiled kernels sum
 ONE = torch.ones(())  # a number would cost each operation of a single query as much again
 
 
 def distances(a: Tensor, b: Tensor) -> Tensor:
-    """Return distances (..., n, m) [m] of places (..., n, D) and (..., m, D), with gradients; exact at 0.
+    """Return distances (..., n, m) [m] of places (..., n, D) and (..., m, D), with gradients;
+    exact at 0.
 
     Differences are formed before squaring: the expanded form loses millimetres in float32.
 
@@ -37,14 +41,17 @@ def distances(a: Tensor, b: Tensor) -> Tensor:
     """
     if not needs_reference(a, b):
         return torch.cdist(a, b, compute_mode="donot_use_mm_for_euclid_dist")
-    squared = (a[..., :, None, :] - b[..., None, :, :]).square().sum(-1)  # `cdist` has no forward mode
+    # `cdist` has no forward mode
+    squared = (a[..., :, None, :] - b[..., None, :, :]).square().sum(-1)
     none = squared == 0
     # The inner `where` keeps the root's slope at 0, which is infinite, out of the gradient.
     return torch.where(none, 0.0, torch.where(none, 1.0, squared).sqrt())
 
 
 def median_distance(distance: Tensor) -> float:
-    """Return the median of distances (...) [m], of rows at few places the largest, of those at one 1."""
+    """Return the median of distances (...) [m], of rows at few places the largest,
+    of those at one 1.
+    """
     return float(np.median(distance.numpy())) or float(distance.max()) or 1.0
 
 
@@ -60,7 +67,9 @@ def matern32(distance: Tensor, length: Tensor | float) -> Tensor:
 
 
 def matern32_of_squares(squared: Tensor) -> Tensor:
-    """Return the Matern-3/2 of squared distances (...) in units of the length, with a slope at 0."""
+    """Return the Matern-3/2 of squared distances (...) in units of the length,
+    with a slope at 0.
+    """
     # What is added keeps the slope of the root finite where two places are one.
     root = (3 * squared + 1e-9).sqrt()
     return (1 + root) * torch.exp(-root)
@@ -127,7 +136,8 @@ class Shadowing(Stationary):
 
 
 class ExponentialShadowing(Stationary):
-    """Shadows of `length`, Matern-1/2: rough at any scale (M. Gudmundson, Electronics Letters 27 (1991)).
+    """Shadows of `length`, Matern-1/2: rough at any scale (M. Gudmundson, Electronics Letters 27
+    (1991)).
 
     >>> ExponentialShadowing(2.0).correlation(torch.tensor([0.0, 2.0]))
     tensor([1.0000, 0.3679])
@@ -142,7 +152,8 @@ class ExponentialShadowing(Stationary):
 
 @dataclass(frozen=True)
 class EndShadowing(Shadowing):
-    """The same about one of two ends that both move, whatever the other does: its surroundings, its gain.
+    """The same about one of two ends that both move, whatever the other does: its surroundings,
+    its gain.
 
     >>> near = torch.tensor([[0.0, 0, 0, 9, 9, 9]])  # one transmitter, another receiver
     >>> EndShadowing(2.0).covariance(near, torch.tensor([[0.0, 0, 0, 5, 5, 5]]))
@@ -175,11 +186,12 @@ class SmoothRough(Stationary):
 class IsotropicWaves(Stationary):
     """`sin(kd) / (kd) Matern-3/2(d / length)`: waves from everywhere alike.
 
-    Where both ends move it is the product over both, as waves leave in all directions as they arrive from all
-    (R. K. Cook et al., J. Acoust. Soc. Am. 27 (1955)).
+    Where both ends move it is the product over both, as waves leave in all directions as they
+    arrive from all (R. K. Cook et al., J. Acoust. Soc. Am. 27 (1955)).
 
     >>> waves = IsotropicWaves(length=1e6, wavenumber=2 * math.pi)  # of 1 m wavelength
-    >>> waves.covariance(torch.zeros(1, 3), torch.tensor([[0, 0, 0.75], [0.25, 0, 0]])).round(decimals=3)
+    >>> others = torch.tensor([[0, 0, 0.75], [0.25, 0, 0]])
+    >>> waves.covariance(torch.zeros(1, 3), others).round(decimals=3)
     tensor([[-0.2120,  0.6370]])
 
     Attributes:
@@ -195,7 +207,9 @@ class IsotropicWaves(Stationary):
         return torch.sinc(distance * (self.wavenumber / math.pi)) * matern32(distance, self.length)
 
     def covariance(self, a: Tensor, b: Tensor) -> Tensor:
-        """Return correlations (..., n, m) of places (..., n, 3), (..., m, 3) of one end, or 6 of both [m]."""
+        """Return correlations (..., n, m) of places (..., n, 3), (..., m, 3) of one end,
+        or 6 of both [m].
+        """
         ends = zip(a.split(3, -1), b.split(3, -1), strict=True)
         first, *other = (self.correlation(distances(*pair)) for pair in ends)
         return first * other[0] if other else first
@@ -234,7 +248,10 @@ class Kernel(Stored):
     """`amplitude (sum of terms)`, white noise the last of them.
 
     >>> kernel = Kernel.from_lengths(lengths=(5.0, 50.0), shares=(0.4, 0.6), noise=0.1)
-    >>> kernel.gram(torch.zeros(1, 2, dtype=torch.float64))  # one place: its variance and that of the noise
+
+    One place: its variance and that of the noise:
+
+    >>> kernel.gram(torch.zeros(1, 2, dtype=torch.float64))
     tensor([[1.1000]], dtype=torch.float64)
     >>> torch.allclose(kernel.with_values(kernel.parameters()).parameters(), kernel.parameters())
     True
@@ -295,7 +312,9 @@ class Kernel(Stored):
         """
         parts = [f"{length:.4g} m" for length in self.lengths]
         if len(parts) > 1:
-            parts = [f"{part} ({share:.0%})" for part, share in zip(parts, self.shares, strict=True)]
+            parts = [
+                f"{part} ({share:.0%})" for part, share in zip(parts, self.shares, strict=True)
+            ]
         ends = [" of each end" * isinstance(term, EndShadowing) for term in self.signals]
         kind = "exponential " * isinstance(self.terms[0], ExponentialShadowing)
         word = "lengths" if len(parts) > 1 else "length"
@@ -304,7 +323,9 @@ class Kernel(Stored):
 
     @property
     def compiled_lengths(self) -> list[float] | None:
-        """Lengths as compiled kernels have them, negative of Matern-1/2; None where they cannot answer."""
+        """Lengths as compiled kernels have them, negative of Matern-1/2;
+        None where they cannot answer.
+        """
         signed = [term.compiled * float(term.length) for term in self.signals]
         return signed if all(signed) and len(signed) <= COMPILED else None
 
@@ -328,17 +349,23 @@ class Kernel(Stored):
         return sum(others, first)
 
     def correlations_of(self, apart: Tensor) -> Tensor:
-        """Return correlations (..., n, n) at distances [m], or at places (..., n, D) where more counts."""
+        """Return correlations (..., n, n) at distances [m], or at places (..., n, D)
+        where more counts.
+        """
         return self.correlation(apart) if self.is_isotropic else self.correlations(apart, apart)
 
     def gram(self, places: Tensor) -> Tensor:
-        """Return correlations (n, n) with noise of places (n, D) [m]; times `amplitude`: covariances."""
+        """Return correlations (n, n) with noise of places (n, D) [m]; times `amplitude`:
+        covariances.
+        """
         result = self.correlations(places, places)
         result.diagonal().add_(self.noise)
         return result
 
     def parameters(self) -> Tensor:
-        """Return those of all signals, logarithms of shares relative to the last, that of the noise."""
+        """Return those of all signals, logarithms of shares relative to the last,
+        that of the noise.
+        """
         *signals, noise = (term.parameters() for term in self.terms)
         shares = torch.tensor(self.shares if len(signals) > 1 else [1.0], dtype=torch.float64).log()
         return torch.cat([*signals, shares[:-1] - shares[-1], noise])
@@ -346,7 +373,8 @@ class Kernel(Stored):
     def bounds(self, distance: Tensor) -> list[tuple[float, float]]:
         """Return bounds of the parameters, in their order.
 
-        Takes distances (...) [m] of the rows where terms depend on these alone, else their places (n, D) [m].
+        Takes distances (...) [m] of the rows where terms depend on these alone,
+        else their places (n, D) [m].
 
         >>> [round(low, 2) for low, _ in Kernel.from_length(1.0, 1.0).bounds(torch.tensor([10.0]))]
         [-4.61, -13.82]
@@ -360,11 +388,15 @@ class Kernel(Stored):
         """Return the kernel of other parameters; numbers are tensors where gradients flow."""
         sizes, count = [len(term.parameters()) for term in self.terms], len(self.terms) - 1
         *numbers, logits, noise = parameters.split([*sizes[:-1], count - 1, sizes[-1]])
-        signals = tuple(term.with_values(values) for term, values in zip(self.signals, numbers, strict=True))
+        signals = tuple(
+            term.with_values(values) for term, values in zip(self.signals, numbers, strict=True)
+        )
         if count > 1:
             # Of logits all shares lie between 0 and 1, whatever a step does.
             shares = torch.cat([logits, logits.new_zeros(1)]).softmax(0)
-            signals = tuple(replace(one, share=to_number(s)) for one, s in zip(signals, shares, strict=True))
+            signals = tuple(
+                replace(one, share=to_number(s)) for one, s in zip(signals, shares, strict=True)
+            )
         return replace(self, terms=(*signals, self.terms[-1].with_values(noise)))
 
 

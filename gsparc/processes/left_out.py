@@ -1,8 +1,9 @@
-"""Rows predicted from all others, or from all outside a group (Rasmussen and Williams 2006, eq. 5.12).
+"""Rows predicted from all others, or from all outside a group (Rasmussen
+and Williams 2006, eq. 5.12).
 
-Without a group S its residuals are `(K^-1_SS)^-1 (K^-1 Y)_S`, their covariance `(K^-1_SS)^-1`: a small system
-for each group instead of one of all other rows. Systems of many sizes are solved in batches of the largest,
-with units where a group has ended.
+Without a group S its residuals are `(K^-1_SS)^-1 (K^-1 Y)_S`, their covariance `(K^-1_SS)^-1`: a
+small system for each group instead of one of all other rows. Systems of many sizes are solved in
+batches of the largest, with units where a group has ended.
 """
 
 from __future__ import annotations
@@ -21,7 +22,9 @@ ENTRIES = 2_000_000  # of systems solved at a time: memory
 
 
 class LeftOutErrors(NamedTuple):
-    """Residuals (n, R) of rows that were left out, and their variances (n,); of a group their covariance."""
+    """Residuals (n, R) of rows that were left out, and their variances (n,);
+    of a group their covariance.
+    """
 
     residual: Tensor
     variance: Tensor
@@ -40,11 +43,14 @@ def left_out_residuals(
     Args:
         inverse: `K^-1` (n, n), or its diagonal (n,) where rows are left out one by one.
         weights: `K^-1 Y` (n, ...), real or complex.
-        groups: numbers of rows that are left out together, every row in one of them; None: one by one.
+        groups: numbers of rows that are left out together, every row in one of them; None: one by
+            one.
     """
     if groups is None:
         precision = inverse if inverse.dim() == 1 else inverse.diagonal().real
-        return LeftOutErrors(weights / precision.view(-1, *[1] * (weights.dim() - 1)), 1 / precision)
+        return LeftOutErrors(
+            weights / precision.view(-1, *[1] * (weights.dim() - 1)), 1 / precision
+        )
     residual, variance = torch.empty_like(weights), torch.empty_like(inverse.diagonal().real)
     for _, index, valid, block in _padded_blocks(inverse, list(groups)):
         residual[index[valid]] = block.solve(weights[index])[valid]
@@ -55,7 +61,9 @@ def left_out_residuals(
 def _padded_blocks(
     inverse: Tensor, sets: Sequence[Tensor]
 ) -> Iterator[tuple[Tensor, Tensor, Tensor, Factor]]:
-    """Yield numbers (c,) of sets of rows, their rows (c, m), which of these are valid, and `K^-1` of them."""
+    """Yield numbers (c,) of sets of rows, their rows (c, m), which of these are valid,
+    and `K^-1` of them.
+    """
     size = torch.tensor([len(one) for one in sets])
     order = size.argsort()
     while len(order):
@@ -70,7 +78,9 @@ def _padded_blocks(
 
 
 def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor) -> LeftOutErrors:
-    """Return residuals (c, R) of rows (c,), each without what is `near` it (c, n) bool, and variances."""
+    """Return residuals (c, R) of rows (c,), each without what is `near` it (c, n) bool,
+    and variances.
+    """
     residual, variance = weights[rows].clone(), inverse.diagonal()[rows].real.clone()
     for part, index, valid, block in _padded_blocks(inverse, [one.nonzero()[:, 0] for one in near]):
         unit = ((index == rows[part, None]) & valid).to(inverse.dtype)
@@ -83,10 +93,12 @@ def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor
 def left_out_signal(
     inverse: Tensor, weights: Tensor, disturbance: Tensor, groups: Iterable[Tensor] | None = None
 ) -> tuple[Tensor, Tensor | None]:
-    """Return each row less the signal predicted from all others (n, R), and its variance (n,) without groups.
+    """Return each row less the signal predicted from all others (n, R), and its variance (n,)
+    without groups.
 
-    With K = S + N the signal of all rows outside a group is, in it, `y - N K^-1 y - (1 - N K^-1) r` with the
-    residual r of `left_out_residuals`: what disturbs others by their order alone is not predicted.
+    With K = S + N the signal of all rows outside a group is, in it, `y - N K^-1 y - (1 - N K^-1) r`
+    with the residual r of `left_out_residuals`:
+    what disturbs others by their order alone is not predicted.
 
     Args:
         inverse, weights, groups: as in `left_out_residuals`.

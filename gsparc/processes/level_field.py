@@ -1,7 +1,9 @@
-"""Levels as a field over places: correlated exponentially, noise, and a mean that is linear in regressors.
+"""Levels as a field over places: correlated exponentially, noise,
+and a mean that is linear in regressors.
 
-Correlation is Gudmundson's (Electronics Letters 27, 1991). Its length, and how strong the noise is beside it,
-are those of most likelihood on a grid: for questions about data, which finer ones answer no better.
+Correlation is Gudmundson's (Electronics Letters 27, 1991). Its length, and how strong the noise is
+beside it, are those of most likelihood on a grid: for questions about data,
+which finer ones answer no better.
 """
 
 from __future__ import annotations
@@ -49,13 +51,16 @@ class LevelField:
 
 
 def fit_level_field(
-    place: np.ndarray, level: np.ndarray, group: np.ndarray, columns: Sequence[np.ndarray] = (),
+    place: np.ndarray,
+    level: np.ndarray,
+    group: np.ndarray,
+    columns: Sequence[np.ndarray] = (),
     nuggets: Sequence[float] = NUGGETS,
-) -> LevelField:  # fmt: skip
+) -> LevelField:
     """Fit a field and a constant for each of groups, and slopes of columns over all of them.
 
-    Constants are random about a mean that nobody knows (restricted likelihood): many groups of few rows cost
-    what they leave open, not half a logarithm of all rows each.
+    Constants are random about a mean that nobody knows (restricted likelihood): many groups of few
+    rows cost what they leave open, not half a logarithm of all rows each.
 
     >>> place = np.random.default_rng(0).uniform(0, 100, (60, 2))
     >>> field = fit_level_field(place, 3 * place[:, 0], np.zeros(60), [place[:, 0]])
@@ -97,5 +102,7 @@ def fit_level_field(
                 more = float(np.log1p(spread * weight).sum()) + math.log(values.sum())
                 more += len(slope) * math.log(count)
                 score = -0.5 * (count * math.log(variance) + logarithms + more)
-                found.append(LevelField(score, replace(kernel, amplitude=variance), table[:, 1:], slope))
+                found.append(
+                    LevelField(score, replace(kernel, amplitude=variance), table[:, 1:], slope)
+                )
     return max(found, key=lambda one: one.score)

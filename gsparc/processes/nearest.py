@@ -1,11 +1,11 @@
 """A process given very many rows: each place is predicted from the rows nearest to it.
 
-A. V. Vecchia, "Estimation and model identification for continuous spatial processes", J. R. Stat. Soc. B 50
-(1988); A. Datta et al., "Hierarchical nearest-neighbor Gaussian process models for large geostatistical
-datasets", JASA 111 (2016): near rows screen far ones, so that a density given all rows is nearly that given
-the nearest. The mean law's terms, which reach everywhere, are weighed once on rows that cover the site.
-Rows of one place are their mean, with the noise of that mean, which loses nothing. Settings maximise the
-density of rows given their nearest ones.
+A. V. Vecchia, "Estimation and model identification for continuous spatial processes", J. R. Stat.
+Soc. B 50 (1988); A. Datta et al., "Hierarchical nearest-neighbor Gaussian process models for large
+geostatistical datasets", JASA 111 (2016): near rows screen far ones, so that a density given all
+rows is nearly that given the nearest. The mean law's terms, which reach everywhere, are weighed
+once on rows that cover the site. Rows of one place are their mean, with the noise of that mean,
+which loses nothing. Settings maximise the density of rows given their nearest ones.
 """
 
 from __future__ import annotations
@@ -29,7 +29,12 @@ from gsparc.processes.factor import Factor, NotDefiniteError
 from gsparc.processes.few_rows import covering_rows
 from gsparc.processes.fit_kernel import LOOKS, SETTLED, fit_kernel
 from gsparc.processes.kernel import Kernel, distances
-from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood, nearest_distance, rows_with_nearest
+from gsparc.processes.neighbourhood import (
+    NEIGHBOURS,
+    Neighbourhood,
+    nearest_distance,
+    rows_with_nearest,
+)
 from gsparc.processes.prior import Posterior, Prior
 
 COVER, FEW = 2_000, 500  # rows that weigh the mean law, where it is to stay, and for choices
@@ -42,14 +47,17 @@ EXCESS = 20.0  # nats, of an amplitude e times the variance of the values
 
 
 class KrigingWeights(NamedTuple):
-    """Weights (B, k) of near values in the mean at places, and what they take off its variance (B,)."""
+    """Weights (B, k) of near values in the mean at places,
+    and what they take off its variance (B,).
+    """
 
     weights: Tensor
     explained_variance: Tensor
 
 
 def kriging_weights(gram: Tensor, cross: Tensor) -> KrigingWeights:
-    """Return weights (B, k) of near values in the mean at places, and what they take off its variance (B,).
+    """Return weights (B, k) of near values in the mean at places,
+    and what they take off its variance (B,).
 
     Args:
         gram: (B, k, k) covariances of the near values, with their noise.
@@ -59,8 +67,12 @@ def kriging_weights(gram: Tensor, cross: Tensor) -> KrigingWeights:
     return KrigingWeights(weights, (weights * cross).sum(-1))
 
 
-def neighbour_weights(kernel: Kernel, places: Tensor, neighbours: Tensor, noise: Tensor) -> KrigingWeights:
-    """Return the same at places (B, D) float64 [m], with autograd, by rows (B, k, D) of `noise` (B, k)."""
+def neighbour_weights(
+    kernel: Kernel, places: Tensor, neighbours: Tensor, noise: Tensor
+) -> KrigingWeights:
+    """Return the same at places (B, D) float64 [m], with autograd, by rows (B, k, D)
+    of `noise` (B, k).
+    """
     gram = kernel.correlations(neighbours, neighbours)
     gram.diagonal(dim1=-2, dim2=-1).add_(noise + JITTER)
     return kriging_weights(gram, kernel.correlations(places[:, None], neighbours)[:, 0])
@@ -70,7 +82,8 @@ def neighbour_weights(kernel: Kernel, places: Tensor, neighbours: Tensor, noise:
 class PlaceValues:
     """Places, each once, and what was measured there.
 
-    >>> values = PlaceValues.from_rows(np.zeros((2, 3)), torch.tensor([[1.0], [3.0]], dtype=torch.float64))
+    >>> rows = torch.tensor([[1.0], [3.0]], dtype=torch.float64)
+    >>> values = PlaceValues.from_rows(np.zeros((2, 3)), rows)
     >>> values.values, values.count  # two rows of one place
     (tensor([[2.]], dtype=torch.float64), tensor([2.], dtype=torch.float64))
 
@@ -132,7 +145,9 @@ class Nearest(Posterior):
 
     def mean_at(self, queries: Tensor, float64: bool = False) -> Tensor:
         """See `Posterior`."""
-        return torch.cat([self._answer(part, None, float64).mean for part in queries.split(self._block)])
+        return torch.cat(
+            [self._answer(part, None, float64).mean for part in queries.split(self._block)]
+        )
 
     def left_out(self, rows: Tensor | None = None) -> MeanVariance:
         """See `Posterior`."""
@@ -144,13 +159,17 @@ class Nearest(Posterior):
     ) -> MeanVariance:
         step = self._block
         blocks = [slice(start, start + step) for start in range(0, len(queries), step)]
-        parts = (self._answer(queries[b], None if excluded is None else excluded[b], float64) for b in blocks)
+        parts = (
+            self._answer(queries[b], None if excluded is None else excluded[b], float64)
+            for b in blocks
+        )
         if len(blocks) < 2 or not has_query_kernel(queries):
             return MeanVariance(*(torch.cat(part) for part in zip(*parts, strict=True)))
         first = next(parts)
         blank = first.mean.new_empty(len(queries), first.mean.shape[1])
         result = MeanVariance(blank, queries.new_empty(len(queries)))
-        # Parts kept in a list would lie between freed systems in memory, which then is not used again.
+        # Parts kept in a list would lie between freed systems in memory,
+        # which then is not used again.
         for block, part in zip(blocks, chain([first], parts), strict=True):
             result.mean[block], result.variance[block] = part.mean, part.variance
         return result
@@ -197,21 +216,29 @@ class Nearest(Posterior):
         return nearest_distance(self.near.tree, queries)
 
     def subset(self, chosen: np.ndarray, seed: int) -> Self:
-        """Return the same given the places `chosen` alone; the mean law's weights stay as all places say."""
+        """Return the same given the places `chosen` alone;
+        the mean law's weights stay as all places say.
+        """
         near = Neighbourhood.from_places(self.near.places[chosen], seed)
         return replace(self, near=near, rest=self.rest[chosen], noise=self.noise[chosen])
 
 
 def condition_on_nearest(
-    prior: Prior, values: PlaceValues, seed: int, pseudo_values: PlaceValues | None = None,
-    pseudo_variance: Tensor | None = None, neighbours: int = NEIGHBOURS, cover: int = COVER,
-) -> Nearest:  # fmt: skip
+    prior: Prior,
+    values: PlaceValues,
+    seed: int,
+    pseudo_values: PlaceValues | None = None,
+    pseudo_variance: Tensor | None = None,
+    neighbours: int = NEIGHBOURS,
+    cover: int = COVER,
+) -> Nearest:
     """Return the process given places, with settings as they are.
 
     >>> line = np.linspace(0.0, 9.0, 10)[:, None]
     >>> values = PlaceValues.from_rows(line, torch.from_numpy(np.sin(line)))
-    >>> posterior = condition_on_nearest(Prior(Kernel.from_length(3.0, 1e-4)), values, seed=0, neighbours=4)
-    >>> posterior.approximation, posterior.answer(torch.tensor([[4.5]], dtype=torch.float64)).mean.shape
+    >>> prior, place = Prior(Kernel.from_length(3.0, 1e-4)), torch.tensor([[4.5]]).double()
+    >>> posterior = condition_on_nearest(prior, values, seed=0, neighbours=4)
+    >>> posterior.approximation, posterior.answer(place).mean.shape
     ('Vecchia 4', torch.Size([1, 1]))
 
     Args:
@@ -246,7 +273,8 @@ def condition_on_nearest(
 def trend_mean_and_covariance(
     prior: Prior, places: np.ndarray, rest: Tensor, noise: Tensor, seed: int, cover: int
 ) -> tuple[Tensor, Tensor]:
-    """Return mean (Q, P) and covariance (Q, Q) of the mean law's terms, unit normal before, given some rows.
+    """Return mean (Q, P) and covariance (Q, Q) of the mean law's terms, unit normal before,
+    given some rows.
 
     Args:
         prior: see there.
@@ -270,8 +298,10 @@ class NeighbourSample(NamedTuple):
     """Rows with their nearest others: each row first, then its neighbours.
 
     Attributes:
-        apart: (T, 1 + k, 1 + k) distances between them [m]; their places (T, 1 + k, D) where more counts.
-        values: (T, 1 + k, P), less the mean law and its weighed terms; outputs share kernel and amplitude.
+        apart: (T, 1 + k, 1 + k) distances between them [m]; their places (T, 1 + k, D) where more
+            counts.
+        values: (T, 1 + k, P), less the mean law and its weighed terms; outputs share kernel and
+            amplitude.
         counts: (T, 1 + k) rows that each value is the mean of.
         scatter: (T,) sum of squares of the first one's rows about their mean; None: not looked at.
     """
@@ -285,7 +315,9 @@ class NeighbourSample(NamedTuple):
 def nearest_density(
     kernel: Kernel, sample: NeighbourSample, penalty: float = EXCESS
 ) -> tuple[Tensor, Tensor]:
-    """Return the negative log density, mean over rows [nats], and the best amplitude; see `EXCESS`."""
+    """Return the negative log density, mean over rows [nats], and the best amplitude;
+    see `EXCESS`.
+    """
     covariance, noise = kernel.correlations_of(sample.apart), kernel.noise / sample.counts
     value, near = sample.values[:, 0], sample.values[:, 1:]
     gram = covariance[:, 1:, 1:] + torch.diag_embed(noise[:, 1:] + JITTER)
@@ -296,7 +328,10 @@ def nearest_density(
     count = variance.new_tensor(len(variance))
     if sample.scatter is not None:  # visits again tell of the noise alone
         again = (sample.counts[:, 0] - 1).sum()
-        squared, spread = squared + sample.scatter / kernel.noise, spread + again * math.log(kernel.noise)
+        squared, spread = (
+            squared + sample.scatter / kernel.noise,
+            spread + again * math.log(kernel.noise),
+        )
         count = count + again
     amplitude = (squared.sum() / count).clamp_min(TINY)
     # Near rows alone tell no long process of a huge amplitude from one of the values' own.
@@ -308,8 +343,8 @@ def nearest_density(
 def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tuple[Kernel, str]:
     """Choose the kernel most likely by rows that cover the site, and say on what it was chosen.
 
-    Neighbours are looked for among all places, among an eighth of them, and so on: what is near shows the
-    short length, what is sparse the long one.
+    Neighbours are looked for among all places, among an eighth of them, and so on: what is near
+    shows the short length, what is sparse the long one.
 
     Args:
         prior: mean law, and a kernel chosen on few rows.
@@ -321,7 +356,9 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
         return start, f"settings of {count} places, as they were"
     every = torch.from_numpy(values.places)
     rest = values.values - prior.mean(every)
-    about, _ = trend_mean_and_covariance(prior, values.places, rest, start.noise / values.count, seed, FEW)
+    about, _ = trend_mean_and_covariance(
+        prior, values.places, rest, start.noise / values.count, seed, FEW
+    )
     rest = rest - prior.columns(every) @ about
     level = Neighbourhood.from_places(values.places, seed).level
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]

@@ -25,7 +25,8 @@ FEWEST = 500  # places in the sparsest of them
 class Neighbourhood(Stored):
     """Places in sets that are ever sparser and cover the site.
 
-    A vehicle measures every metre of one street: its nearest places alone are of a few metres of that street.
+    A vehicle measures every metre of one street:
+    its nearest places alone are of a few metres of that street.
 
     >>> line = np.linspace(0, 100, 11)[:, None]  # every 10 m
     >>> Neighbourhood.from_places(line, seed=0).nearest_rows(np.array([[41.0]]), most=2).tolist()
@@ -63,12 +64,16 @@ class Neighbourhood(Stored):
         return cKDTree(self.places)
 
     def split_by_density(self, most: int) -> list[tuple[np.ndarray, int]]:
-        """Return rows (m,) of each set, the densest first, and how many of `most` neighbours are of it."""
+        """Return rows (m,) of each set, the densest first,
+        and how many of `most` neighbours are of it.
+        """
         sparser = len(self._trees) - 1
         share = int(most * WIDER) // max(sparser, 1)
         # The densest set has what the sparser ones leave, rounding included.
         counts = [most - share * sparser, *[share] * sparser]
-        return [(members, count) for (members, _), count in zip(self._trees[::-1], counts, strict=True)]
+        return [
+            (members, count) for (members, _), count in zip(self._trees[::-1], counts, strict=True)
+        ]
 
     def nearest_rows(
         self, queries: np.ndarray, excluded: np.ndarray | None = None, most: int = NEIGHBOURS
@@ -77,18 +82,22 @@ class Neighbourhood(Stored):
 
         Args:
             queries: [m].
-            excluded: (B,) a place for each query that is no neighbour of it; None: none. Of one place
-                alone there is then no neighbour.
+            excluded: (B,) a place for each query that is no neighbour of it; None: none. Of one
+                place alone there is then no neighbour.
             most: neighbours.
         """
         result: list[np.ndarray] = []
         # One more is looked for, as the place itself is among the nearest.
         more = 0 if excluded is None else 1
-        for (members, count), (_, tree) in zip(self.split_by_density(most), self._trees[::-1], strict=True):
+        for (members, count), (_, tree) in zip(
+            self.split_by_density(most), self._trees[::-1], strict=True
+        ):
             row = members[tree.query(queries, k=np.arange(1, min(count + more, tree.n) + 1))[1]]
             if excluded is not None:
                 # A stable sort puts the place itself last and keeps the others from near to far.
-                later = np.argsort(row == excluded[:, None], axis=1, kind="stable")[:, : row.shape[1] - 1]
+                later = np.argsort(row == excluded[:, None], axis=1, kind="stable")[
+                    :, : row.shape[1] - 1
+                ]
                 row = np.take_along_axis(row, later, 1)
             result.append(row)
         return np.concatenate(result, 1)
@@ -106,7 +115,9 @@ def rows_with_nearest(places: np.ndarray, row: np.ndarray, most: int = NEIGHBOUR
 
 
 def nearest_distance(tree: cKDTree, queries: Tensor) -> Tensor:
-    """Return distances (B,) [m] from queries (B, D) float64 to a tree's nearest place, with autograd."""
+    """Return distances (B,) [m] from queries (B, D) float64 to a tree's nearest place,
+    with autograd.
+    """
     distance, row = tree.query(to_numpy(queries))
     if not is_differentiated(queries):
         return torch.from_numpy(distance)

@@ -17,7 +17,8 @@ UNKNOWN = torch.full_like(ORIGIN, math.nan)  # a place that nobody gave
 
 
 def first_end(places: Places) -> Places:
-    """Return the first end (..., 3) of places (..., D) [m]: the one that moves, or of two the transmitter.
+    """Return the first end (..., 3) of places (..., D) [m]: the one that moves,
+    or of two the transmitter.
 
     >>> first_end(np.array([[1.0, 2.0, 3.0, 0.0, 0.0, 9.0]]))
     array([[1., 2., 3.]])

@@ -1,7 +1,7 @@
 """A process conditioned on rows: exactly, or each query on the rows nearest to it.
 
-Many outputs share one covariance. Variances are of a measurement, its noise included, in units of the
-kernel's amplitude.
+Many outputs share one covariance. Variances are of a measurement, its noise included, in units of
+the kernel's amplitude.
 """
 
 from __future__ import annotations
@@ -51,10 +51,16 @@ class Exact(Posterior):
 
     @classmethod
     def from_values(
-        cls, prior: Prior, places: Tensor, values: Tensor, extra: Tensor | None = None,
+        cls,
+        prior: Prior,
+        places: Tensor,
+        values: Tensor,
+        extra: Tensor | None = None,
         factor: Factor | None = None,
-    ) -> Exact:  # fmt: skip
-        """Condition on values (n, P) at places (n, D) float64 [m]; with their factor where it is known."""
+    ) -> Exact:
+        """Condition on values (n, P) at places (n, D) float64 [m];
+        with their factor where it is known.
+        """
         extra = torch.zeros(len(places), dtype=torch.float64) if extra is None else extra
         factor = _factor(prior, places, extra) if factor is None else factor
         result = cls(prior, places, factor.solve(values - prior.mean(places)), extra)
@@ -83,7 +89,9 @@ class Exact(Posterior):
 
     @cached_property
     def _vecchia(self) -> Nearest | None:
-        """What states the variance of many rows: exactly it costs their number squared for each place."""
+        """What states the variance of many rows:
+        exactly it costs their number squared for each place.
+        """
         if len(self.rows) <= MANY or not self.prior.kernel.is_isotropic:
             return None
         terms = self.factor.whiten(self._trend_columns)
@@ -106,7 +114,9 @@ class Exact(Posterior):
         return result if self.prior.trend is None else self.prior.mean(queries) + result
 
     def cross_covariance(self, queries: Tensor, columns: Tensor) -> Tensor:
-        """Return covariances (B, n) of places (B, D), whose terms are `columns` (B, Q), with the rows."""
+        """Return covariances (B, n) of places (B, D), whose terms are `columns` (B, Q),
+        with the rows.
+        """
         result = self.prior.kernel.correlations(queries, self.rows)
         return result if self.prior.trend is None else result.addmm(columns, self._trend_columns.T)
 
@@ -136,7 +146,9 @@ class Exact(Posterior):
         """Return the covariance (B, B) of the signal at places (B, D), in the kernel's units."""
         cross = self.cross_covariance(queries, self.prior.columns(queries))
         white = self.factor.whiten(cross.T)
-        return self.prior.kernel.amplitude * (self.prior.cross_covariance(queries, queries) - white.T @ white)
+        return self.prior.kernel.amplitude * (
+            self.prior.cross_covariance(queries, queries) - white.T @ white
+        )
 
 
 def _factor(prior: Prior, places: Tensor, extra: Tensor) -> Factor:

@@ -24,7 +24,8 @@ from gsparc.processes.prior import Prior
 from gsparc.processes.stored import Stored
 from gsparc.processes.trend import Law, Trend
 
-MOST_ROWS = 6_000  # whose covariance is factored as one: of more, each place is predicted from the nearest
+# Whose covariance is factored as one: of more, each place is predicted from the nearest
+MOST_ROWS = 6_000
 LEAST_SILENT, MOST_SILENT = 200, 3_000  # silent ones of them: no more than were heard, but for few
 BOUNDS = {1: "where nothing was heard are below", -1: "in saturation are above"}
 REACH = 0.25  # diagonals of the known places, by which a law's confidence falls to 1/e
@@ -34,14 +35,16 @@ REACH = 0.25  # diagonals of the known places, by which a law's confidence falls
 class PowerRows:
     """Powers and where they were measured.
 
-    >>> rows = PowerRows(np.zeros((3, 3)), np.array([-60.0, -95.0, -70.0]), np.array([0, 1, 0], np.int8))
+    >>> levels, sides = np.array([-60.0, -95.0, -70.0]), np.array([0, 1, 0], np.int8)
+    >>> rows = PowerRows(np.zeros((3, 3)), levels, sides)
     >>> rows.silent, len(rows.measured_rows.decibels)  # the second lies below its level
     (array([False,  True, False]), 2)
 
     Attributes:
         places: (n, 3) of the moving end, or (n, 6) of both [m].
         decibels: (n,) powers, or levels [dB].
-        side: (n,) int8, 1 where the power lies below its level, -1 where above, 0 where it was measured.
+        side: (n,) int8, 1 where the power lies below its level, -1 where above, 0 where it was
+            measured.
     """
 
     places: np.ndarray
@@ -72,19 +75,26 @@ class PowerRows:
         return PlaceValues.from_rows(self.places, torch.from_numpy(self.decibels)[:, None])
 
     def view(self, trend: Trend, kernel: Kernel | None = None) -> KernelRows:
-        """Return the rows [dB] less the mean of a trend and with its terms, as a kernel's settings see them.
+        """Return the rows [dB] less the mean of a trend and with its terms,
+        as a kernel's settings see them.
 
         Of a `kernel` to which more than distances counts, places (n, D) [m] stand for these.
         """
         places = torch.from_numpy(self.places)
         rest = torch.from_numpy(self.decibels) - trend.mean(places)
         geometry = distances(places, places) if kernel is None or kernel.is_isotropic else places
-        return KernelRows(geometry, trend.columns(places), rest[:, None], torch.from_numpy(self.side))
+        return KernelRows(
+            geometry, trend.columns(places), rest[:, None], torch.from_numpy(self.side)
+        )
 
     def draw_subset(self, count: int, seed: int) -> Self:
-        """Draw at most so many, in their order; at least half of them were heard where as many were."""
+        """Draw at most so many, in their order; at least half of them were heard
+        where as many were.
+        """
         rng = np.random.default_rng(seed)
-        order = np.concatenate([rng.permutation(np.flatnonzero(one)) for one in (~self.silent, self.silent)])
+        order = np.concatenate(
+            [rng.permutation(np.flatnonzero(one)) for one in (~self.silent, self.silent)]
+        )
         return self.subset(first_rows(order, count, np.zeros(len(order)), self.silent))
 
 
@@ -145,23 +155,30 @@ class PowerProcess(Stored):
         return self.posterior.places.numpy()
 
     def answer(self, queries: Tensor, far: Tensor | None = None) -> PowerAnswer:
-        """Predict powers at places (B, 3) or (B, 6) [m], `far` (B,) from all rows where that is known [m].
+        """Predict powers at places (B, 3) or (B, 6) [m], `far` (B,)
+        from all rows where that is known [m].
 
-        Unknown is the variance as a share of that of the known rows. What the mean law explains of them
-        counts as known near them only: its slope says nothing of places far from all data.
+        Unknown is the variance as a share of that of the known rows. What the mean law explains of
+        them counts as known near them only: its slope says nothing of places far from all data.
         """
         far = self.posterior.nearest_distance(queries) if far is None else far
         if self.others:
             parts = [(share, *one.answer(queries, far)) for share, one in self.members]
             mean, variance = mixture_moments([part[:3] for part in parts])
-            return PowerAnswer(mean, variance, sum((p[0] * p[3] for p in parts), torch.zeros_like(mean)))
+            return PowerAnswer(
+                mean, variance, sum((p[0] * p[3] for p in parts), torch.zeros_like(mean))
+            )
         result = self.posterior.answer(queries)
         prior_variance = 1 + self.kernel.noise
         whole = max(self.heard, prior_variance)
         by_law = 1 - prior_variance / whole  # share of that variance
         # What the law explains counts as unknown where no row is near.
-        unknown = result.variance / whole + by_law * (1 - (-(far / self._trend_reach).square()).exp())
-        return PowerAnswer(result.mean[:, 0], self.kernel.amplitude * result.variance, unknown.clamp_max(1.0))
+        unknown = result.variance / whole + by_law * (
+            1 - (-(far / self._trend_reach).square()).exp()
+        )
+        return PowerAnswer(
+            result.mean[:, 0], self.kernel.amplitude * result.variance, unknown.clamp_max(1.0)
+        )
 
     @cached_property
     def _trend_reach(self) -> float:
@@ -184,7 +201,9 @@ class PowerProcess(Stored):
         parts = []
         for share, one in self.members:
             exact = one.posterior if isinstance(one.posterior, Exact) else None
-            heard = torch.from_numpy(places) if exact is None else (exact.extra == 0).nonzero()[:, 0]
+            heard = (
+                torch.from_numpy(places) if exact is None else (exact.extra == 0).nonzero()[:, 0]
+            )
             if some is None:
                 mean, variance = (part[heard] for part in one.posterior.left_out())
             else:
@@ -193,7 +212,9 @@ class PowerProcess(Stored):
         return mixture_moments(parts)
 
     def with_exact_posterior(self) -> PowerProcess:
-        """Return the first alone, with covariances between places; of many rows, given some of them."""
+        """Return the first alone, with covariances between places; of many rows,
+        given some of them.
+        """
         nearest = self.posterior
         if not isinstance(nearest, Nearest):
             return replace(self, others=())
@@ -226,7 +247,9 @@ def condition_on_powers(
     share = values.count / values.count.sum()
     middle = (share * values.values[:, 0]).sum()
     heard = float((share * (values.values[:, 0] - middle).square()).sum()) / prior.kernel.amplitude
-    note = f"each place is predicted from the {NEIGHBOURS} nearest of {len(values.places)} (Vecchia)"
+    note = (
+        f"each place is predicted from the {NEIGHBOURS} nearest of {len(values.places)} (Vecchia)"
+    )
     if not rows.silent.any():
         return PowerProcess(condition_on_nearest(prior, values, seed), heard), (note,)
     part = rows.draw_subset(MOST_ROWS, seed)
@@ -239,12 +262,17 @@ def condition_on_powers(
         posterior.given_values()[quiet],
         torch.ones(int(quiet.sum()), dtype=torch.float64),
     )
-    of = f"of {int(rows.silent.sum())} censored rows {int(part.silent.sum())}, drawn evenly, are looked at"
+    of = (
+        f"of {int(rows.silent.sum())} censored rows {int(part.silent.sum())}, drawn evenly, are "
+        "looked at"
+    )
     nearest = condition_on_nearest(prior, values, seed, stand_ins, posterior.extra[quiet])
     return PowerProcess(nearest, heard), (note, of, *notes)
 
 
-def _condition_exactly(rows: PowerRows, prior: Prior, least: int) -> tuple[PowerProcess, tuple[str, ...]]:
+def _condition_exactly(
+    rows: PowerRows, prior: Prior, least: int
+) -> tuple[PowerProcess, tuple[str, ...]]:
     counts = {phrase: int((rows.side == side).sum()) for side, phrase in BOUNDS.items()}
     notes = [f"{count} rows {phrase} their level" for phrase, count in counts.items() if count]
     places, decibels, extra, factor = _add_pseudo_values(rows, prior, least, notes)
@@ -257,7 +285,9 @@ def _condition_exactly(rows: PowerRows, prior: Prior, least: int) -> tuple[Power
 def _add_pseudo_values(
     rows: PowerRows, prior: Prior, least: int, notes: list[str]
 ) -> tuple[Tensor, Tensor, Tensor, Factor | None]:
-    """Places, decibels, extra variances and a factor; pseudo-values of the silent rows that say anything."""
+    """Places, decibels, extra variances and a factor;
+    pseudo-values of the silent rows that say anything.
+    """
     places, decibels = torch.from_numpy(rows.places), torch.from_numpy(rows.decibels)
     extra, silent = torch.zeros_like(decibels), torch.from_numpy(rows.silent)
     if not rows.silent.any():

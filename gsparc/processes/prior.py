@@ -1,4 +1,6 @@
-"""What is known of values before any row (`Prior`), and what rows say of other places (`Posterior`)."""
+"""What is known of values before any row (`Prior`),
+and what rows say of other places (`Posterior`).
+"""
 
 from __future__ import annotations
 
@@ -36,11 +38,17 @@ class Prior(Stored):
 
     def mean(self, places: Tensor) -> Tensor:
         """Return the mean (n, 1) at places (n, D) [m]."""
-        return places.new_zeros(len(places), 1) if self.trend is None else self.trend.mean(places)[:, None]
+        return (
+            places.new_zeros(len(places), 1)
+            if self.trend is None
+            else self.trend.mean(places)[:, None]
+        )
 
     def columns(self, places: Tensor) -> Tensor:
         """Return terms (n, Q) at places (n, D) [m]."""
-        return places.new_zeros(len(places), 0) if self.trend is None else self.trend.columns(places)
+        return (
+            places.new_zeros(len(places), 0) if self.trend is None else self.trend.columns(places)
+        )
 
     def mean_and_columns(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """Return `mean` and `columns` at once, which may have much in common."""
@@ -73,7 +81,8 @@ class Posterior(Stored, ABC):
 
     @abstractmethod
     def answer(self, queries: Tensor, float64: bool = False) -> MeanVariance:
-        """Return mean (B, P) and variance of a measurement (B,) at places (B, D) float64 [m], with autograd.
+        """Return mean (B, P) and variance of a measurement (B,) at places (B, D) float64 [m],
+        with autograd.
 
         Which rows are nearest has no gradient.
 
@@ -86,7 +95,8 @@ class Posterior(Stored, ABC):
 
     @abstractmethod
     def left_out(self, rows: Tensor | None = None) -> MeanVariance:
-        """Return the mean (n, P) and variance of a measurement (n,) at each row's place without its own.
+        """Return the mean (n, P) and variance of a measurement (n,)
+        at each row's place without its own.
 
         Of some `rows` (m,) by their numbers, or of all.
         """

@@ -1,10 +1,11 @@
-"""Powers of a network's sectors: a law of distance, their patterns, shadowing that those of a site share.
+"""Powers of a network's sectors: a law of distance, their patterns,
+shadowing that those of a site share.
 
-Places (n, 7) are of the moving end, of the station [m], and the station's number. The pattern is that of 3GPP
-TR 36.814, table A.2.1.1-2:
-`-min(min(12 (azimuth / width)^2, floor) + min(12 (elevation / height)^2, 20), floor)`, of angles [deg] from
-the azimuth, clockwise from north, and from the tilt, positive downwards. Widths lie between 3 dB points;
-`floor` (A_m there) starts at 25 dB and is learned, 20 dB (SLA_v) is fixed.
+Places (n, 7) are of the moving end, of the station [m], and the station's number. The pattern is
+that of 3GPP TR 36.814, table A.2.1.1-2:
+`-min(min(12 (azimuth / width)^2, floor) + min(12 (elevation / height)^2, 20), floor)`, of angles
+[deg] from the azimuth, clockwise from north, and from the tilt, positive downwards. Widths lie
+between 3 dB points; `floor` (A_m there) starts at 25 dB and is learned, 20 dB (SLA_v) is fixed.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from gsparc.processes.trend import Trend
 
 ELEVATION_FLOOR_DB = 20.0
 BEARING = 0.5  # radians, over which a sector's deviations from its pattern are alike
-# Shared by all: exponent, bend [dB a squared decade], logarithms of both widths, floor [dB], tilt [deg].
+# Shared by all: exponent, bend [dB a squared decade], logarithms of both widths, floor [dB],
+# tilt [deg].
 SHARED = torch.tensor((3.5, 0.0, 0.0, 0.0, 25.0, 0.0), dtype=torch.float64)
 SHARED_SPREAD = torch.tensor((0.7, 2.0, 0.2, 0.3, 4.0, 1.5), dtype=torch.float64)
 # Of a sector's own: azimuth, tilt [deg], logarithm of its width, floor [dB]; slope [dB a decade].
@@ -49,13 +51,14 @@ class Sectors(Trend):
     """The mean of powers of T sectors, and what of it is uncertain.
 
     Attributes:
-        table: (T, 5) float64: azimuth from north, tilt, widths across and in height [deg], power [dB]; one
-            without azimuth has no pattern, and -1 there.
+        table: (T, 5) float64: azimuth from north, tilt, widths across and in height [deg], power
+            [dB]; one without azimuth has no pattern, and -1 there.
         site: (T,) of each, and its band, int64.
         band: see `site`.
         shared: (6,) see `SHARED`.
         levels: (bands,) at the middle distance [dB].
-        doubt: (6 + bands, Q) what is uncertain of `shared_columns`, for unit normal weights of a site.
+        doubt: (6 + bands, Q) what is uncertain of `shared_columns`, for unit normal weights of a
+            site.
         unit: deviation of the processes [dB], in which terms are.
     """
 
@@ -69,7 +72,9 @@ class Sectors(Trend):
 
     @cached_property
     def indicators(self) -> tuple[Tensor, Tensor]:
-        """Return which of its site (T, R) each sector is, and of which band (T, bands), as units."""
+        """Return which of its site (T, R) each sector is, and of which band (T, bands),
+        as units.
+        """
         rank = (self.site[:, None] == self.site).tril(-1).sum(1)
         units = torch.nn.functional.one_hot
         return units(rank).double(), units(self.band, len(self.levels)).double()
@@ -95,7 +100,9 @@ class Sectors(Trend):
     def powers_at(  # type: ignore[override]
         self, places: Tensor, shared: Tensor, levels: Tensor, own: Tensor | None = None
     ) -> Tensor:
-        """Return powers (..., n) [dB] for shared parameters (..., 6), levels; a sector's own (..., 4)."""
+        """Return powers (..., n) [dB] for shared parameters (..., 6), levels;
+        a sector's own (..., 4).
+        """
         assert self.law is not None
         number = sector_of(places).long()
         decades = self.law.decades(places) - self.middle
@@ -103,12 +110,14 @@ class Sectors(Trend):
         level = levels[self.band[number]] + self.table[number, 4] - 10 * exponent * decades
         return level - bend * decades.square() - self.pattern_loss(places, shared, own)
 
-    def pattern_loss(self, places: Tensor, shared: Tensor | None = None, own: Tensor | None = None) -> Tensor:
+    def pattern_loss(
+        self, places: Tensor, shared: Tensor | None = None, own: Tensor | None = None
+    ) -> Tensor:
         """Return what patterns take off (..., n) [dB]; see `powers_at`.
 
         >>> north = Sectors(0.0, table=torch.tensor([[0.0, 0.0, 70.0, 10.0, 0.0]]))
-        >>> aside_and_behind = torch.tensor([[0.5736, 0.8192, 0, 0, 0, 0, 0], [0.0, -1, 0, 0, 0, 0, 0]])
-        >>> north.pattern_loss(aside_and_behind).float()  # 35 degrees aside
+        >>> aside, behind = [0.5736, 0.8192, 0, 0, 0, 0, 0], [0.0, -1, 0, 0, 0, 0, 0]
+        >>> north.pattern_loss(torch.tensor([aside, behind])).float()  # 35 degrees aside
         tensor([ 2.9999, 25.0000])
         """
         azimuth, tilt, width, height, _ = self.table[sector_of(places).long()].T
@@ -129,7 +138,8 @@ class Sectors(Trend):
         return torch.where(azimuth == NO_AZIMUTH, 0.0, loss.minimum(floor))
 
     def linearise(self, places: Tensor) -> tuple[Tensor, Tensor]:
-        """Return means (n,), and what deviations of all shared parameters, of a sector's own, do to them.
+        """Return means (n,), and what deviations of all shared parameters, of a sector's own,
+        do to them.
 
         The latter (n, 10) [dB] are central differences, half a spread to either side.
         """
@@ -150,7 +160,10 @@ class Sectors(Trend):
     def mean_and_columns(self, places: Tensor) -> tuple[Tensor, Tensor]:
         """See `Trend`."""
         assert self.law is not None
-        (mean, slopes), decades = self.linearise(places), (self.law.decades(places) - self.middle)[:, None]
+        (mean, slopes), decades = (
+            self.linearise(places),
+            (self.law.decades(places) - self.middle)[:, None],
+        )
         parts = torch.cat([slopes[:, len(SHARED) :], OWN_SPREAD[-1] * decades], 1)
         # Each sector of a site has columns of its own, which are 0 in the rows of the others.
         blocks = (self.indicators[0][sector_of(places).long(), :, None] * parts[:, None]).flatten(1)
@@ -163,8 +176,8 @@ class Sectors(Trend):
 class SectorShadowing(Term[Tensor]):
     """`a exp(site) + same sector (b exp(own) + c bearing + d)` of one site's sectors.
 
-    Shadowing decays exponentially over distance (M. Gudmundson, Electronics Letters 27 (1991); 3GPP TR
-    38.901, section 7.4.4).
+    Shadowing decays exponentially over distance (M. Gudmundson, Electronics Letters 27 (1991); 3GPP
+    TR 38.901, section 7.4.4).
 
     Attributes:
         lengths: of a site's shadowing and of a sector's own [m].
@@ -198,4 +211,6 @@ class SectorShadowing(Term[Tensor]):
     def with_values(self, parameters: Tensor) -> Self:
         """See `Term`."""
         lengths, shares = parameters.exp().split((len(self.lengths), len(self.shares)))
-        return replace(self, lengths=tuple(map(to_number, lengths)), shares=tuple(map(to_number, shares)))
+        return replace(
+            self, lengths=tuple(map(to_number, lengths)), shares=tuple(map(to_number, shares))
+        )

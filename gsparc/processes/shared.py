@@ -1,7 +1,8 @@
 """Several processes that share terms: a factor of each, and one of the weights of what they share.
 
-The covariance is a block for each process plus columns of all: with K = L L^T of a block and V = L^-1 C of
-its columns, the weights' precision is I + sum V^T V (M. A. Woodbury, "Inverting modified matrices", 1950).
+The covariance is a block for each process plus columns of all: with K = L L^T of a block and V =
+L^-1 C of its columns, the weights' precision is I + sum V^T V (M. A. Woodbury, "Inverting modified
+matrices", 1950).
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
 
 QUERIES = 512  # at a time: memory
-ROUNDED_FROM, ROUNDED = 1e-2, 8  # noise, of the amplitude, and queries of a process, for float32 factors
+# Noise, of the amplitude, and queries of a process, for float32 factors
+ROUNDED_FROM, ROUNDED = 1e-2, 8
 
 
 @dataclass(frozen=True)
@@ -70,8 +72,10 @@ class SharedTermsPosterior:
     Args:
         processes: by number, of one value each; possibly none, of which rows were heard before.
         never: prior of a process without rows, whose trend all have.
-        columns: of places (n, D), (n, P) of the shared terms for unit normal weights, possibly none.
-        weights: factor of the precision (P, P) of the weights, and their mean (P,); None: of all processes.
+        columns: of places (n, D), (n, P) of the shared terms for unit normal weights, possibly
+            none.
+        weights: factor of the precision (P, P) of the weights, and their mean (P,); None: of all
+            processes.
     """
 
     def __init__(
@@ -85,7 +89,9 @@ class SharedTermsPosterior:
         self._alike = len({one.prior.kernel for one in processes.values()}) == 1
         self._blocks: dict[int, Block] = {}
         self._stacks: dict[tuple[tuple[int, ...], torch.dtype], tuple[Tensor, ...]] = {}
-        self.factor, self.mean = weights or shared_weights([self.block(number) for number in processes])
+        self.factor, self.mean = weights or shared_weights(
+            [self.block(number) for number in processes]
+        )
 
     def block(self, number: int) -> Block:
         """Return the block of one process, factored when it is asked for."""
@@ -105,7 +111,9 @@ class SharedTermsPosterior:
         (mean, term), columns = self.never.mean_and_columns(queries), self.columns(queries)
         mean, variance = mean[:, 0], torch.zeros(len(queries), dtype=torch.float64)
         for who, at in self._group_queries(number):
-            prior, more, white, shared = self._condition(queries[at], who, term[at], columns[at], not float64)
+            prior, more, white, shared = self._condition(
+                queries[at], who, term[at], columns[at], not float64
+            )
             # -1 stands where a process is asked less often than another of the batch.
             there = at >= 0
             at = at[there]
@@ -118,14 +126,18 @@ class SharedTermsPosterior:
         return MeanVariance(mean, variance)
 
     def predict_joint(self, queries: Tensor, number: int) -> tuple[Tensor, Tensor]:
-        """Return means (B, k) and covariances (B, k, k) of one process's measurements at (B, k, D)."""
+        """Return means (B, k) and covariances (B, k, k)
+        of one process's measurements at (B, k, D).
+        """
         flat, groups = queries.flatten(0, 1), queries.shape[:2]
         flat_terms = self.never.columns(flat)
         inputs = flat[None], (number,), flat_terms[None], self.columns(flat)[None]
         prior, more, white, shared = self._condition(*inputs, may_round=False)
         terms, kernel = flat_terms.unflatten(0, groups), prior.kernel
         matrix = kernel.correlations(queries, queries) + terms @ terms.mT
-        matrix = kernel.amplitude * (matrix + kernel.noise * torch.eye(groups[1], dtype=matrix.dtype))
+        matrix = kernel.amplitude * (
+            matrix + kernel.noise * torch.eye(groups[1], dtype=matrix.dtype)
+        )
         # Rows take variance away; weights that are not fully known give some back.
         for root, sign in (*((one, -1) for one in white), (shared[0], 1)):
             each = root.unflatten(0, groups)
@@ -134,7 +146,9 @@ class SharedTermsPosterior:
         return mean.unflatten(0, groups), matrix
 
     def _group_queries(self, number: Tensor) -> Iterator[tuple[tuple[int, ...], Tensor]]:
-        """Processes and their queries (S, k), -1 in place of none: all at once where each is asked little."""
+        """Processes and their queries (S, k), -1 in place of none:
+        all at once where each is asked little.
+        """
         order = number.argsort(stable=True)
         which, count = number[order].unique_consecutive(return_counts=True)
         numbers, at = which.tolist(), order.split(count.tolist())
@@ -145,16 +159,27 @@ class SharedTermsPosterior:
             yield from (((one,), part[None]) for part in queries.split(QUERIES))
 
     def _condition(
-        self, queries: Tensor, numbers: tuple[int, ...], own_terms: Tensor, columns: Tensor, may_round: bool
+        self,
+        queries: Tensor,
+        numbers: tuple[int, ...],
+        own_terms: Tensor,
+        columns: Tensor,
+        may_round: bool,
     ) -> Conditioning:
-        """Of processes `numbers` at (S, k, D), own terms (S, k, Q), columns (S, k, P); may be in float32."""
+        """Of processes `numbers` at (S, k, D), own terms (S, k, Q), columns (S, k, P);
+        may be in float32.
+        """
         more, shared = columns @ self.mean, columns.flatten(0, 1)
         prior, white = self.never, list[Tensor]()
         if numbers[0] in self.processes:
             prior = self.processes[numbers[0]].prior
             # With less noise float32's rounding would show in the variance.
-            rounded = may_round and prior.kernel.noise >= ROUNDED_FROM and queries.shape[1] <= ROUNDED
-            places, terms, weights = self._stack(numbers, torch.float32 if rounded else torch.float64)
+            rounded = (
+                may_round and prior.kernel.noise >= ROUNDED_FROM and queries.shape[1] <= ROUNDED
+            )
+            places, terms, weights = self._stack(
+                numbers, torch.float32 if rounded else torch.float64
+            )
             near = prior.kernel.correlations(queries.to(places), places)
             cross = process_deviation(prior) * near.baddbmm(own_terms.to(places), terms.mT)
             more = more + (cross @ weights)[..., 0]
@@ -166,14 +191,18 @@ class SharedTermsPosterior:
             else:
                 white = [one.whiten(part).T for one, part in zip(factors, parts, strict=True)]
             if len(self.mean):
-                projections = [one.double() @ block.columns for one, block in zip(white, blocks, strict=True)]
+                projections = [
+                    one.double() @ block.columns for one, block in zip(white, blocks, strict=True)
+                ]
                 shared = shared - torch.cat(projections)
         if len(self.mean):
             shared = self.factor.whiten(shared.T).T
         return Conditioning(prior, more, white, shared.unflatten(0, queries.shape[:2]))
 
     def _stack(self, numbers: tuple[int, ...], dtype: torch.dtype) -> tuple[Tensor, ...]:
-        """Rows (S, N, D), terms (S, N, Q) and weights (S, N, 1) of processes; 0 beyond the rows of one."""
+        """Rows (S, N, D), terms (S, N, Q) and weights (S, N, 1) of processes;
+        0 beyond the rows of one.
+        """
         if (numbers, dtype) not in self._stacks:
             parts = []
             for one in numbers:
@@ -182,13 +211,16 @@ class SharedTermsPosterior:
                 # The rest is whitened: K^-1 L rest = L^-T rest.
                 weights = process.factor.solve(process.factor.lower @ rest)
                 parts.append((process.rows, process.prior.columns(process.rows), weights))
-            padded = (pad_sequence(list(part), batch_first=True) for part in zip(*parts, strict=True))
+            padded = (
+                pad_sequence(list(part), batch_first=True) for part in zip(*parts, strict=True)
+            )
             self._stacks[numbers, dtype] = tuple(part.to(dtype) for part in padded)
         return self._stacks[numbers, dtype]
 
     @torch.no_grad()
     def left_out(self, number: int, rows: Tensor | None = None) -> LeftOutErrors:
-        """Return errors (n,) of a process's rows, each predicted from all others, and variances (n,).
+        """Return errors (n,) of a process's rows, each predicted from all others,
+        and variances (n,).
 
         Of some `rows` (m,) by their numbers, or of all.
         """

@@ -24,7 +24,8 @@ def kind_name(kind: type) -> str:
 class Stored:
     """A kind of objects that checkpoints hold, told by its class's name.
 
-    Attributes may be numbers, strings, tensors, NumPy arrays, None, tuples, mappings, and such objects.
+    Attributes may be numbers, strings, tensors, NumPy arrays, None, tuples, mappings,
+    and such objects.
     """
 
     def __init_subclass__(cls, **rest: Any) -> None:
@@ -77,7 +78,8 @@ def find_kind(name: str) -> type[Stored]:
         ValueError: there is none.
     """
     if name not in KINDS:
-        for point in entry_points(group=PLUGINS):  # what is installed may be imported, a file's word may not
+        # What is installed may be imported, a file's word may not
+        for point in entry_points(group=PLUGINS):
             if f"{point.module}.{point.attr}" == name:
                 point.load()
     if name in KINDS:
@@ -86,8 +88,11 @@ def find_kind(name: str) -> type[Stored]:
     if not module:
         raise ValueError(f"{name!r} is of another version of gsparc: fit again")
     if module == MAIN:
-        raise ValueError(f"{name!r} is of a notebook or script: define it here, too, before it is read")
+        raise ValueError(
+            f"{name!r} is of a notebook or script: define it here, too, before it is read"
+        )
     raise ValueError(
-        f"a term {name!r} is not known: in Python `import {module}` first; for commands install a package "
+        f"a term {name!r} is not known: in Python `import {module}` first; for commands install "
+        "a package "
         f"that names it in the group {PLUGINS} of its entry points, see docs/terms.md"
     )

@@ -1,4 +1,6 @@
-"""A term of a covariance, one object in one file: what it says of two sets of rows, and its parameters."""
+"""A term of a covariance, one object in one file: what it says of two sets of rows,
+and its parameters.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +12,8 @@ from torch import Tensor
 
 from gsparc.processes.stored import Stored
 
-Rows = TypeVar("Rows")  # what terms know of measurements: places (n, D) of powers, groups of channels
+# What terms know of measurements: places (n, D) of powers, groups of channels
+Rows = TypeVar("Rows")
 
 
 class Term(Stored, ABC, Generic[Rows]):
@@ -19,7 +22,8 @@ class Term(Stored, ABC, Generic[Rows]):
     Numbers of a term may be floats, or tensors with gradients where they are being learned.
     """
 
-    by_distance: ClassVar[bool] = False  # whether distances of rows are all that counts, also of both ends
+    # Whether distances of rows are all that counts, also of both ends
+    by_distance: ClassVar[bool] = False
 
     @abstractmethod
     def covariance(self, a: Rows, b: Rows) -> Tensor:
@@ -27,7 +31,9 @@ class Term(Stored, ABC, Generic[Rows]):
 
     @abstractmethod
     def parameters(self) -> Tensor:
-        """Return what is learned of it (p,) float64, unbounded: logarithms of powers and lengths."""
+        """Return what is learned of it (p,) float64, unbounded:
+        logarithms of powers and lengths.
+        """
 
     @abstractmethod
     def bounds(self, scale: float) -> list[tuple[float, float]]:
@@ -39,11 +45,12 @@ class Term(Stored, ABC, Generic[Rows]):
 
 
 class Columns(Stored, ABC):
-    """A term of places (n, D) [m] that is linear in weights, of unit variance times the prior's deviation.
+    """A term of places (n, D) [m] that is linear in weights,
+    of unit variance times the prior's deviation.
 
     Attributes:
-        prior_db: mean and deviation of each weight of a user's term [dB of a column's unit]; None: 0, and
-            that of the process. A field of this name makes it a setting.
+        prior_db: mean and deviation of each weight of a user's term [dB of a column's unit]; None:
+            0, and that of the process. A field of this name makes it a setting.
     """
 
     prior_db: Sequence[float] | None = None

@@ -1,7 +1,7 @@
 """The mean law of powers, and what of it is uncertain: losses in known walls among it.
 
-The multi-wall model (COST Action 231, "Digital mobile radio towards future generation systems", final report,
-1999, section 4.7.2): one loss for each wall, another for each floor.
+The multi-wall model (COST Action 231, "Digital mobile radio towards future generation systems",
+final report, 1999, section 4.7.2): one loss for each wall, another for each floor.
 """
 
 from __future__ import annotations
@@ -16,7 +16,8 @@ from gsparc.processes.stored import Stored
 from gsparc.processes.term import Columns
 
 TINY_M = 1e-6  # distance that has a logarithm
-LEAST_SPREAD = 0.1  # decades: rows at nearly one distance say nothing of a slope that holds far away
+# Decades: rows at nearly one distance say nothing of a slope that holds far away
+LEAST_SPREAD = 0.1
 LEVEL = 0.7  # upward part of a floor's normal
 
 
@@ -25,7 +26,10 @@ class Law(Stored):
     """`P [dB] = level - 10 exponent log10(max(distance, floor))`.
 
     >>> law = Law(level=-40.0, exponent=2.0, floor=1.0, scale=6.0, place=(0.0, 0.0, 0.0))
-    >>> law.mean(torch.tensor([[10.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))  # at 10 m, and nearer than the floor
+
+    At 10 m, and nearer than the floor:
+
+    >>> law.mean(torch.tensor([[10.0, 0.0, 0.0], [0.0, 0.0, 0.0]]))
     tensor([-60., -40.])
 
     Attributes:
@@ -67,7 +71,10 @@ class Walls(Columns):
     >>> axes = torch.tensor([[[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]])  # normal along x
     >>> corner, size = torch.tensor([[2.0, 0, 0]]), torch.tensor([[4.0, 3.0]])
     >>> wall = Walls(axes, corner, size, still=torch.tensor([0, 1.0, 1.0]))
-    >>> wall.columns(torch.tensor([[5.0, 1.0, 1.0], [1.0, 1.0, 1.0]]))  # behind the wall x = 2, and before it
+
+    Behind the wall x = 2, and before it:
+
+    >>> wall.columns(torch.tensor([[5.0, 1.0, 1.0], [1.0, 1.0, 1.0]]))
     tensor([[1., 0.],
             [0., 0.]])
 
@@ -84,14 +91,17 @@ class Walls(Columns):
     still: Tensor
 
     def columns(self, places: Tensor) -> Tensor:
-        """Count walls and floors (n, 2) on paths to places (n, 3), or between both ends (n, 6) [m]."""
+        """Count walls and floors (n, 2) on paths to places (n, 3), or between both ends (n, 6)
+        [m].
+        """
         other = self.still.expand(len(places), -1) if len(self.still) else other_end(places)
         start, end = (
             (at @ self.axes.flatten(0, 1).T).view(len(places), -1, 3) - self.corners
             for at in (first_end(places), other)
         )
         difference = (start - end)[..., :1]
-        # Where a path meets the wall's plane; a path along the plane is divided by 1, and never counts.
+        # Where a path meets the wall's plane; a path along the plane is divided by 1,
+        # and never counts.
         met = start + start[..., :1] / torch.where(difference == 0, 1.0, difference) * (end - start)
         inside = ((met[..., 1:] >= 0) & (met[..., 1:] <= self.sizes)).all(-1)
         hit = (inside & (start[..., 0] * end[..., 0] < 0)).to(places)
@@ -122,13 +132,21 @@ class Trend(Columns):
 
     @classmethod
     def from_law(cls, law: Law, places: Tensor) -> Trend:
-        """Return a trend about a law that was fitted to rows at places (n, 3) or (n, 6) float64 [m]."""
+        """Return a trend about a law that was fitted to rows at places (n, 3) or (n, 6)
+        float64 [m].
+        """
         decades = law.decades(places)
-        return cls(0.0, law, float(decades.mean()), max(float(decades.std(correction=0)), LEAST_SPREAD))
+        return cls(
+            0.0, law, float(decades.mean()), max(float(decades.std(correction=0)), LEAST_SPREAD)
+        )
 
     def mean(self, places: Tensor) -> Tensor:
         """Return powers (n,) [dB] at places (n, 3) or (n, 6) [m]."""
-        mean = places.new_full((len(places),), self.level) if self.law is None else self.law.mean(places)
+        mean = (
+            places.new_full((len(places),), self.level)
+            if self.law is None
+            else self.law.mean(places)
+        )
         return sum((term.mean(places) for term in self.more), mean)
 
     def mean_and_columns(self, places: Tensor) -> tuple[Tensor, Tensor]:
@@ -136,7 +154,9 @@ class Trend(Columns):
         return self.mean(places), self.columns(places)
 
     def columns(self, places: Tensor) -> Tensor:
-        """Return what is uncertain of the mean (n, Q): constant, slope, and what `more` terms have."""
+        """Return what is uncertain of the mean (n, Q): constant, slope,
+        and what `more` terms have.
+        """
         parts = [torch.ones_like(places[:, :1])]
         if self.law is not None:
             # Centred, so that slope and level are nearly independent.

@@ -1,7 +1,9 @@
-"""How sure: errors of rows that nothing was learned from, and their groups -> an interval, a threshold.
+"""How sure: errors of rows that nothing was learned from, and their groups -> an interval,
+a threshold.
 
-Rows of one group (a block of places, a station, a run) err together: by them a mean is known, and a share
-held, no better than by as many groups. Formulas alone; errors are gathered in `gsparc.prediction.left_out`.
+Rows of one group (a block of places, a station, a run) err together: by them a mean is known, and a
+share held, no better than by as many groups. Formulas alone;
+errors are gathered in `gsparc.prediction.left_out`.
 """
 
 from __future__ import annotations
@@ -15,7 +17,8 @@ from scipy.special import bdtrik, betainc, betaincinv, chdtri, erf, log_expit, n
 
 # Thresholds that are tried: more of them resolve finer, but each one may end the search.
 LEVELS = 50
-# Odds of bad as powers of the rank, all equally likely before positions are seen: powers and log factors.
+# Odds of bad as powers of the rank, all equally likely before positions are seen:
+# powers and log factors.
 CURVES = np.array([0, 0.5, 1, 2, 4])[:, None, None], np.linspace(-6, 6, 25)[:, None]
 NEARLY_BEST = 0.98  # of the best level's chance to pass: the laxest such level is tried first
 SURE_OF_EFFECT = 0.8
@@ -26,7 +29,8 @@ ONE_DEVIATION = float(erf(0.5**0.5))  # share of a normal variable within a devi
 def half_width(share: float, degrees: float = np.inf) -> float:
     """Return how many deviations about the mean hold a share of a normal variable.
 
-    Where the deviation is estimated from few values, with `degrees` of freedom, they are more (Student's t).
+    Where the deviation is estimated from few values, with `degrees` of freedom,
+    they are more (Student's t).
 
     >>> round(half_width(0.9), 3), round(half_width(0.9, 3), 3)
     (1.645, 2.353)
@@ -38,13 +42,17 @@ def half_width(share: float, degrees: float = np.inf) -> float:
 def standard_error(values: np.ndarray, group: np.ndarray | None = None) -> float:
     """Return the standard error of the mean of values (n,).
 
-    Values of one group (n,) are not independent; without groups all are. Infinite of a single group, or
-    value: then nothing tells how far to trust the mean.
+    Values of one group (n,) are not independent; without groups all are. Infinite of a single
+    group, or value: then nothing tells how far to trust the mean.
 
     >>> standard_error(np.array([1.0, 3.0]))
     1.0
     """
-    each = np.arange(len(values)) if group is None else np.unique(group, return_inverse=True)[1].reshape(-1)
+    each = (
+        np.arange(len(values))
+        if group is None
+        else np.unique(group, return_inverse=True)[1].reshape(-1)
+    )
     sums = np.bincount(each, values - np.mean(values))
     if len(sums) < 2:
         return float("inf")
@@ -61,7 +69,9 @@ def mean_and_error(values: np.ndarray, group: np.ndarray) -> tuple[float, float]
 
 
 def is_surely_above(gains: np.ndarray, deviations: float, least: float = 0.0) -> bool:
-    """Tell whether the mean of gains (n,) is above `least`, and above 0 by so many standard errors."""
+    """Tell whether the mean of gains (n,) is above `least`,
+    and above 0 by so many standard errors.
+    """
     return bool(np.mean(gains) > max(least, deviations * standard_error(gains)))
 
 
@@ -71,8 +81,12 @@ def central_interval(draws: np.ndarray, share: float) -> tuple[float, float]:
     return low, high
 
 
-def weighted_quantiles(values: np.ndarray, mass: np.ndarray, share: float | np.ndarray) -> np.ndarray:
-    """Return values, of (n,) with masses (n,), below which shares lie; of equal ones as `np.quantile`."""
+def weighted_quantiles(
+    values: np.ndarray, mass: np.ndarray, share: float | np.ndarray
+) -> np.ndarray:
+    """Return values, of (n,) with masses (n,), below which shares lie;
+    of equal ones as `np.quantile`.
+    """
     order = np.argsort(values, kind="stable")
     before = np.cumsum(mass[order]) - mass[order]
     return np.interp(share, before / max(float(before[-1]), 1e-300), values[order])
@@ -81,7 +95,8 @@ def weighted_quantiles(values: np.ndarray, mass: np.ndarray, share: float | np.n
 def conformal_level(share: float, groups: int) -> float:
     """Return which quantile of the errors of so many groups a share of further errors lies below.
 
-    At most 1, the largest error: the guarantee of `conformal_quantile` ends where groups are too few.
+    At most 1, the largest error: the guarantee of `conformal_quantile` ends
+    where groups are too few.
 
     >>> conformal_level(0.5, 10)
     0.55
@@ -90,10 +105,11 @@ def conformal_level(share: float, groups: int) -> float:
 
 
 def conformal_quantile(values: Sequence[float], share: float) -> float:
-    """Return what a further value exchangeable with these (n,) is below with a probability of `share`.
+    """Return what a further value exchangeable with these (n,)
+    is below with a probability of `share`.
 
-    Split conformal prediction (V. Vovk et al., "Algorithmic Learning in a Random World" (2005)): of n + 1
-    values the ceil((n + 1) share)-th; infinite where that is the further one itself.
+    Split conformal prediction (V. Vovk et al., "Algorithmic Learning in a Random World" (2005)): of
+    n + 1 values the ceil((n + 1) share)-th; infinite where that is the further one itself.
 
     >>> conformal_quantile([0.3, 0.1, 0.2], 0.75), conformal_quantile([0.3, 0.1, 0.2], 0.8)
     (0.3, inf)
@@ -103,10 +119,11 @@ def conformal_quantile(values: Sequence[float], share: float) -> float:
 
 
 def censored_distribution(bound: np.ndarray, side: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return errors (m,) and their masses, those of censored rows spread over the errors they allow.
+    """Return errors (m,) and their masses, those of censored rows spread over the errors they
+    allow.
 
-    The distribution of largest likelihood (B. W. Turnbull, J. Roy. Stat. Soc. B 38 (1976)); a row that allows
-    no measured error counts as the least that its own can be in size.
+    The distribution of largest likelihood (B. W. Turnbull, J. Roy. Stat. Soc. B 38 (1976)); a row
+    that allows no measured error counts as the least that its own can be in size.
 
     Args:
         bound: (n,) errors; of censored rows what bounds them.
@@ -126,7 +143,8 @@ def censored_distribution(bound: np.ndarray, side: np.ndarray) -> tuple[np.ndarr
         total = np.r_[0.0, np.cumsum(mass)]
         share = np.zeros(len(exact) + 1)
         np.add.at(share, below, 1 / total[below])
-        shared = np.cumsum(share[::-1])[::-1][1:]  # an error takes its part of all rows that allow it
+        # An error takes its part of all rows that allow it
+        shared = np.cumsum(share[::-1])[::-1][1:]
         share[:] = 0.0
         np.add.at(share, above, 1 / (total[-1] - total[above]).clip(np.finfo(float).tiny))
         mass = (1 + mass * (shared + np.cumsum(share)[:-1])) / len(bound)
@@ -154,8 +172,11 @@ def binomial_interval(errors: int, count: int, level: float = 0.95) -> tuple[flo
 
 
 def binomial_tail(wrong: Any, count: Any, share: Any) -> Any:
-    """Return P(at most `wrong` of `count` are bad) when a share is, for counts that need not be whole."""
-    # The binomial tail as a regularised incomplete beta function: counts need not be whole, but positive.
+    """Return P(at most `wrong` of `count` are bad) when a share is,
+    for counts that need not be whole.
+    """
+    # The binomial tail as a regularised incomplete beta function: counts need not be whole,
+    # but positive.
     return betainc(np.maximum(count - wrong, 1e-9), wrong + 1, 1 - share)
 
 
@@ -172,7 +193,8 @@ def most_failures(count: Any, share: float, risk: float) -> np.ndarray:
 
 
 def least_accepted(alpha: float, delta: float) -> int:
-    """Return how many, all of them good, show with confidence 1 - delta that at most a share alpha is bad.
+    """Return how many, all of them good, show with confidence 1 - delta that
+    at most a share alpha is bad.
 
     >>> least_accepted(alpha=0.1, delta=0.1)  # 0.9^22 is below 0.1
     22
@@ -182,7 +204,8 @@ def least_accepted(alpha: float, delta: float) -> int:
 
 
 def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
-    """Return the variance of the bad ones' share between groups (n,) over independent draws'; at least 1.
+    """Return the variance of the bad ones' share between groups (n,) over independent draws';
+    at least 1.
 
     A variance between few groups is itself uncertain: what is returned is its one-sided bound at
     `SURE_OF_EFFECT`, as of a normal variance.
@@ -194,16 +217,19 @@ def design_effect(bad: np.ndarray, group: np.ndarray) -> float:
     # One group, or all good or all bad: there is no variance between groups to compare.
     if groups < 2 or share in (0.0, 1.0):
         return 1.0
-    # A sample variance of a normal variable, over the true one, is chi squared over its degrees of freedom.
+    # A sample variance of a normal variable, over the true one,
+    # is chi squared over its degrees of freedom.
     bound = (groups - 1) / chdtri(groups - 1, SURE_OF_EFFECT)
-    return max(1.0, float(bound * len(bad) * standard_error(bad, group) ** 2 / (share * (1 - share))))
+    return max(
+        1.0, float(bound * len(bad) * standard_error(bad, group) ** 2 / (share * (1 - share)))
+    )
 
 
 def risk_coverage(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
     """Return the mean loss of the 1, 2, ..., n surest of n predictions, (n,).
 
-    Its mean is the area under risk against coverage (Geifman, Uziel and El-Yaniv 2019). Equal scores share
-    their mean loss: their order cannot matter.
+    Its mean is the area under risk against coverage (Geifman, Uziel and El-Yaniv 2019). Equal
+    scores share their mean loss: their order cannot matter.
 
     >>> risk_coverage(np.array([0.9, 0.1, 0.5]), np.array([0.0, 1.0, 0.5]))
     array([0.  , 0.25, 0.5 ])
@@ -219,13 +245,15 @@ def risk_coverage(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
 
 
 def area_contributions(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
-    """Return what each of n samples adds to the area under risk-coverage, (n,), whose mean is the area.
+    """Return what each of n samples adds to the area under risk-coverage, (n,),
+    whose mean is the area.
 
     >>> score, loss = np.array([0.9, 0.1, 0.5]), np.array([0.0, 1.0, 0.5])
     >>> bool(np.isclose(area_contributions(score, loss).mean(), risk_coverage(score, loss).mean()))
     True
     """
-    # The sample at rank r is in the means of r, r + 1, ..., n samples; equal scores share their ranks.
+    # The sample at rank r is in the means of r, r + 1, ..., n samples;
+    # equal scores share their ranks.
     weight = np.cumsum(1 / np.arange(len(score), 0, -1))[::-1]
     order, group = np.argsort(-score, kind="stable"), np.unique(-score, return_inverse=True)[1]
     shared = np.bincount(group[order], weight) / np.bincount(group)
@@ -233,7 +261,8 @@ def area_contributions(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
 
 
 def rank_correlation(one: np.ndarray, other: np.ndarray) -> float | None:
-    """Return Spearman's correlation of values (n,) and others (n,); None where one of them is constant.
+    """Return Spearman's correlation of values (n,) and others (n,);
+    None where one of them is constant.
 
     >>> round(rank_correlation(np.array([0.9, 0.1, 0.5]), np.array([0.0, 1.0, 0.5])), 3)
     -1.0
@@ -254,7 +283,8 @@ class Threshold:
     0.099
 
     Attributes:
-        value: accept scores of at least this; infinite when nothing can be promised, -infinite: all.
+        value: accept scores of at least this; infinite when nothing can be promised, -infinite:
+            all.
         accepted: calibration positions it accepts.
         bad: how many of them are bad.
     """
@@ -264,7 +294,9 @@ class Threshold:
     bad: int
 
     def bound(self, delta: float) -> float:
-        """Return the upper confidence bound on the share of bad ones accepted (Clopper and Pearson 1934)."""
+        """Return the upper confidence bound on the share of bad ones accepted (Clopper
+        and Pearson 1934).
+        """
         # Two tails of delta each: the upper end alone is exceeded with that probability.
         return binomial_interval(self.bad, self.accepted, 1 - 2 * delta)[1]
 
@@ -272,11 +304,12 @@ class Threshold:
 def threshold_levels(
     score: np.ndarray, bad: np.ndarray, count: int, alpha: float, delta: float
 ) -> np.ndarray:
-    """Return thresholds (at most `LEVELS`,), strict to lax: quantiles of scores (n,) not the calibration's.
+    """Return thresholds (at most `LEVELS`,), strict to lax: quantiles of scores (n,)
+    not the calibration's.
 
-    The first is the laxest whose chance to pass on `count` calibration positions is nearly the best, so that
-    one bad row among the few surest does not end the search. Chances are predicted from who is `bad` (n,), as
-    the mean over `CURVES`, weighed by their likelihoods.
+    The first is the laxest whose chance to pass on `count` calibration positions is nearly the
+    best, so that one bad row among the few surest does not end the search. Chances are predicted
+    from who is `bad` (n,), as the mean over `CURVES`, weighed by their likelihoods.
     """
     levels = np.unique(np.quantile(score, np.linspace(0, 1, LEVELS)))[::-1]
     order, (powers, factors) = np.argsort(-score), CURVES
@@ -293,32 +326,39 @@ def threshold_levels(
 
 
 def choose_threshold(
-    score: np.ndarray, bad: np.ndarray, levels: np.ndarray, alpha: float, delta: float,
+    score: np.ndarray,
+    bad: np.ndarray,
+    levels: np.ndarray,
+    alpha: float,
+    delta: float,
     group: np.ndarray | None = None,
-) -> Threshold:  # fmt: skip
-    """Choose the laxest threshold of which the calibration set (n,) shows that at most a share alpha is bad.
+) -> Threshold:
+    """Choose the laxest threshold of which the calibration set (n,)
+    shows that at most a share alpha is bad.
 
-    Learn then Test (Angelopoulos, Bates, Candes, Jordan and Lei 2021) with fixed-sequence testing: `levels`
-    are tried from strict to lax, each is a binomial test on the positions it accepts, and the first that
-    fails ends the search. Where neighbours err together, `group` (n,) names the patch each position belongs
-    to: counts are divided by the design effect, how much more the share varies between patches than binomial
-    counts would (Kish 1965; approximate, where the test without groups is exact). A level too strict to be
-    tested (fewer than `least_accepted`) is passed over, and spends nothing. Where all are, accepting
-    everybody is tested.
+    Learn then Test (Angelopoulos, Bates, Candes, Jordan and Lei 2021) with fixed-sequence testing:
+    `levels` are tried from strict to lax, each is a binomial test on the positions it accepts, and
+    the first that fails ends the search. Where neighbours err together, `group` (n,) names the
+    patch each position belongs to: counts are divided by the design effect, how much more the share
+    varies between patches than binomial counts would (Kish 1965; approximate, where the test
+    without groups is exact). A level too strict to be tested (fewer than `least_accepted`) is
+    passed over, and spends nothing. Where all are, accepting everybody is tested.
 
     >>> score = np.linspace(0, 1, 100)
     >>> choose_threshold(score, score < 0.5, score[::-2], alpha=0.1, delta=0.1).accepted >= 50
     True
     """
     threshold, least = Threshold(float("inf"), 0, 0), least_accepted(alpha, delta)
-    # The laxest of few levels may be too strict to be tested; the last is fixed without the labels, too.
+    # The laxest of few levels may be too strict to be tested;
+    # the last is fixed without the labels, too.
     for level in (*levels, -np.inf):
         rows = score >= level
         accepted, wrong = int(rows.sum()), int(bad[rows].sum())
         if accepted < least or (level == -np.inf and threshold.accepted):
             continue
         effect = 1.0 if group is None else design_effect(bad[rows], group[rows])
-        # A fixed sequence: as the first test that fails ends it, delta need not be divided among the tests.
+        # A fixed sequence: as the first test that fails ends it,
+        # delta need not be divided among the tests.
         if binomial_tail(wrong / effect, accepted / effect, alpha) > delta:
             break
         threshold = Threshold(float(level), accepted, wrong)

@@ -1,4 +1,6 @@
-"""Ending work from outside: threads cannot be interrupted, and loops do not know when, so they ask."""
+"""Ending work from outside: threads cannot be interrupted, and loops do not know when,
+so they ask.
+"""
 
 from __future__ import annotations
 
@@ -26,12 +28,16 @@ def _add_condition(name: str, condition: Callable[[], bool]) -> Iterator[None]:
 
 
 def cancel_when(condition: Callable[[], bool]) -> AbstractContextManager[None]:
-    """Make `raise_if_cancelled` raise, within, as soon as `condition`, or who surrounds it, says so."""
+    """Make `raise_if_cancelled` raise, within, as soon as `condition`, or who surrounds it,
+    says so.
+    """
     return _add_condition("unwanted", condition)
 
 
 def raise_if_cancelled() -> None:
-    """Raise `Cancelled` if this thread's work is unwanted; each factor and block of candidates asks."""
+    """Raise `Cancelled` if this thread's work is unwanted;
+    each factor and block of candidates asks.
+    """
     _asked.steps = getattr(_asked, "steps", 0) + 1
     unwanted = getattr(_asked, "unwanted", None)
     if unwanted is not None and unwanted():
@@ -51,12 +57,16 @@ def end_when(condition: Callable[[], bool]) -> AbstractContextManager[None]:
 
 
 def step_limit(steps: int) -> Callable[[], bool]:
-    """Return a call: whether this thread has made `steps` further factors and blocks of candidates."""
+    """Return a call: whether this thread has made `steps` further factors
+    and blocks of candidates.
+    """
     end = getattr(_asked, "steps", 0) + steps
     return lambda: getattr(_asked, "steps", 0) >= end
 
 
 def out_of_steps() -> bool:
-    """Tell whether this thread's effort is spent: a loop of many steps then ends with what it has."""
+    """Tell whether this thread's effort is spent:
+    a loop of many steps then ends with what it has.
+    """
     over = getattr(_asked, "over", None)
     return over is not None and over()

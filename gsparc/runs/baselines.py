@@ -33,8 +33,14 @@ def baselines_for(data: Measurements, split: Split) -> tuple[str, ...]:
 
 
 def same_as_baseline(config: DictConfig, method: MethodFactory) -> str | None:
-    """Return the name of a run's method where a baseline of that name would be fitted in the same way."""
-    plainly = config.eval_on != "val" and config.get("stations", "auto") == "auto" and not method.takes_effort
+    """Return the name of a run's method where a baseline of
+    that name would be fitted in the same way.
+    """
+    plainly = (
+        config.eval_on != "val"
+        and config.get("stations", "auto") == "auto"
+        and not method.takes_effort
+    )
     kind = all_methods().get(method.name)
     same = kind is not None and to_dict(config.model) == config_node(import_target(kind))
     return method.name if plainly and same else None
@@ -56,24 +62,34 @@ class FittedBaseline:
 
 
 def fit_baseline(
-    name: str, data: Measurements, split: Split, eval_on: str = "test",
-    learned: tuple[Measurements, Split] | None = None, hearing: Sequence[Hearing] | None = None,
-) -> FittedBaseline:  # fmt: skip
+    name: str,
+    data: Measurements,
+    split: Split,
+    eval_on: str = "test",
+    learned: tuple[Measurements, Split] | None = None,
+    hearing: Sequence[Hearing] | None = None,
+) -> FittedBaseline:
     """Fit the baseline `name` with its default settings on each fold, and score it.
 
     Args:
         name: as in `gsparc.models.registry.all_methods()`.
         data: the dataset.
-        split: folds; baselines learn from train and val rows, or from train rows when `val` is scored.
+        split: folds; baselines learn from train and val rows, or from train rows when `val` is
+            scored.
         eval_on: `train`, `val` or `test`.
         learned: other measurements to learn from, and the folds of these; None: `data` and `split`.
         hearing: see `score_methods`.
     """
     learned_data, before = learned or (data, split)
-    if eval_on == "val" and learned is None:  # learned from as methods do, but where they are scored
-        before = replace(before, folds=tuple(replace(fold, val=fold.val[:0]) for fold in before.folds))
+    # Learned from as methods do, but where they are scored
+    if eval_on == "val" and learned is None:
+        before = replace(
+            before, folds=tuple(replace(fold, val=fold.val[:0]) for fold in before.folds)
+        )
 
-    def say(number: int, there: Measurements, rows: Fold, method: Method, report: FitReport) -> None:
+    def say(
+        number: int, there: Measurements, rows: Fold, method: Method, report: FitReport
+    ) -> None:
         for note in report.notes:
             log.info("fold %d: %s", number, note)
 

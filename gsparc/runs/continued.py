@@ -18,10 +18,15 @@ def add_settings_of_run(words: Sequence[str]) -> list[str]:
     """Return a command line with the settings of the run that `ckpt_path=` names; its own win.
 
     Args:
-        words: overrides and options. A group chosen among them, as `model=gp`, leaves out what the run was
-            told of that group. A run that was interrupted finishes in its folder, unless another is given.
+        words: overrides and options. A group chosen among them, as `model=gp`, leaves out what the
+            run was told of that group. A run that was interrupted finishes in its folder,
+            unless another is given.
     """
-    values = {_key(word): word.partition("=")[2].strip("'\"") for word in words if not word.startswith("-")}
+    values = {
+        _key(word): word.partition("=")[2].strip("'\"")
+        for word in words
+        if not word.startswith("-")
+    }
     if values.get("ckpt_path", "") in ("", "null"):
         return [*words]
     ckpt = Path(values["ckpt_path"]).resolve()
@@ -32,12 +37,14 @@ def add_settings_of_run(words: Sequence[str]) -> list[str]:
     files = (hydra_dir / "overrides.yaml", hydra_dir / "hydra.yaml")
     its, hydra = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in files)
     lines = [one for one in its if not {_key(one), _key(one).partition(".")[0]} & values.keys()]
-    lines = [one for one in lines if _key(one).rpartition(".")[2] not in GONE]  # of runs that seconds ended
+    # Of runs that seconds ended
+    lines = [one for one in lines if _key(one).rpartition(".")[2] not in GONE]
     lines = [_found_from(Path(hydra["hydra"]["runtime"]["cwd"]), one) for one in lines]
     if {"-m", "--multirun"} & {*words}:
         return [*lines, *words]
     lines.append("hydra.mode=RUN")  # it may be a job of a multirun
-    # What a finished run has left stays as it is, and so do the settings that an interrupted one began with.
+    # What a finished run has left stays as it is,
+    # and so do the settings that an interrupted one began with.
     if "hydra.run.dir" not in values and not (hydra_dir.parent / SUMMARY).exists():
         lines += [f"hydra.run.dir='{hydra_dir.parent}'", "hydra.output_subdir=null"]
     return [*lines, *words]

@@ -38,7 +38,8 @@ log = logging.getLogger(__name__)
 
 # results.py reads the key render_ms_batch64 by this number.
 BATCH = 64
-SLOWEST_BATCH_MS = 20_000.0  # of one batch, from single queries; slower methods are not timed in batches
+# Of one batch, from single queries; slower methods are not timed in batches
+SLOWEST_BATCH_MS = 20_000.0
 FIELD = "field"  # Gaussians of the evaluated method, without the process that they are mixed with
 
 
@@ -91,11 +92,19 @@ class TrainedRun:
 
 
 def evaluate(
-    methods: Method | Sequence[Method], train_s: float | Sequence[float] | None, data: Measurements,
-    split: Split, *, eval_on: str = "test", baselines: Sequence[str] | None = None,
-    clock: ClockSettings | None = None, learned: tuple[Measurements, Split] | None = None,
-    shared: str | None = None, timed: bool = True, hearing: Sequence[Hearing] | None = None,
-) -> Evaluation:  # fmt: skip
+    methods: Method | Sequence[Method],
+    train_s: float | Sequence[float] | None,
+    data: Measurements,
+    split: Split,
+    *,
+    eval_on: str = "test",
+    baselines: Sequence[str] | None = None,
+    clock: ClockSettings | None = None,
+    learned: tuple[Measurements, Split] | None = None,
+    shared: str | None = None,
+    timed: bool = True,
+    hearing: Sequence[Hearing] | None = None,
+) -> Evaluation:
     """Score and time a method beside the baselines.
 
     Args:
@@ -104,9 +113,11 @@ def evaluate(
         data: the dataset.
         split: as the methods were fitted with; test results are pooled over its folds.
         eval_on: `train`, `val` or `test`; also the prefix of the figures' keys.
-        baselines: names in `gsparc.models.registry.all_methods()`; None: all plain that serve these rows.
+        baselines: names in `gsparc.models.registry.all_methods()`; None: all plain that serve these
+            rows.
         clock: how long to measure latencies.
-        learned: what baselines learn from where the methods learned from other data; None: `data`, `split`.
+        learned: what baselines learn from where the methods learned from other data; None: `data`,
+            `split`.
         shared: the baseline that the methods are, which is then not fitted again.
         timed: whether latencies are measured.
         hearing: see `score_methods`; as checkpoints hold it.
@@ -134,7 +145,8 @@ def evaluate(
     names = baselines_for(*(learned or (data, split))) if baselines is None else baselines
     if fitted := [name for name in names if name != shared]:
         log.info("%-10s%s", "baselines", ", ".join(fitted))
-    # A method that is a baseline (model=gp) has one fit and one row: another would only differ in seconds.
+    # A method that is a baseline (model=gp) has one fit and one row:
+    # another would only differ in seconds.
     same = FittedBaseline(methods, scores, tuple(seconds or ()))
     told = eval_on, learned, hearing
     fits = {n: same if n == shared else fit_baseline(n, data, split, *told) for n in names}
@@ -144,7 +156,8 @@ def evaluate(
     # The first fold's methods alone are timed: folds differ in rows, hardly in cost.
     contenders = {"time": methods[0], **{room: other.methods[0] for room, other in others.items()}}
     fields = [one for one in (method.without_process() for method in methods) if one is not None]
-    # Only where each fold kept its field: figures of some folds would be of other rows than those beside.
+    # Only where each fold kept its field: figures of some folds would be of other rows
+    # than those beside.
     if len(fields) == len(methods):
         every[FIELD] = score_methods(fields, data, split, eval_on, learned, hearing=hearing)
         contenders[FIELD] = fields[0]
@@ -155,7 +168,8 @@ def evaluate(
     judged = judged_by({**facts, "dataset/kind": data.site.scored}, eval_on)
     cells = {"": every}
     if off := [int(number) for number in unlisted_stations(scores, data).index]:
-        # Rows of lists that they do not fill are judged by other levels: it is no choice of rows alone.
+        # Rows of lists that they do not fill are judged by other levels:
+        # it is no choice of rows alone.
         fitted_of = {eval_on: methods, **{room: other.methods for room, other in others.items()}}
         cells[WITHOUT_OFF] = {
             room: score_methods(fitted, data, split, eval_on, learned, off=off, hearing=hearing)
@@ -177,7 +191,11 @@ def evaluate(
     if decided and data.row_names:
         decided["decided_by/name"] = data.row_names[int(decided["decided_by/row"])]
     facts |= {f"{eval_on}/{k}": v for k, v in decided.items()}
-    facts |= time_methods(contenders, data, rows_to_score(split.folds[0], eval_on), clock) if timed else {}
+    facts |= (
+        time_methods(contenders, data, rows_to_score(split.folds[0], eval_on), clock)
+        if timed
+        else {}
+    )
     facts["split/unseen_runs"] = sum(len(unseen_runs(data, fold, eval_on)) for fold in split.folds)
     facts |= _about(methods, seconds, data, split)
     if FIELD in every:
@@ -189,7 +207,9 @@ def evaluate(
     beside_it = {name: fit.methods[0] for name, fit in fits.items() if fit is not same}
     example_methods = beside_it | {methods[0].name: methods[0]}
     rows = rows_to_score(split.folds[0], eval_on)
-    examples = Examples.of_methods(example_methods, data, rows) if data.site.target.is_image else None
+    examples = (
+        Examples.of_methods(example_methods, data, rows) if data.site.target.is_image else None
+    )
     return Evaluation(facts, columns, station_columns({"": scores, **beside}, data), examples)
 
 
@@ -201,28 +221,44 @@ def _about(
     Steps are means over folds, the rest of `model/*` is of the first.
     """
     first, every = methods[0], [method.facts() for method in methods]
-    keys = [k for k in ("model/steps", "model/steps_taken") if len(every) > 1 and every[0].get(k) is not None]
+    keys = [
+        k
+        for k in ("model/steps", "model/steps_taken")
+        if len(every) > 1 and every[0].get(k) is not None
+    ]
     model_facts = every[0] | {key: np.mean([facts[key] for facts in every]) for key in keys}
     return {
-        "model/name": first.name, "model/label": common_label(first.name, methods),
-        "model/effects": first.effects, **model_facts,
+        "model/name": first.name,
+        "model/label": common_label(first.name, methods),
+        "model/effects": first.effects,
+        **model_facts,
         "time/train_s": None if seconds is None else float(np.mean(seconds)),
         "time/train_total_s": None if seconds is None else float(sum(seconds)),
-        **dataset_facts(data), **split_facts(split), **timing.machine_facts(), **timing.peak_memory(),
-    }  # fmt: skip
+        **dataset_facts(data),
+        **split_facts(split),
+        **timing.machine_facts(),
+        **timing.peak_memory(),
+    }
 
 
 def time_methods(
-    methods: Mapping[str, Method], data: Measurements, rows: np.ndarray, clock: ClockSettings | None = None
+    methods: Mapping[str, Method],
+    data: Measurements,
+    rows: np.ndarray,
+    clock: ClockSettings | None = None,
 ) -> dict[str, float | int | str | None]:
     """Return `time/*` and `<room>/render_ms_*` of methods by their rooms of facts, timed in turns.
 
-    Methods slower than `SLOWEST_BATCH_MS` per batch have no batch figure: timing them would take minutes.
+    Methods slower than `SLOWEST_BATCH_MS` per batch have no batch figure:
+    timing them would take minutes.
     """
     clock = clock or ClockSettings()
     one = time_beside_copy(query_calls(methods, data, rows), clock)
-    fewer = replace(clock, rounds=max(clock.least, clock.rounds // 5))  # a batch is many queries already
-    quick = {name: m for name, m in methods.items() if one[name]["query_ms"] * BATCH < SLOWEST_BATCH_MS}
+    # A batch is many queries already
+    fewer = replace(clock, rounds=max(clock.least, clock.rounds // 5))
+    quick = {
+        name: m for name, m in methods.items() if one[name]["query_ms"] * BATCH < SLOWEST_BATCH_MS
+    }
     # Without a copy beside them, which empties the caches.
     many = time_interleaved(query_calls(quick, data, rows, BATCH), fewer)
     first = next(iter(one.values()))
@@ -231,7 +267,8 @@ def time_methods(
         "time/copy_ms": first["query_ms"] / first["to_copy"],
         "time/rounds": first["rounds"],
         "time/includes": (
-            f"one query end to end, a position in host memory in, a {shape} {data.site.kind} in host memory "
+            f"one query end to end, a position in host memory in, a {shape} {data.site.kind} in "
+            "host memory "
             "out; warm, plans made before; no file, no picture"
         ),
     }
@@ -257,18 +294,28 @@ def dataset_facts(data: Measurements) -> dict[str, Any]:
 
 def split_facts(split: Split) -> dict[str, Any]:
     """Return `split/*`; counts are sums over folds."""
-    counts = {f"split/{k}": sum(len(getattr(f, k)) for f in split.folds) for k in ("train", "val", "test")}
-    hashes = {"split/sha256": split.sha256, "split/test_sha256": hash_indices(split.folds, ["test"])}
+    counts = {
+        f"split/{k}": sum(len(getattr(f, k)) for f in split.folds) for k in ("train", "val", "test")
+    }
+    hashes = {
+        "split/sha256": split.sha256,
+        "split/test_sha256": hash_indices(split.folds, ["test"]),
+    }
     return {"split/name": split.name, **hashes, "split/folds": len(split.folds), **counts}
 
 
 def _skill(scores: Scores, nearest: Scores | None) -> float | None:
-    """1 - MSE / MSE(nearest), of powers in decibels; None without a neighbour, or when that one is right."""
+    """1 - MSE / MSE(nearest), of powers in decibels; None without a neighbour,
+    or when that one is right.
+    """
     if nearest is None:
         return None
     # Rows without a target are NaN in both, so that the means are over the same rows.
     every = (one.samples for one in (scores, nearest))
-    mse, bar = (float(np.nanmean(one["error_db"] ** 2 if "error_db" in one else one["mse"])) for one in every)
+    mse, bar = (
+        float(np.nanmean(one["error_db"] ** 2 if "error_db" in one else one["mse"]))
+        for one in every
+    )
     return 1 - mse / bar if bar > 0 else None
 
 
@@ -277,17 +324,31 @@ def _columns(scores: Scores, data: Measurements) -> dict[str, Any]:
     world = data.moving[scores.row][:, -3:] + data.site.origin
     names = data.row_names or [f"row {i}" for i in range(len(data))]
     columns: dict[str, Any] = {
-        "fold": scores.fold, "row": scores.row, "name": [names[i] for i in scores.row],
-        "x_m": world[:, 0], "y_m": world[:, 1], "z_m": world[:, 2],
-        # Of what was measured, not of stored targets: channels and spectra have errors in these units.
-        "confidence": scores.confidence, "variance": scores.variance * data.site.target_scale**2,
-        **scores.samples, **paired_values(scores.samples),
-    }  # fmt: skip
+        "fold": scores.fold,
+        "row": scores.row,
+        "name": [names[i] for i in scores.row],
+        "x_m": world[:, 0],
+        "y_m": world[:, 1],
+        "z_m": world[:, 2],
+        # Of what was measured, not of stored targets:
+        # channels and spectra have errors in these units.
+        "confidence": scores.confidence,
+        "variance": scores.variance * data.site.target_scale**2,
+        **scores.samples,
+        **paired_values(scores.samples),
+    }
     if data.site.target.is_level:
-        levels = {"predicted_db": scores.samples["prediction"], "measured_db": scores.samples["target"]}
-        columns |= {name: to_decibels(np.where(power > 0, power, np.nan)) for name, power in levels.items()}
+        levels = {
+            "predicted_db": scores.samples["prediction"],
+            "measured_db": scores.samples["target"],
+        }
+        columns |= {
+            name: to_decibels(np.where(power > 0, power, np.nan)) for name, power in levels.items()
+        }
     of_row = data.stations_of(scores.row)
-    columns |= {head: np.array(names)[of_row] for head, names in data.site.every_station.named.items()}
+    columns |= {
+        head: np.array(names)[of_row] for head, names in data.site.every_station.named.items()
+    }
     for end in data.site.moving_ends[:-1]:
         other = data.ends[end][scores.row] + data.site.origin
         columns |= {f"{end}_{axis}_m": other[:, i] for i, axis in enumerate("xyz")}

@@ -36,7 +36,8 @@ class RunInputs:
         method: unfitted, or what chooses it.
         module, split: the data, read, and their folds.
         walls: known ones, drawn beside what is found.
-        learned: what a fold learns from instead, such as displaced or fewer measurements; None: these.
+        learned: what a fold learns from instead, such as displaced or fewer measurements; None:
+            these.
     """
 
     method: MethodFactory
@@ -59,10 +60,11 @@ def read_inputs(config: DictConfig, known: Measurements | None = None) -> RunInp
         known: the measurements, where they were read before.
 
     Raises:
-        ValueError: bad data, walls or settings, or a split without rows to learn from or to test on; one line
-            each.
+        ValueError: bad data, walls or settings, or a split without rows to learn from or to test
+            on; one line each.
     """
-    method = build(fill_defaults(config.model))  # once: each fold, and each station, fits a copy of it
+    # Once: each fold, and each station, fits a copy of it
+    method = build(fill_defaults(config.model))
     RunSettings.from_config(config)
     tracking.refuse_missing_loggers(config)
     module = _data(config, known)
@@ -74,10 +76,14 @@ def read_inputs(config: DictConfig, known: Measurements | None = None) -> RunInp
 
 
 def _data(config: DictConfig, known: Measurements | None) -> DataModule:
-    """The data, read or known, in coordinates and units of the model that training starts from, if any."""
+    """The data, read or known, in coordinates and units of the model that training starts from,
+    if any.
+    """
     path, start = config.ckpt_path, config.get("init_from")
     if path is not None and not Path(path).exists():  # before anything is read or simulated
-        raise ValueError(f"ckpt_path={path}: no such file; give an interrupted run's folder or last.ckpt")
+        raise ValueError(
+            f"ckpt_path={path}: no such file; give an interrupted run's folder or last.ckpt"
+        )
     module = datamodule(config.dataset)
     if known is not None:
         module.measurements = known

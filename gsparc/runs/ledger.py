@@ -1,4 +1,6 @@
-"""The ledger of fits: one is done when its settings, data, split and program are those of its record."""
+"""The ledger of fits: one is done when its settings, data,
+split and program are those of its record.
+"""
 
 from __future__ import annotations
 
@@ -31,14 +33,17 @@ from gsparc.models.fitting import LAST, dotted_settings
 
 log = logging.getLogger(__name__)
 
-RECORD = "job.json"  # in a fit's folder: its state and program, when it began, and whether it has ended
+# In a fit's folder: its state and program, when it began, and whether it has ended
+RECORD = "job.json"
 FAILURE = "failure.txt"  # why it has failed
-WHERE = ("engine", "workers", "ray", "logger", "reuse", "ckpt_path")  # of where, or whether, a fit is done
+# Of where, or whether, a fit is done
+WHERE = ("engine", "workers", "ray", "logger", "reuse", "ckpt_path")
 OF_DATA = (  # paths that stand for what was read from them, or is written there where nothing is
     *("dataset.root", "dataset.file", "split.path"),
     "dataset.stand_in.root",
 )
-WORDS = (".name", "._target_")  # settings that are never paths: a folder may be called as a method is
+# Settings that are never paths: a folder may be called as a method is
+WORDS = (".name", "._target_")
 WHOLE = "gsparc.datasets.own.Own"  # reads no file but those that its settings name
 LEFT = (  # by a training: of another one, all of it would be read beside this one's
     *("summary.json", "split.json", "per_sample.csv", "by_station.csv", "render_ms.csv"),
@@ -48,7 +53,9 @@ LEFT = (  # by a training: of another one, all of it would be read beside this o
 PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
 GSPARC, ROOT = "gsparc", Path(__file__).resolve().parents[1]
 OURS = ("gsparc", "hydra_plugins", "__main__", "__mp_main__")  # modules that the edition tells of
-INSTALLED = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
+INSTALLED = tuple(
+    {sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")}
+)
 
 
 @dataclass(frozen=True)
@@ -58,10 +65,11 @@ class FitInputs:
     Attributes:
         settings: resolved, by dotted name, without those that say where data lie.
         files: SHA-256 of the files that settings name, by these.
-        data: SHA-256 of the measurements, whatever files they were read from; "" before they are read.
+        data: SHA-256 of the measurements, whatever files they were read from; "" before they are
+            read.
         split: SHA-256 of the folds.
-        unread: SHA-256 of the files that data and folds are read from; a state before they are read is known
-            by these.
+        unread: SHA-256 of the files that data and folds are read from; a state before they are read
+            is known by these.
     """
 
     settings: dict[str, Any]
@@ -72,7 +80,9 @@ class FitInputs:
 
     @classmethod
     def from_config(cls, config: DictConfig, data: str = "", split: str = "") -> FitInputs:
-        """Return the state of a resolved configuration, of hashes of measurements and of their split."""
+        """Return the state of a resolved configuration,
+        of hashes of measurements and of their split.
+        """
         subset = OmegaConf.masked_copy(config, [str(name) for name in config if name not in WHERE])
         whole: Any = OmegaConf.to_container(subset, resolve=True)  # what is missing is `???`
         named = dict(dotted_settings(whole))
@@ -82,7 +92,9 @@ class FitInputs:
 
     @property
     def tells_data(self) -> bool:
-        """Whether what is read is known: its content, or the bytes of all files that it is read from."""
+        """Whether what is read is known: its content,
+        or the bytes of all files that it is read from.
+        """
         alone = self.settings.get("dataset._target_") == WHOLE and "dataset.file" in self.unread
         return bool(self.data) or alone or "dataset.root" in self.unread
 
@@ -115,22 +127,32 @@ def read_finished(folder: Path, state: FitInputs, reuse: bool = False) -> dict[s
         reuse: whether a result of another program counts, too; its `git` says of which.
     """
     record = read_summary(folder / RECORD)
-    if record is None or not record.get("ended") or not state.tells_data or state.changes(record, reuse):
+    if (
+        record is None
+        or not record.get("ended")
+        or not state.tells_data
+        or state.changes(record, reuse)
+    ):
         return None
     return read_summary(folder / SUMMARY)
 
 
 def run_once(
-    folder: Path, state: FitInputs, work: Callable[[str | None], object], *, reuse: bool = False,
-    again: bool = False, resumes: bool = False,
-) -> dict[str, Any]:  # fmt: skip
+    folder: Path,
+    state: FitInputs,
+    work: Callable[[str | None], object],
+    *,
+    reuse: bool = False,
+    again: bool = False,
+    resumes: bool = False,
+) -> dict[str, Any]:
     """Return the summary of a fit, which is done now where it is not done.
 
     Args:
         folder: its own, held by the caller.
         state: of the fit.
-        work: does it, and writes the summary; is given the checkpoint, or folder, of the same state that an
-            interrupted try has left, None to begin anew.
+        work: does it, and writes the summary; is given the checkpoint, or folder, of the same state
+            that an interrupted try has left, None to begin anew.
         reuse: see `read_finished`.
         again: one that is done is done anew.
         resumes: whether the work goes on from a file that it was told, whatever changed since.
@@ -149,7 +171,8 @@ def run_once(
             settings = state.changes(record, reuse=True)
             words = [*settings, "the program"] if changes != settings else settings
             log.info("%s: runs again, as these changed since it ran: %s", folder, list_first(words))
-        set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
+        # Before the record: of two states one would take the other's for its own
+        set_aside(folder, SUMMARY)
         record = {**asdict(state), "began": time.time()}
     else:
         resume_path = _last_state(folder, record["began"])
@@ -190,13 +213,17 @@ def edited(record: Mapping[str, Any]) -> list[str]:
 
 
 def program() -> dict[str, str]:
-    """Return gsparc's edition, and the content of modules that no environment installed, by their files.
+    """Return gsparc's edition, and the content of modules that no environment installed,
+    by their files.
 
-    The edition is the commit of the source tree with a hash of what was edited since, else the version.
+    The edition is the commit of the source tree with a hash of what was edited since,
+    else the version.
     """
     modules = [m for name, m in list(sys.modules.items()) if name.partition(".")[0] not in OURS]
     files = {os.path.abspath(getattr(module, "__file__", None) or os.curdir) for module in modules}
-    others = sorted(file for file in files if os.path.isfile(file) and not file.startswith(INSTALLED))
+    others = sorted(
+        file for file in files if os.path.isfile(file) and not file.startswith(INSTALLED)
+    )
     return {name: _content(name) for name in (GSPARC, *others)}
 
 
@@ -215,7 +242,9 @@ def _edition() -> str:
 
 
 def _joined(files: Iterable[Path], root: Path) -> str:
-    hashes = {str(file.relative_to(root)): _hash_of(file) for file in sorted(files) if file.is_file()}
+    hashes = {
+        str(file.relative_to(root)): _hash_of(file) for file in sorted(files) if file.is_file()
+    }
     return sha256(repr(hashes).encode()).hexdigest()
 
 
@@ -238,7 +267,9 @@ def _named(value: Any) -> str:
 
 
 def _files_under(root: str) -> Iterator[Path]:
-    """All files of a folder and of those that links in it lead to, each folder once; not those of fits."""
+    """All files of a folder and of those that links in it lead to, each folder once;
+    not those of fits.
+    """
     seen = set[str]()
     for folder, inner, names in os.walk(root, followlinks=True):
         if os.path.realpath(folder) in seen or (RECORD in names and folder != root):
@@ -254,8 +285,8 @@ def _hash_of(file: Path) -> str:
 
 
 def _last_state(folder: Path, began: float) -> str | None:
-    """The last checkpoint of this fit, not of one of another state before, or the folder of one of many
-    parts; None: it begins anew."""
+    """The last checkpoint of this fit, not of one of another state before, or the folder of one of
+    many parts; None: it begins anew."""
 
     def own(path: Path) -> bool:
         return path.exists() and path.stat().st_mtime >= began
@@ -263,4 +294,8 @@ def _last_state(folder: Path, began: float) -> str | None:
     for name in LAST:
         if own(folder / name):
             return str(folder / name)
-    return str(folder) if any(own(path) for pattern in PARTS for path in folder.glob(pattern)) else None
+    return (
+        str(folder)
+        if any(own(path) for pattern in PARTS for path in folder.glob(pattern))
+        else None
+    )

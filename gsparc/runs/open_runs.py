@@ -56,10 +56,10 @@ class Opened:
         data: in the models' local coordinates and units.
         split: the folds the methods were trained on, or others that were asked for.
         foreign: what differs from what the methods were trained on, one clause; None: nothing.
-        learned: test rows that the methods have learned from, of other data those at places that they have
-            learned from; None: not known.
-        trained: of other data or rows, what they learned from in their coordinates, and its folds; None where
-            that is gone.
+        learned: test rows that the methods have learned from, of other data those at places that
+            they have learned from; None: not known.
+        trained: of other data or rows, what they learned from in their coordinates, and its folds;
+            None where that is gone.
     """
 
     methods: list[Method]
@@ -71,7 +71,9 @@ class Opened:
     trained: tuple[Measurements, Split] | None = None
 
     def facts(self) -> dict[str, Any]:
-        """Return `dataset/*`, `split/*` and `model/name`; `split/foreign` says why rows may not be unseen."""
+        """Return `dataset/*`, `split/*` and `model/name`;
+        `split/foreign` says why rows may not be unseen.
+        """
         run_facts = {"split/foreign": self.doubt, "model/name": self.methods[0].name}
         return dataset_facts(self.data) | split_facts(self.split) | run_facts
 
@@ -87,7 +89,8 @@ class Opened:
         return Predictor(self.methods[0], site, trusted=read_trusted(extra), extra=extra)
 
     def retraining(self, effort: float | None = None, **others: Any) -> Learned:
-        """Return the first method with what it learned from; only classes of gsparc make it unfitted.
+        """Return the first method with what it learned from;
+        only classes of gsparc make it unfitted.
 
         Args:
             effort: in place of the run's; None: the run's.
@@ -106,7 +109,9 @@ class Opened:
         return Learned(self.methods[0], factory, self.data, self.split.folds[0], context)
 
     def group_places(self, places: np.ndarray, count: int, seed: int) -> np.ndarray:
-        """Return which of `count` groups, cut as test rows were, trained places (n, D) [m] are of, or -1."""
+        """Return which of `count` groups, cut as test rows were, trained places (n, D) [m] are of,
+        or -1.
+        """
         fold, split = self.split.folds[0], effort_settings(self.stored[0].configuration)["split"]
         rows, group = fold.learned(), np.full(len(self.data), -1)
         for number, inner in enumerate(cut_folds(self.data, fold, split, count, seed).folds):
@@ -115,15 +120,19 @@ class Opened:
 
 
 def open_files(
-    paths: Sequence[str | Path], dataset: Mapping[str, Any] | None = None,
-    split: Mapping[str, Any] | None = None, *, others_whole: bool = False,
-) -> Opened:  # fmt: skip
+    paths: Sequence[str | Path],
+    dataset: Mapping[str, Any] | None = None,
+    split: Mapping[str, Any] | None = None,
+    *,
+    others_whole: bool = False,
+) -> Opened:
     """Load checkpoints of one run, one per fold, and their data.
 
     Args:
         paths: checkpoint files in the order of their folds.
         dataset, split: settings that replace those stored in the first checkpoint.
-        others_whole: other data than these checkpoints' are test rows throughout, where no split is given.
+        others_whole: other data than these checkpoints' are test rows throughout, where no split is
+            given.
 
     Raises:
         ValueError: unreadable checkpoint or data, wrong kind of data, wrong number of checkpoints.
@@ -179,7 +188,8 @@ def read_like_stored(stored: checkpoint.StoredModel, path: str | Path) -> tuple[
 
 
 def module_of(stored: checkpoint.StoredModel, dataset: Mapping[str, Any] | None) -> DataModule:
-    """Return what reads a model's data with settings that replace those stored; nothing is read yet.
+    """Return what reads a model's data with settings that replace those stored;
+    nothing is read yet.
 
     How they are read is said unless training said it.
 
@@ -187,13 +197,17 @@ def module_of(stored: checkpoint.StoredModel, dataset: Mapping[str, Any] | None)
         ValueError: a setting that its data do not have, or no name.
     """
     # A class is imported only where the caller named it, never because a file does.
-    module = datamodule(_settings("dataset", stored, dataset), trusted="_target_" in (dataset or {}))
+    module = datamodule(
+        _settings("dataset", stored, dataset), trusted="_target_" in (dataset or {})
+    )
     module.told = stored.extra.get("read_notes", ())
     return module
 
 
 def check_dataset(path: str | Path, dataset: Mapping[str, Any]) -> None:
-    """Raise ValueError for a setting that the data of a checkpoint do not have, before they are needed."""
+    """Raise ValueError for a setting that the data of a checkpoint do not have,
+    before they are needed.
+    """
     if any(value is not None for value in dataset.values()):
         module_of(checkpoint.read(path), dataset)
 
@@ -201,9 +215,11 @@ def check_dataset(path: str | Path, dataset: Mapping[str, Any]) -> None:
 def _settings(
     group: str, stored: checkpoint.StoredModel, overrides: Mapping[str, Any] | None
 ) -> dict[str, Any]:
-    """The checkpoint's settings of a config group under the ones given now (those that are not null).
+    """The checkpoint's settings of a config group under the ones given now (those
+    that are not null).
 
-    Another name or a `_target_` given now replaces all that is stored, classes out of the file with it.
+    Another name or a `_target_` given now replaces all that is stored,
+    classes out of the file with it.
 
     Raises:
         ValueError: no name.
@@ -215,7 +231,8 @@ def _settings(
         before = {}
     settings = {**before, **now}
     for key in [key for key in now if now[key] and isinstance(before.get(key), dict)]:
-        settings[key] = {**before[key], **now[key]}  # such as columns; an empty group replaces all of it
+        # Such as columns; an empty group replaces all of it
+        settings[key] = {**before[key], **now[key]}
     if not {"name", "_target_"} & set(settings):
         raise ValueError(f"{stored.path} does not name its {group}; give {group}.name=...")
     return settings
@@ -232,12 +249,15 @@ def _folds(split: Split, stored: Sequence[checkpoint.StoredModel]) -> Split:
             f"give as many checkpoints in their order, ckpt=[fold0.ckpt,fold1.ckpt,...]"
         )
     if any(number >= len(split.folds) for number in numbers):
-        raise ValueError(f"fold {max(numbers)} was trained, split={split.name} has {len(split.folds)} folds")
+        raise ValueError(
+            f"fold {max(numbers)} was trained, split={split.name} has {len(split.folds)} folds"
+        )
     return replace(split, folds=tuple(split.folds[number] for number in numbers))
 
 
 def were_trained_on(stored: Sequence[checkpoint.StoredModel], split: Split) -> bool | None:
-    """Return whether checkpoints, one per fold of `split`, say that they were; None: one does not say it.
+    """Return whether checkpoints, one per fold of `split`, say that they were; None:
+    one does not say it.
 
     A finished model has the hash of its whole split, an interrupted training that of its own rows.
     """
@@ -253,7 +273,9 @@ def were_trained_on(stored: Sequence[checkpoint.StoredModel], split: Split) -> b
 def _foreign(
     stored: Sequence[checkpoint.StoredModel], data: Measurements, chosen: Split
 ) -> tuple[str | None, int | None, tuple[Measurements, Split] | None]:
-    """What was trained on instead, how many of these test rows the models learned from, and `_trained`."""
+    """What was trained on instead, how many of these test rows the models learned from,
+    and `_trained`.
+    """
     same = data.site.sha256 == stored[0].site.sha256
     same_split = were_trained_on(stored, chosen)
     if same and same_split:
@@ -261,8 +283,14 @@ def _foreign(
     what = "another split" if same else f"other data than {data.site.name} (content hashes differ)"
     unplaced = [one for one in (data.site, stored[0].site) if one.georeference is None]
     if not same and len(unplaced) == 1:
-        what += f"; metres of {unplaced[0].name} are about an unknown origin, the others' about degrees"
-        return f"{what}: whether these test rows lie where it was TRAINED cannot be told", None, None
+        what += (
+            f"; metres of {unplaced[0].name} are about an unknown origin, the others' about degrees"
+        )
+        return (
+            (f"{what}: whether these test rows lie where it was TRAINED cannot be told"),
+            None,
+            None,
+        )
     trained = _trained(stored, data)
     if trained is None:
         what = "rows that it does not name" if same and same_split is None else what
@@ -280,23 +308,33 @@ def _foreign(
         if same:
             learned += int(np.isin(fold.test, rows).sum())
         else:
-            # Order and names may differ between two files: rows at one place are taken for the same.
+            # Order and names may differ between two files:
+            # rows at one place are taken for the same.
             gaps, _ = cKDTree(trained_data.moving[rows]).query(data.moving[fold.test])
             learned += int((gaps < SAME_ROW_M).sum())
     what += f" ({before.name})" * same
-    how = ("were " if same else "are at places that were ") + ("TRAINED on" if learned else "trained on")
-    return f"{what}: {learned or 'none'} of these {len(tested)} test rows{listed} {how}", learned, trained
+    how = ("were " if same else "are at places that were ") + (
+        "TRAINED on" if learned else "trained on"
+    )
+    return (
+        (f"{what}: {learned or 'none'} of these {len(tested)} test rows{listed} {how}"),
+        learned,
+        trained,
+    )
 
 
 def _trained(
     stored: Sequence[checkpoint.StoredModel], data: Measurements
 ) -> tuple[Measurements, Split] | None:
-    """What checkpoints were trained on (`data` where it is that) and its folds; None where these are gone."""
+    """What checkpoints were trained on (`data` where it is that) and its folds;
+    None where these are gone.
+    """
     site = stored[0].site
     try:
         if data.site.sha256 != site.sha256:
             data = module_of(stored[0], None).measurements
-            # The file was changed or exchanged after training: its rows do not tell what was learned.
+            # The file was changed or exchanged after training:
+            # its rows do not tell what was learned.
             if data.site.sha256 != site.sha256:
                 return None
             data = align_to_site(data, site)
@@ -309,7 +347,8 @@ def _trained(
 
 @dataclass(frozen=True)
 class Unseen:
-    """A checkpoint with evidence of its own test rows: a bound holds for rows that nothing was chosen on.
+    """A checkpoint with evidence of its own test rows:
+    a bound holds for rows that nothing was chosen on.
 
     Attributes:
         path: of the file.
@@ -345,26 +384,44 @@ class Unseen:
     def calibrate_and_store(
         self, guarantee: Guarantee, kind: str, spatial: bool, seed: int
     ) -> tuple[Trusted, str]:
-        """Choose a confidence and its threshold, keep them with the model, return them and how it went."""
+        """Choose a confidence and its threshold, keep them with the model,
+        return them and how it went.
+        """
         evidence, how = self.evidence, (kind, spatial, seed)
-        kind_used, choice, _, choose_on = risk.calibrate_threshold(evidence, guarantee, *how, tested=False)
+        kind_used, choice, _, choose_on = risk.calibrate_threshold(
+            evidence, guarantee, *how, tested=False
+        )
         threshold = confidence_threshold(kind_used, choice)
         box = calibrated_box(self.rivals.known, evidence.position)
-        stored = replace(self.rivals, kind=kind_used, threshold=threshold, promise=guarantee, box=box)
+        stored = replace(
+            self.rivals, kind=kind_used, threshold=threshold, promise=guarantee, box=box
+        )
         before = self.earlier.kind or "the model's own"
         # Programs that read confidences get another number from now on: it is said.
         why = f", {risk.explain_kind(evidence, choose_on)}" if kind == "auto" else ""
         kind_changed = f"confidence={kind_used}{why}, before: {before}; "
         if kind == "auto" and not np.isfinite(threshold):
-            # Without a promise a choice by chance would replace what falls away from the measurements.
-            stored, kind_changed = self.earlier, f"confidence stays {before}, the checkpoint is unchanged; "
+            # Without a promise a choice by chance would replace what falls away
+            # from the measurements.
+            stored, kind_changed = (
+                self.earlier,
+                (f"confidence stays {before}, the checkpoint is unchanged; "),
+            )
         else:
             store_trusted(self.path, stored)
         if np.isfinite(threshold):
             share = np.mean(evidence.scores[kind_used] >= choice.value)
-            of = f"at most {guarantee.alpha:.0%} of the accepted are worse than {guarantee.limit_db:g} dB"
-            from_there = f"accepted from {threshold:.4g}, {share:.0%} of {len(evidence)} test positions"
-            of += f", which fails in at most {guarantee.delta:.0%} of cases; threshold stored in {self.path}"
+            of = (
+                f"at most {guarantee.alpha:.0%} of the accepted are worse than "
+                f"{guarantee.limit_db:g} dB"
+            )
+            from_there = (
+                f"accepted from {threshold:.4g}, {share:.0%} of {len(evidence)} test positions"
+            )
+            of += (
+                f", which fails in at most {guarantee.delta:.0%} of cases; threshold stored in "
+                f"{self.path}"
+            )
             return stored, f"{kind_changed}{from_there}: {of}"
         return stored, f"{kind_changed}no threshold keeps the promise: " + risk.explain_none(
             evidence, guarantee, *how

@@ -30,7 +30,8 @@ def run_directory() -> Path:
 
 
 def begin_run(config: DictConfig) -> tuple[Path, dict[str, Any]]:
-    """Check the settings of a run, before anything is read; return where it writes, and plain settings.
+    """Check the settings of a run, before anything is read; return where it writes,
+    and plain settings.
 
     Raises:
         ValueError: a setting that cannot be.
@@ -41,12 +42,16 @@ def begin_run(config: DictConfig) -> tuple[Path, dict[str, Any]]:
 
 
 def warn_of_held_out(predictor: Predictor) -> None:
-    """Warn of rows that were held out for a test: to a map they are places where nobody measured."""
+    """Warn of rows that were held out for a test:
+    to a map they are places where nobody measured.
+    """
     if count := predictor.extra.get("tested"):
         log.warning(
-            "%d rows of its file were held out for the test and count as not measured here: train the final "
-            "model with split=none", count,
-        )  # fmt: skip
+            "%d rows of its file were held out for the test and count as not measured here: "
+            "train the final "
+            "model with split=none",
+            count,
+        )
 
 
 def in_multirun() -> bool:
@@ -54,8 +59,12 @@ def in_multirun() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
-def show_result(run_dir: Path, *tables: RenderableType, lines: Iterable[str] = (), before: str = "") -> None:
-    """Show what a command ends with: tables, sentences, and `before` with where everything was written."""
+def show_result(
+    run_dir: Path, *tables: RenderableType, lines: Iterable[str] = (), before: str = ""
+) -> None:
+    """Show what a command ends with: tables, sentences,
+    and `before` with where everything was written.
+    """
     console = open_console()
     console.record = True
     for one in tables:
@@ -67,16 +76,24 @@ def show_result(run_dir: Path, *tables: RenderableType, lines: Iterable[str] = (
     files = [one for one in logging.getLogger().handlers if isinstance(one, logging.FileHandler)]
     text = console.export_text().rstrip()
     for file in files:  # to the log's file alone: the console has it
-        file.handle(logging.LogRecord(__name__, logging.INFO, __file__, 0, f"result:\n{text}", None, None))
+        file.handle(
+            logging.LogRecord(__name__, logging.INFO, __file__, 0, f"result:\n{text}", None, None)
+        )
 
 
 def show_training(
-    config: DictConfig, run_dir: Path, facts: Mapping[str, Any], split: Split, stations: Mapping[str, Any]
+    config: DictConfig,
+    run_dir: Path,
+    facts: Mapping[str, Any],
+    split: Split,
+    stations: Mapping[str, Any],
 ) -> None:
     """Show the table of a training, the worst of its `stations`, and remarks."""
     drawn = config.split.get("seed") is not None and not split.of_release
     draw = f" (split.seed={config.split.seed})" if drawn else ""
-    title = f"{facts['dataset/name']}, split {split.title}{draw}, {config.eval_on}, seed {config.seed}"
+    title = (
+        f"{facts['dataset/name']}, split {split.title}{draw}, {config.eval_on}, seed {config.seed}"
+    )
     tables = tables_of(facts, title, config.eval_on, stations)
     tested = any(name.startswith(f"{config.eval_on}/") for name in facts)
     show_result(run_dir, *tables * tested, lines=remarks(facts, config.eval_on))
@@ -84,8 +101,10 @@ def show_training(
 
 def tables_of(
     facts: Mapping[str, Any], title: str, eval_on: str, stations: Mapping[str, Any]
-) -> list[Table]:  # fmt: skip
-    """Return the table of a method beside others, and that of the worst of its `stations`, if any."""
+) -> list[Table]:
+    """Return the table of a method beside others, and that of the worst of its `stations`,
+    if any.
+    """
     label, later = facts["model/label"], not facts.get("split/train")
     return [results_table(facts, label, title, eval_on), *worst_stations(stations, label, later)]
 

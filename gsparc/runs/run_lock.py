@@ -1,4 +1,6 @@
-"""One run per folder: the second is refused before it writes anything, and told who holds the first."""
+"""One run per folder: the second is refused before it writes anything,
+and told who holds the first.
+"""
 
 from __future__ import annotations
 
@@ -23,11 +25,15 @@ _locks: list[FileLock] = []  # by the command that is running
 
 
 class InUse(BaseException):
-    """The folder is not ours to write to; no `Exception`, which Hydra makes a warning of in a callback."""
+    """The folder is not ours to write to; no `Exception`,
+    which Hydra makes a warning of in a callback.
+    """
 
 
 class RunLock(Callback):
-    """Hydra calls it before the folder of a run or a multirun is written to; `release_folders` ends it."""
+    """Hydra calls it before the folder of a run or a multirun is written to;
+    `release_folders` ends it.
+    """
 
     def on_run_start(self, config: DictConfig, **unused: Any) -> None:
         """Hold the run's folder, in which an earlier summary would be that of other files."""
@@ -51,15 +57,16 @@ def _folder(config: DictConfig, key: str) -> Path:
 
 
 def hold_folder(folder: Path, jobs: bool = False) -> None:
-    """Lock a folder until `release_folders`; the system does so too when the process ends, however it ends.
+    """Lock a folder until `release_folders`; the system does so too when the process ends,
+    however it ends.
 
     Args:
         folder: made where there is none.
         jobs: whether folders in it will be written to as well.
 
     Raises:
-        InUse: another process has locked it, a folder it lies in, or, with `jobs`, one in it: says which,
-            since when, with which command. Or it cannot be locked.
+        InUse: another process has locked it, a folder it lies in, or, with `jobs`, one in it: says
+            which, since when, with which command. Or it cannot be locked.
     """
     since = datetime.now().isoformat(sep=" ", timespec="seconds")
     who = f"process {os.getpid()} on {socket.gethostname()} since {since}: {' '.join(sys.argv)}"

@@ -15,7 +15,16 @@ from threadpoolctl import threadpool_limits
 from gsparc.base import executor
 from gsparc.base.executor import Engine
 from gsparc.base.instantiate import suggest_or_list
-from gsparc.base.limits import POSITIVE, Checked, Limit, SettingError, choice, or_null, setting, whole
+from gsparc.base.limits import (
+    POSITIVE,
+    Checked,
+    Limit,
+    SettingError,
+    choice,
+    or_null,
+    setting,
+    whole,
+)
 from gsparc.evaluation.console import to_dict as to_dict
 from gsparc.models.registry import all_methods
 from gsparc.training.effort import refuse_seconds
@@ -57,25 +66,35 @@ class RunSettings(Checked):
         values = OmegaConf.to_container(config, resolve=True)
         assert isinstance(values, dict)
         refuse_seconds(dict(_leaves(values)))
-        arguments: dict[str, Any] = {f.name: values[f.name] for f in fields(cls) if f.name in values}
+        arguments: dict[str, Any] = {
+            f.name: values[f.name] for f in fields(cls) if f.name in values
+        }
         if "model" not in values:  # names of stations to ask, not how they are learned
             arguments.pop("stations", None)
         settings = cls(**{**arguments, "baselines": _methods(arguments.get("baselines", []))})
         trainer = values.get("trainer") or {}
         clip = trainer.get("gradient_clip_val")
         or_null(POSITIVE).check("trainer.gradient_clip_val", clip)  # Lightning takes any number
-        if few := trainer.get("overfit_batches"):  # starts in closed form and refits learn from all rows
-            fault = f"trainer.overfit_batches={few}: not supported; split.train_count=32 learns from few rows"
+        # Starts in closed form and refits learn from all rows
+        if few := trainer.get("overfit_batches"):
+            fault = (
+                f"trainer.overfit_batches={few}: not supported; split.train_count=32 learns "
+                "from few rows"
+            )
             raise SettingError(f"{fault}, which eval_on=train then scores")
         accelerator = trainer.get("accelerator", "auto")
         kinds = ["auto", "gpu", *_accelerators()] if trainer else [accelerator]
         if accelerator not in kinds:  # Lightning says so, but not where a model takes no steps
             raise SettingError(f"trainer.accelerator={accelerator!r}: one of {', '.join(kinds)}")
         if accelerator in ("gpu", "cuda") and not torch.cuda.is_available():
-            raise SettingError(f"trainer.accelerator={accelerator}: there is no GPU here; say trainer=cpu")
+            raise SettingError(
+                f"trainer.accelerator={accelerator}: there is no GPU here; say trainer=cpu"
+            )
         for name, node in (config.get("callbacks") or {}).items():
             if node is not None and not isinstance(node, Mapping):
-                raise SettingError(f"callbacks.{name}={node}: is a group of settings; null leaves it out")
+                raise SettingError(
+                    f"callbacks.{name}={node}: is a group of settings; null leaves it out"
+                )
             instantiate(node)  # checks itself
         for key, value in _leaves(values):
             # YAML's .inf and .nan are floats, and no comparison with NaN refuses it.
@@ -91,7 +110,8 @@ class RunSettings(Checked):
 
 
 def _accelerators() -> list[str]:
-    from lightning.pytorch.accelerators import AcceleratorRegistry  # seconds; not every command trains
+    # seconds; not every command trains
+    from lightning.pytorch.accelerators import AcceleratorRegistry
 
     return sorted(AcceleratorRegistry.available_accelerators())
 
@@ -102,7 +122,9 @@ def _methods(names: Any) -> tuple[str, ...] | None:
     methods = all_methods()
     if isinstance(names, list) and all(name in methods for name in names):
         return tuple(names)
-    wrong = next((b for b in names if b not in methods), names) if isinstance(names, list) else names
+    wrong = (
+        next((b for b in names if b not in methods), names) if isinstance(names, list) else names
+    )
     hint = suggest_or_list(str(wrong), methods)
     raise SettingError(f"baselines={names}: a list of methods is needed, {wrong!r} is none{hint}")
 

@@ -1,4 +1,6 @@
-"""The run of a command, entered in the ledger: a job of a multirun that is done is not done again."""
+"""The run of a command, entered in the ledger:
+a job of a multirun that is done is not done again.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ from gsparc.runs.run_lock import locked
 log = logging.getLogger(__name__)
 
 
-def train_once(config: DictConfig, train: Callable[[DictConfig, Path, RunInputs], object]) -> dict[str, Any]:
+def train_once(
+    config: DictConfig, train: Callable[[DictConfig, Path, RunInputs], object]
+) -> dict[str, Any]:
     """Return the facts of a training; `train` does it, from what an interrupted try has left."""
     run_dir, job = run_directory(), in_multirun()
 
@@ -30,7 +34,8 @@ def train_once(config: DictConfig, train: Callable[[DictConfig, Path, RunInputs]
         train(config, run_dir, inputs)
 
     with locked(run_dir / ".job"):  # the run's own is its training's
-        unread = FitInputs.from_config(config) if job else None  # of a job that is done no data are read
+        # Of a job that is done no data are read
+        unread = FitInputs.from_config(config) if job else None
         facts = read_finished(run_dir, unread, config.reuse) if unread else None
         if facts is not None:
             log.info("%s: already done", run_dir)
@@ -49,8 +54,8 @@ def train_once(config: DictConfig, train: Callable[[DictConfig, Path, RunInputs]
 def objective(config: DictConfig, facts: Mapping[str, Any]) -> float:
     """Return the deciding figure of a training, larger is better, which a search improves.
 
-    Ratios of powers as -10 log10, errors with their sign turned; NaN where the data, or `split=none`, do not
-    tell it and no search asks.
+    Ratios of powers as -10 log10, errors with their sign turned; NaN where the data, or
+    `split=none`, do not tell it and no search asks.
     """
     figure = main_figure(facts, config.eval_on)
     value = facts.get(f"{config.eval_on}/{figure}")  # absent where nothing was tested
@@ -58,5 +63,7 @@ def objective(config: DictConfig, facts: Mapping[str, Any]) -> float:
         return score_of(figure, value)
     # A search cannot rank a job without its figure; a plain multirun can do without.
     if in_multirun() and HydraConfig.get().runtime.choices["hydra/sweeper"] != "basic":
-        raise ValueError(f"{config.eval_on}/{figure}: these data do not tell what the search improves")
+        raise ValueError(
+            f"{config.eval_on}/{figure}: these data do not tell what the search improves"
+        )
     return math.nan

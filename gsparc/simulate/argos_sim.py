@@ -1,8 +1,8 @@
 """`argos-sim`: a stand-in for the Argos release, in its layout, from rays among city blocks.
 
 Not real data. 4,000 users walk in open and blocked streets before an 8 x 8 array at 2.4 GHz; each
-snapshot carries a phase, a timing and a frequency offset of its own, as measured ones do. Besides the
-release's files (`csidata.npy` of 8 antennas, `base-station.yml`) there are all 64 antennas
+snapshot carries a phase, a timing and a frequency offset of its own, as measured ones do. Besides
+the release's files (`csidata.npy` of 8 antennas, `base-station.yml`) there are all 64 antennas
 (`csidata-64.npy`) and what no release tells: where the users were (`positions.npy`).
 """
 
@@ -50,7 +50,9 @@ class Offsets:
 
 
 def build_streets(seed: int = 0, scatterers: int = SCATTERERS) -> Streets:
-    """Build nine blocks, a base station in the middle street, `scatterers` lamp posts and parked cars."""
+    """Build nine blocks, a base station in the middle street,
+    `scatterers` lamp posts and parked cars.
+    """
     rng = np.random.default_rng([seed, 1])
     centres = np.array([(x, y) for x in (-100.0, 0.0, 100.0) for y in (-75.0, 0.0, 75.0)])
     half = np.array([36.0, 25.0]) + rng.uniform(-4.0, 4.0, (9, 2))
@@ -68,7 +70,8 @@ def build_streets(seed: int = 0, scatterers: int = SCATTERERS) -> Streets:
 
 
 def antenna_array() -> np.ndarray:
-    """Return element positions (64, 3) [m] about the base: an upright half-wavelength square, row by row.
+    """Return element positions (64, 3) [m] about the base: an upright half-wavelength square,
+    row by row.
 
     >>> antenna_array().shape
     (64, 3)
@@ -94,11 +97,15 @@ class World:
     noise_power: float
 
     def response(self, frequency_hz: np.ndarray, rows: np.ndarray | None = None) -> np.ndarray:
-        """Return true channels (S, 64, K) complex64 at absolute frequencies (K,) [Hz]; some `rows` only."""
+        """Return true channels (S, 64, K) complex64 at absolute frequencies (K,) [Hz];
+        some `rows` only.
+        """
         rows = np.arange(len(self.users)) if rows is None else rows
         parts = []
         for some in np.array_split(rows, max(1, len(rows) // CHUNK)):
-            response = self.rays.select_users(some).response(antenna_array(), CARRIER_HZ, frequency_hz)
+            response = self.rays.select_users(some).response(
+                antenna_array(), CARRIER_HZ, frequency_hz
+            )
             parts.append(response.astype(np.complex64))
         return np.concatenate(parts)
 
@@ -145,7 +152,11 @@ def draw_snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:
         turning = np.exp(2j * np.pi * np.outer(drift[some], np.arange(FFT)) / FFT)
         samples = np.fft.ifft(grid) * turning[:, None]
         received = np.fft.fft(samples)[..., TONES % FFT] * pilot
-        noise = rng.normal(size=(*received.shape, 2)) @ np.array([1, 1j]) * np.sqrt(truth.noise_power / 2)
+        noise = (
+            rng.normal(size=(*received.shape, 2))
+            @ np.array([1, 1j])
+            * np.sqrt(truth.noise_power / 2)
+        )
         measured[some] = received + noise
     return measured
 
@@ -160,10 +171,17 @@ def write_argos_sim(folder: Path, count: int, seed: int, offsets: Offsets, scatt
         np.save(partial / "positions.npy", truth.users)
         places = (build_streets(seed).base + antenna_array()).round(6)
         description = {
-            "dataset_name": STAND_IN, "carrier_hz": CARRIER_HZ, "spacing_hz": SPACING_HZ,
-            "tones": TONES.tolist(), "noise_power": truth.noise_power, "base_station": places[:SIDE].tolist(),
-            "base_station_64": places.tolist(), "count": count, "seed": seed, "scatterers": scatterers,
-        }  # fmt: skip
+            "dataset_name": STAND_IN,
+            "carrier_hz": CARRIER_HZ,
+            "spacing_hz": SPACING_HZ,
+            "tones": TONES.tolist(),
+            "noise_power": truth.noise_power,
+            "base_station": places[:SIDE].tolist(),
+            "base_station_64": places.tolist(),
+            "count": count,
+            "seed": seed,
+            "scatterers": scatterers,
+        }
         text = yaml.safe_dump(description, sort_keys=False)
         (partial / "base-station.yml").write_text(text, encoding="utf-8")
         write_split(partial, count, seed)

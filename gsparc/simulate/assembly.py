@@ -20,12 +20,16 @@ from gsparc.simulate.spectrum import render_spectra
 from gsparc.simulate.survey import Survey, TracingEngine
 from gsparc.tables.own import write_own
 
-STORED = ("offsets", "direction", "gain", "delay", "order", "mechanisms")  # arrays of paths in the file
-WEAKEST = 1e-6  # of the power of a receiver's strongest path: weaker ones are not listed in the file
+# Arrays of paths in the file
+STORED = ("offsets", "direction", "gain", "delay", "order", "mechanisms")
+# Of the power of a receiver's strongest path: weaker ones are not listed in the file
+WEAKEST = 1e-6
 SECONDS = "seconds"  # entry of a shard: time of tracing it, kept across interruptions
 
 
-def shard_arrays(paths: TracedPaths, campaign: CampaignSettings, wavelength: float) -> dict[str, np.ndarray]:
+def shard_arrays(
+    paths: TracedPaths, campaign: CampaignSettings, wavelength: float
+) -> dict[str, np.ndarray]:
     """Return what a shard keeps of some receivers."""
     frequency = campaign.scene.frequency_hz
     images, peak = render_spectra(paths, campaign.spectrum, frequency, wavelength)
@@ -54,10 +58,11 @@ def assemble_dataset(
     shards: Shards,
     rows: ShardRows,
 ) -> tuple[Measurements, dict[str, float]]:
-    """Write the file from what the shards hold (`join_shards`), drop the shards; as `load_own` reads it.
+    """Write the file from what the shards hold (`join_shards`), drop the shards;
+    as `load_own` reads it.
 
-    Facts beside it decide what the data can be used for, as `below_horizon`, the share of power that an upper
-    hemisphere cannot show.
+    Facts beside it decide what the data can be used for, as `below_horizon`, the share of power
+    that an upper hemisphere cannot show.
 
     `seconds` [s] were spent on anything but the shards, which know their own; both are the file's
     `simulate_s`.
@@ -82,7 +87,9 @@ def assemble_dataset(
     about = {**_provenance(campaign, engine), **facts}
     if survey.georeference is not None:
         about |= {f"origin_{name}": value for name, value in asdict(survey.georeference).items()}
-    about["antennas"] = json.dumps([str(getattr(one, "antenna", "isotropic")) for one in survey.engines])
+    about["antennas"] = json.dumps(
+        [str(getattr(one, "antenna", "isotropic")) for one in survey.engines]
+    )
     if convergence is not None:
         about |= {"convergence_error": convergence.nmse, **convergence.attributes()}
     if choice is not None:
@@ -94,7 +101,9 @@ def assemble_dataset(
 
 
 class ShardRows(NamedTuple):
-    """What all shards hold: arrays with a row for each of the survey's, by name, and their paths."""
+    """What all shards hold: arrays with a row for each of the survey's, by name,
+    and their paths.
+    """
 
     arrays: dict[str, np.ndarray]
     paths: TracedPaths
@@ -114,7 +123,8 @@ def join_shards(shards: Shards, rows: int) -> ShardRows:
     for number in shards.list_shards():
         part = shards.read(number)
         index, mine, _ = part.pop(ROWS), part.pop("offsets"), part.pop(SECONDS)
-        place = np.repeat(offsets[index] - mine[:-1], np.diff(mine)) + np.arange(mine[-1])  # of its paths
+        # Of its paths
+        place = np.repeat(offsets[index] - mine[:-1], np.diff(mine)) + np.arange(mine[-1])
         for name, values in part.items():
             at, length = (place, offsets[-1]) if name in ARRAYS else (index, rows)
             if name not in whole:
@@ -124,16 +134,24 @@ def join_shards(shards: Shards, rows: int) -> ShardRows:
 
 
 def _arrays(campaign: CampaignSettings, survey: Survey, rows: ShardRows) -> dict[str, np.ndarray]:
-    scene, wavelength, snr_db = campaign.scene, survey.engine.wavelength, campaign.decided.noise_snr_db
+    scene, wavelength, snr_db = (
+        campaign.scene,
+        survey.engine.wavelength,
+        campaign.decided.noise_snr_db,
+    )
     (whole, paths), csi = rows, rows.arrays["csi"]
     order = np.random.default_rng(scene.seed).permutation(len(survey.places))
     tests = max(1, round(scene.test_share * len(order)))
-    each = np.arange(len(survey.engines))[:, None] * len(order)  # a place is held out with all transmitters
+    # A place is held out with all transmitters
+    each = np.arange(len(survey.engines))[:, None] * len(order)
     arrays = {
         **_ends(survey),
         "frequency_hz": scene.frequency_hz,
         "carrier_hz": np.array(scene.carrier_hz),
-        **{name: whole[name] for name in ("spectrum", "spectrum_peak", "received_power", "delay_spread")},
+        **{
+            name: whole[name]
+            for name in ("spectrum", "spectrum_peak", "received_power", "delay_spread")
+        },
         **{f"path_{name}": getattr(paths, name) for name in STORED},
         "path_gain": paths.gain[:, 0] if paths.gain.shape[1] == 1 else paths.gain,
         "line_of_sight": paths.receiver_sums((paths.order == 0).astype(float)) > 0,
@@ -187,7 +205,8 @@ def _provenance(campaign: CampaignSettings, engine: TracingEngine) -> dict[str, 
         "effects_json": json.dumps(asdict(campaign.decided)),
         "sampling": json.dumps(asdict(campaign.sampling)),
         "path_gain_convention": "without carrier phase: multiply by exp(-j 2 pi f path_delay)",
-        "path_mechanisms_bits": "0 sight, 1 specular, 2 diffuse, 4 refraction, 8 diffraction, 16 edge",
+        "path_mechanisms_bits": "0 sight, 1 specular, 2 diffuse, 4 refraction, 8 diffraction, 16 "
+        "edge",
         "frames": "receiver axes are world axes, z up",
         **campaign.spectrum.attributes(),
     }

@@ -1,7 +1,8 @@
-"""Contribution of each propagation effect at each receiver, from the interactions of one full simulation.
+"""Contribution of each propagation effect at each receiver,
+from the interactions of one full simulation.
 
-Nothing is traced again: without an effect the solver draws other rays, and the difference would include
-the solver's noise.
+Nothing is traced again: without an effect the solver draws other rays, and the difference would
+include the solver's noise.
 """
 
 from __future__ import annotations
@@ -19,7 +20,9 @@ from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.spectrum import SpectrumSettings, render_spectra
 
 SILENCE_DB = 99.0  # error of a receiver that loses everything
-REQUIREMENT = re.compile(r"(coverage|csi|spectrum)\b\D*?(-?\d+(?:\.\d+)?)?\s*(?:dB)?", re.IGNORECASE)
+REQUIREMENT = re.compile(
+    r"(coverage|csi|spectrum)\b\D*?(-?\d+(?:\.\d+)?)?\s*(?:dB)?", re.IGNORECASE
+)
 DEFAULTS = {"coverage": 1.0, "csi": 20.0, "spectrum": 0.9}  # where the text gives no number
 
 
@@ -32,8 +35,8 @@ class Deliverable:
 
     Attributes:
         kind: `coverage` (received power), `csi` (channel) or `spectrum`.
-        tolerance: largest error: |dB| of received power; NMSE of the channel in dB; for spectra the error as
-            a share of the error of taking the nearest other receiver's spectrum.
+        tolerance: largest error: |dB| of received power; NMSE of the channel in dB; for spectra the
+            error as a share of the error of taking the nearest other receiver's spectrum.
         quantile: share of the receivers for which it must hold.
     """
 
@@ -43,7 +46,8 @@ class Deliverable:
 
     @staticmethod
     def parse(text: str, quantile: float = 0.95) -> Deliverable:
-        """Read text: `coverage +-1 dB`, `csi -20 dB`, `spectrum skill` (0.9 unless a number is given).
+        """Read text: `coverage +-1 dB`, `csi -20 dB`,
+        `spectrum skill` (0.9 unless a number is given).
 
         Raises:
             ValueError: none of these.
@@ -57,14 +61,19 @@ class Deliverable:
         if kind == "spectrum" and not 0 < number < 1:
             raise ValueError(f"effects.deliverable={text!r}: a skill lies between 0 and 1")
         # A skill of 0.9 is an error of 0.1; rounded, since 1 - 0.9 is not 0.1 in binary.
-        tolerance = {"coverage": abs(number), "csi": -abs(number), "spectrum": round(1 - number, 6)}[kind]
+        tolerance = {
+            "coverage": abs(number),
+            "csi": -abs(number),
+            "spectrum": round(1 - number, 6),
+        }[kind]
         return Deliverable(kind, tolerance, quantile)
 
     def __str__(self) -> str:
         wanted = {
             "coverage": f"received power within +-{self.tolerance:g} dB",
             "csi": f"channel NMSE at most {self.tolerance:g} dB",
-            "spectrum": f"spectrum skill at least {1 - self.tolerance:g} over the nearest receiver's",
+            "spectrum": f"spectrum skill at least {1 - self.tolerance:g} over the nearest "
+            "receiver's",
         }
         return f"{wanted[self.kind]} for {self.quantile:.0%} of the receivers"
 
@@ -80,7 +89,8 @@ class SurveyProbe:
         wavelength: at the carrier [m].
         elements: (M, 3) [m] of the array that channels are measured with.
         spectrum: definition of spectra.
-        nearest: paths of the nearest other receiver of each, (R receivers); needed for spectra only.
+        nearest: paths of the nearest other receiver of each, (R receivers); needed for spectra
+            only.
     """
 
     paths: TracedPaths
@@ -118,7 +128,9 @@ class SurveyProbe:
         return 1 - self._rest(remaining).received_power() / np.where(full > 0, full, 1)
 
     def nmse(self, remaining: Effects | TracedPaths) -> np.ndarray:
-        """Return the NMSE of each receiver's channel (R,), over all tones, elements and polarisations."""
+        """Return the NMSE of each receiver's channel (R,), over all tones,
+        elements and polarisations.
+        """
         full, rest = self._channels, self._responses(self._rest(remaining))
         error = (np.abs(full[:, : rest.shape[1]] - rest) ** 2).sum((1, 2))
         # A polarisation that is left out is missed whole.
@@ -142,7 +154,9 @@ class SurveyProbe:
 
     def _rest(self, remaining: Effects | TracedPaths) -> TracedPaths:
         # Nothing is traced again: without an effect the solver would draw other rays.
-        return remaining if isinstance(remaining, TracedPaths) else self.paths.keep_effects(remaining)
+        return (
+            remaining if isinstance(remaining, TracedPaths) else self.paths.keep_effects(remaining)
+        )
 
     def _responses(self, paths: TracedPaths) -> np.ndarray:
         return paths.responses(self.frequency_hz, self.elements, self.wavelength)
@@ -152,7 +166,8 @@ class SurveyProbe:
 
 
 def list_removals(full: Effects) -> dict[str, Effects]:
-    """Return what can be left out of `full`, one at a time: a mechanism, a depth, the second polarisation.
+    """Return what can be left out of `full`, one at a time: a mechanism, a depth,
+    the second polarisation.
 
     >>> full = Effects(depth=2).switch_off("refraction", "diffraction", "diffuse")
     >>> list(list_removals(full))
@@ -164,7 +179,9 @@ def list_removals(full: Effects) -> dict[str, Effects]:
 
 
 def list_effect_sets(full: Effects, removable: tuple[str, ...]) -> list[Effects]:
-    """List every set of switches without some of `removable` (named as in `list_removals`); `full` first."""
+    """List every set of switches without some of `removable` (named as in `list_removals`);
+    `full` first.
+    """
     sets = {full}
     for name in removable:
         sets |= {less for less in (_without(one, name) for one in sets) if less is not None}

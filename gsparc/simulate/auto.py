@@ -1,4 +1,6 @@
-"""`effects=auto`: measure each effect, keep those the requirement needs, verify on held-back receivers."""
+"""`effects=auto`: measure each effect, keep those the requirement needs,
+verify on held-back receivers.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +17,17 @@ from gsparc.simulate.attribution import Deliverable, SurveyProbe, list_effect_se
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import TracedPaths
 
-# Share of the processor time of a row, traced and stored, that goes with an effect, between those in the
-# street canyon and in the conference room (docs/results/simulate.md).
+# Share of the processor time of a row, traced and stored, that goes with an effect, between those
+# in the street canyon and in the conference room (docs/results/simulate.md).
 PRICE = {
-    "line_of_sight": 0.0, "specular": 0.25, "refraction": 0.0, "diffraction": 0.22, "edge_diffraction": 0.1,
-    "diffuse": 0.1, "polarisation": 0.02,
-}  # fmt: skip
+    "line_of_sight": 0.0,
+    "specular": 0.25,
+    "refraction": 0.0,
+    "diffraction": 0.22,
+    "edge_diffraction": 0.1,
+    "diffuse": 0.1,
+    "polarisation": 0.02,
+}
 BOUNCES = 0.8  # and with the bounces, to equal parts
 RAYS = 0.8  # and with the rays
 SIMILAR = 0.1  # of prices, within which the set of fewer effects is taken
@@ -58,7 +65,8 @@ class AutoSettings(Checked):
         return Deliverable.parse(self.deliverable, self.quantile)
 
     def allowed_failures(self, heard: int) -> int:
-        """Return how many of `heard` receivers may exceed the tolerance, so that the quantile follows.
+        """Return how many of `heard` receivers may exceed the tolerance,
+        so that the quantile follows.
 
         0 where even none proves nothing.
 
@@ -118,7 +126,8 @@ class Choice:
         table: one row per effect.
         probes: receivers that it took.
         samples: rays that are enough, of a call; None for those of the settings.
-        refuted: effects that probes allowed and held-back receivers did not, so that everything is needed.
+        refuted: effects that probes allowed and held-back receivers did not, so that everything is
+            needed.
         verdict: filled by `verify_choice`.
     """
 
@@ -153,7 +162,8 @@ def choose_effects(probe: SurveyProbe, settings: AutoSettings) -> Choice:
     full, required, heard = probe.effects, settings.required, int(probe.reached.sum())
     if not heard:
         raise ValueError(
-            "effects=auto: nothing reaches any probe receiver; is the transmitter inside a building?"
+            "effects=auto: nothing reaches any probe receiver; is the transmitter inside a "
+            "building?"
         )
     most = settings.allowed_failures(heard)
     rows = [_row(name, probe, less, required) for name, less in list_removals(full).items()]
@@ -164,7 +174,9 @@ def choose_effects(probe: SurveyProbe, settings: AutoSettings) -> Choice:
 
     removable = tuple(row.effect for row in rows if row.failures <= most)
     # The cheapest first: the search ends soon after the first set that holds.
-    sets = sorted(list_effect_sets(full, removable), key=lambda effects: relative_cost(effects, full))
+    sets = sorted(
+        list_effect_sets(full, removable), key=lambda effects: relative_cost(effects, full)
+    )
     chosen, table = _cheapest(sets, holds, full), []
     for row in rows:
         effect, _, depth = row.effect.partition(" > ")
@@ -175,18 +187,23 @@ def choose_effects(probe: SurveyProbe, settings: AutoSettings) -> Choice:
 
 
 def verify_choice(choice: Choice, settings: AutoSettings, errors: np.ndarray) -> Choice:
-    """Return the choice with its verification, by errors (n,) of the deliverable at held-back receivers."""
+    """Return the choice with its verification, by errors (n,)
+    of the deliverable at held-back receivers.
+    """
     if not len(errors):
         return choice
     met = float((errors <= settings.required.tolerance).mean())
-    verdict = Verification(len(errors), met, float(np.median(errors)), _p95(errors), met >= settings.quantile)
+    verdict = Verification(
+        len(errors), met, float(np.median(errors)), _p95(errors), met >= settings.quantile
+    )
     return replace(choice, verdict=verdict)
 
 
 def choose_rays(
     choice: Choice, settings: AutoSettings, probe: SurveyProbe, traced: TracedPaths, samples: int
 ) -> Choice:
-    """Return the choice with so many `samples` where those are enough, or without; a row says which.
+    """Return the choice with so many `samples` where those are enough, or without;
+    a row says which.
 
     Args:
         choice, settings, probe: as of `choose_effects`.
@@ -201,11 +218,14 @@ def choose_rays(
 
 def keep_all_rays(choice: Choice) -> Choice:
     """Return the choice, whose fewer rays the held-back receivers refute."""
-    return replace(choice, samples=None, table=(*choice.table[:-1], replace(choice.table[-1], kept=True)))
+    return replace(
+        choice, samples=None, table=(*choice.table[:-1], replace(choice.table[-1], kept=True))
+    )
 
 
 def relative_cost(effects: Effects, full: Effects, rays: float = 1.0) -> float:
-    """Return the expected time of tracing with some effects and a share of the rays, 1 with everything.
+    """Return the expected time of tracing with some effects and a share of the rays,
+    1 with everything.
 
     >>> full = Effects(depth=5)
     >>> relative_cost(full, full), relative_cost(full.switch_off("diffuse"), full) < 1
@@ -228,15 +248,23 @@ def _cheapest(sets: list[Effects], holds: Callable[[Effects], bool], full: Effec
     return min(enough, key=lambda s: (len(s.enabled), s.polarisation, s.depth), default=full)
 
 
-def _row(name: str, probe: SurveyProbe, less: Effects | TracedPaths, required: Deliverable) -> EffectRow:
+def _row(
+    name: str, probe: SurveyProbe, less: Effects | TracedPaths, required: Deliverable
+) -> EffectRow:
     """What is lost with `less`, at receivers that something reaches; kept until it is clear."""
     share, error = (
-        part[probe.reached] for part in (np.abs(probe.lost_power_shares(less)), probe.errors(less, required))
+        part[probe.reached]
+        for part in (np.abs(probe.lost_power_shares(less)), probe.errors(less, required))
     )
     return EffectRow(
-        name, float(share.mean()), _p95(share), float(np.median(error)), _p95(error),
-        int((error > required.tolerance).sum()), True,
-    )  # fmt: skip
+        name,
+        float(share.mean()),
+        _p95(share),
+        float(np.median(error)),
+        _p95(error),
+        int((error > required.tolerance).sum()),
+        True,
+    )
 
 
 def _p95(values: np.ndarray) -> float:

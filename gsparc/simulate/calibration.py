@@ -1,9 +1,10 @@
-"""Materials of a known scene, from received powers: paths are traced once, fields computed in every step.
+"""Materials of a known scene, from received powers: paths are traced once,
+fields computed in every step.
 
-J. Hoydis et al., "Learning Radio Environments by Differentiable Ray Tracing", IEEE Trans. Mach. Learn.
-Commun. Netw. 2 (2024), arXiv:2311.18558: relative permittivity and conductivity by gradient, through
-Sionna's Fresnel and diffraction coefficients. Where rays go does not depend on materials, so that one step
-is a replay of the stored paths under other materials and not a trace.
+J. Hoydis et al., "Learning Radio Environments by Differentiable Ray Tracing", IEEE Trans. Mach.
+Learn. Commun. Netw. 2 (2024), arXiv:2311.18558: relative permittivity and conductivity by gradient,
+through Sionna's Fresnel and diffraction coefficients. Where rays go does not depend on materials,
+so that one step is a replay of the stored paths under other materials and not a trace.
 """
 
 from __future__ import annotations
@@ -23,9 +24,11 @@ from gsparc.simulate.raytracer import RayTracer
 
 log = logging.getLogger(__name__)
 
-TAILS = 4.0  # degrees of freedom of Student's t, the density of residuals: shadows are missed by tens of dB
+# Degrees of freedom of Student's t, the density of residuals: shadows are missed by tens of dB
+TAILS = 4.0
 TINY_W = 1e-30  # power that has a logarithm, far below any path's
-PRIOR = (1.0, 2.0)  # deviation of the logarithms of permittivity - 1 and of conductivity about the start
+# Deviation of the logarithms of permittivity - 1 and of conductivity about the start
+PRIOR = (1.0, 2.0)
 RANGE = 4.0  # of a logarithm about its start, in these deviations
 LEAST_DB = 0.5  # scale of the residuals: below, the posterior is a needle that no search finds
 ROUNDS = 100  # of expectation maximisation
@@ -94,7 +97,8 @@ def apply_materials(tracer: RayTracer, materials: Mapping[str, Material]) -> Non
     there = tracer.radio_materials()
     for name, material in materials.items():
         if name in there:
-            # Plain numbers are constants of kernels: every other value would compile all of them anew.
+            # Plain numbers are constants of kernels:
+            # every other value would compile all of them anew.
             there[name].relative_permittivity = dr.opaque(mi.Float, material.permittivity)
             there[name].conductivity = dr.opaque(mi.Float, material.conductivity)
 
@@ -118,7 +122,9 @@ class Replay:
         return self._powers().numpy().astype(np.float64)
 
     def cost_and_gradient(
-        self, materials: Mapping[str, np.ndarray], slopes: Callable[[np.ndarray], tuple[float, np.ndarray]]
+        self,
+        materials: Mapping[str, np.ndarray],
+        slopes: Callable[[np.ndarray], tuple[float, np.ndarray]],
     ) -> tuple[float, np.ndarray]:
         """Evaluate a function of the powers in decibels, and its gradient by the materials.
 
@@ -134,7 +140,8 @@ class Replay:
 
         there, free = self.tracer.radio_materials(), []
         for name, logarithms in materials.items():
-            pair = [dr.opaque(mi.Float, float(value)) for value in logarithms]  # as in `apply_materials`
+            # As in `apply_materials`
+            pair = [dr.opaque(mi.Float, float(value)) for value in logarithms]
             for one in pair:
                 dr.enable_grad(one)
             there[name].relative_permittivity = 1 + dr.exp(pair[0])
@@ -152,12 +159,15 @@ class Replay:
         if invalid.any():
             log.warning(
                 "%d of %d slopes by materials are not finite: these do not move in this step",
-                int(invalid.sum()), len(gradient),
-            )  # fmt: skip
+                int(invalid.sum()),
+                len(gradient),
+            )
         return value, np.where(invalid, 0.0, gradient)
 
     def _powers(self) -> Any:
-        """(R,) as the solver's array, with gradients: evaluated loops have them, and cost the same here."""
+        """(R,) as the solver's array, with gradients: evaluated loops have them,
+        and cost the same here.
+        """
         import drjit as dr
         import mitsuba as mi
         from sionna.rt.path_solvers.field_calculator import FieldCalculator
@@ -165,14 +175,16 @@ class Replay:
         calculator, total = FieldCalculator(), dr.zeros(mi.Float, self._count)
         calculator.loop_mode = "evaluated"
         for arguments, owner in self._parts:
-            # The buffer is shared by all calls: each changes its flags in place, which made the kernel of
-            # every step longer than that of the one before.
+            # The buffer is shared by all calls: each changes its flags in place, which made the
+            # kernel of every step longer than that of the one before.
             valid = mi.Bool(arguments["paths"].valid)
             gains = calculator(**arguments).a
             arguments["paths"].valid = valid
             for row in gains:
                 for gain in row:
-                    dr.scatter_add(total, dr.square(dr.real(gain)) + dr.square(dr.imag(gain)), owner)
+                    dr.scatter_add(
+                        total, dr.square(dr.real(gain)) + dr.square(dr.imag(gain)), owner
+                    )
         return total
 
 
@@ -201,13 +213,17 @@ def _field_arguments(
 
 
 def calibrate(
-    replay: Replay, start: Mapping[str, Material], traced: np.ndarray, measured_db: np.ndarray, steps: int
+    replay: Replay,
+    start: Mapping[str, Material],
+    traced: np.ndarray,
+    measured_db: np.ndarray,
+    steps: int,
 ) -> RoomCalibration:
     """Find materials, one gain and the residuals' scale of largest posterior.
 
-    Residuals have Student's density of `TAILS` degrees of freedom, whose gain and scale follow from the
-    materials (`fit_gain_and_scale`). Logarithms of the materials have a normal prior about the start, so that
-    those that no path meets stay there. The replay's scene keeps the materials.
+    Residuals have Student's density of `TAILS` degrees of freedom, whose gain and scale follow from
+    the materials (`fit_gain_and_scale`). Logarithms of the materials have a normal prior about the
+    start, so that those that no path meets stay there. The replay's scene keeps the materials.
 
     Args:
         replay: paths to R receivers.
@@ -238,7 +254,9 @@ def calibrate(
             value, by_level[reached] = student_loss(gain - missed, scale)
             return value, by_level
 
-        value, by_material = replay.cost_and_gradient(dict(zip(start, x.reshape(-1, 2), strict=True)), slopes)
+        value, by_material = replay.cost_and_gradient(
+            dict(zip(start, x.reshape(-1, 2), strict=True)), slopes
+        )
         away = (x - centre) / deviation
         # Of a row: the search begins with a step as long as the gradient.
         value = (value + 0.5 * float(away @ away)) / len(traced)
@@ -251,7 +269,9 @@ def calibrate(
     options = {"maxfun": steps, "maxiter": steps}
     minimize(objective, centre, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
     _, x, gain, scale = best
-    materials = {name: Material.from_logarithms(x) for name, x in zip(start, x.reshape(-1, 2), strict=True)}
+    materials = {
+        name: Material.from_logarithms(x) for name, x in zip(start, x.reshape(-1, 2), strict=True)
+    }
     apply_materials(replay.tracer, materials)
     return RoomCalibration(materials, gain, scale, spent)
 
@@ -259,8 +279,8 @@ def calibrate(
 def fit_gain_and_scale(missed: np.ndarray) -> tuple[float, float]:
     """Return location and scale of largest likelihood of Student's density, `missed` (n,) [dB].
 
-    Expectation maximisation (K. L. Lange et al., J. Am. Stat. Assoc. 84 (1989)); a scale of at least
-    `LEAST_DB`.
+    Expectation maximisation (K. L. Lange et al., J. Am. Stat. Assoc. 84 (1989)); a scale of at
+    least `LEAST_DB`.
 
     >>> missed = np.array([2.0, 3.0, 3.0, 3.0, 4.0, 60.0])  # [dB], the last by a shadow
     >>> bool(fit_gain_and_scale(missed)[0] < missed.mean() / 3)

@@ -1,4 +1,6 @@
-"""A simulated dataset from beginning to end: places, effects, shards, convergence error, one file."""
+"""A simulated dataset from beginning to end: places, effects, shards, convergence error,
+one file.
+"""
 
 from __future__ import annotations
 
@@ -71,7 +73,9 @@ def simulate(campaign: CampaignSettings, out: Path) -> Outcome:
         decision = _decided(campaign, campaign.effects, survey, shards)
         campaign = replace(campaign, effects=decision.effects)
         if decision.samples is not None:
-            campaign = replace(campaign, sampling=replace(campaign.sampling, samples=decision.samples))
+            campaign = replace(
+                campaign, sampling=replace(campaign.sampling, samples=decision.samples)
+            )
             survey = survey.with_samples(decision.samples)
             left_out = _decided_on(shards)  # these rows have more rays than the others
     campaign = replace(campaign, effects=survey.engine.supported_effects(campaign.decided))
@@ -90,7 +94,9 @@ def simulate(campaign: CampaignSettings, out: Path) -> Outcome:
     return Outcome(data, facts, rows, survey, campaign.decided, decision, error, seconds)
 
 
-def _decided(campaign: CampaignSettings, settings: AutoSettings, survey: Survey, shards: Shards) -> Decision:
+def _decided(
+    campaign: CampaignSettings, settings: AutoSettings, survey: Survey, shards: Shards
+) -> Decision:
     """The decision of `auto`, taken once; what it traced is the first shard."""
     stored = shards.read_note()
     if stored is not None:
@@ -108,7 +114,9 @@ def _decided(campaign: CampaignSettings, settings: AutoSettings, survey: Survey,
 
 @dataclass
 class _Tracing:
-    """Traces and stores shards; where it is sent to, it builds the scene once, which cannot be pickled."""
+    """Traces and stores shards; where it is sent to, it builds the scene once,
+    which cannot be pickled.
+    """
 
     campaign: CampaignSettings
     shards: Shards
@@ -125,13 +133,18 @@ class _Tracing:
             self.survey = build_survey(self.campaign.scene, self.campaign.sampling)
         paths = self.survey.trace(rows, self.campaign.decided)
         arrays = shard_arrays(paths, self.campaign, self.survey.engine.wavelength)
-        self.shards.write(number, {**arrays, ROWS: rows, SECONDS: np.array(time.perf_counter() - begin)})
+        self.shards.write(
+            number, {**arrays, ROWS: rows, SECONDS: np.array(time.perf_counter() - begin)}
+        )
 
 
 def _trace_all(campaign: CampaignSettings, survey: Survey, shards: Shards) -> None:
     """Trace what is missing."""
     rest = np.setdiff1d(np.arange(len(survey)), _decided_on(shards))
-    parts = [(n, rest[i : i + campaign.shard]) for n, i in enumerate(range(0, len(rest), campaign.shard), 1)]
+    parts = [
+        (n, rest[i : i + campaign.shard])
+        for n, i in enumerate(range(0, len(rest), campaign.shard), 1)
+    ]
     missing = [(n, rows) for n, rows in parts if not shards.path(n).exists()]
     if len(missing) < len(parts):
         log.info("%d of %d shards already done", len(parts) - len(missing), len(parts))

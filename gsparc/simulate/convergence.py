@@ -23,7 +23,8 @@ class Convergence:
     Attributes:
         nmse: of the channels, sum |difference|^2 / sum |channel|^2.
         spectrum_nmse, spectrum_psnr_db, spectrum_ssim: of the spectra.
-        power_db: 95th percentile of |difference| of the received power, of receivers that both reach [dB].
+        power_db: 95th percentile of |difference| of the received power, of receivers that both
+            reach [dB].
         receivers: how many were traced twice.
     """
 
@@ -36,11 +37,16 @@ class Convergence:
 
     def attributes(self) -> dict[str, float | int]:
         """Return attributes for the file, beside `convergence_error`, which is `nmse`."""
-        return {f"convergence_{name}": value for name, value in vars(self).items() if name != "nmse"}
+        return {
+            f"convergence_{name}": value for name, value in vars(self).items() if name != "nmse"
+        }
 
 
 def measure_convergence(
-    campaign: CampaignSettings, survey: Survey, traced: Mapping[str, np.ndarray], left_out: np.ndarray
+    campaign: CampaignSettings,
+    survey: Survey,
+    traced: Mapping[str, np.ndarray],
+    left_out: np.ndarray,
 ) -> Convergence | None:
     """Compare rows of a file with a second seed's; None where none is asked for, or without rays.
 

@@ -36,7 +36,8 @@ class Effects(Checked):
         edge_diffraction: at free edges of a sheet; needs `diffraction`.
         diffuse: scattering off rough surfaces; needs `specular`.
         depth: most interactions of a path.
-        polarisation: receive the horizontal component beside the vertical one; off: the vertical one only.
+        polarisation: receive the horizontal component beside the vertical one; off: the vertical
+            one only.
         noise_snr_db: white noise on channels this far below their mean power [dB]; None for none.
     """
 
@@ -80,7 +81,8 @@ class Effects(Checked):
         """Tell which paths exist under these switches: (P,) bool.
 
         >>> kept = Effects(refraction=False, depth=2)
-        >>> kept.allows_paths(np.array([0, SPECULAR, REFRACTION, SPECULAR], np.uint8), np.array([0, 1, 1, 3]))
+        >>> kinds = np.array([0, SPECULAR, REFRACTION, SPECULAR], np.uint8)
+        >>> kept.allows_paths(kinds, np.array([0, 1, 1, 3]))
         array([ True,  True, False, False])
 
         Args:

@@ -1,9 +1,12 @@
-"""The LLVM library that Sionna's CPU back end needs: found, fetched without root, tried in a subprocess.
+"""The LLVM library that Sionna's CPU back end needs: found, fetched without root,
+tried in a subprocess.
 
-Dr.Jit refuses LLVM 14; with 15 and 16 it imports and then aborts the whole process at the first solve,
-which no `try` catches. So a library is accepted only after a tiny solve in a process of its own.
+Dr.Jit refuses LLVM 14; with 15 and 16 it imports and then aborts the whole process at the first
+solve, which no `try` catches. So a library is accepted only after a tiny solve
+in a process of its own.
 
-`python -m gsparc.simulate.llvm` (or `make sionna`) fetches Debian's package where no library is good.
+`python -m gsparc.simulate.llvm` (or `make sionna`)
+fetches Debian's package where no library is good.
 """
 
 from __future__ import annotations
@@ -25,11 +28,14 @@ VARIABLE = "DRJIT_LIBLLVM_PATH"
 FETCHED = Path(sys.prefix) / "lib" / "llvm19" / "libLLVM.so.19.1"
 SYSTEM = ("llvm-19/lib", "*-linux-gnu", "llvm-20/lib", "llvm-18/lib")  # below /usr/lib, best first
 MODULE = "python -m gsparc.simulate.llvm"
-REMEDY = f"get one with `{MODULE}` (Debian's, no root needed) or name a library of LLVM 19 in {VARIABLE}"
+REMEDY = (
+    f"get one with `{MODULE}` (Debian's, no root needed) or name a library of LLVM 19 in {VARIABLE}"
+)
 TINY_SOLVE = """
 import sionna.rt as rt
 scene = rt.load_scene(rt.scene.floor_wall)
-scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+scene.tx_array = scene.rx_array = array
 scene.add(rt.Transmitter("tx", position=[-2.5, 0, 3]))
 scene.add(rt.Receiver("rx", position=[2.5, 0, 3]))
 paths = rt.PathSolver()(scene, max_depth=1, samples_per_src=1000, diffuse_reflection=False)
@@ -50,10 +56,14 @@ class SimulatorMissing(RuntimeError):
 
 
 def find_libraries() -> list[Path]:
-    """Return libraries to try, best first: the one the user names (then no other), ours, the system's."""
+    """Return libraries to try, best first: the one the user names (then no other), ours,
+    the system's.
+    """
     if named := os.environ.get(VARIABLE):
         return [Path(named)]
-    system = (p for folder in SYSTEM for p in sorted(Path("/usr/lib").glob(f"{folder}/libLLVM.so.*.1")))
+    system = (
+        p for folder in SYSTEM for p in sorted(Path("/usr/lib").glob(f"{folder}/libLLVM.so.*.1"))
+    )
     return [path for path in (FETCHED, *system) if path.exists()]
 
 
@@ -79,12 +89,18 @@ def library_fault(library: Path) -> str | None:
         with whole_file(seal) as partial:
             partial.touch()
         return None
-    died = f"killed by signal {-result.returncode}" if result.returncode < 0 else f"exit {result.returncode}"
+    died = (
+        f"killed by signal {-result.returncode}"
+        if result.returncode < 0
+        else f"exit {result.returncode}"
+    )
     return f"a tiny solve failed ({died}: {words[:160]})"
 
 
 def _seal(library: Path) -> Path:
-    """An empty file that is there once a solve worked with this library and these versions of the solver."""
+    """An empty file that is there once a solve worked with this library
+    and these versions of the solver.
+    """
     stat = library.stat()
     # Another library, solver or interpreter is tried anew.
     parts = [str(library.resolve()), stat.st_mtime_ns, stat.st_size, sys.executable]
@@ -95,13 +111,16 @@ def _seal(library: Path) -> Path:
 
 
 def prepare_llvm(fetch_missing: bool = False) -> Path:
-    """Make sure that `import sionna.rt` will work in this process, and return the library it will use.
+    """Make sure that `import sionna.rt` will work in this process,
+    and return the library it will use.
 
     Raises:
         SimulatorMissing: Sionna is not installed, or no library passes the tiny solve.
     """
     if importlib.util.find_spec("sionna") is None or importlib.util.find_spec("sionna.rt") is None:
-        raise SimulatorMissing("Sionna is not installed; run `make sionna` or pip install 'gsparc[sionna]'")
+        raise SimulatorMissing(
+            "Sionna is not installed; run `make sionna` or pip install 'gsparc[sionna]'"
+        )
     faults = []
     for library in find_libraries():
         wrong = library_fault(library)
@@ -129,7 +148,9 @@ def fetch_llvm() -> None:
         process = subprocess.run(script, cwd=scratch, capture_output=True, text=True)
     if process.returncode:
         words = (process.stderr.strip().splitlines() or [f"exit {process.returncode}"])[-1]
-        raise SimulatorMissing(f"libllvm19: {words}; put LLVM 19 on this machine and name it in {VARIABLE}")
+        raise SimulatorMissing(
+            f"libllvm19: {words}; put LLVM 19 on this machine and name it in {VARIABLE}"
+        )
 
 
 if __name__ == "__main__":

@@ -14,12 +14,15 @@ from gsparc.simulate.scenes.solid import LISTED_MATERIALS, Solid
 
 # Thickness [m] and scattering coefficient, where a scene gives none.
 MATERIALS = {
-    row["material"]: (float(row["thickness_m"]), float(row["scattering"])) for row in LISTED_MATERIALS
+    row["material"]: (float(row["thickness_m"]), float(row["scattering"]))
+    for row in LISTED_MATERIALS
 }
 OTHERS = (0.10, 0.20)
 
 
-def load_scene(source: Sequence[Solid] | str | Path, carrier_hz: float, scattering: float | None) -> Any:
+def load_scene(
+    source: Sequence[Solid] | str | Path, carrier_hz: float, scattering: float | None
+) -> Any:
     """Return a Sionna scene of solids, of a file, or of a name, at a carrier [Hz].
 
     Args:
@@ -40,7 +43,9 @@ def load_scene(source: Sequence[Solid] | str | Path, carrier_hz: float, scatteri
         for material in scene.radio_materials.values():
             # Built-in scenes come with 0: diffuse reflection would silently contribute nothing.
             if float(material.scattering_coefficient[0]) == 0.0:
-                material.scattering_coefficient = scatters(getattr(material, "itu_type", None) or "")
+                material.scattering_coefficient = scatters(
+                    getattr(material, "itu_type", None) or ""
+                )
     else:
         scene = rt.load_scene()
         _add(scene, source, scatters)
@@ -58,8 +63,12 @@ def _load_file(source: str | Path) -> Any:
         try:
             return rt.load_scene(str(path))
         except Exception as error:  # Mitsuba raises RuntimeError, Sionna several others
-            first = next((line for line in str(error).splitlines() if line.strip()), type(error).__name__)
-            raise ValueError(f"scene.xml={source}: Sionna cannot read it ({first.strip()})") from error
+            first = next(
+                (line for line in str(error).splitlines() if line.strip()), type(error).__name__
+            )
+            raise ValueError(
+                f"scene.xml={source}: Sionna cannot read it ({first.strip()})"
+            ) from error
     choice(*list_shipped_scenes()).check("scene.builtin", source)
     return rt.load_scene(getattr(rt.scene, str(source)))
 
@@ -70,7 +79,10 @@ def _add(scene: Any, solids: Sequence[Solid], scatters: Callable[[str], float]) 
 
     materials = {
         name: rt.ITURadioMaterial(
-            f"itu-{name}", name, MATERIALS.get(name, OTHERS)[0], scattering_coefficient=scatters(name)
+            f"itu-{name}",
+            name,
+            MATERIALS.get(name, OTHERS)[0],
+            scattering_coefficient=scatters(name),
         )
         for name in sorted({solid.material for solid in solids})
     }
@@ -78,7 +90,9 @@ def _add(scene: Any, solids: Sequence[Solid], scatters: Callable[[str], float]) 
     for solid in solids:
         mesh = mi.Mesh(solid.name, vertex_count=len(solid.vertices), face_count=len(solid.faces))
         parameters = mi.traverse(mesh)
-        parameters["vertex_positions"] = np.ascontiguousarray(solid.vertices, dtype=np.float32).ravel()
+        parameters["vertex_positions"] = np.ascontiguousarray(
+            solid.vertices, dtype=np.float32
+        ).ravel()
         parameters["faces"] = np.ascontiguousarray(solid.faces, dtype=np.uint32).ravel()
         parameters.update()
         material = materials[solid.material]

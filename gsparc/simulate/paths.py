@@ -12,9 +12,11 @@ from gsparc.simulate.effects import Effects
 
 @dataclass(frozen=True)
 class TracedPaths:
-    """Paths of R receivers, sorted by receiver and then by delay; those of r are `offsets[r]:offsets[r+1]`.
+    """Paths of R receivers, sorted by receiver and then by delay;
+    those of r are `offsets[r]:offsets[r+1]`.
 
-    >>> receiver, delay, count = np.array([1, 0, 1]), np.array([2e-8, 1e-8, 1e-8]), np.zeros(3, np.uint8)
+    >>> receiver, delay = np.array([1, 0, 1]), np.array([2e-8, 1e-8, 1e-8])
+    >>> count = np.zeros(3, np.uint8)
     >>> gain, direction = np.ones((3, 1), np.complex64), np.ones((3, 3))
     >>> paths = TracedPaths.from_unsorted(2, receiver, gain, delay, direction, count, count)
     >>> paths.offsets, paths.received_power()  # one path of the first receiver, two of the second
@@ -22,10 +24,13 @@ class TracedPaths:
 
     Attributes:
         offsets: (R + 1,) int64.
-        gain: (P, ports) complex64 without the carrier's phase, one column per received polarisation.
+        gain: (P, ports) complex64 without the carrier's phase, one column per received
+            polarisation.
         delay: (P,) float64 [s].
-        direction: (P, 3) float32 unit vectors from the receiver to where the path comes from, world axes.
-        mechanisms: (P,) uint8, OR of the bits of `effects.BITS` over its interactions; 0: line of sight.
+        direction: (P, 3) float32 unit vectors from the receiver to where the path comes from, world
+            axes.
+        mechanisms: (P,) uint8, OR of the bits of `effects.BITS` over its interactions; 0: line of
+            sight.
         order: (P,) uint8 number of interactions.
     """
 
@@ -38,14 +43,23 @@ class TracedPaths:
 
     @staticmethod
     def from_unsorted(
-        receivers: int, receiver_index: np.ndarray, gain: np.ndarray, delay: np.ndarray,
-        direction: np.ndarray, mechanisms: np.ndarray, order: np.ndarray,
-    ) -> TracedPaths:  # fmt: skip
-        """Sort paths in any order; `receiver_index` (P,) says whose each is, the rest as of this class."""
+        receivers: int,
+        receiver_index: np.ndarray,
+        gain: np.ndarray,
+        delay: np.ndarray,
+        direction: np.ndarray,
+        mechanisms: np.ndarray,
+        order: np.ndarray,
+    ) -> TracedPaths:
+        """Sort paths in any order; `receiver_index` (P,) says whose each is,
+        the rest as of this class.
+        """
         # The last key counts most: by receiver, then by delay.
         rank = np.lexsort((delay, receiver_index))
         offsets = group_offsets(np.bincount(receiver_index, minlength=receivers))
-        return TracedPaths(offsets, *(array[rank] for array in (gain, delay, direction, mechanisms, order)))
+        return TracedPaths(
+            offsets, *(array[rank] for array in (gain, delay, direction, mechanisms, order))
+        )
 
     def __len__(self) -> int:
         return len(self.offsets) - 1
@@ -63,7 +77,9 @@ class TracedPaths:
     def select_paths(self, selected: np.ndarray) -> TracedPaths:
         """Return only the paths where `selected` (P,) bool is true; receivers stay."""
         counts = np.bincount(self.receiver_index[selected], minlength=len(self))
-        return TracedPaths(group_offsets(counts), *(getattr(self, name)[selected] for name in ARRAYS))
+        return TracedPaths(
+            group_offsets(counts), *(getattr(self, name)[selected] for name in ARRAYS)
+        )
 
     def select_receivers(self, receivers: np.ndarray) -> TracedPaths:
         """Return receivers (n,) alone, in this order."""
@@ -91,10 +107,15 @@ class TracedPaths:
         # Where nothing arrives 0 is divided by the least float64.
         total = np.maximum(self.received_power(), np.finfo(float).tiny)
         mean = self.receiver_sums(self.power * self.delay) / total
-        return np.sqrt(self.receiver_sums(self.power * (self.delay - mean[self.receiver_index]) ** 2) / total)
+        return np.sqrt(
+            self.receiver_sums(self.power * (self.delay - mean[self.receiver_index]) ** 2) / total
+        )
 
-    def responses(self, frequency_hz: np.ndarray, elements: np.ndarray, wavelength: float) -> np.ndarray:
-        """Return channels (R, ports x M, K) complex128: `sum_p a_p exp(-j 2 pi f tau_p) exp(+j k u_p . e_m)`.
+    def responses(
+        self, frequency_hz: np.ndarray, elements: np.ndarray, wavelength: float
+    ) -> np.ndarray:
+        """Return channels (R, ports x M, K) complex128:
+        `sum_p a_p exp(-j 2 pi f tau_p) exp(+j k u_p . e_m)`.
 
         Args:
             frequency_hz: (K,) absolute frequencies [Hz].
@@ -102,12 +123,16 @@ class TracedPaths:
             wavelength: [m], at the carrier.
         """
         ports = self.gain.shape[1]
-        channels = np.zeros((len(self), ports * len(elements), len(frequency_hz)), dtype=np.complex128)
+        channels = np.zeros(
+            (len(self), ports * len(elements), len(frequency_hz)), dtype=np.complex128
+        )
         for r, (start, stop) in enumerate(zip(self.offsets[:-1], self.offsets[1:], strict=True)):
             one = slice(start, stop)
             # cycles, not radians, and reduced in float64 before the exponential
             tones = np.exp(-2j * np.pi * np.mod(np.outer(self.delay[one], frequency_hz), 1.0))
-            steered = np.exp(2j * np.pi / wavelength * (elements @ self.direction[one].T.astype(np.float64)))
+            steered = np.exp(
+                2j * np.pi / wavelength * (elements @ self.direction[one].T.astype(np.float64))
+            )
             for port in range(ports):
                 block = (steered * self.gain[one, port]) @ tones
                 channels[r, port * len(elements) : (port + 1) * len(elements)] = block
@@ -130,5 +155,6 @@ def join_receivers(parts: Sequence[TracedPaths]) -> TracedPaths:
     """Return receivers of all parts, one after the other."""
     counts = np.concatenate([np.diff(part.offsets) for part in parts])
     return TracedPaths(
-        group_offsets(counts), *(np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS)
+        group_offsets(counts),
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in ARRAYS),
     )

@@ -1,8 +1,10 @@
-"""Sionna's ray tracer as an engine, with a check for each known failure; Sionna is imported when it traces.
+"""Sionna's ray tracer as an engine, with a check for each known failure;
+Sionna is imported when it traces.
 
-What is guarded: candidates cut off at the shared limit (detected, and the batch is halved and traced again),
-specular chains lost to one another (a hash table large enough for a batch), duplicated lines of sight
-(refused), materials without scattering (completed), receivers inside objects.
+What is guarded: candidates cut off at the shared limit (detected, and the batch is halved and
+traced again), specular chains lost to one another (a hash table large enough for a batch),
+duplicated lines of sight (refused), materials without scattering (completed),
+receivers inside objects.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ from gsparc.simulate.survey import TracingEngine
 log = logging.getLogger(__name__)
 
 CANDIDATES_PER_RECEIVER = 20_000
-# Two tables of this, 512 MB; Sionna's own (1e6 at least) loses a tenth of the paths of 200 receivers.
+# Two tables of this, 512 MB; Sionna's own (1e6 at least)
+# loses a tenth of the paths of 200 receivers.
 HASHES = 64_000_000
 GROUND_LEVEL = 0.7  # least share of the ground's area that is level
 LARGEST_BUFFER = 8_000_000  # candidates of one call; about 300 bytes each
@@ -61,7 +64,8 @@ class RayTracer(TracingEngine):
     """One scene with one transmitter, ready to trace.
 
     Args:
-        source: objects built in code, the name of one of Sionna's scenes, or the path of an XML file.
+        source: objects built in code, the name of one of Sionna's scenes, or the path of an XML
+            file.
         transmitter, antenna: (3,) [m], and what it radiates.
         carrier_hz: [Hz].
         sampling: effort of the solver.
@@ -95,9 +99,11 @@ class RayTracer(TracingEngine):
         self.wavelength = LIGHT / carrier_hz
         self.scene = load_scene(source, carrier_hz, scattering)
         self.transmitter, self.antenna = np.asarray(transmitter, dtype=np.float64), antenna
-        self._arrays: list[tuple[int, str]] = []  # antennas of the scene, shared by `with_transmitter`
+        # Antennas of the scene, shared by `with_transmitter`
+        self._arrays: list[tuple[int, str]] = []
         self.retried = 0  # batches traced again because candidates were cut off
-        self._buffer_factor: dict[Effects, int] = {}  # enlargement of the candidate buffer by effects
+        # Enlargement of the candidate buffer by effects
+        self._buffer_factor: dict[Effects, int] = {}
 
     def with_transmitter(self, transmitter: np.ndarray, antenna: Antenna) -> RayTracer:
         """Return the same scene with the transmitter elsewhere."""
@@ -134,20 +140,28 @@ class RayTracer(TracingEngine):
         used = {thing.radio_material.name for thing in self.scene.objects.values()}
         return {name: one for name, one in self.scene.radio_materials.items() if name in used}
 
-    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> TracedPaths:
+    def trace(
+        self, receivers: np.ndarray, effects: Effects, seed: int | None = None
+    ) -> TracedPaths:
         """Trace paths to receivers (R, 3) [m], world; `seed` in place of `sampling.seed`.
 
         Raises:
-            RuntimeError: a receiver has several lines of sight, or one alone has more candidates than fit.
+            RuntimeError: a receiver has several lines of sight, or one alone has more candidates
+                than fit.
         """
-        # How many receivers a call has is a constant of its kernels: any other number compiles them anew.
+        # How many receivers a call has is a constant of its kernels:
+        # any other number compiles them anew.
         beneath = np.append(self.transmitter[:2], self._lowest - 1.0)
         parts, first = [], 0
         for count, size in divide_into_calls(len(receivers), self.sampling.batch):
-            filled = np.concatenate([receivers[first : first + count], np.tile(beneath, (size - count, 1))])
+            filled = np.concatenate(
+                [receivers[first : first + count], np.tile(beneath, (size - count, 1))]
+            )
             solved = self.trace_in_batches(filled, effects, seed)
             ports = 2 if effects.polarisation else 1
-            part = join_receivers([_collect(solution, number, ports) for solution, number in solved])
+            part = join_receivers(
+                [_collect(solution, number, ports) for solution, number in solved]
+            )
             parts.append(part.select_receivers(np.arange(count)))
             first += count
         return join_receivers(parts)
@@ -157,16 +171,20 @@ class RayTracer(TracingEngine):
     ) -> Iterator[tuple[Any, int]]:
         """Yield Sionna's own paths (`sionna.rt.Paths`) of consecutive receivers, and of how many.
 
-        The scene holds these receivers until the next is asked for. Arguments and errors as of `trace`.
+        The scene holds these receivers until the next is asked for.
+        Arguments and errors as of `trace`.
         """
         rays, size = self.sampling.seed if seed is None else seed, self.sampling.batch
         for first in range(0, len(receivers), size):
             yield from self._batch(receivers[first : first + size], effects, rays)
 
-    def _batch(self, receivers: np.ndarray, effects: Effects, seed: int) -> Iterator[tuple[Any, int]]:
+    def _batch(
+        self, receivers: np.ndarray, effects: Effects, seed: int
+    ) -> Iterator[tuple[Any, int]]:
         """One call; halved, or with a larger buffer, when candidates were cut off."""
         boost = self._buffer_factor.get(effects, 1)
-        # A full batch's whatever the size: the limit is a constant of the kernel, another compiles it anew.
+        # A full batch's whatever the size: the limit is a constant of the kernel,
+        # another compiles it anew.
         batch = max(self.sampling.batch, len(receivers))
         limit = min(CANDIDATES_PER_RECEIVER * boost * batch, LARGEST_BUFFER)
         solution = self._solve(receivers, effects, seed, limit)
@@ -175,7 +193,11 @@ class RayTracer(TracingEngine):
             return
         self.retried += 1
         if limit < LARGEST_BUFFER:
-            log.info("candidate paths were cut off at %d; tracing %d receivers again", limit, len(receivers))
+            log.info(
+                "candidate paths were cut off at %d; tracing %d receivers again",
+                limit,
+                len(receivers),
+            )
             # Kept by effects: later batches begin with the buffer that this one needed.
             self._buffer_factor[effects] = boost * 4
             yield from self._batch(receivers, effects, seed)
@@ -185,7 +207,11 @@ class RayTracer(TracingEngine):
                 f"one receiver has over {LARGEST_BUFFER} candidate paths; lower sampling.samples"
             )
         half = len(receivers) // 2
-        log.info("candidate paths were cut off at %d; tracing halves of %d receivers", limit, len(receivers))
+        log.info(
+            "candidate paths were cut off at %d; tracing halves of %d receivers",
+            limit,
+            len(receivers),
+        )
         for part in (receivers[:half], receivers[half:]):
             yield from self._batch(part, effects, seed)
 
@@ -233,7 +259,9 @@ class RayTracer(TracingEngine):
         if self._arrays != [wanted]:
 
             def one(pattern: str, polarisation: str) -> Any:
-                return rt.PlanarArray(num_rows=1, num_cols=1, pattern=pattern, polarization=polarisation)
+                return rt.PlanarArray(
+                    num_rows=1, num_cols=1, pattern=pattern, polarization=polarisation
+                )
 
             scene.tx_array = one(self.antenna.pattern, "V")
             scene.rx_array = one("iso", "V" if ports == 1 else "VH")
@@ -251,12 +279,16 @@ class RayTracer(TracingEngine):
 
         tx = scene.get("tx")
         tx.position, ahead = point(self.transmitter), point(np.zeros(3))
-        tx.orientation = point(np.radians([self.antenna.azimuth_deg, self.antenna.downtilt_deg, 0.0]))
+        tx.orientation = point(
+            np.radians([self.antenna.azimuth_deg, self.antenna.downtilt_deg, 0.0])
+        )
         for i, place in enumerate(receivers):
             scene.add(rt.Receiver(f"rx{i}", position=point(place), orientation=ahead))
 
     def under_open_sky(self, points: np.ndarray) -> np.ndarray:
-        """Tell whether nothing is above points (N, 3) [m]: outdoors that means outside of buildings."""
+        """Tell whether nothing is above points (N, 3) [m]:
+        outdoors that means outside of buildings.
+        """
         return ~np.isfinite(self._hit(points, np.array([0.0, 0.0, 1.0])).t.numpy())
 
     def clear_of_surfaces(self, points: np.ndarray, gap: float) -> np.ndarray:
@@ -282,11 +314,14 @@ class RayTracer(TracingEngine):
         triangles = {}
         for name, thing in self.scene.objects.items():
             vertices = thing.mi_mesh.vertex_positions_buffer().numpy().reshape(-1, 3)
-            triangles[name] = vertices[thing.mi_mesh.faces_buffer().numpy().reshape(-1, 3)].astype(np.float64)
+            triangles[name] = vertices[thing.mi_mesh.faces_buffer().numpy().reshape(-1, 3)].astype(
+                np.float64
+            )
         return triangles
 
     def highest_surface(self, across: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the highest surface (n,) [m] at (n, 2) [m], -inf without one, and whether it is ground.
+        """Return the highest surface (n,) [m] at (n, 2) [m], -inf without one,
+        and whether it is ground.
 
         The ground is the widest object whose area is mostly level; without one all is.
         """
@@ -318,16 +353,21 @@ class RayTracer(TracingEngine):
         return max(level, key=level.__getitem__, default=None)
 
     def has_open_sky(self, area: np.ndarray) -> bool:
-        """Tell whether an area (2, 2) [m] is not closed by a ceiling: seen from above, some of it is low.
+        """Tell whether an area (2, 2) [m] is not closed by a ceiling: seen from above,
+        some of it is low.
 
         Raises:
             ValueError: nothing of the scene is in the area.
         """
         low, top = self.bounding_box()[:, 2]
-        height = self.surface_height(np.random.default_rng(0).uniform(area[0], area[1], size=(500, 2)))
+        height = self.surface_height(
+            np.random.default_rng(0).uniform(area[0], area[1], size=(500, 2))
+        )
         heights = height[np.isfinite(height)]
         if not len(heights):
-            raise ValueError(f"scene.area_m={area.tolist()}: nothing of the scene is there; say another")
+            raise ValueError(
+                f"scene.area_m={area.tolist()}: nothing of the scene is there; say another"
+            )
         return bool((heights < (low + top) / 2).mean() > 0.05)
 
     def _hit(self, points: np.ndarray, direction: np.ndarray) -> Any:
@@ -358,11 +398,16 @@ def divide_into_calls(receivers: int, batch: int) -> list[tuple[int, int]]:
     rest = receivers - whole * batch
     if whole and rest > 2 * size:
         return [*[(batch, batch)] * whole, (rest, batch)]
-    return [*[(batch, batch)] * whole, *((min(size, rest - at), size) for at in range(0, rest, size))]
+    return [
+        *[(batch, batch)] * whole,
+        *((min(size, rest - at), size) for at in range(0, rest, size)),
+    ]
 
 
 def _collect(solution: Any, receivers: int, ports: int) -> TracedPaths:
-    """The solver's flat buffer, sorted; its padded public arrays would need receivers x longest list."""
+    """The solver's flat buffer, sorted; its padded public arrays would need receivers x longest
+    list.
+    """
     buffer = solution._paths_buffer
     owner = buffer.target_indices.numpy().astype(np.int64)
     if not len(owner):  # nothing is heard anywhere: the solver has made no gains either
@@ -377,12 +422,16 @@ def _collect(solution: Any, receivers: int, ports: int) -> TracedPaths:
         # A free edge has the same triangle on both sides.
         edge = wedges.prim0.numpy() == wedges.primn.numpy()
     kinds = np.where(edge[:, None] & (kinds == DIFFRACTION), EDGE, kinds).astype(np.uint8)
-    mechanisms = np.bitwise_or.reduce(kinds, axis=1) if kinds.shape[1] else np.zeros(len(owner), np.uint8)
+    mechanisms = (
+        np.bitwise_or.reduce(kinds, axis=1) if kinds.shape[1] else np.zeros(len(owner), np.uint8)
+    )
     order = (kinds > 0).sum(1).astype(np.uint8)
     direction = buffer.k_rx.numpy().T.astype(np.float32).reshape(len(owner), 3)
     direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
     sight = np.bincount(owner[order == 0], minlength=receivers)
     if len(sight) and sight.max() > 1:
         row = int(sight.argmax())
-        raise RuntimeError(f"receiver {row} of a batch has {sight[row]} lines of sight, one at most is true")
+        raise RuntimeError(
+            f"receiver {row} of a batch has {sight[row]} lines of sight, one at most is true"
+        )
     return TracedPaths.from_unsorted(receivers, owner, gain, delay, direction, mechanisms, order)

@@ -15,7 +15,9 @@ STATED = ("deliverable", "probes", "samples")
 def choice_table(choice: Choice) -> Table:
     """Return a row per effect: its share of power, errors without it, its cost, kept or dropped."""
     table = Table(
-        title=f"requirement: {choice.deliverable}", caption=describe_choice(choice), caption_justify="left"
+        title=f"requirement: {choice.deliverable}",
+        caption=describe_choice(choice),
+        caption_justify="left",
     )
     table.add_column("left out")
     for name in ("power %", "p95", "error", "p95", "probes off"):
@@ -24,11 +26,14 @@ def choice_table(choice: Choice) -> Table:
     for row in choice.table:
         table.add_row(
             row.effect.replace("_", " "),
-            f"{row.share:.1%}", f"{row.share_p95:.1%}", f"{row.error:.2g}", f"{row.error_p95:.2g}",
+            f"{row.share:.1%}",
+            f"{row.share_p95:.1%}",
+            f"{row.error:.2g}",
+            f"{row.error_p95:.2g}",
             str(row.failures),
             "kept" if row.kept else "dropped",
             style="bold" if row.kept else None,
-        )  # fmt: skip
+        )
     return table
 
 
@@ -41,7 +46,8 @@ def describe_choice(choice: Choice) -> str:
         return chosen
     outcome = "met" if checked.kept else f"NOT MET by less ({choice.refuted})"
     return (
-        f"{chosen}; requirement {outcome}: {checked.met:.1%} of {checked.receivers} held-back receivers are "
+        f"{chosen}; requirement {outcome}: {checked.met:.1%} of {checked.receivers} held-back "
+        "receivers are "
         f"within tolerance (error {checked.error:.2g} median, {checked.error_p95:.2g} at 95 %)"
     )
 

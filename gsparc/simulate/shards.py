@@ -1,7 +1,7 @@
 """Shards of a simulation on disk: each written once and atomically, and counted only when complete.
 
-HDF5 does not survive a kill, so nothing is appended to: each shard is a file of its own that appears by
-renaming, and the dataset is written from all of them at the end.
+HDF5 does not survive a kill, so nothing is appended to: each shard is a file of its own that
+appears by renaming, and the dataset is written from all of them at the end.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ class Shards:
         stored = self.folder / "plan.json"
         if stored.exists() and stored.read_text(encoding="utf-8") != self.plan:
             raise ValueError(
-                f"{self.folder} holds parts of a different simulation; remove it, or choose another out="
+                f"{self.folder} holds parts of a different simulation; remove it, or choose "
+                "another out="
             )
         if not stored.exists():
             write_whole(stored, self.plan)
@@ -71,7 +72,9 @@ class Shards:
 
     def list_shards(self) -> list[int]:
         """Return numbers of the shards that are there."""
-        return sorted(int(path.stem.removeprefix("shard_")) for path in self.folder.glob("shard_*.npz"))
+        return sorted(
+            int(path.stem.removeprefix("shard_")) for path in self.folder.glob("shard_*.npz")
+        )
 
     def read(self, number: int, *names: str) -> dict[str, np.ndarray]:
         """Return the arrays of a finished shard; `names` alone where given."""
@@ -80,7 +83,8 @@ class Shards:
 
     def remove(self) -> None:
         """Remove everything, after the dataset is written."""
-        # Renamed first: a kill amid the removal would leave shards without the plan that they belong to.
+        # Renamed first: a kill amid the removal would leave shards without the plan
+        # that they belong to.
         self._sweep()
         os.replace(self.folder, self._removed)
         self._sweep()

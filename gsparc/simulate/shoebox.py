@@ -1,8 +1,10 @@
-"""Exact image sources in a shoebox room with absorbing boxes: ground truth whose every path is known.
+"""Exact image sources in a shoebox room with absorbing boxes:
+ground truth whose every path is known.
 
-Source: J. B. Allen and D. A. Berkley, "Image method for efficiently simulating small-room acoustics",
-J. Acoust. Soc. Am. 65 (1979). A path of one transmitter and one receiver is the straight line to an
-image of the transmitter; the amplitude law is wavelength / (4 pi d), the phase exp(-j 2 pi f d / c).
+Source: J. B. Allen and D. A. Berkley, "Image method for efficiently simulating small-room
+acoustics", J. Acoust. Soc. Am. 65 (1979). A path of one transmitter and one receiver is the
+straight line to an image of the transmitter; the amplitude law is wavelength / (4 pi d),
+the phase exp(-j 2 pi f d / c).
 """
 
 from __future__ import annotations
@@ -41,19 +43,26 @@ class Room:
     def __post_init__(self) -> None:
         for name, shape in (("lower", (3,)), ("upper", (3,)), ("reflection", (6,))):
             if np.shape(getattr(self, name)) != shape:
-                raise ValueError(f"room.{name}: expected shape {shape}, got {np.shape(getattr(self, name))}")
+                raise ValueError(
+                    f"room.{name}: expected shape {shape}, got {np.shape(getattr(self, name))}"
+                )
         if not (np.asarray(self.upper) > np.asarray(self.lower)).all():
-            raise ValueError(f"room: upper {self.upper} must lie above lower {self.lower} on every axis")
+            raise ValueError(
+                f"room: upper {self.upper} must lie above lower {self.lower} on every axis"
+            )
         if np.asarray(self.occluders).shape[1:] != (2, 3):
             raise ValueError(f"room.occluders: expected (n, 2, 3), got {np.shape(self.occluders)}")
 
     @staticmethod
     def from_size(size: ArrayLike, reflection: complex | np.ndarray = -0.7, **kwargs) -> Room:
-        """Return a room from the origin to `size` (3,) [m]; `reflection` of all six walls, or (6,)."""
+        """Return a room from the origin to `size` (3,) [m]; `reflection` of all six walls,
+        or (6,).
+        """
         return Room(np.zeros(3), np.array(size, dtype=float), np.full(6, reflection), **kwargs)
 
     def contains(self, points: np.ndarray) -> np.ndarray:
-        """Tell whether points (..., 3) [m] are inside the room and outside every occluder: (...) bool.
+        """Tell whether points (..., 3) [m] are inside the room and outside every occluder: (...)
+        bool.
 
         >>> Room.from_size((6.0, 4.0, 3.0)).contains(np.array([[1.0, 1.0, 1.0], [7.0, 1.0, 1.0]]))
         array([ True, False])
@@ -70,7 +79,8 @@ class RoomImages:
     """The mirror images of a room up to some order: the image of p is `signs * p + offsets`.
 
     Attributes:
-        cell: (I, 3) int, which mirrored copy of the room the image lies in; |cell| counts reflections.
+        cell: (I, 3) int, which mirrored copy of the room the image lies in; |cell| counts
+            reflections.
         signs: (I, 3) of +-1, the diagonal of the orthogonal matrix Q.
         offsets: (I, 3) [m].
         gain: (I,) complex product of the reflection coefficients on the way.
@@ -94,7 +104,9 @@ class RoomImages:
 def mirror_images(room: Room, max_order: int) -> RoomImages:
     """Return all images of order <= `max_order`, sorted by order; the first is the point itself.
 
-    >>> mirror_images(Room.from_size((6.0, 4.0, 3.0)), max_order=1).order.tolist()  # itself, one in each wall
+    Itself, one in each wall:
+
+    >>> mirror_images(Room.from_size((6.0, 4.0, 3.0)), max_order=1).order.tolist()
     [0, 1, 1, 1, 1, 1, 1]
     """
     reach = range(-max_order, max_order + 1)
@@ -114,16 +126,19 @@ def _mirror(room: Room, cell: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The map p -> signs * p + offsets into cells (I, 3)."""
     size = np.asarray(room.upper) - room.lower
     even = cell % 2 == 0
-    # An even cell is a shifted copy of the room; an odd one is mirrored, the cell -1 in the lower wall.
+    # An even cell is a shifted copy of the room; an odd one is mirrored,
+    # the cell -1 in the lower wall.
     return np.where(even, 1.0, -1.0), np.where(even, 0.0, 2.0 * room.lower + size) + cell * size
 
 
-def visible_images(room: Room, images: RoomImages, source: np.ndarray, observer: np.ndarray) -> np.ndarray:
+def visible_images(
+    room: Room, images: RoomImages, source: np.ndarray, observer: np.ndarray
+) -> np.ndarray:
     """Tell whether each observer sees each image of a source, exactly: (S, I) bool.
 
     The straight line from the observer to the image runs through mirrored copies of the room; it is
-    blocked when it meets a copy of an occluder in one of them (unfolding). Source and observer are (S, 3) [m]
-    inside the room, broadcast against each other.
+    blocked when it meets a copy of an occluder in one of them (unfolding). Source and observer are
+    (S, 3) [m] inside the room, broadcast against each other.
     """
     source, observer = np.broadcast_arrays(np.atleast_2d(source), np.atleast_2d(observer))
     seen = np.ones((len(observer), len(images.cell)), dtype=bool)
@@ -134,13 +149,19 @@ def visible_images(room: Room, images: RoomImages, source: np.ndarray, observer:
         signs, offsets = _mirror(room, np.array(list(crossed), dtype=np.int64))
         for low, high in room.occluders:
             corner, other = signs * low + offsets, signs * high + offsets
-            for box_low, box_high in zip(np.minimum(corner, other), np.maximum(corner, other), strict=True):
+            for box_low, box_high in zip(
+                np.minimum(corner, other), np.maximum(corner, other), strict=True
+            ):
                 seen[:, i] &= ~segments_meet_box(observer, places[:, i], box_low, box_high)
     return seen
 
 
-def segments_meet_box(start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """Tell whether segments start -> end (S, D) meet the box from low to high (D,): (S,) bool; slab test."""
+def segments_meet_box(
+    start: np.ndarray, end: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Tell whether segments start -> end (S, D) meet the box from low to high (D,): (S,) bool;
+    slab test.
+    """
     along = end - start
     parallel = along == 0
     # Any divisor does: along a parallel axis `outside` decides alone.
@@ -150,7 +171,9 @@ def segments_meet_box(start: np.ndarray, end: np.ndarray, low: np.ndarray, high:
     outside = parallel & ((start < low) | (start > high))
     near, far = np.where(parallel, -np.inf, near), np.where(parallel, np.inf, far)
     # A segment meets the box where it is between all three pairs of planes at once.
-    return (np.maximum(near.max(axis=1), 0.0) <= np.minimum(far.min(axis=1), 1.0)) & ~outside.any(axis=1)
+    return (np.maximum(near.max(axis=1), 0.0) <= np.minimum(far.min(axis=1), 1.0)) & ~outside.any(
+        axis=1
+    )
 
 
 @dataclass(frozen=True)
@@ -162,7 +185,8 @@ class Trace:
         tx, rx: (S, 3) [m].
         frequency_hz: (K,) [Hz].
         array: (A, 3) [m], receive elements relative to `rx`, world axes.
-        images: the mirror images; sources of a static transmitter are `images.mirror_points(tx[0])`.
+        images: the mirror images; sources of a static transmitter are
+            `images.mirror_points(tx[0])`.
         visible: (S, I) bool, seen from the array's centre.
         noise_variance: per entry of `csi`; 0 without noise.
     """
@@ -198,14 +222,17 @@ def trace_room(
     Args:
         tx, rx: (S, 3) or (3,) [m] inside the room, broadcast against each other.
         frequency_hz: (K,) or a number [Hz].
-        array: (A, 3) [m] receive elements relative to `rx`, world axes; None for one element at `rx`.
+        array: (A, 3) [m] receive elements relative to `rx`, world axes; None for one element at
+            `rx`.
         snr_db: complex white noise is added this far below the mean power; None for none.
         seed: of the noise.
 
     Raises:
         ValueError: a position lies outside the room or inside an occluder.
     """
-    tx, rx = (p.astype(np.float64) for p in np.broadcast_arrays(np.atleast_2d(tx), np.atleast_2d(rx)))
+    tx, rx = (
+        p.astype(np.float64) for p in np.broadcast_arrays(np.atleast_2d(tx), np.atleast_2d(rx))
+    )
     for name, position in (("tx", tx), ("rx", rx)):
         outside = np.flatnonzero(~room.contains(position))
         if len(outside):
@@ -230,12 +257,16 @@ def trace_room(
         variance = float(np.mean(np.abs(csi) ** 2) / from_decibels(snr_db))
         rng = np.random.default_rng(seed)
         # Half of the variance in the real part, half in the imaginary one.
-        csi += np.sqrt(variance / 2) * (rng.normal(size=csi.shape) + 1j * rng.normal(size=csi.shape))
+        csi += np.sqrt(variance / 2) * (
+            rng.normal(size=csi.shape) + 1j * rng.normal(size=csi.shape)
+        )
     return Trace(csi, tx, rx, frequency, elements, mirrored, seen, variance)
 
 
 class ShoeboxEngine(TracingEngine):
-    """A shoebox room with one transmitter (3,) [m] as a `TracingEngine`: direct path and mirrors."""
+    """A shoebox room with one transmitter (3,) [m] as a `TracingEngine`:
+    direct path and mirrors.
+    """
 
     name = "gsparc-shoebox"
     random = False
@@ -245,10 +276,14 @@ class ShoeboxEngine(TracingEngine):
         self.transmitter = np.asarray(transmitter, dtype=np.float64)
         self.wavelength = LIGHT / carrier_hz
         if not room.contains(self.transmitter):
-            raise ValueError(f"scene.transmitter_m={self.transmitter.tolist()}: outside the room or in a box")
+            raise ValueError(
+                f"scene.transmitter_m={self.transmitter.tolist()}: outside the room or in a box"
+            )
 
     def supported_effects(self, effects: Effects) -> Effects:
-        """Keep line of sight and specular reflection; walls do not transmit, edges do not diffract."""
+        """Keep line of sight and specular reflection; walls do not transmit,
+        edges do not diffract.
+        """
         return replace(
             effects.switch_off("diffuse", "diffraction", "refraction"),
             polarisation=False,
@@ -256,7 +291,9 @@ class ShoeboxEngine(TracingEngine):
             depth=effects.depth if effects.specular else 0,
         )
 
-    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> TracedPaths:
+    def trace(
+        self, receivers: np.ndarray, effects: Effects, seed: int | None = None
+    ) -> TracedPaths:
         """Trace paths to receivers (R, 3) [m]; there are no rays, so no seed matters."""
         mirrored = mirror_images(self.room, effects.depth)
         seen = visible_images(self.room, mirrored, self.transmitter[None], receivers)
@@ -269,11 +306,17 @@ class ShoeboxEngine(TracingEngine):
         gain = mirrored.gain[image] * self.wavelength / (4 * np.pi * distance)
         order = mirrored.order[image].astype(np.uint8)
         return TracedPaths.from_unsorted(
-            len(receivers), owner, gain[:, None].astype(np.complex64), distance / LIGHT,
-            (way / distance[:, None]).astype(np.float32), np.where(order > 0, SPECULAR, 0).astype(np.uint8),
+            len(receivers),
+            owner,
+            gain[:, None].astype(np.complex64),
+            distance / LIGHT,
+            (way / distance[:, None]).astype(np.float32),
+            np.where(order > 0, SPECULAR, 0).astype(np.uint8),
             order,
-        )  # fmt: skip
+        )
 
     def materials(self) -> dict[str, dict[str, Any]]:
         """Return the amplitude reflection coefficients of the walls."""
-        return {f"wall{i}": {"reflection": abs(complex(r))} for i, r in enumerate(self.room.reflection)}
+        return {
+            f"wall{i}": {"reflection": abs(complex(r))} for i, r in enumerate(self.room.reflection)
+        }

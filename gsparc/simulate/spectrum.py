@@ -1,8 +1,8 @@
 """Definition of a simulated spectrum, stored with the data.
 
 Bartlett: the elements of a stated planar array receive the paths from above their ground plane on
-every subcarrier, `P(u) = mean_k |a(u)^H h_k|^2 / M^2`, the subcarriers being the snapshots; interference
-within the band is real.
+every subcarrier, `P(u) = mean_k |a(u)^H h_k|^2 / M^2`, the subcarriers being the snapshots;
+interference within the band is real.
 """
 
 from __future__ import annotations
@@ -38,7 +38,10 @@ class ArraySettings(Checked):
         >>> ArraySettings(rows=2, columns=1).elements(wavelength=0.1)[:, 0].tolist()
         [-0.025, 0.025]
         """
-        x, y = ((np.arange(n) - (n - 1) / 2) * self.spacing * wavelength for n in (self.rows, self.columns))
+        x, y = (
+            (np.arange(n) - (n - 1) / 2) * self.spacing * wavelength
+            for n in (self.rows, self.columns)
+        )
         return np.stack(np.meshgrid(x, y, 0.0, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
@@ -47,7 +50,8 @@ class SpectrumSettings(ArraySettings):
     """One definition of a spectrum, of an array; a pixel is an amplitude.
 
     Attributes:
-        height, width: pixels; row i is i x 90/height degrees of elevation, column j j x 360/width of azimuth.
+        height, width: pixels; row i is i x 90/height degrees of elevation, column j j x 360/width
+            of azimuth.
     """
 
     rows: int = setting(8, whole(1))
@@ -69,10 +73,12 @@ class SpectrumSettings(ArraySettings):
 def render_spectra(
     paths: TracedPaths, settings: SpectrumSettings, frequency_hz: np.ndarray, wavelength: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return spectra (R, H, W) float32, and the largest amplitude of each (R,), which it was divided by.
+    """Return spectra (R, H, W) float32, and the largest amplitude of each (R,),
+    which it was divided by.
 
-    Only paths from above the horizon are received; world axes are the receivers'. A receiver without any is
-    black, divided by 1. The subcarriers (K,) [Hz] are the snapshots of the Bartlett spectrum.
+    Only paths from above the horizon are received; world axes are the receivers'. A receiver
+    without any is black, divided by 1. The subcarriers (K,)
+    [Hz] are the snapshots of the Bartlett spectrum.
     """
     above = paths.select_paths(paths.direction[:, 2] >= 0)
     images = np.empty((len(paths), settings.height, settings.width), dtype=np.float32)
@@ -91,10 +97,12 @@ def render_spectra(
 
 
 class _Bartlett:
-    """The spectrum of a planar lattice from its lags: (2 rows - 1)(2 columns - 1) real numbers per image.
+    """The spectrum of a planar lattice from its lags: (2 rows - 1)(2 columns - 1)
+    real numbers per image.
 
-    `a^H R a` depends on R only through sums over equal element differences, which are the autocorrelation
-    of the channel over the lattice: one small product instead of M^2 terms per pixel.
+    `a^H R a` depends on R only through sums over equal element differences, which are the
+    autocorrelation of the channel over the lattice:
+    one small product instead of M^2 terms per pixel.
     """
 
     def __init__(self, settings: SpectrumSettings) -> None:
@@ -115,7 +123,9 @@ class _Bartlett:
 
     def __call__(self, channels: np.ndarray) -> np.ndarray:
         """Power (R, H, W) of channels (R, ports, M, K)."""
-        lattice = np.moveaxis(channels, 2, -1).reshape(*channels.shape[:2], channels.shape[3], *self.shape)
+        lattice = np.moveaxis(channels, 2, -1).reshape(
+            *channels.shape[:2], channels.shape[3], *self.shape
+        )
         # Padded to twice the size, so that the circular autocorrelation is the one of the lattice.
         power = np.abs(np.fft.fft2(lattice, s=self.padded)) ** 2
         lags = np.fft.ifft2(power.mean(axis=2).sum(axis=1)).reshape(len(channels), -1)[:, self.half]

@@ -1,9 +1,10 @@
-"""Rays among city blocks, seen from above: walls reflect, corners diffract, lamp posts and cars scatter.
+"""Rays among city blocks, seen from above: walls reflect, corners diffract,
+lamp posts and cars scatter.
 
-A 2.5-D engine: buildings are taller than every ray, so what blocks is decided in the plane, and the third
-dimension enters as the difference of heights, once straight and once by way of the ground. Reflections are
-image sources (Allen and Berkley, 1979), edges follow Keller's half-plane coefficient (Keller, 1962), and
-scatterers the radar equation.
+A 2.5-D engine: buildings are taller than every ray, so what blocks is decided in the plane, and the
+third dimension enters as the difference of heights, once straight and once by way of the ground.
+Reflections are image sources (Allen and Berkley, 1979), edges follow Keller's half-plane
+coefficient (Keller, 1962), and scatterers the radar equation.
 """
 
 from __future__ import annotations
@@ -28,7 +29,10 @@ class Streets:
 
     >>> block, none = np.array([[[10.0, -5.0], [20.0, 5.0]]]), np.zeros(0)
     >>> streets = Streets(block, np.array([-0.8]), np.zeros((0, 3)), none, none, base=np.zeros(3))
-    >>> streets.are_blocked(np.zeros((2, 2)), np.array([[30.0, 0.0], [0.0, 30.0]]))  # behind it, beside it
+
+    Behind it, beside it:
+
+    >>> streets.are_blocked(np.zeros((2, 2)), np.array([[30.0, 0.0], [0.0, 30.0]]))
     array([ True, False])
 
     Attributes:
@@ -81,8 +85,12 @@ class StreetPaths:
         """Return the paths of some users (n,)."""
         return StreetPaths(self.gain[users], self.delay[users], self.direction[users])
 
-    def response(self, array: np.ndarray, carrier_hz: float, frequency_hz: np.ndarray) -> np.ndarray:
-        """Return channels (U, A, K) complex128 at (K,) [Hz] of elements (A, 3) [m] about the base."""
+    def response(
+        self, array: np.ndarray, carrier_hz: float, frequency_hz: np.ndarray
+    ) -> np.ndarray:
+        """Return channels (U, A, K) complex128 at (K,) [Hz] of elements (A, 3)
+        [m] about the base.
+        """
         steering = np.exp(2j * np.pi * carrier_hz / LIGHT * (self.direction @ array.T))  # (U, P, A)
         turns = np.mod(self.delay[..., None] * frequency_hz, 1.0)
         return np.swapaxes(steering, 1, 2) @ (self.gain[..., None] * np.exp(-2j * np.pi * turns))
@@ -99,7 +107,9 @@ class _Route:
 
 
 def trace_streets(streets: Streets, users: np.ndarray, wavelength: float) -> StreetPaths:
-    """Trace paths from the base to users (U, 3) [m]: direct, two reflections, scatterers and edges."""
+    """Trace paths from the base to users (U, 3) [m]: direct, two reflections,
+    scatterers and edges.
+    """
     routes = list(_routes(streets, users, wavelength))
     gain = np.zeros((len(users), 2 * len(routes)), complex)
     delay, direction = np.zeros(gain.shape), np.zeros((*gain.shape, 3))
@@ -109,7 +119,8 @@ def trace_streets(streets: Streets, users: np.ndarray, wavelength: float) -> Str
             climb = sign * users[route.users, 2] - streets.base[2]
             length = np.hypot(route.length, climb)
             at = route.users, np.full(len(route.users), 2 * i + j)
-            # Gains of routes are of lengths in the plane; amplitudes fall with the lengths in space.
+            # Gains of routes are of lengths in the plane;
+            # amplitudes fall with the lengths in space.
             gain[at] = route.gain * loss * route.length / length
             delay[at] = length / LIGHT
             flat = route.towards * (route.length / length)[:, None]
@@ -136,12 +147,15 @@ def _routes(streets: Streets, users: np.ndarray, wavelength: float) -> Iterator[
     number = 2 * np.pi / wavelength
     low, high = streets.buildings[:, 0], streets.buildings[:, 1]
     signs = np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-    for corner in np.concatenate([np.where(s < 0, low, high) + 1e-3 * s for s in signs]):  # in the street
+    # In the street
+    for corner in np.concatenate([np.where(s < 0, low, high) + 1e-3 * s for s in signs]):
         yield from _edge(streets, flat, corner, shadow, spread, number)
 
 
 def _reflections(streets: Streets, flat: np.ndarray, spread: float) -> Iterator[_Route]:
-    """One and two reflections: the straight line to an image must cross its walls, and nothing else."""
+    """One and two reflections: the straight line to an image must cross its walls,
+    and nothing else.
+    """
     base = streets.base[:2]
     walls = [  # axis, coordinate, low, high, outward sign, reflection
         (axis, place[axis], low[1 - axis], high[1 - axis], sign, reflection)
@@ -169,7 +183,13 @@ def _reflections(streets: Streets, flat: np.ndarray, spread: float) -> Iterator[
             with np.errstate(divide="ignore", invalid="ignore"):
                 share = (coordinate - image[axis]) / (target[:, axis] - image[axis])
                 at = image + share[:, None] * (target - image)
-            good = front & (share > 0) & (share < 1) & (at[:, 1 - axis] > low) & (at[:, 1 - axis] < high)
+            good = (
+                front
+                & (share > 0)
+                & (share < 1)
+                & (at[:, 1 - axis] > low)
+                & (at[:, 1 - axis] < high)
+            )
             users, points, target = users[good], [p[good] for p in points] + [at[good]], at[good]
         if not len(users):
             continue
@@ -186,7 +206,9 @@ def _reflections(streets: Streets, flat: np.ndarray, spread: float) -> Iterator[
 
 
 def _bounce(streets: Streets, flat: np.ndarray, place: np.ndarray, law) -> Iterator[_Route]:
-    """Base to `place` to the users in its line of sight; amplitude `law(first leg, second leg)` [m]."""
+    """Base to `place` to the users in its line of sight;
+    amplitude `law(first leg, second leg)` [m].
+    """
     base = streets.base[:2]
     if streets.are_blocked(base[None], place[None])[0]:
         return
@@ -200,7 +222,12 @@ def _bounce(streets: Streets, flat: np.ndarray, place: np.ndarray, law) -> Itera
 
 
 def _edge(
-    streets: Streets, flat: np.ndarray, corner: np.ndarray, shadow: np.ndarray, spread: float, number: float
+    streets: Streets,
+    flat: np.ndarray,
+    corner: np.ndarray,
+    shadow: np.ndarray,
+    spread: float,
+    number: float,
 ) -> Iterator[_Route]:
     """Round one corner into the shadow (Keller's coefficient of a half-plane)."""
     for route in _bounce(streets, flat, corner, lambda d, e: 1 / np.sqrt(d * e * (d + e))):

@@ -1,4 +1,6 @@
-"""The protocol of simulators; every pair of a receiver and a transmitter of one scene: the rows of a file."""
+"""The protocol of simulators; every pair of a receiver and a transmitter of one scene:
+the rows of a file.
+"""
 
 from __future__ import annotations
 
@@ -61,10 +63,14 @@ class Survey:
 
     def choose_distant_rows(self, count: int, seed: int) -> np.ndarray:
         """Choose at most `count` rows far apart, transmitters by turns."""
-        order, turns = farthest_points(self.places, min(count, len(self.places)), seed), len(self.engines)
+        order, turns = (
+            farthest_points(self.places, min(count, len(self.places)), seed),
+            len(self.engines),
+        )
         # Place i with transmitter i, then every place with the next one: all have their turn.
         rounds = [
-            order + (np.arange(len(order)) + shift) % turns * len(self.places) for shift in range(turns)
+            order + (np.arange(len(order)) + shift) % turns * len(self.places)
+            for shift in range(turns)
         ]
         return np.concatenate(rounds)[:count]
 
@@ -74,7 +80,8 @@ class Survey:
         # Stable: rows of a transmitter stay in the order in which they are traced.
         order = np.argsort(owner, kind="stable")
         parts = [
-            self.engines[t].trace(self.places[place[owner == t]], effects, seed) for t in np.unique(owner)
+            self.engines[t].trace(self.places[place[owner == t]], effects, seed)
+            for t in np.unique(owner)
         ]
         return join_receivers(parts).select_receivers(np.argsort(order, kind="stable"))
 
@@ -94,7 +101,9 @@ class TracingEngine(Protocol):
     wavelength: float
     random: bool
 
-    def trace(self, receivers: np.ndarray, effects: Effects, seed: int | None = None) -> TracedPaths:
+    def trace(
+        self, receivers: np.ndarray, effects: Effects, seed: int | None = None
+    ) -> TracedPaths:
         """Trace paths to receivers (R, 3) [m]; `seed` of the rays where there are any."""
 
     def materials(self) -> dict[str, dict[str, Any]]:

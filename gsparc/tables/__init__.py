@@ -1,4 +1,5 @@
-"""Tables of measurements (text, Parquet, records): one row for each place, or for each place and station.
+"""Tables of measurements (text, Parquet, records): one row for each place,
+or for each place and station.
 
 `read.parse_table` reads one; it is not imported here, as pandas takes half a second.
 """

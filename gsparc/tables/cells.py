@@ -19,15 +19,20 @@ from gsparc.tables.sheet import Sheet
 
 LIST = re.compile(r"\s*\[(.+)\]\s*", re.DOTALL)
 PLACES = LISTS["place"] | LISTS["vector"] | set(AXIS_WORDS)
-LOGGED = "CSI_DATA"  # begins the rows of an ESP32, whose lists hold imaginary parts before real ones
+# Begins the rows of an ESP32, whose lists hold imaginary parts before real ones
+LOGGED = "CSI_DATA"
 NUMBER = r"[-+]?\d*\.?\d+(?:e[-+]?\d+)?"
 PAIR = re.compile(rf"(?i)[\[(]?\s*({NUMBER}(?:(?:\s*[,;]\s*|\s+){NUMBER}){{1,2}})\s*[\])]?")
-POINT = re.compile(rf"(?i)(?:SRID=\d+;)?\s*POINT\s*Z?M?\s*(?:\(\s*({NUMBER}(?:\s+{NUMBER})+)\s*\)|EMPTY)")
+POINT = re.compile(
+    rf"(?i)(?:SRID=\d+;)?\s*POINT\s*Z?M?\s*(?:\(\s*({NUMBER}(?:\s+{NUMBER})+)\s*\)|EMPTY)"
+)
 FINE = re.compile(r"\.\d{4}")  # digits of degrees that tell streets apart
 
 
 def unfold_cells(sheet: Sheet) -> Sheet:
-    """Return lists of one length as NAME_1, ..., complex numbers as csi_re_1, ..., and named ones; noted."""
+    """Return lists of one length as NAME_1, ..., complex numbers as csi_re_1, ..., and named ones;
+    noted.
+    """
     logged = bool((sheet.frame.iloc[:, :1] == LOGGED).all(axis=None))
     parts: list[pd.DataFrame] = []
     unfolded: list[str] = []
@@ -37,17 +42,32 @@ def unfold_cells(sheet: Sheet) -> Sheet:
             unfolded.append(f"{head} ({', '.join(table)})")
             continue
         rows = [_numbers(cell) for cell in sheet.frame[head].iloc[:1]]
-        rows += [_numbers(cell) for cell in sheet.frame[head].iloc[1:]] if rows[0] is not None else []
+        rows += (
+            [_numbers(cell) for cell in sheet.frame[head].iloc[1:]] if rows[0] is not None else []
+        )
         if len({-1 if row is None else len(row) for row in rows}) > 1 or rows[0] is None:
             parts.append(sheet.frame[[head]])
             continue
         values, number = np.array(rows), re.search(r"(\d+)\W*$", head)
-        tones = [int(number[1])] if number and values.shape[1] == 1 else [*range(1, values.shape[1] + 1)]
+        tones = (
+            [int(number[1])]
+            if number and values.shape[1] == 1
+            else [*range(1, values.shape[1] + 1)]
+        )
         if logged:
             values = values[:, 1::2] + 1j * values[:, ::2].real
-            tones = np.fft.fftfreq(values.shape[1], 1 / values.shape[1]).round().astype(int).tolist()
-        named = {"csi_re": values.real, "csi_im": values.imag} if values.imag.any() else {head: values.real}
-        parts += [pd.DataFrame(v, columns=[f"{name}_{tone}" for tone in tones]) for name, v in named.items()]
+            tones = (
+                np.fft.fftfreq(values.shape[1], 1 / values.shape[1]).round().astype(int).tolist()
+            )
+        named = (
+            {"csi_re": values.real, "csi_im": values.imag}
+            if values.imag.any()
+            else {head: values.real}
+        )
+        parts += [
+            pd.DataFrame(v, columns=[f"{name}_{tone}" for tone in tones])
+            for name, v in named.items()
+        ]
         unfolded.append(head)
     frame = pd.concat(parts, axis=1) if unfolded else sheet.frame
     if not unfolded or frame.columns.has_duplicates:
@@ -57,7 +77,9 @@ def unfold_cells(sheet: Sheet) -> Sheet:
 
 
 def _records(sheet: Sheet, head: str) -> pd.DataFrame | None:
-    """Columns of what a column's cells hold by names or as places; None where one of them holds neither."""
+    """Columns of what a column's cells hold by names or as places;
+    None where one of them holds neither.
+    """
     named = bool(PLACES & {*words_of(head)}) and parse_head(head).role is None
     texts = (cell.strip() for cell in sheet.frame[head] if isinstance(cell, str))
     first = next((text for text in texts if text.lower() not in SHEET["missing"]), "")
@@ -68,12 +90,16 @@ def _records(sheet: Sheet, head: str) -> pd.DataFrame | None:
         return None
     frame = unfold_places(pd.json_normalize([{head: record} for record in read]))
     short = {name: name.removeprefix(f"{head}.") for name in frame}
-    plain = [n for n, bare in short.items() if parse_head(n).role is None and bare not in sheet.heads]
+    plain = [
+        n for n, bare in short.items() if parse_head(n).role is None and bare not in sheet.heads
+    ]
     return None if frame.empty else frame.rename(columns={name: short[name] for name in plain})
 
 
 def _record(cell: str, named: bool) -> dict[str, Any] | None:
-    """What one cell holds by name, places under one of `records.PLACES`; None where it is neither."""
+    """What one cell holds by name, places under one of `records.PLACES`;
+    None where it is neither.
+    """
     if cell.startswith("{"):
         for read in (json.loads, ast.literal_eval):
             with suppress(ValueError, SyntaxError, RecursionError, MemoryError):

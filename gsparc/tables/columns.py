@@ -14,17 +14,33 @@ import pandas as pd
 from gsparc.base.errors import Caution, list_first, suggest_name
 from gsparc.data.units import SCHEMA, UNITS, Unit, list_units
 from gsparc.tables import heads
-from gsparc.tables.heads import CHANNELS, ENDS, KINDS, LISTS, POLAR, Head, unit_of, unit_suits, words_of
+from gsparc.tables.heads import (
+    CHANNELS,
+    ENDS,
+    KINDS,
+    LISTS,
+    POLAR,
+    Head,
+    unit_of,
+    unit_suits,
+    words_of,
+)
 from gsparc.tables.sheet import Sheet
 from gsparc.tables.times import find_times
 
 MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in heads.LEVELS), CHANNELS, POLAR)
-# Of each group one way of saying it: the measurement, and the place of each end in metres or degrees.
-ONE_OF = (MEASURED, *(((f"{end}x", f"{end}y"), (f"{end}latitude", f"{end}longitude")) for end in ENDS))
+# Of each group one way of saying it: the measurement,
+# and the place of each end in metres or degrees.
+ONE_OF = (
+    MEASURED,
+    *(((f"{end}x", f"{end}y"), (f"{end}latitude", f"{end}longitude")) for end in ENDS),
+)
 LESS = LISTS["labels"] | LISTS["plain"]  # words that are no part of a name
 _STATIONS = "|".join(sorted(heads.STATION_WORDS))
 # A letter or a number that remains of a head names a station; a whole word says another quantity.
-STATION = re.compile(rf"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|{_STATIONS})?[\W_]*\d+)[\W_]*$")
+STATION = re.compile(
+    rf"(?i)^[\W_]*(?:[a-z]|(?:ant|antenna|port|carrier|{_STATIONS})?[\W_]*\d+)[\W_]*$"
+)
 MOST_LOOKED_AT = 10_000  # rows, for columns that may be levels
 BY_ROW = "#"  # in place of a head: the number of the row; before heads: of what they hold together
 REPEATED = 4  # rows for each name of a column that may hold stations
@@ -36,7 +52,8 @@ class Column(Head):
 
     Attributes:
         head: of the column; None for a number.
-        value: the number, or the first and the last of evenly spaced ones; none: the number of the row.
+        value: the number, or the first and the last of evenly spaced ones; none: the number of the
+            row.
         plus: columns and numbers that are added to it.
         **rest: see `Head`; no unit is the schema's, no word a column that was said.
     """
@@ -57,23 +74,32 @@ class Column(Head):
         unit, raw_unit = SCHEMA.get(KINDS[self.role], "deg"), self.unit
         if (raw_unit is None or not raw_unit.name) and "rsrp" in words_of(self.head or ""):
             return unit  # dBm by definition (3GPP TS 36.214)
-        # Other levels of which nobody said more are in dB; calling them dBm would invent a reference.
-        relative = raw_unit is None or (raw_unit.name != "dBm" and (raw_unit.times or not raw_unit.changes))
+        # Other levels of which nobody said more are in dB;
+        # calling them dBm would invent a reference.
+        relative = raw_unit is None or (
+            raw_unit.name != "dBm" and (raw_unit.times or not raw_unit.changes)
+        )
         return "dB" if unit == "dBm" and relative else unit
 
     def numbers(self, sheet: Sheet) -> np.ndarray | None:
-        """Read (S,) float64 in the schema's unit, NaN: no value; None, and noted, where unusable."""
+        """Read (S,) float64 in the schema's unit, NaN: no value; None, and noted,
+        where unusable.
+        """
         if self.by_row:
             moments = sheet.joined(self.label.split(BY_ROW)) if self.label else np.array(sheet.rows)
             return pd.factorize(moments)[0].astype(float)
         if self.head is None:
             return np.full(len(sheet), self.value[0])
         if self.unit is not None and not unit_suits(self.role, self.unit):
-            wanted = f"one of {list_units(kind)}" if (kind := KINDS[self.role]) in SCHEMA else "no unit"
+            wanted = (
+                f"one of {list_units(kind)}" if (kind := KINDS[self.role]) in SCHEMA else "no unit"
+            )
             remedy = heads.PERCENT if self.unit.kind == "quality" else f"{self.role} needs {wanted}"
             return sheet.refuse(f"is in {self.unit.name}: {remedy}", self.head)
         marks = self.role == "rssi_db"
-        values = sheet.numbers(self.head, self.unit, lambda unit: unit_suits(self.role, unit), marks)
+        values = sheet.numbers(
+            self.head, self.unit, lambda unit: unit_suits(self.role, unit), marks
+        )
         for other in self.plus:
             more = other.numbers(sheet)
             values = None if values is None or more is None else values + more
@@ -132,14 +158,20 @@ def choose_columns(
     # First of all, as a second measurement is no second candidate for the first one.
     _one_way(sheet, guesses)
     for role, found in guesses.items():
-        # Columns whose head says less than others of the quantity count only where there is nothing better.
+        # Columns whose head says less than others of the quantity count only
+        # where there is nothing better.
         candidates = [column for column in found if not column.less] or found
         if role == "station":
             candidates = _finest(sheet, _identity(sheet, candidates, always=only is not None))
         tones = role in (*CHANNELS, *POLAR)  # of a row, or stations
         # With a column of stations a row is of one: several columns of levels would contradict it.
         one_each = tones or "station" not in {**chosen, **guesses}
-        several = role in heads.MANY and len(candidates) > 1 and one_each and all(c.label for c in candidates)
+        several = (
+            role in heads.MANY
+            and len(candidates) > 1
+            and one_each
+            and all(c.label for c in candidates)
+        )
         # Columns of different words (`rssi_1`, `power_2`) are no family of stations.
         several &= len({column.word for column in candidates}) == 1
         several |= role == "station" and candidates[0].label == JOINED
@@ -149,7 +181,11 @@ def choose_columns(
             _ambiguous(sheet, role, candidates)
             continue
         # `rssi_delta` or `predicted_rssi` are levels by their words and not what was received.
-        if role in heads.LEVELS and len(candidates) == 1 and not _is_plain(candidates[0], labelled.values()):
+        if (
+            role in heads.LEVELS
+            and len(candidates) == 1
+            and not _is_plain(candidates[0], labelled.values())
+        ):
             fault = "a received level or power, or something else? if it is one, say "
             sheet.refuse(fault + _choice(candidates[0]), candidates[0].head)
             continue
@@ -170,7 +206,9 @@ def choose_columns(
     unused = [repr(head) for head in sheet.heads if head not in used]
     if unused:
         timed = heads.SHEET["times"] * any(LISTS["time"] & set(words_of(head)) for head in unused)
-        sheet.notes.append(f"not used: column{'s' * (len(unused) > 1)} {list_first(unused, 8)}{timed}")
+        sheet.notes.append(
+            f"not used: column{'s' * (len(unused) > 1)} {list_first(unused, 8)}{timed}"
+        )
     if only is None:
         _warn_of_levels(sheet, chosen.get("rssi_db", ()), used)
     return chosen
@@ -188,7 +226,9 @@ JOINED = "joined"  # label of columns whose values together name a station
 
 
 def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Column]:
-    """A station's column and those that tell it from others of its name, `always` or where some do."""
+    """A station's column and those that tell it from others of its name,
+    `always` or where some do.
+    """
     for first in candidates:
         parts = heads.TOGETHER.get(first.word, set())
         bare = {head: set(words_of(head)) - LESS for head in sheet.heads if head != first.head}
@@ -198,11 +238,16 @@ def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Colu
         columns = [first]
         for head in more:
             longer = [*columns, replace(first, head=head)]
-            fewer, many = (len(set(sheet.joined(c.head for c in one).tolist())) for one in (columns, longer))
-            # A column that tells rows rather than stations apart has nearly as many values as there are rows.
+            fewer, many = (
+                len(set(sheet.joined(c.head for c in one).tolist())) for one in (columns, longer)
+            )
+            # A column that tells rows rather than stations apart has nearly as many values
+            # as there are rows.
             if always or fewer < many <= len(sheet) // REPEATED:
                 columns = longer
-        return columns if len(columns) == 1 else [replace(column, label=JOINED) for column in columns]
+        return (
+            columns if len(columns) == 1 else [replace(column, label=JOINED) for column in columns]
+        )
     return candidates
 
 
@@ -218,7 +263,9 @@ def _wide_survey(sheet: Sheet, chosen: Chosen) -> None:
     named = [head for head in rest if MAC.search(head) or NAMED.match(head)]
     alike = named or [head for head in rest if _may_be_levels(sheet, head)]
     if alike and "station" not in chosen:
-        chosen["rssi_db"] = tuple(Column("rssi_db", head, head=head, word="station") for head in alike)
+        chosen["rssi_db"] = tuple(
+            Column("rssi_db", head, head=head, word="station") for head in alike
+        )
         note = _note(chosen["rssi_db"])
         sheet.notes.append(note if named else Caution(f"{note}, by their values: no head says so"))
 
@@ -243,16 +290,27 @@ def _warn_of_levels(sheet: Sheet, columns: tuple[Column, ...], used: Container[s
     numbers = sheet.frame.iloc[:MOST_LOOKED_AT].apply(pd.to_numeric, errors="coerce")
     levels = numbers[[column.head for column in columns]].stack()
     low, high = levels.min(), min(levels.max(), 0)
-    alike = [Column(head=h) for h in rest if (numbers[h].between(low, high) & (numbers[h] < 0)).mean() > 0.5]
+    alike = [
+        Column(head=h)
+        for h in rest
+        if (numbers[h].between(low, high) & (numbers[h] < 0)).mean() > 0.5
+    ]
     if alike:
-        finding = f"{_names(alike)} hold{'s' * (len(alike) == 1)} values like these levels and are not used: "
-        sheet.notes.append(Caution(f"{finding}of stations, too? call them as {columns[0].head!r} is called"))
+        finding = (
+            f"{_names(alike)} hold{'s' * (len(alike) == 1)} values like these levels and "
+            "are not used: "
+        )
+        sheet.notes.append(
+            Caution(f"{finding}of stations, too? call them as {columns[0].head!r} is called")
+        )
 
 
 def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     role, where = heads.OTHER_NAMES.get(key, key), f"dataset.columns.{key}={value}"
     if role not in KINDS:
-        hint = suggest_name(key, [*KINDS, *heads.OTHER_NAMES], 0.4) or f"; known are {', '.join(KINDS)}"
+        hint = suggest_name(key, [*KINDS, *heads.OTHER_NAMES], 0.4) or (
+            f"; known are {', '.join(KINDS)}"
+        )
         return sheet.problems.add(where, f"no such quantity{hint}") or ()
     text = str(value).strip()
     if text.startswith(BY_ROW):  # before heads, whose words alone are compared
@@ -275,7 +333,8 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
             return tuple(Column(role, label, _unit(h, role), head=h) for h, label in labels.items())
         fault = "expected one * only" if "*" in after else "no column is called so"
         return sheet.problems.add(where, fault) or ()
-    # `FIRST:LAST` of frequencies, or one number for all rows; other text becomes NaN and no constant.
+    # `FIRST:LAST` of frequencies, or one number for all rows;
+    # other text becomes NaN and no constant.
     numbers = tuple(pd.to_numeric(np.array(text.split(":"), object), errors="coerce").tolist())
     constant = all(map(math.isfinite, numbers)) and KINDS[role] != "text" and role not in heads.MANY
     if constant and len(numbers) <= (2 if role == "frequency_hz" else 1):
@@ -286,7 +345,9 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
 
 
 def _sum_of_columns(sheet: Sheet, role: str, text: str) -> Column | None:
-    """A column times a factor, as in `pathloss*-1`, with others and numbers: `asu*2-113`, `rssi-tx_power`."""
+    """A column times a factor, as in `pathloss*-1`, with others and numbers: `asu*2-113`,
+    `rssi-tx_power`.
+    """
     for cut in [len(text), *(found.start() for found in re.finditer(r"[-+]", text))]:
         times = re.fullmatch(r"(.+)\*([-+]?\d*\.?\d+)", text[:cut].strip())
         head = _head(sheet, times[1].strip() if times else text[:cut].strip()) if cut else None
@@ -318,14 +379,20 @@ def _head(sheet: Sheet, text: str) -> str | None:
     if text in sheet.heads:
         return text
     words = words_of(text)
-    # Case, spaces and a unit in brackets are layout; where two heads differ in them alone, none is meant.
+    # Case, spaces and a unit in brackets are layout; where two heads differ in them alone,
+    # none is meant.
     alike = [h for h in sheet.heads if words and words in (words_of(h), words_of(unit_of(h)[0]))]
     return alike[0] if len(alike) == 1 else None
 
 
 def _unit(head: str, role: str) -> Unit | None:
     unit, words = unit_of(head)[1], words_of(head)
-    if unit is None and len(words) > 1 and words[-1] in UNITS and unit_suits(role, UNITS[words[-1]]):
+    if (
+        unit is None
+        and len(words) > 1
+        and words[-1] in UNITS
+        and unit_suits(role, UNITS[words[-1]])
+    ):
         return UNITS[words[-1]]
     return unit
 
@@ -337,13 +404,18 @@ def _settled(role: str, chosen: Chosen) -> bool:
 
 
 def _one_way(sheet: Sheet, guesses: dict[str, list[Column]]) -> None:
-    """Refuse several measurements (levels, powers, channels), and an end that has both metres and degrees."""
+    """Refuse several measurements (levels, powers, channels),
+    and an end that has both metres and degrees.
+    """
     for ways in ONE_OF:
         by_way = [[column for role in way for column in guesses.get(role, ())] for way in ways]
         by_way = [columns for columns in by_way if columns]
         if len(by_way) < 2:
             continue
-        first = [replace(cols[0], head=_pattern(cols)) if ways is MEASURED else cols[0] for cols in by_way]
+        first = [
+            replace(cols[0], head=_pattern(cols)) if ways is MEASURED else cols[0]
+            for cols in by_way
+        ]
         fault = f"{' and '.join(map(_names, by_way))} both say where"
         if ways is MEASURED:
             fault = f"{_names(first)} are different measurements"
@@ -359,7 +431,9 @@ def _pattern(columns: list[Column]) -> str | None:
 
 
 def _is_plain(column: Column, stations: Iterable[str]) -> bool:
-    """Whether the head of a guessed column says a level and nothing beyond that it may be of a station."""
+    """Whether the head of a guessed column says a level and nothing beyond
+    that it may be of a station.
+    """
     absolute = column.unit is not None and column.unit.name != "dB"
     named = column.label in stations or re.fullmatch(r"\W*", column.label)
     plain = set(words_of(column.label)) <= LISTS["plain"] | {column.word}
@@ -369,10 +443,12 @@ def _is_plain(column: Column, stations: Iterable[str]) -> bool:
 def _one_unit(sheet: Sheet, chosen: Chosen) -> None:
     """Refuse a column in another unit than the schema's beside one of its kind that says none."""
     for kind in SCHEMA:
-        # Kinds rather than quantities: a position in mm beside another axis without a unit mixes both.
+        # Kinds rather than quantities: a position in mm
+        # beside another axis without a unit mixes both.
         columns = [c for one in chosen.values() for c in one if c.head and KINDS[c.role] == kind]
         turned = [c for c in columns if c.unit is not None and c.unit.changes and not c.unit.times]
-        silent = [c for c in columns if c.unit is None or c.unit.name == "dB"]  # to watts or milliwatts?
+        # To watts or milliwatts?
+        silent = [c for c in columns if c.unit is None or c.unit.name == "dB"]
         if turned and silent and turned[0].unit is not None:
             other = silent[0].unit
             fault = f"{turned[0].head!r} is in {turned[0].unit.name}, {silent[0].head!r} "
@@ -423,11 +499,15 @@ def _note(columns: tuple[Column, ...]) -> str:
         what += f" of the {of} {', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''}"
         what += " (dBm? set unit=dBm)" if unit == " [dB]" else ""
     turned = first.unit is not None and first.unit.changes
-    return what + (f", {first.unit.name} turned into {first.schema_unit}" if turned and first.unit else "")
+    return what + (
+        f", {first.unit.name} turned into {first.schema_unit}" if turned and first.unit else ""
+    )
 
 
 def _turned(column: Column, unit: Unit) -> str:
-    """What becomes of a column that a setting chose; with a caution where its unit is counted twice."""
+    """What becomes of a column that a setting chose;
+    with a caution where its unit is counted twice.
+    """
     factor, bare, wanted = unit.times, unit.name, column.schema_unit
     if not factor:
         return f"column {column.head!r}: {bare} turned into {wanted}"

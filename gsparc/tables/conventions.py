@@ -1,7 +1,8 @@
 """Conventions of channels, spectra and places: what a file may follow instead of the schema's.
 
-`CONVENTIONS` names each with the change from it to the schema's: applied where a setting or an attribute of
-the file names it, and tried by `gsparc.tables.checks.conventions`, which scores how well the direct path fits.
+`CONVENTIONS` names each with the change from it to the schema's: applied where a setting or an
+attribute of the file names it, and tried by `gsparc.tables.checks.conventions`,
+which scores how well the direct path fits.
 """
 
 from __future__ import annotations
@@ -43,7 +44,9 @@ class Convention:
 
 
 def known_array(data: Measurements) -> np.ndarray | None:
-    """Return places (A, 3) [m] of the channel's antennas, receiver frame; None where they are unknown."""
+    """Return places (A, 3) [m] of the channel's antennas, receiver frame;
+    None where they are unknown.
+    """
     array = data.site.array if data.site.target.is_complex else None
     return array if array is not None and len(array) == data.target.shape[1] else None
 
@@ -53,17 +56,26 @@ def traits(data: Measurements) -> set[str]:
     grid, shape = data.site.grid, data.target.shape[1:]
     # Degrees are no feet; heights beside them may be.
     metres = data.site.georeference is None and not data.site.target.is_image
-    placed = {"metres": metres, "heights": not data.site.target.is_image and bool(np.ptp(data.moving[:, 2]))}
+    placed = {
+        "metres": metres,
+        "heights": not data.site.target.is_image and bool(np.ptp(data.moving[:, 2])),
+    }
     if data.site.target.is_level:
         holds = {}
     elif grid is None:
-        tones, square, antennas = shape[1] > 1, 1 < shape[0] == shape[1], known_array(data) is not None
+        tones, square, antennas = (
+            shape[1] > 1,
+            1 < shape[0] == shape[1],
+            known_array(data) is not None,
+        )
         holds = {"channels": True, "tones": tones, "square": square, "antennas": antennas}
     else:
         # Of the file, or of its transpose: no `grid_deg` says otherwise.
         plain = grid in (SphereGrid.hemisphere(*shape), SphereGrid.hemisphere(*shape[::-1]))
         holds = {"spectra": True, "above": grid.first_elevation >= 0, "hemisphere": plain}
-    turned = {"turned": not data.site.target.is_level and bool((data.rx_rotation != np.eye(3)).any())}
+    turned = {
+        "turned": not data.site.target.is_level and bool((data.rx_rotation != np.eye(3)).any())
+    }
     return {name for name, flag in {**holds, **placed, **turned}.items() if flag}
 
 
@@ -73,7 +85,9 @@ def _values(change: Callable[[np.ndarray], np.ndarray]) -> Change:
 
 def _moved(change: Callable[[np.ndarray], np.ndarray]) -> Change:
     """Entries of values and mask are elsewhere."""
-    return lambda d: replace(d, target=change(d.target), mask=None if d.mask is None else change(d.mask))
+    return lambda d: replace(
+        d, target=change(d.target), mask=None if d.mask is None else change(d.mask)
+    )
 
 
 def _array(factor: Callable[[Measurements], float]) -> Change:
@@ -146,50 +160,79 @@ def _azimuth(turn: float) -> Change:
 
 
 CONVENTIONS = {
-    "conjugate": Convention("conjugated channels, exp(+j 2 pi f d / c)", "channels", _values(np.conj)),
+    "conjugate": Convention(
+        "conjugated channels, exp(+j 2 pi f d / c)", "channels", _values(np.conj)
+    ),
     # I and Q exchanged are a conjugate turned by a quarter, Q + jI = j conj(I + jQ): tried as such.
     "swap_iq": Convention("I and Q swapped", "channels", _values(lambda v: 1j * v.conj()), False),
-    "exchange_axes": Convention("axes of antennas and tones exchanged", "square",
-                                _moved(lambda v: v.swapaxes(1, 2))),
-    "fft_order": Convention("tones in the order of an FFT", "tones",
-                            _moved(lambda v: np.fft.fftshift(v, axes=2))),
-    "reverse_tones": Convention("tones from the highest to the lowest", "tones",
-                                _moved(lambda v: np.flip(v, 2))),
-    "reverse_antennas": Convention("antennas in reverse order", "antennas", _moved(lambda v: np.flip(v, 1))),
+    "exchange_axes": Convention(
+        "axes of antennas and tones exchanged", "square", _moved(lambda v: v.swapaxes(1, 2))
+    ),
+    "fft_order": Convention(
+        "tones in the order of an FFT", "tones", _moved(lambda v: np.fft.fftshift(v, axes=2))
+    ),
+    "reverse_tones": Convention(
+        "tones from the highest to the lowest", "tones", _moved(lambda v: np.flip(v, 2))
+    ),
+    "reverse_antennas": Convention(
+        "antennas in reverse order", "antennas", _moved(lambda v: np.flip(v, 1))
+    ),
     "array_mm": Convention("array_position in millimetres", "antennas", _array(lambda _: 1e-3)),
-    "array_wavelengths": Convention("array_position in wavelengths", "antennas",
-                                    _array(lambda data: LIGHT / float(data.site.tones().mean()))),
+    "array_wavelengths": Convention(
+        "array_position in wavelengths",
+        "antennas",
+        _array(lambda data: LIGHT / float(data.site.tones().mean())),
+    ),
     "delays_removed": Convention("the delay of each row taken out", "tones", _with_delays),
     "feet": Convention("positions in feet", "metres", _places(lambda p: p * FOOT, "tx", "rx")),
-    "centimetres": Convention("positions in centimetres", "metres",
-                              _places(lambda p: p / 100, "tx", "rx")),
-    "static_feet": Convention("places of stations in feet beside rows in metres", "metres",
-                              _places(lambda p: p * FOOT, "static")),
-    "moving_feet": Convention("places of rows in feet beside stations in metres", "metres",
-                              _places(lambda p: p * FOOT, "moving")),
-    "heights_feet": Convention("heights of rows in feet", "heights",
-                               _places(lambda p: p * [1, 1, FOOT], "moving")),
-    "exchange_xy": Convention("x and y of the receiver exchanged", "metres",
-                              _places(lambda p: p[:, [1, 0, 2]], "rx")),
-    "downwards": Convention("heights of the receiver counted downwards", "metres",
-                            _places(lambda p: p * [1, 1, -1], "rx")),
-    "scalar_last": Convention("orientations as x, y, z, w", "turned",
-                              _turned(lambda r: Rotation.from_quat(np.roll(r.as_quat(), 1, 1)))),
-    "world_to_receiver": Convention("orientations from the world to the receiver", "turned",
-                                    _turned(lambda r: r.inv())),
+    "centimetres": Convention(
+        "positions in centimetres", "metres", _places(lambda p: p / 100, "tx", "rx")
+    ),
+    "static_feet": Convention(
+        "places of stations in feet beside rows in metres",
+        "metres",
+        _places(lambda p: p * FOOT, "static"),
+    ),
+    "moving_feet": Convention(
+        "places of rows in feet beside stations in metres",
+        "metres",
+        _places(lambda p: p * FOOT, "moving"),
+    ),
+    "heights_feet": Convention(
+        "heights of rows in feet", "heights", _places(lambda p: p * [1, 1, FOOT], "moving")
+    ),
+    "exchange_xy": Convention(
+        "x and y of the receiver exchanged", "metres", _places(lambda p: p[:, [1, 0, 2]], "rx")
+    ),
+    "downwards": Convention(
+        "heights of the receiver counted downwards",
+        "metres",
+        _places(lambda p: p * [1, 1, -1], "rx"),
+    ),
+    "scalar_last": Convention(
+        "orientations as x, y, z, w",
+        "turned",
+        _turned(lambda r: Rotation.from_quat(np.roll(r.as_quat(), 1, 1))),
+    ),
+    "world_to_receiver": Convention(
+        "orientations from the world to the receiver", "turned", _turned(lambda r: r.inv())
+    ),
     "transposed": Convention("rows as azimuths, columns as elevations", "hemisphere", _transposed),
     "zenith": Convention("elevation from the zenith", "above", _grid(_from_zenith, 1)),
-    "clockwise": Convention("clockwise azimuth", "spectra",
-                            _grid(lambda g: (g.first_elevation, -_last(g)[1]), 2)),
+    "clockwise": Convention(
+        "clockwise azimuth", "spectra", _grid(lambda g: (g.first_elevation, -_last(g)[1]), 2)
+    ),
     "azimuth_180": Convention("azimuth from -180 degrees", "spectra", _azimuth(-math.pi)),
     "azimuth_north": Convention("azimuth from the y axis", "spectra", _azimuth(math.pi / 2)),
-    "decibels": Convention("decibels", "spectra",
-                           _values(lambda v: from_decibels(v.astype(np.float64))), False),
-}  # fmt: skip
+    "decibels": Convention(
+        "decibels", "spectra", _values(lambda v: from_decibels(v.astype(np.float64))), False
+    ),
+}
 
 
 def convert_conventions(data: Measurements, names: Iterable[str]) -> Measurements:
-    """Return measurements in the schema's conventions, from those of a file that follows the ones named.
+    """Return measurements in the schema's conventions,
+    from those of a file that follows the ones named.
 
     Raises:
         DataError: no such convention, or one that cannot be of these measurements.
@@ -197,7 +240,8 @@ def convert_conventions(data: Measurements, names: Iterable[str]) -> Measurement
     chosen = set(names)
     for name in chosen:
         choice(*CONVENTIONS).check("conventions", name)
-    # In the table's order, not the user's: axes are exchanged before what runs along them is turned.
+    # In the table's order, not the user's: axes are exchanged before what runs along them is
+    # turned.
     for name in [name for name in CONVENTIONS if name in chosen]:
         one = CONVENTIONS[name]
         if one.trait not in traits(data):
@@ -217,4 +261,6 @@ def _in_blocks(data: Measurements, change: Change) -> Measurements:
         changed = change(data.subset(rows[part]))
         values[part] = changed.target
         masks += [] if changed.mask is None else [changed.mask]
-    return replace(data, target=values, mask=np.concatenate(masks) if masks else None, site=first.site)
+    return replace(
+        data, target=values, mask=np.concatenate(masks) if masks else None, site=first.site
+    )

@@ -24,7 +24,9 @@ AXES = {"x": "length", "y": "length", "z": "length", "latitude": "angle", "longi
 LEVELS, CHANNELS, POLAR = ("rssi_db", "rssi"), ("csi_re", "csi_im"), ("csi_amp", "csi_phase")
 MANY = (*LEVELS, *CHANNELS, *POLAR)  # may be several columns: stations, or frequencies
 OTHER_NAMES = {"lat": "latitude", "lon": "longitude", "lng": "longitude", "height": "z"}
-OTHER_NAMES |= {f"{end}{short}": f"{end}{long}" for end in ENDS for short, long in OTHER_NAMES.items()}
+OTHER_NAMES |= {
+    f"{end}{short}": f"{end}{long}" for end in ENDS for short, long in OTHER_NAMES.items()
+}
 
 
 def meaning_by_word(table: str) -> dict[str, str]:
@@ -32,11 +34,17 @@ def meaning_by_word(table: str) -> dict[str, str]:
     return {word: meaning for meaning, words in SHEET[table].items() for word in words.split()}
 
 
-SHEET: dict[str, Any] = yaml.safe_load(files(__package__).joinpath("words.yaml").read_text(encoding="utf-8"))
+SHEET: dict[str, Any] = yaml.safe_load(
+    files(__package__).joinpath("words.yaml").read_text(encoding="utf-8")
+)
 LISTS = {name: set(words.split()) for name, words in SHEET.items() if isinstance(words, str)}
-KINDS = {f"{end}{axis}": kind for end in ENDS for axis, kind in AXES.items()} | meaning_by_word("kinds")
+KINDS = {f"{end}{axis}": kind for end in ENDS for axis, kind in AXES.items()} | meaning_by_word(
+    "kinds"
+)
 STATION_WORDS, END_WORDS = LISTS["station"], meaning_by_word("ends")
-TOGETHER = {word: set(parts.split()) for parts, words in SHEET["together"].items() for word in words.split()}
+TOGETHER = {
+    word: set(parts.split()) for parts, words in SHEET["together"].items() for word in words.split()
+}
 AXIS_WORDS, PARTS = meaning_by_word("axes"), meaning_by_word("part")
 
 
@@ -46,7 +54,8 @@ class Head:
 
     Attributes:
         role: one of `KINDS`; None where it says nothing that is known.
-        label: the rest, where the role may be several columns: name of a station, or number of a frequency.
+        label: the rest, where the role may be several columns: name of a station, or number of a
+            frequency.
         unit: where it says one.
         word: what named the role, in small letters.
         strange: text in brackets that is no known unit.
@@ -62,7 +71,9 @@ class Head:
 
 
 def parse_head(text: str) -> Head:
-    """Read a head such as `RSRP [dBm]`, `tx_x_mm`, `Latitude (deg)`, `rssi_gateway7` or `csi_re_3`."""
+    """Read a head such as `RSRP [dBm]`, `tx_x_mm`, `Latitude (deg)`,
+    `rssi_gateway7` or `csi_re_3`.
+    """
     if len(text) > LONGEST_HEAD:
         return Head()
     plain, unit, strange = unit_of(text)
@@ -94,11 +105,16 @@ def station_in_head(text: str) -> str:
 
 def unit_suits(role: str, unit: Unit) -> bool:
     """Tell whether a column of `role` can be in `unit`."""
-    return KINDS[role] == unit.kind or (role, unit.kind) in (("csi_phase", "angle"), ("csi_amp", "level"))
+    return KINDS[role] == unit.kind or (role, unit.kind) in (
+        ("csi_phase", "angle"),
+        ("csi_amp", "level"),
+    )
 
 
 def unit_of(text: str) -> tuple[str, Unit | None, str]:
-    """Return a head without its unit, the unit, and text in square brackets that is no known unit."""
+    """Return a head without its unit, the unit,
+    and text in square brackets that is no known unit.
+    """
     match = re.search(r"\s*(?:\[([^\]]*)\]|\(([^)]*)\)|/\s*([^\s/]+))\s*$", text)
     if match is None:
         return text, None, ""
@@ -123,7 +139,8 @@ def words_of(text: str) -> list[str]:
 
 
 def _role(words: list[str], unit: Unit | None, plain: str) -> Head:
-    if words[-1] in ("1", "2", "3") and LISTS["vector"] & set(words):  # position_3 of an array's column
+    # position_3 of an array's column
+    if words[-1] in ("1", "2", "3") and LISTS["vector"] & set(words):
         words = [*words[:-1], "xyz"[int(words[-1]) - 1]]
     rest = [word for word in words if word not in LISTS["place"]]
     joined = "_".join(rest)
@@ -132,7 +149,12 @@ def _role(words: list[str], unit: Unit | None, plain: str) -> Head:
         return Head(role, unit=unit, word=joined)
     measured = _level(words, unit, plain) or _channel(words, unit, plain)
     head = _axis(rest, unit) or measured or _text(words, unit)
-    if head.role or unit is None or unit.name not in ("dBm", "dBW") or LISTS["no_level"] & set(words):
+    if (
+        head.role
+        or unit is None
+        or unit.name not in ("dBm", "dBW")
+        or LISTS["no_level"] & set(words)
+    ):
         return head
     return Head("rssi_db", plain.strip("_ "), unit, less=True)  # in any language
 
@@ -140,14 +162,18 @@ def _role(words: list[str], unit: Unit | None, plain: str) -> Head:
 def _axis(rest: list[str], unit: Unit | None) -> Head | None:
     axes = [word for word in rest if word in AXIS_WORDS]
     above = len(axes) == 1 and AXIS_WORDS[axes[0]] == "z"
-    ends = [word for word in rest if word not in AXIS_WORDS and not (above and word in LISTS["above"])]
+    ends = [
+        word for word in rest if word not in AXIS_WORDS and not (above and word in LISTS["above"])
+    ]
     less = len(ends) + len(axes) < len(rest)
     if len(axes) != 1 or len(ends) > 1:
         return None
     if not ends:
         return Head(AXIS_WORDS[axes[0]], unit=unit, word=axes[0], less=less)
     end = "station_" if ends[0] in STATION_WORDS else END_WORDS.get(ends[0])
-    return None if end is None else Head(end + AXIS_WORDS[axes[0]], unit=unit, word=axes[0], less=less)
+    return (
+        None if end is None else Head(end + AXIS_WORDS[axes[0]], unit=unit, word=axes[0], less=less)
+    )
 
 
 def _level(words: list[str], unit: Unit | None, plain: str) -> Head | None:
@@ -156,7 +182,9 @@ def _level(words: list[str], unit: Unit | None, plain: str) -> Head | None:
         return None
     # 'signal strength' and 'signal power' are one thing said twice.
     word = next((w for w in named if w != "signal"), "signal")
-    rest = [w for w in words if w != word and w not in LISTS["about_level"] and w not in ("db", "dbm")]
+    rest = [
+        w for w in words if w != word and w not in LISTS["about_level"] and w not in ("db", "dbm")
+    ]
     label = ""
     if rest:
         # One mark between the level and the name: a sign or # after it is the name's.
@@ -175,16 +203,24 @@ def _channel(words: list[str], unit: Unit | None, plain: str) -> Head | None:
         return Head(PARTS[parts[0]], tone[0], unit, parts[0])
     others = [word for word in words if word not in {*PARTS, *numbers, *LISTS["channel"]}]
     named = bool(LISTS["channel"] & set(words))
-    plainly = ("re", "im", "real", "imag", *("amp", "amplitude", "mag", "magnitude", "phase") * bool(numbers))
+    plainly = (
+        "re",
+        "im",
+        "real",
+        "imag",
+        *("amp", "amplitude", "mag", "magnitude", "phase") * bool(numbers),
+    )
     if len(parts) != 1 or not (named or parts[0] in plainly):
         return None
-    if others or len(numbers) > 1:  # of a channel, but not plainly the number of a tone: refused by its label
+    # Of a channel, but not plainly the number of a tone: refused by its label
+    if others or len(numbers) > 1:
         return Head(PARTS[parts[0]], " ".join(numbers + others), unit, parts[0]) if named else None
     label = numbers[0] if numbers else ""
     dash = re.search(rf"(.?)[-\u2212]{label}(?!\d)", plain) if numbers else None
     if dash is not None and not dash[1].isalnum():
         label = f"-{label}"
-    elif dash is not None and "-" not in plain[: dash.start()]:  # csi-re-2 has the mark between all words
+    elif dash is not None and "-" not in plain[: dash.start()]:
+        # csi-re-2 has the mark between all words
         label = f"{label} or -{label}"
     return Head(PARTS[parts[0]], label, unit, parts[0])
 
@@ -194,7 +230,9 @@ def _text(words: list[str], unit: Unit | None) -> Head:
     if len(rest) == 1 and rest[0] in STATION_WORDS:
         return Head("station", word=rest[0])
     if not rest and set(words) & LISTS["less"]:
-        return Head("station", word=next(word for word in words if word in LISTS["less"]), less=True)
+        return Head(
+            "station", word=next(word for word in words if word in LISTS["less"]), less=True
+        )
     if rest == ["run"]:
         return Head("run", word="run")
     if rest and set(rest) <= LISTS["carrier"]:

@@ -1,4 +1,6 @@
-"""From files, of text or Parquet, to `Sheet`: delimiters, banners, comments, decimal marks, limits."""
+"""From files, of text or Parquet, to `Sheet`: delimiters, banners, comments, decimal marks,
+limits.
+"""
 
 from __future__ import annotations
 
@@ -35,11 +37,13 @@ def read_frame(path: Path, kind: str) -> Sheet:
     source = str(path)
     if kind != RECORDS and find_spec("pyarrow") is None:
         raise DataError(f"{source}: {kind} needs pyarrow; say: pip install 'gsparc[tables]'")
-    with readable(source, f"damaged or not a {kind} file", Exception):  # pyarrow and pandas raise anything
+    # Pyarrow and pandas raise anything
+    with readable(source, f"damaged or not a {kind} file", Exception):
         frame = FRAMES[kind](path)
     unnamed = [i for i, name in enumerate(frame.index.names) if name is None]
     frame = frame.reset_index(level=unnamed, drop=True) if unnamed else frame
-    if frame.index.names[0] is not None:  # pandas sets some columns aside as an index: columns all the same
+    # Pandas sets some columns aside as an index: columns all the same
+    if frame.index.names[0] is not None:
         frame = frame.reset_index(allow_duplicates=True)
     frame.columns = frame.columns.astype(str)
     for name in frame.columns[frame.columns.duplicated()]:
@@ -51,8 +55,10 @@ def read_frame(path: Path, kind: str) -> Sheet:
 
 RECORDS = "JSON, GPX or KML"
 FRAMES: dict[str, Callable[[Path], pd.DataFrame]] = {
-    "Parquet": pd.read_parquet, "Feather": pd.read_feather, RECORDS: read_records
-}  # fmt: skip
+    "Parquet": pd.read_parquet,
+    "Feather": pd.read_feather,
+    RECORDS: read_records,
+}
 STARTS = {b"PAR1": "Parquet", b"ARRO": "Feather", **dict.fromkeys((b"{", b"[{", b"<"), RECORDS)}
 DECIMAL_COMMA = r"\s*[-+]?\d*,\d+(?:[eE][-+]?\d+)?\s*"
 GZIP = b"\x1f\x8b"
@@ -89,7 +95,10 @@ def read_text(path: Path) -> Sheet:
         raise DataError(f"{source}: {fault}; expected commas, semicolons or tabs between several")
     width = len(_cells(lines[min(lines)], delimiter))
     if width > MOST_COLUMNS or width * len(lines) > MOST_CELLS:
-        fault = f"{width:,} columns of {len(lines):,} lines; at most {MOST_COLUMNS:,} and {MOST_CELLS:,}"
+        fault = (
+            f"{width:,} columns of {len(lines):,} lines; at most {MOST_COLUMNS:,} and "
+            f"{MOST_CELLS:,}"
+        )
         how = "write Parquet, of means by cells of places where rows are many"
         raise DataError(f"{source}: {fault} cells are read: {how}")
     lines = _with_heads(lines, comment, delimiter, source)
@@ -102,7 +111,9 @@ def read_text(path: Path) -> Sheet:
             hint = "; is there no line of heads?" if _is_number(head) else "; rename one"
             raise DataError(f"{source}: {where} are both named {head!r}{hint}")
     if not rows:
-        raise DataError(f"{source}: line {min(lines)} names columns, but there are no rows below it")
+        raise DataError(
+            f"{source}: line {min(lines)} names columns, but there are no rows below it"
+        )
     frame = pd.DataFrame(rows, dtype=object)
     if delimiter != ",":
         notes.append(f"{DELIMITERS.get(delimiter, repr(delimiter))} between columns")
@@ -117,7 +128,9 @@ def _decoded(path: Path) -> tuple[str, str]:
         packed = file.read(len(GZIP)) == GZIP
     most = most_text(path.stat().st_size if packed else None)
     with (
-        readable(path, "damaged or not compressed by gzip", (EOFError, zlib.error, gzip.BadGzipFile)),
+        readable(
+            path, "damaged or not compressed by gzip", (EOFError, zlib.error, gzip.BadGzipFile)
+        ),
         gzip.open(path) if packed else path.open("rb") as file,
     ):
         content = file.read(most + 1)
@@ -130,10 +143,13 @@ def _decoded(path: Path) -> tuple[str, str]:
         try:
             return content.decode("utf-16"), "UTF-16"
         except UnicodeDecodeError as error:
-            raise DataError(f"{path}: damaged UTF-16 at byte {error.start}; save it as UTF-8") from None
+            raise DataError(
+                f"{path}: damaged UTF-16 at byte {error.start}; save it as UTF-8"
+            ) from None
     if content.startswith((b"II*\0", b"MM\0*")):
         raise DataError(
-            f"{path}: a raster (TIFF), squares of a map; give the table of the rows that were measured, "
+            f"{path}: a raster (TIFF), squares of a map; give the table of the rows that were "
+            "measured, "
             f"and beside it model.prior={path}"
         )
     if b"\0" in content:
@@ -185,15 +201,24 @@ MOST_ABOVE = 10  # lines above the heads
 
 
 def _without_banner(lines: Lines, notes: list[str]) -> Lines:
-    """The lines from the heads on, where lines above them that hold something else leave no doubt."""
+    """The lines from the heads on, where lines above them
+    that hold something else leave no doubt.
+    """
     numbers = list(lines)[:LOOKED_AT]
     for delimiter in DELIMITERS:
         cells = [_cells(lines[n], delimiter) for n in numbers]
         usual = Counter(map(len, cells)).most_common(1)[0][0]
-        named = {cell: bool(parse_head(cell).role) for row in cells[:MOST_ABOVE] for cell in set(row)}
+        named = {
+            cell: bool(parse_head(cell).role) for row in cells[:MOST_ABOVE] for cell in set(row)
+        }
         roles = [sum(named[cell] for cell in row) for row in cells[:MOST_ABOVE]]
-        first = next((i for i, count in enumerate(roles) if count > 1 and len(cells[i]) == usual), 0)
-        above = [len(row) != usual or 2 * sum(c.strip() != "" for c in row) <= usual for row in cells[:first]]
+        first = next(
+            (i for i, count in enumerate(roles) if count > 1 and len(cells[i]) == usual), 0
+        )
+        above = [
+            len(row) != usual or 2 * sum(c.strip() != "" for c in row) <= usual
+            for row in cells[:first]
+        ]
         if usual > 1 and first and all(above) and 2 * max(roles[:first]) < roles[first]:
             above_them = f"left out above: {lines[numbers[0]][:40]!r}"
             notes.append(f"the heads stand in line {numbers[first]}; {above_them}")
@@ -225,7 +250,9 @@ def _cells(line: str, delimiter: str) -> list[str]:
 
 
 def _delimiter(lines: list[str], comment: str) -> str | None:
-    """The one by which heads in a comment, then most lines, have as many cells as the first, and not one."""
+    """The one by which heads in a comment, then most lines, have as many cells as the first,
+    and not one.
+    """
     sample = lines[:LOOKED_AT]
 
     def suits(delimiter: str) -> tuple[bool, bool, bool, float, int]:
@@ -240,7 +267,9 @@ def _delimiter(lines: list[str], comment: str) -> str | None:
 
 
 def _with_heads(lines: Lines, comment: str, delimiter: str, source: str) -> Lines:
-    """The lines, the first of them heads; a comment before values is taken for them where it fits."""
+    """The lines, the first of them heads; a comment before values is taken
+    for them where it fits.
+    """
     first = _cells(lines[min(lines)], delimiter)
     heads = _cells(comment, delimiter) if comment else []
     named = [sum(parse_head(cell).role is not None for cell in cells) for cells in (heads, first)]
@@ -257,21 +286,25 @@ def _with_heads(lines: Lines, comment: str, delimiter: str, source: str) -> Line
 
 
 def _is_number(cell: str) -> bool:
-    return re.fullmatch(r"\s*(?:[-+]?[\d.,]+(?:[eE][-+]?\d+)?|nan)?\s*", cell, re.IGNORECASE) is not None
+    return (
+        re.fullmatch(r"\s*(?:[-+]?[\d.,]+(?:[eE][-+]?\d+)?|nan)?\s*", cell, re.IGNORECASE)
+        is not None
+    )
 
 
 def _without_comments(lines: Lines, delimiter: str, source: str, notes: list[str]) -> Lines:
     """The lines without comments below the heads.
 
-    A line that begins like a comment and has as many cells as there are heads is a row, as stations may be
-    called #1; it is refused where it may be a row that somebody took out.
+    A line that begins like a comment and has as many cells as there are heads is a row, as stations
+    may be called #1; it is refused where it may be a row that somebody took out.
     """
     heads, *below = lines
     marked = [n for n in below if lines[n].lstrip().startswith(COMMENTS)]
     if not marked:
         return lines
     cells = {n: _cells(line, delimiter) for n, line in lines.items()}
-    like = [_cells(lines[n].lstrip(" #%/"), delimiter) for n in marked]  # between spaces a mark may be a cell
+    # Between spaces a mark may be a cell
+    like = [_cells(lines[n].lstrip(" #%/"), delimiter) for n in marked]
     if all(len(cells[heads]) != len(row) for row in (*like, *(cells[n] for n in marked))):
         notes.append(f"{len(marked)} comments below the heads, the first in line {marked[0]}")
         return {n: line for n, line in lines.items() if n not in set(marked)}
@@ -279,12 +312,15 @@ def _without_comments(lines: Lines, delimiter: str, source: str, notes: list[str
     plain = [first[n] for n in below if n not in set(marked)]
     numbers = bool(plain) and all(map(_is_number, plain))
     for n in marked:
-        mark = next((mark for mark in COMMENTS if first[n].startswith(mark)), "")  # none in an empty cell
+        # None in an empty cell
+        mark = next((mark for mark in COMMENTS if first[n].startswith(mark)), "")
         name = first[n].removeprefix(mark).strip('"')
         is_row = name.strip() and not name[0].isspace() and name not in first.values()
         if not is_row or (numbers and _is_number(name)):
             begin = (first[n] or lines[n].strip())[:20]
-            fault = f"begins with {begin!r}: a row, or a comment? quote the cell or take the line out"
+            fault = (
+                f"begins with {begin!r}: a row, or a comment? quote the cell or take the line out"
+            )
             raise DataError(f"{source}, line {n}: {fault}")
     like_it = f"{first[marked[0]]!r} or the like, the first in line {marked[0]}"
     notes.append(f"{len(marked)} rows begin with {like_it}")
@@ -292,14 +328,20 @@ def _without_comments(lines: Lines, delimiter: str, source: str, notes: list[str
 
 
 def _rectangular(lines: Lines, delimiter: str, source: str) -> list[list[str]]:
-    """All cells; quotes that stay open, and lines with more or fewer cells than heads, are refused."""
+    """All cells; quotes that stay open, and lines with more or fewer cells than heads,
+    are refused.
+    """
     for n, line in lines.items():
         if line.count('"') % 2:
-            raise DataError(f"{source}, line {n}: a quotation mark is not closed; close it, or double it")
+            raise DataError(
+                f"{source}, line {n}: a quotation mark is not closed; close it, or double it"
+            )
     cells = [_cells(line, delimiter) for line in lines.values()]
     count, *counts = map(len, cells)
     if counts and len(set(counts)) == 1 and counts[0] != count:
-        hint = "; decimal commas need semicolons or tabs between columns" if delimiter == "," else ""
+        hint = (
+            ("; decimal commas need semicolons or tabs between columns") if delimiter == "," else ""
+        )
         longer = cells[1:] if counts[0] > count else cells[:1]
         if abs(counts[0] - count) == 1 and not any(row[-1].strip() for row in longer):
             hint = ", the last of them empty: end heads and rows alike"
@@ -310,7 +352,11 @@ def _rectangular(lines: Lines, delimiter: str, source: str) -> list[list[str]]:
         if len(row) != count and sum(parse_head(cell).role is not None for cell in row) > 1:
             fault = f"heads of another table than that of line {min(lines)}"
             raise DataError(f"{source}, line {n}: {fault}: write each into a file of its own")
-    names = (f"line {n} ({width} cells)" for n, width in zip(below, counts, strict=True) if width != count)
+    names = (
+        f"line {n} ({width} cells)"
+        for n, width in zip(below, counts, strict=True)
+        if width != count
+    )
     mark = DELIMITERS.get(delimiter, delimiter)
     problems.add_rows(source, names, f"expected {count} cells between {mark}, as there are heads")
     problems.raise_if_any()
@@ -320,8 +366,8 @@ def _rectangular(lines: Lines, delimiter: str, source: str) -> list[list[str]]:
 def _decimal(text: str, frame: pd.DataFrame, delimiter: str, notes: list[str]) -> str:
     """The mark that most numbers have that have one; a comma is noted.
 
-    Between commas it can be one in quoted cells alone; where all cells with a comma may be marked between
-    thousands, the note asks.
+    Between commas it can be one in quoted cells alone; where all cells with a comma may be marked
+    between thousands, the note asks.
     """
     if delimiter == "," and '"' not in text:
         return "."
@@ -333,13 +379,16 @@ def _decimal(text: str, frame: pd.DataFrame, delimiter: str, notes: list[str]) -
     if (delimiter == "," and thousands) or commas <= points:
         return "."
     first = marked.iloc[0].strip()
-    hint = f": {first} is {first.replace(',', '.')}; if commas stand between thousands, take them out"
+    hint = (
+        f": {first} is {first.replace(',', '.')}; if commas stand between thousands, take them out"
+    )
     notes.append("decimal commas" + hint * thousands)
     return ","
 
 
 def read_sheet(path: str | Path, problems: Problems | None = None) -> Sheet:
-    """Read the cells of a table, a column for each number of one, with notes on what was recognised.
+    """Read the cells of a table, a column for each number of one,
+    with notes on what was recognised.
 
     Args:
         path: of the table.
@@ -350,7 +399,9 @@ def read_sheet(path: str | Path, problems: Problems | None = None) -> Sheet:
     """
     path = Path(path)
     if not path.is_file():
-        raise DataError(f"{absent(path)}; expected a table, or arrays (*{', *'.join(ARRAY_SUFFIXES)})")
+        raise DataError(
+            f"{absent(path)}; expected a table, or arrays (*{', *'.join(ARRAY_SUFFIXES)})"
+        )
     if not is_table(path):
         raise DataError(f"{path}: expected a table (csv, parquet, json, ...), no arrays")
     check_fetched(path)

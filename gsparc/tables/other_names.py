@@ -25,7 +25,9 @@ FIELD_OF = {_plain(other): field.name for field in FIELDS.values() for other in 
 
 
 def _joined(raw: Raw) -> Raw:
-    """The same with real and imaginary parts, or amplitudes and phases, of channels as one complex array."""
+    """The same with real and imaginary parts, or amplitudes and phases,
+    of channels as one complex array.
+    """
     parts = dict[str, str]()
     for name in raw.arrays:
         words = words_of(name)
@@ -34,13 +36,19 @@ def _joined(raw: Raw) -> Raw:
             parts.setdefault(roles.pop(), name)
     for pair in (CHANNELS, POLAR):
         names = [parts[part] for part in pair if part in parts]
-        if len(names) < 2 or raw.arrays[names[0]].shape != raw.arrays[names[1]].shape or "csi" in raw.arrays:
+        if (
+            len(names) < 2
+            or raw.arrays[names[0]].shape != raw.arrays[names[1]].shape
+            or "csi" in raw.arrays
+        ):
             continue
         units = [UNITS.get(words_of(name)[-1]) for name in names]
         first, second = (raw.arrays[name].astype(np.float64) for name in names)
         second = second if units[1] is None else units[1].convert(second)
         polar = pair == POLAR
-        csi, notes = join_polar(first, second, units) if polar else (first + 1j * second, list[str]())
+        csi, notes = (
+            join_polar(first, second, units) if polar else (first + 1j * second, list[str]())
+        )
         notes = [f"{' and '.join(names)}: taken as {' and '.join(pair)} of csi", *notes]
         arrays = {name: array for name, array in raw.arrays.items() if name not in names}
         return replace(raw, arrays={**arrays, "csi": csi}, notes=(*raw.notes, *notes))
@@ -48,10 +56,11 @@ def _joined(raw: Raw) -> Raw:
 
 
 def name_arrays(raw: Raw) -> Raw:
-    """Return `raw` with `fields.csv`'s other names of arrays replaced, and channels as complex (S, ...).
+    """Return `raw` with `fields.csv`'s other names of arrays replaced,
+    and channels as complex (S, ...).
 
-    Real numbers with an axis of two become real and imaginary parts; axes of length 1 go where there are
-    more than `MOST_AXES`, or where one place is written (1, 3).
+    Real numbers with an axis of two become real and imaginary parts; axes of length 1 go where
+    there are more than `MOST_AXES`, or where one place is written (1, 3).
     """
     raw, names = _joined(raw), dict[str, str]()
     for name, array in raw.arrays.items():
@@ -60,12 +69,17 @@ def name_arrays(raw: Raw) -> Raw:
         channel = array.dtype.kind == "c" or _parts(array) or re.search("amp|mag|abs", name)
         if name not in FIELDS and field not in used_names and (field != "csi" or channel):
             names[name] = field
-    arrays, notes = rename_arrays(raw, names).arrays, [f"{name}: taken as {names[name]}" for name in names]
+    arrays, notes = (
+        rename_arrays(raw, names).arrays,
+        [f"{name}: taken as {names[name]}" for name in names],
+    )
     csi = arrays.get("csi", np.zeros(0))
     if axis := _parts(csi):
         first, second = np.moveaxis(csi, axis, 0).astype(np.float64)
         csi = first + 1j * second
-        notes.append(Caution(f"csi: real numbers, taken as real and imaginary parts along axis {axis}"))
+        notes.append(
+            Caution(f"csi: real numbers, taken as real and imaginary parts along axis {axis}")
+        )
     if csi.ndim > MOST_AXES and not any(name.startswith("station_") for name in arrays):
         csi = csi.reshape(len(csi), *(count for count in csi.shape[1:] if count > 1))
     arrays |= {"csi": csi} if "csi" in arrays else {}

@@ -1,7 +1,8 @@
 """Measurements of one's own, and what our simulators write: one documented schema, npz or HDF5.
 
-docs/reference/schema.md documents it; fields.csv is its table. `interpret` turns arrays into measurements
-or lists everything that is wrong, `load_own` is its strict form, `write_own` refuses what `load_own` would.
+docs/reference/schema.md documents it; fields.csv is its table. `interpret` turns arrays into
+measurements or lists everything that is wrong, `load_own` is its strict form,
+`write_own` refuses what `load_own` would.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ log = logging.getLogger(__name__)
 
 SSIM_WINDOW = 11  # pixels along each side; as in losses and metrics, which data do not import
 Arrays = Mapping[str, np.ndarray]
-OF_ROWS = ("station", "place", "censored", "run")  # of `Measurements`, as `expand_links` leaves them
+# Of `Measurements`, as `expand_links` leaves them
+OF_ROWS = ("station", "place", "censored", "run")
 OWN_ATTRIBUTES = ("name", "measurement", "normalisation", "stand_in", "convergence_error")
 
 
@@ -47,7 +49,8 @@ class Reading:
     Attributes:
         data: the measurements.
         notes: remarks for the user, one line each; nothing is wrong.
-        file_row: (S,) number of each row in its file from 0, as `dataset.level_steps` counts; None: its own.
+        file_row: (S,) number of each row in its file from 0, as `dataset.level_steps` counts; None:
+            its own.
     """
 
     data: Measurements
@@ -72,8 +75,11 @@ def interpret_and_log(raw: Raw, source: str | Path) -> Measurements:
     return reading.data
 
 
-def write_own(path: str | Path, arrays: Arrays, attributes: Mapping[str, Any] | None = None) -> Measurements:
-    """Write arrays named as in the schema (validated first, atomically) and return them as measurements.
+def write_own(
+    path: str | Path, arrays: Arrays, attributes: Mapping[str, Any] | None = None
+) -> Measurements:
+    """Write arrays named as in the schema (validated first, atomically)
+    and return them as measurements.
 
     Args:
         path: *.npz, *.h5 or *.hdf5.
@@ -84,7 +90,9 @@ def write_own(path: str | Path, arrays: Arrays, attributes: Mapping[str, Any] | 
         DataError: what `load_own` would refuse.
     """
     contents = {name: np.asarray(array) for name, array in arrays.items()}
-    units = {name: FIELDS[name].unit for name in contents if name in FIELDS and FIELDS[name].unit != "1"}
+    units = {
+        name: FIELDS[name].unit for name in contents if name in FIELDS and FIELDS[name].unit != "1"
+    }
     raw = Raw(contents, dict(attributes or {}), units)
     data = interpret(raw, path).data
     write_raw(path, raw)
@@ -104,9 +112,10 @@ def from_arrays(arrays: Arrays, attributes: Mapping[str, Any] | None = None) -> 
 def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     """Validate `raw` and centre, scale and hash it.
 
-    CSI is divided by its root mean square over all measured entries, RSSI by its mean power; spectra of
-    floating point are divided by their largest value unless it lies between 0.1 and 1. The constant is
-    one per site, rounded to whole decibels, and kept as `site.target_scale`: metrics multiply it back.
+    CSI is divided by its root mean square over all measured entries, RSSI by its mean power;
+    spectra of floating point are divided by their largest value unless it lies between 0.1 and 1.
+    The constant is one per site, rounded to whole decibels, and kept as `site.target_scale`:
+    metrics multiply it back.
 
     Args:
         raw: named as in docs/reference/schema.md.
@@ -119,7 +128,8 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     check = Checker(amplitudes_to_levels(name_arrays(raw)), str(source))
     check.check_names()
     measured = check.measurement()
-    stated = {name: "stated" for name in raw.arrays if name == "sensitivity_db"}  # lists add one of their own
+    # Lists add one of their own
+    stated = {name: "stated" for name in raw.arrays if name == "sensitivity_db"}
     about = _attributes(check, Path(source).stem, measured)
     links = None if measured is None else expand_links(check, measured, part)
     # Without a measurement no array has a length to be checked against: nothing more can be said.
@@ -148,7 +158,10 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     named = str(raw.attributes.get("conventions", "")).split()
     if facts.is_complex and check.fits_exchanged(*values.shape[1:]):
         if "exchange_axes" not in named:
-            fits = f"rows of shape {values.shape[1:]} fit frequencies and antennas with their axes exchanged"
+            fits = (
+                f"rows of shape {values.shape[1:]} fit frequencies and antennas with their "
+                "axes exchanged"
+            )
             check.refuse("csi", f"{fits}; say dataset.exchange_axes=true")
         named = [one for one in named if one != "exchange_axes"]  # it is done here
         values, mask = values.swapaxes(1, 2), None if mask is None else mask.swapaxes(1, 2)
@@ -179,19 +192,41 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     directions = _directions(check, offsets, rx, rotation)
     if facts.is_image and min(values.shape[1:]) < SSIM_WINDOW:
         check.notes.append(
-            f"images of {values.shape[1]} x {values.shape[2]} pixels are smaller than SSIM's window of "
+            f"images of {values.shape[1]} x {values.shape[2]} pixels are smaller than SSIM's "
+            "window of "
             f"{SSIM_WINDOW} x {SSIM_WINDOW}: losses are L1 alone, ssim_gauss is undefined"
         )
     site = Site(
-        kind=kind, static_end=links.static_end, grid=grid, array=array, carrier_hz=carrier,
-        subcarriers_hz=frequency if facts.is_complex else None, stations=links.stations,
-        georeference=links.georeference, **about,
-    )  # fmt: skip
-    provenance = {str(k): str(v) for k, v in raw.attributes.items() if k not in OWN_ATTRIBUTES} | stated
+        kind=kind,
+        static_end=links.static_end,
+        grid=grid,
+        array=array,
+        carrier_hz=carrier,
+        subcarriers_hz=frequency if facts.is_complex else None,
+        stations=links.stations,
+        georeference=links.georeference,
+        **about,
+    )
+    provenance = {
+        str(k): str(v) for k, v in raw.attributes.items() if k not in OWN_ATTRIBUTES
+    } | stated
     data = Measurements(
-        site, tx, rx, rotation, values, mask, noise, directions, row_names, release_split, provenance,
-        position_std=position_std, device=devices, sequence=check.read_sequence(rows, kind), **of_rows,
-    )  # fmt: skip
+        site,
+        tx,
+        rx,
+        rotation,
+        values,
+        mask,
+        noise,
+        directions,
+        row_names,
+        release_split,
+        provenance,
+        position_std=position_std,
+        device=devices,
+        sequence=check.read_sequence(rows, kind),
+        **of_rows,
+    )
     data = mark_constants(data, check.notes)
     # Conventions turn values before they are scaled: the scale is that of what is stored.
     data = leave_out_unmeasured(convert_conventions(data, named))
@@ -206,7 +241,8 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
         check.refuse(measured, "every measured value is zero; expected some signal")
     check.problems.raise_if_any()
     # Variances scale with the square of the amplitude that was divided out.
-    noise = None if noise is None else (noise / (scale * scale)).astype(np.float32)  # `**` may overflow
+    # `**` may overflow
+    noise = None if noise is None else (noise / (scale * scale)).astype(np.float32)
     site = replace(data.site, target_scale=scale)
     data = centre_positions(replace(data, site=site, target=target, noise_variance=noise))
     file_row = raw.arrays["file_row"]
@@ -218,15 +254,22 @@ def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, An
     attributes = check.raw.attributes
     normalisation = str(attributes.get("normalisation", "none"))
     if normalisation not in NORMALISATIONS:
-        check.refuse("normalisation", f"{normalisation!r}; expected one of {', '.join(NORMALISATIONS)}")
+        check.refuse(
+            "normalisation", f"{normalisation!r}; expected one of {', '.join(NORMALISATIONS)}"
+        )
     error, stand_in = attributes.get("convergence_error"), attributes.get("stand_in")
     if not or_null(number(0)).holds(error):
-        error = check.refuse("convergence_error", f"{error!r}; expected a finite number, at least 0")
+        error = check.refuse(
+            "convergence_error", f"{error!r}; expected a finite number, at least 0"
+        )
     for name in ("name", "stand_in"):
         if not isinstance(attributes.get(name), str | None):
             check.refuse(name, f"a {type(attributes[name]).__name__}; expected text")
     # Linear powers are watts if the file says nothing, levels are dB of an unknown reference.
-    level_unit, unit = str(attributes.get("level_unit", "dBW" if measured == "rssi" else "dB")), None
+    level_unit, unit = (
+        str(attributes.get("level_unit", "dBW" if measured == "rssi" else "dB")),
+        None,
+    )
     if measured in ("rssi", "rssi_db"):
         linear = "W" if level_unit == "dBW" else LINEAR
         unit = attributes.get("unit", linear if measured == "rssi" else None)
@@ -277,12 +320,17 @@ def _not_negative(check: Checker, name: str, rows: int) -> np.ndarray | None:
 
 
 def _static(check: Checker, links: Links, ends: Mapping[str, Any], rotation: Any) -> None:
-    """Refuse ends of which neither moves, a static receiver that turns, and static ends far from all rows."""
+    """Refuse ends of which neither moves, a static receiver that turns,
+    and static ends far from all rows.
+    """
     several, fault = links.stations is not None, ""
     if not several and all((p == np.atleast_2d(p)[:1]).all() for p in ends.values()):
         fault = "neither end moves; expected (S, 3) positions for one of them"
     elif not several and links.static_end == "rx" and (rotation != rotation[0]).any():
-        fault = "the receiver stands still but turns while the transmitter moves; expected one orientation"
+        fault = (
+            "the receiver stands still but turns while the transmitter moves; expected one "
+            "orientation"
+        )
     if fault:
         check.problems.add(check.source, fault)
     if links.static_end is None:
@@ -290,7 +338,9 @@ def _static(check: Checker, links: Links, ends: Mapping[str, Any], rotation: Any
     still, moving = ends[links.static_end], ends[OTHER[links.static_end]]
     if moving.ndim < 2 or not np.isfinite(still).any():
         return
-    fault, certain = check_static_ends(np.unique(np.atleast_2d(still), axis=0), moving, links.georeference)
+    fault, certain = check_static_ends(
+        np.unique(np.atleast_2d(still), axis=0), moving, links.georeference
+    )
     if fault and certain:
         check.problems.add(check.source, fault)
     elif fault:
@@ -307,8 +357,10 @@ def _note_plane(check: Checker, moving: np.ndarray, carrier_hz: float | None) ->
     # Twice a quarter wavelength: paths of a source and of its mirror image differ by half a wave.
     if thickness < wavelength / 4:
         check.notes.append(
-            f"the positions spread only {thickness:.2g} m ({thickness / wavelength:.2g} wavelengths) about a "
-            "plane: a source and its mirror image in it look the same; several heights tell them apart"
+            f"the positions spread only {thickness:.2g} m ({thickness / wavelength:.2g} "
+            "wavelengths) about a "
+            "plane: a source and its mirror image in it look the same; several heights tell them "
+            "apart"
         )
 
 
@@ -325,7 +377,8 @@ def _directions(
         return None
     owner = np.repeat(np.arange(len(rx)), np.diff(offsets))
     if name == "path_last_point":
-        # Transposed rotation: from the world to the receiver's frame, in which spectra and arrays are.
+        # Transposed rotation: from the world to the receiver's frame,
+        # in which spectra and arrays are.
         vectors = np.einsum("pji,pj->pi", rotation[owner], vectors - rx[owner])
     # Directions of any length are taken, so that overflow here is a row to refuse, not an error.
     with np.errstate(over="ignore"):
@@ -340,10 +393,13 @@ def _directions(
 def _scaled(
     name: str, values: np.ndarray, mask: np.ndarray | None, censored: np.ndarray | None
 ) -> tuple[np.ndarray, float]:
-    """The target as stored and the constant it was divided by (0 for silence); censored rows are levels."""
+    """The target as stored and the constant it was divided by (0 for silence);
+    censored rows are levels.
+    """
     mask_or_level = mask
     if censored is not None:
-        # A censored row's target is the level of hearing, which the loss needs though the mask says False.
+        # A censored row's target is the level of hearing,
+        # which the loss needs though the mask says False.
         bound = censored[:, None] != 0
         mask_or_level = bound if mask is None else mask | bound
     if mask_or_level is not None:
@@ -368,4 +424,6 @@ def _scaled(
     with np.errstate(over="ignore"):  # what is then infinite is refused by row
         if mask_or_level is not None or name == "rssi_db" or not is_big(values):
             return (values * lift / divisor).astype(stored), scale
-        return write_blocks(values.shape, stored, lambda at: values[at].astype(exact) * lift / divisor), scale
+        return write_blocks(
+            values.shape, stored, lambda at: values[at].astype(exact) * lift / divisor
+        ), scale

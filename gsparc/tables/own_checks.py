@@ -1,4 +1,6 @@
-"""What is wrong with a file of one's own: each check notes problems with array, row and expectation."""
+"""What is wrong with a file of one's own: each check notes problems with array,
+row and expectation.
+"""
 
 from __future__ import annotations
 
@@ -26,15 +28,21 @@ Shape = tuple[int | str | None, ...]
 
 
 def _fits(sizes: tuple[int, ...], shape: Shape) -> bool:
-    return len(sizes) == len(shape) and all(want in (None, n) for want, n in zip(shape, sizes, strict=True))
+    return len(sizes) == len(shape) and all(
+        want in (None, n) for want, n in zip(shape, sizes, strict=True)
+    )
 
 
 class Checker:
-    """Takes arrays out of a `Raw`, noting what is wrong; a method returns None when its array is unusable."""
+    """Takes arrays out of a `Raw`, noting what is wrong;
+    a method returns None when its array is unusable.
+    """
 
     def __init__(self, raw: Raw, source: str) -> None:
         # HDF5 holds attributes that are arrays: lists can be compared with words.
-        plain = {k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in raw.attributes.items()}
+        plain = {
+            k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in raw.attributes.items()
+        }
         self.raw, self.source = replace(raw, attributes=plain), source
         self.problems = Problems(source)
         self.notes, self.given = [*raw.notes], raw.arrays
@@ -51,7 +59,9 @@ class Checker:
         self.problems.add(self.describe_array(name), what)
 
     def refuse_rows(self, name: str, bad: np.ndarray, what: str) -> bool:
-        """Note `what` for the rows of an array where `bad` (S, ...) has a True; returns whether one does."""
+        """Note `what` for the rows of an array where `bad` (S, ...) has a True;
+        returns whether one does.
+        """
         rows = np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))
         self.problems.add_rows(self.describe_array(name), (self.row_names[i] for i in rows), what)
         return len(rows) > 0
@@ -64,11 +74,14 @@ class Checker:
         """Refuse misspelt names and foreign units; note that other unknown names are ignored.
 
         Raises:
-            DataError: arrays of another type or number of axes than the schema's: nobody else looks at these.
+            DataError: arrays of another type or number of axes than the schema's: nobody else looks
+                at these.
         """
         sound, arrays = True, self.given
         # What is ignored must not be taken for an array of the same name that is made of others.
-        self.raw = replace(self.raw, arrays={name: arrays[name] for name in arrays if name in FIELDS})
+        self.raw = replace(
+            self.raw, arrays={name: arrays[name] for name in arrays if name in FIELDS}
+        )
         for name in arrays:
             if name in FIELDS:
                 unit = self.raw.units.get(name, FIELDS[name].unit)
@@ -76,7 +89,9 @@ class Checker:
                     self.refuse(name, f"units are {unit!r}; expected {FIELDS[name].unit!r}")
                 shapes = FIELDS[name].shapes
                 # Channels and spectra may have an axis of stations behind that of rows.
-                shapes += [(*shape, None) for shape in shapes] if name in ("csi", "spectrum") else []
+                shapes += (
+                    [(*shape, None) for shape in shapes] if name in ("csi", "spectrum") else []
+                )
                 sound &= self.read_array(name, *shapes) is not None
                 continue
             # A name that the file holds, too, cannot be what the misspelt one was to be.
@@ -88,17 +103,25 @@ class Checker:
             self.problems.raise_if_any()
 
     def measurement(self) -> str | None:
-        """Choose spectrum, csi, rssi or rssi_db: the only one, or the one that an attribute names."""
+        """Choose spectrum, csi, rssi or rssi_db: the only one,
+        or the one that an attribute names.
+        """
         present, named = self.present(*MEASUREMENTS), self.raw.attributes.get("measurement")
         if named is not None and named not in present:
             there = " and ".join(present) or "none of these"
-            self.refuse("measurement", f"{named!r} names no measurement of this file, which holds {there}")
+            self.refuse(
+                "measurement", f"{named!r} names no measurement of this file, which holds {there}"
+            )
         if len(present) == 1:
             return present[0]
         if named in present:
             return str(named)
-        rest = [f"{name} {array.shape}" for name, array in self.given.items()] or ["no arrays outside groups"]
-        names = " and ".join(present) or f"none of them among {list_first(rest, 8)}; rename what it is"
+        rest = [f"{name} {array.shape}" for name, array in self.given.items()] or [
+            "no arrays outside groups"
+        ]
+        names = " and ".join(present) or (
+            f"none of them among {list_first(rest, 8)}; rename what it is"
+        )
         wanted = f"expected exactly one of {', '.join(MEASUREMENTS)}"
         return self.problems.add(self.source, f"{wanted}; found {names}")
 
@@ -114,7 +137,9 @@ class Checker:
         return named
 
     def read_array(self, name: str, *shapes: Shape, holds: str = "") -> np.ndarray | None:
-        """Return array `name` if it `holds` what it should and fits one of `shapes` (None: any length)."""
+        """Return array `name` if it `holds` what it should and fits one
+        of `shapes` (None: any length).
+        """
         array, holds = self.raw.arrays.get(name), holds or FIELDS[name].holds
         if array is None:
             return None
@@ -130,15 +155,23 @@ class Checker:
         return None if array is None else array.astype(np.float64)
 
     def has_shape(self, name: str, array: np.ndarray, *shapes: Shape) -> bool:
-        """Tell whether `array` has one of `shapes`, letters for sizes found before; note it when not."""
-        wanted = [tuple(self.sizes.get(a) if isinstance(a, str) else a for a in shape) for shape in shapes]
+        """Tell whether `array` has one of `shapes`, letters for sizes found before;
+        note it when not.
+        """
+        wanted = [
+            tuple(self.sizes.get(a) if isinstance(a, str) else a for a in shape) for shape in shapes
+        ]
         if not wanted or any(_fits(array.shape, shape) for shape in wanted):
             return True
         # Samples come first: an array of three rows is mostly (3, S) instead of (S, 3).
-        turned = array.ndim > 1 and (len(array) == 3 or any(_fits(array.shape[::-1], s) for s in wanted))
+        turned = array.ndim > 1 and (
+            len(array) == 3 or any(_fits(array.shape[::-1], s) for s in wanted)
+        )
         here = " or ".join(map(str, wanted))
         here = f", here {here}" if any(wanted) and "None" not in here else ""
-        layout = FIELDS[name].shape if name in FIELDS else " or ".join(map(str, shapes)).replace("'", "")
+        layout = (
+            FIELDS[name].shape if name in FIELDS else " or ".join(map(str, shapes)).replace("'", "")
+        )
         fault = f"found {array.shape}{'; transposed?' if turned else ''}"
         self.refuse(name, f"expected shape {layout}{here}, {fault}")
         return False
@@ -147,18 +180,25 @@ class Checker:
         """Return (S, 3) or (3,) float64 [m]."""
         if name not in self.raw.arrays:
             remedy = "; or say dataset.tx_position=[X,Y,Z]" if name == "tx_position" else ""
-            return self.refuse(name, f"missing; expected {FIELDS[name].shape} [{FIELDS[name].unit}]{remedy}")
+            return self.refuse(
+                name, f"missing; expected {FIELDS[name].shape} [{FIELDS[name].unit}]{remedy}"
+            )
         array = self.read_real(name, (3,), (rows, 3))
         if array is None:
             return None
         # Places that nobody gave are NaN on purpose and pass unchecked.
         if name == self.unknown:
             return array
-        names = (self.row_names or numbered_rows(len(array)).tolist()) if array.ndim == 2 else ["its value"]
+        names = (
+            (self.row_names or numbered_rows(len(array)).tolist())
+            if array.ndim == 2
+            else ["its value"]
+        )
         if check_positions(self.problems, self.describe_array(name), np.atleast_2d(array), names):
             return None
         stored = self.raw.arrays[name]
-        # Distance to the next number: at a UTM northing of 5,000 km float32 has steps of half a metre.
+        # Distance to the next number: at a UTM northing
+        # of 5,000 km float32 has steps of half a metre.
         step = float(np.spacing(np.abs(stored).max(initial=0))) if stored.dtype.kind == "f" else 0.0
         if stored.dtype.itemsize <= 4 and step > 1e-3:
             self.notes.append(
@@ -168,7 +208,9 @@ class Checker:
         return array
 
     def check_range(self, name: str, values: np.ndarray, mask: np.ndarray | None) -> None:
-        """Refuse rows of which a measured entry of `values` (S, ...) is not finite, or beyond all powers."""
+        """Refuse rows of which a measured entry of `values` (S, ...) is not finite,
+        or beyond all powers.
+        """
         # Magnitudes of complex64 overflow and comparisons with NaN warn; both are tested for here.
         with np.errstate(over="ignore", invalid="ignore"):
             unmarked = "not finite; expected numbers (mark what was not measured in mask)"
@@ -185,8 +227,12 @@ class Checker:
                 out = rows_with(values, lambda part: part < 0, mask)
         self.refuse_rows(name, out, f"out of range; expected {wanted}")
 
-    def read_devices(self, rows: int, kind: Kind) -> tuple[tuple[str, ...] | None, np.ndarray | None]:
-        """Return names (D,) of devices and which of them measured each row (S,) int64; None where none is."""
+    def read_devices(
+        self, rows: int, kind: Kind
+    ) -> tuple[tuple[str, ...] | None, np.ndarray | None]:
+        """Return names (D,) of devices and which of them measured each row (S,) int64;
+        None where none is.
+        """
         array = self.read_array("device", (rows,))
         if array is None:
             return None, None
@@ -202,13 +248,19 @@ class Checker:
             return None
         return np.argsort(np.argsort(time, kind="stable"))
 
-    def read_mask(self, shape: tuple[int, ...], censored: np.ndarray | None = None) -> np.ndarray | None:
-        """Return bool, like the measurement; None: all was measured. Only `censored` rows may be empty."""
+    def read_mask(
+        self, shape: tuple[int, ...], censored: np.ndarray | None = None
+    ) -> np.ndarray | None:
+        """Return bool, like the measurement; None: all was measured.
+        Only `censored` rows may be empty.
+        """
         array = self.read_array("mask", shape)
         if array is None:
             return None
         if not np.isin(array, (0, 1)).all():
-            return self.refuse("mask", f"expected True and False, found {array.dtype} of other values")
+            return self.refuse(
+                "mask", f"expected True and False, found {array.dtype} of other values"
+            )
         mask = array.astype(bool)
         # A row without a measured entry has no error to learn from and no power to scale by.
         empty = ~mask.reshape(len(mask), -1).max(axis=1)
@@ -218,18 +270,26 @@ class Checker:
         return mask
 
     def read_frequencies(self, count: int | None) -> tuple[np.ndarray | None, float | None]:
-        """Return (K,) [Hz] or None, and the carrier [Hz] or None; csi needs `count` (None without csi)."""
+        """Return (K,) [Hz] or None, and the carrier [Hz] or None;
+        csi needs `count` (None without csi).
+        """
         frequency = self.read_real("frequency_hz", (), (None,) if count is None else (count,))
         carrier, spacing = (self.read_real(name, ()) for name in ("carrier_hz", "spacing_hz"))
         if count is not None and frequency is None and carrier is not None and spacing is not None:
             frequency = (np.arange(count) - count // 2) * spacing
         elif count is not None and "frequency_hz" not in self.raw.arrays:
-            fault = f"missing; csi needs the {count} frequencies [Hz]; or say dataset.frequency_hz=[...]"
+            fault = (
+                f"missing; csi needs the {count} frequencies [Hz]; or say "
+                "dataset.frequency_hz=[...]"
+            )
             self.refuse("frequency_hz", f"{fault}, or dataset.carrier_hz=HZ dataset.spacing_hz=HZ")
         if frequency is not None and carrier is not None and frequency.size:
             away = np.abs(frequency)
-            if 2 * away.max() < carrier and away.min() <= np.ptp(frequency):  # values in MHz are far from 0
-                self.notes.append(f"frequency_hz: read as offsets from carrier_hz, {float(carrier):g}")
+            # Values in MHz are far from 0
+            if 2 * away.max() < carrier and away.min() <= np.ptp(frequency):
+                self.notes.append(
+                    f"frequency_hz: read as offsets from carrier_hz, {float(carrier):g}"
+                )
                 frequency = frequency + carrier
         for name, values in (("frequency_hz", frequency), ("carrier_hz", carrier)):
             if values is None:
@@ -242,7 +302,8 @@ class Checker:
                 self.refuse(name, "the same frequency twice; expected distinct ones [Hz]")
         if frequency is None:
             return None, None if carrier is None else float(carrier)
-        # A single frequency with several columns: they may be antennas, and then the shape is wrong.
+        # A single frequency with several columns: they may be antennas,
+        # and then the shape is wrong.
         if frequency.ndim == 0 and count not in (None, 1):
             self.refuse(
                 "frequency_hz",
@@ -277,18 +338,30 @@ class Checker:
             return None
         values = np.broadcast_to(values, (rows, *shape))
         if present == ["rx_rotation"]:
-            expected = "not a rotation; expected an orthogonal matrix with determinant +1, receiver to world"
-            return None if self.refuse_rows("rx_rotation", ~is_rotation(values), expected) else values.copy()
+            expected = (
+                "not a rotation; expected an orthogonal matrix with determinant +1, "
+                "receiver to world"
+            )
+            return (
+                None
+                if self.refuse_rows("rx_rotation", ~is_rotation(values), expected)
+                else values.copy()
+            )
         return self.to_matrices("rx_orientation", values, self.row_names)
 
     def to_matrices(self, name: str, values: np.ndarray, rows: Sequence[str]) -> np.ndarray | None:
         """Return rotations (n, 3, 3) of quaternions (n, 4) of an array."""
-        where, expected = self.describe_array(name), "expected a quaternion (w, x, y, z) of length 1"
+        where, expected = (
+            self.describe_array(name),
+            ("expected a quaternion (w, x, y, z) of length 1"),
+        )
         bad = self.problems.add_values(where, rows, values, is_unit(values), expected)
         return None if bad else quaternion_to_matrix(values, scalar_first=True)
 
     def read_grid(self, height: int, width: int) -> SphereGrid | None:
-        """Return directions of the pixels; by default row i, column j at i and j steps from the horizon."""
+        """Return directions of the pixels; by default row i,
+        column j at i and j steps from the horizon.
+        """
         if "grid_deg" not in self.raw.arrays:
             return SphereGrid.hemisphere(height, width)
         values = self.read_real("grid_deg", (4,))
@@ -309,7 +382,9 @@ class Checker:
 
     def read_ragged(self, rows: int) -> np.ndarray | None:
         """Return path_offsets (S + 1,) int64."""
-        per_path = self.present(*(n for n in FIELDS if n.startswith("path_") and n != "path_offsets"))
+        per_path = self.present(
+            *(n for n in FIELDS if n.startswith("path_") and n != "path_offsets")
+        )
         if per_path and "path_offsets" not in self.raw.arrays:
             return self.refuse("path_offsets", f"missing, but {per_path[0]} is given")
         offsets = self.read_array("path_offsets", (rows + 1,))
@@ -317,18 +392,24 @@ class Checker:
             return None
         # Cast first: differences of unsigned integers wrap around and never are negative.
         if offsets[0] != 0 or (np.diff(offsets.astype(np.int64)) < 0).any():
-            return self.refuse("path_offsets", "expected integers that start at 0 and never decrease")
+            return self.refuse(
+                "path_offsets", "expected integers that start at 0 and never decrease"
+            )
         for name in per_path:
             shape, count = self.raw.arrays[name].shape[:1], int(offsets[-1])
             if shape != (count,):
-                return self.refuse(name, f"expected {count} paths as path_offsets says, found {shape}")
+                return self.refuse(
+                    name, f"expected {count} paths as path_offsets says, found {shape}"
+                )
         return offsets.astype(np.int64)
 
     def read_split(self, rows: int) -> TrainTest | None:
         """Return (train, test) rows that the file names, or None."""
         names = self.present("split_train", "split_test")
         if len(names) == 1:
-            self.problems.add(self.source, f"{names[0]} is given alone; expected split_train and split_test")
+            self.problems.add(
+                self.source, f"{names[0]} is given alone; expected split_train and split_test"
+            )
         if len(names) < 2:
             return None
         parts = []
@@ -341,7 +422,9 @@ class Checker:
             self._refuse_numbers(name, out, f"out of range; rows are 0 to {rows - 1}")
             self._refuse_numbers(name, values[counts > 1], "named twice")
             parts.append(values.astype(np.int64))
-        self._refuse_numbers("split_test", np.intersect1d(parts[0], parts[1]), "also in split_train")
+        self._refuse_numbers(
+            "split_test", np.intersect1d(parts[0], parts[1]), "also in split_train"
+        )
         return parts[0], parts[1]
 
     def _refuse_numbers(self, name: str, rows: np.ndarray, what: str) -> None:
@@ -351,7 +434,9 @@ class Checker:
 def rows_with(
     values: np.ndarray, test: Callable[[np.ndarray], np.ndarray], mask: np.ndarray | None = None
 ) -> np.ndarray:
-    """Tell which rows (S,) of `values` (S, ...) have a measured entry that passes a test, by blocks."""
+    """Tell which rows (S,) of `values` (S, ...) have a measured entry that passes a test,
+    by blocks.
+    """
     passed = (test(values[p]) & (True if mask is None else mask[p]) for p in row_blocks(values))
     return np.concatenate([part.reshape(len(part), -1).any(1) for part in passed])
 
@@ -365,7 +450,9 @@ UNIT_TOLERANCE = 1e-2  # releases print quaternions with few digits; beyond this
 
 
 def is_unit(quaternion: np.ndarray) -> np.ndarray:
-    """Tell whether quaternions (..., 4) are finite, of length 1 within `UNIT_TOLERANCE`: (...) bool."""
+    """Tell whether quaternions (..., 4) are finite, of length 1 within `UNIT_TOLERANCE`: (...)
+    bool.
+    """
     with np.errstate(over="ignore", invalid="ignore"):
         return np.abs(np.linalg.norm(quaternion, axis=-1) - 1) <= UNIT_TOLERANCE
 

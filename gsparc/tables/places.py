@@ -46,16 +46,19 @@ class Places:
 
     def take(self, rows: np.ndarray) -> Places:
         """Return those of some rows."""
-        return Places(self.across[rows], None if self.height is None else self.height[rows], self.degrees)
+        return Places(
+            self.across[rows], None if self.height is None else self.height[rows], self.degrees
+        )
 
 
 def read_places(
     sheet: Sheet, chosen: Chosen, end: str, unknown: bool = False, strict: bool = True
 ) -> Places | None:
-    """Read coordinates of an end (`rx_`, `tx_`, `station_`, or empty); None where the table has none.
+    """Read coordinates of an end (`rx_`, `tx_`, `station_`, or empty);
+    None where the table has none.
 
-    Where places may be `unknown`, rows without any coordinate are NaN; what is not on Earth is refused where
-    it is `strict`, else left to `gsparc.tables.links.positions`.
+    Where places may be `unknown`, rows without any coordinate are NaN; what is not on Earth is
+    refused where it is `strict`, else left to `gsparc.tables.links.positions`.
     """
     for degrees, axes in ((False, ("x", "y")), (True, ("latitude", "longitude"))):
         roles = [f"{end}{axis}" for axis in axes]
@@ -68,8 +71,12 @@ def read_places(
             return sheet.refuse(f"{found}; say {say_column(missing, 'COLUMN')}")
         absent = np.zeros(len(sheet), bool)
         if unknown:
-            present = [role for role in (*roles, f"{end}z") if role in chosen and chosen[role][0].head]
-            absent = np.all([sheet.words(chosen[role][0].head or "") == "" for role in present], axis=0)
+            present = [
+                role for role in (*roles, f"{end}z") if role in chosen and chosen[role][0].head
+            ]
+            absent = np.all(
+                [sheet.words(chosen[role][0].head or "") == "" for role in present], axis=0
+            )
         columns = [_complete(sheet, chosen, role, absent) for role in roles]
         height = _complete(sheet, chosen, f"{end}z", absent) if f"{end}z" in chosen else None
         if columns[0] is None or columns[1] is None:
@@ -88,7 +95,9 @@ def read_ends(sheet: Sheet, chosen: Chosen, strict: bool = True) -> dict[str, Pl
 
 
 def drop_rows_without_place(sheet: Sheet, chosen: Chosen) -> Sheet:
-    """Leave out rows in which a coordinate of an end is empty, as loggers write them between fixes."""
+    """Leave out rows in which a coordinate of an end is empty,
+    as loggers write them between fixes.
+    """
     lost = np.zeros(len(sheet), bool)
     for end in ENDS[:-1]:
         for pair in (("x", "y"), ("latitude", "longitude")):
@@ -98,7 +107,10 @@ def drop_rows_without_place(sheet: Sheet, chosen: Chosen) -> Sheet:
     if not lost.any() or lost.all():
         return sheet
     named = np.array(sheet.rows)
-    remark = f"{name_row_ranges(named[lost].tolist())}: no place; these {lost.sum()} of {len(sheet)} rows are"
+    remark = (
+        f"{name_row_ranges(named[lost].tolist())}: no place; these {lost.sum()} of "
+        f"{len(sheet)} rows are"
+    )
     sheet.notes.append(Caution(f"{remark} left out"))
     frame = sheet.frame[~lost].reset_index(drop=True)
     return replace(sheet, frame=frame, rows=tuple(named[~lost].tolist()))
@@ -113,7 +125,8 @@ def place_by_row(path: str | Path, columns: Mapping[str, object], end: str) -> d
         end: that moved, `tx` or `rx`.
 
     Raises:
-        DataError: rows are of one station each, and no column of times says which are of one moment.
+        DataError: rows are of one station each, and no column of times says which are of one
+            moment.
     """
     sheet = read_sheet(path)
     roles = [f"{before}{axis}" for before in ENDS[:-1] for axis in AXES]
@@ -124,14 +137,20 @@ def place_by_row(path: str | Path, columns: Mapping[str, object], end: str) -> d
         return {}
     row_key = BY_ROW
     if "station" in chosen:
-        row_key += BY_ROW.join(_times(sheet, sheet.joined(column.head for column in chosen["station"])))
+        row_key += BY_ROW.join(
+            _times(sheet, sheet.joined(column.head for column in chosen["station"]))
+        )
     return {**dict.fromkeys(settings), f"{end}_x": row_key, f"{end}_y": row_key, f"{end}_z": 0}
 
 
 def _times(sheet: Sheet, station: np.ndarray) -> list[str]:
-    """Heads of the columns that tell which rows, of a station (S,) each, are of one moment, or DataError."""
+    """Heads of the columns that tell which rows, of a station (S,) each, are of one moment,
+    or DataError.
+    """
     heads = [head for head in sheet.heads if LISTS["time"] & set(words_of(head))]
-    fault = f"{sheet.source}: no coordinates, and rows of one station each: which are of one moment?"
+    fault = (
+        f"{sheet.source}: no coordinates, and rows of one station each: which are of one moment?"
+    )
     wanted = "expected a column of times, or one row a moment with a column of levels per station"
     if not heads:
         raise DataError(f"{fault} {wanted}")
@@ -150,21 +169,32 @@ def _complete(sheet: Sheet, chosen: Chosen, role: str, absent: np.ndarray) -> np
     values = column.numbers(sheet)
     if values is not None and (np.isnan(values) & ~absent).any():
         rows = np.flatnonzero(np.isnan(values) & ~absent)
-        return sheet.refuse_rows(column.head, rows, f"no value; {role} is needed, or take the row out")
+        return sheet.refuse_rows(
+            column.head, rows, f"no value; {role} is needed, or take the row out"
+        )
     return values
 
 
 def _notation(lat: np.ndarray, lon: np.ndarray) -> str | None:
     """What numbers (n,) that are no decimal degrees are instead; None: metres, it seems."""
-    # ddmm.mmmm is about a hundred times the degrees; minutes, its last two whole digits, are below 60.
-    if max(np.abs(lat).max() / 90, np.abs(lon).max() / 180) <= 100 and (np.abs([lat, lon]) % 100 < 60).all():
-        return "degrees and minutes as NMEA writes them (ddmm.mmmm): 4811.98 is 48 + 11.98 / 60; convert them"
+    # ddmm.mmmm is about a hundred times the degrees; minutes, its last two whole digits,
+    # are below 60.
+    if (
+        max(np.abs(lat).max() / 90, np.abs(lon).max() / 180) <= 100
+        and (np.abs([lat, lon]) % 100 < 60).all()
+    ):
+        return (
+            "degrees and minutes as NMEA writes them (ddmm.mmmm): 4811.98 is 48 + 11.98 / 60; "
+            "convert them"
+        )
     # Receivers store degrees as integers in units of 1e-7: 1e7 is one degree, 9e8 the pole.
     whole = np.abs(lat).min() >= 1e7 and np.abs(lat).max() <= 9e8 and np.abs(lon).max() <= 1.8e9
     return "degrees times ten million; divide them" if whole else None
 
 
-def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray, strict: bool) -> None:
+def _on_earth(
+    sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray, strict: bool
+) -> None:
     outside = np.flatnonzero(np.abs(across[:, 0]) > 90)
     swapped = (np.abs(across[:, 1]) <= 90).all()
     heads = [chosen[role][0].head or "" for role in roles]
@@ -174,7 +204,9 @@ def _on_earth(sheet: Sheet, chosen: Chosen, roles: list[str], across: np.ndarray
         metres = f"metres? say {say_column(f'{end}x', heads[1])} {say_column(f'{end}y', heads[0])}"
         fault = _notation(*across[np.isfinite(across).all(axis=1)].T) or metres
         example = f"{across[outside[0], 0]:.10g} in {sheet.rows[outside[0]]}"
-        return sheet.refuse(f"columns {heads[0]!r} and {heads[1]!r} are no degrees ({example}): {fault}")
+        return sheet.refuse(
+            f"columns {heads[0]!r} and {heads[1]!r} are no degrees ({example}): {fault}"
+        )
     if strict and (wrong := find_invalid_coordinate(*np.nan_to_num(across).T)):
         sheet.refuse(f"{sheet.rows[wrong[0]]}: {wrong[1]}")
     return None
@@ -203,7 +235,9 @@ def place_per_station(
         row = moved[0]
         both = (first[station[row]], row)
         at = [f"at ({', '.join(f'{v:.10g}' for v in values[i])}) in {sheet.rows[i]}" for i in both]
-        sheet.refuse(f"station {names[station[row]]!r} is {' and '.join(at)}; expected one place for each")
+        sheet.refuse(
+            f"station {names[station[row]]!r} is {' and '.join(at)}; expected one place for each"
+        )
     return None
 
 
@@ -218,7 +252,8 @@ class StationList:
         names: (T,).
         places: (T,).
         extra: (T,) arrays by name: `PER_STATION`.
-        index: (S,) which station each row of another table is of; None where each has a column there.
+        index: (S,) which station each row of another table is of; None where each has a column
+            there.
         aliases: other names of all of them.
         repeated: names that several of them share, by the head of their column.
         label: (T,) its own names, where `names` are others.
@@ -233,14 +268,27 @@ class StationList:
     label: tuple[str, ...] | None = None
 
     def shared_name_problem(self, words: np.ndarray) -> str | None:
-        """Return what is wrong where words (S,) are of a column whose names several stations share."""
+        """Return what is wrong where words (S,) are of a column whose names several stations
+        share.
+        """
         column = set(words.tolist())
         for head, names in self.repeated.items():
-            twice = [name for name in dict.fromkeys(names) if names.count(name) > 1 and name in column]
+            twice = [
+                name for name in dict.fromkeys(names) if names.count(name) > 1 and name in column
+            ]
             if twice and len(column & set(names)) > len(column & set(self.names)):
-                which = [station for station, name in zip(self.names, names, strict=True) if name == twice[0]]
-                advice = "leave only those of the area in the list, or say dataset.columns.station=HEAD+HEAD"
-                return f"{head} {twice[0]} names {list_first(which)} of the list of stations; {advice}"
+                which = [
+                    station
+                    for station, name in zip(self.names, names, strict=True)
+                    if name == twice[0]
+                ]
+                advice = (
+                    "leave only those of the area in the list, or say "
+                    "dataset.columns.station=HEAD+HEAD"
+                )
+                return (
+                    f"{head} {twice[0]} names {list_first(which)} of the list of stations; {advice}"
+                )
         return None
 
     def use_names_of(self, words: np.ndarray) -> StationList:
@@ -258,23 +306,37 @@ class StationList:
         return StationList(tuple(map(str, names)), self.places.take(which), facts)
 
     def match_heads(self, parts: Mapping[str, str]) -> tuple[StationList, dict[str, str]]:
-        """Return the same under the names that heads, or their `parts`, hold, and that of each such head."""
+        """Return the same under the names that heads, or their `parts`, hold,
+        and that of each such head.
+        """
         renamed = self.use_names_of(np.array([*parts, *parts.values()]))
-        found = {head: one for head, part in parts.items() for one in (part, head) if one in renamed.names}
+        found = {
+            head: one
+            for head, part in parts.items()
+            for one in (part, head)
+            if one in renamed.names
+        }
         # One head alone may be called like a station by chance, unless by its own name.
         return (renamed, found) if len(found) > 1 or renamed.label is None else (self, {})
 
     def add_missing(self, words: np.ndarray, notes: list[str]) -> StationList:
-        """Add those of words (S,) that it lacks, if few, at unknown places, with a note; return it."""
+        """Add those of words (S,) that it lacks, if few, at unknown places, with a note;
+        return it.
+        """
         names = [word for word in dict.fromkeys(words.tolist()) if word]
         missing_names = [word for word in names if word not in self.names]
-        # Of few stations, or with a third of them missing, it is the wrong list rather than an old one.
+        # Of few stations, or with a third of them missing,
+        # it is the wrong list rather than an old one.
         if not missing_names or len(names) < LEAST_LISTED or len(names) < 3 * len(missing_names):
             return self
         rows, more = int(np.isin(words, missing_names).sum()), len(missing_names)
-        finding = f"{more} of {len(names)} stations are not in the list, with {rows} of {len(words)} rows"
+        finding = (
+            f"{more} of {len(names)} stations are not in the list, with {rows} of {len(words)} rows"
+        )
         notes.append(Caution(f"{finding}: {list_first(missing_names)}; their places are unknown"))
-        height = None if self.places.height is None else np.r_[self.places.height, np.full(more, np.nan)]
+        height = (
+            None if self.places.height is None else np.r_[self.places.height, np.full(more, np.nan)]
+        )
         across = np.concatenate([self.places.across, np.full((more, 2), np.nan)])
         extra = {
             # Of what a list says besides, only facts of sectors may be unknown (`Stations.sector`).
@@ -283,21 +345,29 @@ class StationList:
         }
         where = Places(across, height, self.places.degrees)
         label = None if self.label is None else (*self.label, *missing_names)
-        return replace(self, names=(*self.names, *missing_names), places=where, extra=extra, label=label)
+        return replace(
+            self, names=(*self.names, *missing_names), places=where, extra=extra, label=label
+        )
 
 
 def read_stations(sheet: Sheet) -> StationList | None:
-    """Read a table of stations: name, and x, y, z or latitude, longitude, height, empty: unknown."""
+    """Read a table of stations: name, and x, y, z or latitude, longitude, height, empty:
+    unknown.
+    """
     called = [head for head in sheet.heads if head.strip().lower() in ("name", "id")]
     naming = [head for head in sheet.heads if parse_head(head).role == "station"]
-    if not called and len(naming) > 1:  # a list names a station in each row, and may name its site, too
+    # A list names a station in each row, and may name its site, too
+    if not called and len(naming) > 1:
         called = [head for head in naming if len(set(sheet.words(head).tolist())) == len(sheet)][:1]
     # What is of a beam, or a carrier, is no measurement, whatever its head says besides.
     group = {*SECTOR, *TILTS, "carrier_hz"}
     others = sheet.frame[[head for head in sheet.heads if sector_quantity(head) not in group]]
     plain = replace(sheet, frame=others, notes=[])
     columns = choose_columns(plain, {"station": called[0]} if len(called) == 1 else {}).values()
-    chosen = {rename_for_stations(group[0]).role: tuple(map(rename_for_stations, group)) for group in columns}
+    chosen = {
+        rename_for_stations(group[0]).role: tuple(map(rename_for_stations, group))
+        for group in columns
+    }
     notes = (note for note in plain.notes if not note.startswith("not used"))
     sheet.notes.extend(type(note)(f"{sheet.source}: {note}") for note in notes)
     if "station" not in chosen:
@@ -310,7 +380,9 @@ def read_stations(sheet: Sheet) -> StationList | None:
     if sites is not None:
         sectors["station_site"] = sites[1]
     if coordinates is not None and coordinates.height is None and "height" in sectors:
-        coordinates = replace(coordinates, height=np.nan_to_num(sectors["height"], nan=UNKNOWN_HEIGHT))
+        coordinates = replace(
+            coordinates, height=np.nan_to_num(sectors["height"], nan=UNKNOWN_HEIGHT)
+        )
     if coordinates is None:
         if not sheet.problems:
             sheet.refuse("no coordinates; expected columns x, y, z or latitude, longitude, height")
@@ -320,24 +392,35 @@ def read_stations(sheet: Sheet) -> StationList | None:
     unique = {head: each for head, each in every.items() if len(set(each)) == len(each)}
     repeated = {head: each for head, each in every.items() if len(set(each)) < len(each)}
     by = ["+".join(c.head or "" for c in chosen["station"]), *unique]
-    # Names that repeat, like sites in a list of sectors, give way to those of a column without copies.
+    # Names that repeat, like sites in a list of sectors,
+    # give way to those of a column without copies.
     if unique and len(set(names.tolist())) < len(names) and (names != "").all():
         names, by = np.array(unique[by[1]]), by[1:]
     of_sites = "" if sites is None else f", sites by {sites[0]!r}"
-    sheet.notes.append(f"{sheet.source}: stations are matched by {list_first([*map(repr, by)])}{of_sites}")
+    sheet.notes.append(
+        f"{sheet.source}: stations are matched by {list_first([*map(repr, by)])}{of_sites}"
+    )
     for i in np.flatnonzero(names == ""):
         sheet.problems.add(f"{sheet.source}, {sheet.rows[i]}", "no name; expected the station's")
     values, counts = np.unique(names, return_counts=True)
     for name in values[(counts > 1) & (values != "")]:
         rows = " and ".join(sheet.rows[i] for i in np.flatnonzero(names == name)[:2])
         sheet.refuse(f"station {str(name)!r} is listed twice, in {rows}")
-    facts = sectors | {role: chosen[role][0].numbers(sheet) for role in PER_STATION if role in chosen}
-    extra = {role: array for role, array in facts.items() if role in PER_STATION and array is not None}
-    return StationList(tuple(map(str, names)), coordinates, extra, None, tuple(unique.values()), repeated)
+    facts = sectors | {
+        role: chosen[role][0].numbers(sheet) for role in PER_STATION if role in chosen
+    }
+    extra = {
+        role: array for role, array in facts.items() if role in PER_STATION and array is not None
+    }
+    return StationList(
+        tuple(map(str, names)), coordinates, extra, None, tuple(unique.values()), repeated
+    )
 
 
 def _aliases(sheet: Sheet, used: set[str | None]) -> list[tuple[str, ...]]:
-    """Columns, alone and with those that make them unique, that may name the stations of a list besides."""
+    """Columns, alone and with those that make them unique,
+    that may name the stations of a list besides.
+    """
     result: list[tuple[str, ...]] = []
     for head in sheet.heads:
         words = set(words_of(head)) & LISTS["station"]
@@ -345,5 +428,9 @@ def _aliases(sheet: Sheet, used: set[str | None]) -> list[tuple[str, ...]]:
             continue
         result += [(head,)] if head not in used else []
         beside = TOGETHER.get(min(words), set())
-        result += [(head, other) for other in sheet.heads if other != head and set(words_of(other)) & beside]
+        result += [
+            (head, other)
+            for other in sheet.heads
+            if other != head and set(words_of(other)) & beside
+        ]
     return result

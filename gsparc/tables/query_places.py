@@ -33,7 +33,8 @@ class QueryPlaces:
         device: (n,) names of devices, empty of none; None where no column names any.
         name: (n,) what a user calls each, where a column says so; else None.
         notes: what was guessed or not used, one line each.
-        table: the columns of a table in order: head, quantity that was read out of it or None, text (n,).
+        table: the columns of a table in order: head, quantity that was read out of it or None, text
+            (n,).
     """
 
     source: str
@@ -61,12 +62,14 @@ def read_query_places(
         columns: of a table, by quantity, where the guess from their heads will not do.
 
     Raises:
-        DataError: no file, no places, or a place that is none; the first problem, with row and column.
+        DataError: no file, no places, or a place that is none; the first problem, with row and
+            column.
     """
     try:
         return _of_sheet(read_sheet(path), moving, columns)
     except DataError as error:
-        # Measurements are checked by `gsparc check`; places are not, and here their settings are called so.
+        # Measurements are checked by `gsparc check`; places are not,
+        # and here their settings are called so.
         first = error.problems[0].replace("dataset.columns", "columns")
         # The first problem alone: a table of queries is mostly wrong in the same way in every row.
         more = len(error.problems) - 1
@@ -92,7 +95,8 @@ def read_times(path: str | Path) -> np.ndarray | None:
 
 def _of_sheet(sheet: Sheet, moving: Sequence[End], columns: Mapping[str, object]) -> QueryPlaces:
     settings = {key: value for key, value in columns.items() if value is not None}
-    if "device" in sheet.heads:  # a head that a table of measurements would not be taken at its word for
+    # A head that a table of measurements would not be taken at its word for
+    if "device" in sheet.heads:
         settings.setdefault("device", "device")
     chosen = choose_columns(sheet, settings, only=GUESSED)
     sheet.problems.raise_if_any()
@@ -109,9 +113,13 @@ def _of_sheet(sheet: Sheet, moving: Sequence[End], columns: Mapping[str, object]
             raise DataError(f"{sheet.source}: {none}; say {axes}")
         ends[end] = rest.pop(named)
     # Static ends stand where they were measured: a query cannot move them.
-    other = [f"of the {ENDS[end]}" for end in ENDS if f"{end}_" in rest] + ["without a name"] * ("" in rest)
+    other = [f"of the {ENDS[end]}" for end in ENDS if f"{end}_" in rest] + ["without a name"] * (
+        "" in rest
+    )
     if other:
-        sheet.notes.append(f"not used: coordinates {' and '.join(other)}; that end is where it was measured")
+        sheet.notes.append(
+            f"not used: coordinates {' and '.join(other)}; that end is where it was measured"
+        )
     several = [role for role in ("station", "device", "row_name") if role in chosen]
     joined = {role: sheet.joined(c.head for c in chosen[role]) for role in several}
     station, plain = joined.get("station"), None

@@ -38,9 +38,19 @@ ARRAY_SUFFIXES = (".npz", ".mat", *HDF5_SUFFIXES, *NETCDF_SUFFIXES)
 UNREADABLE = (SyntaxError, TokenError)  # of a header that is no Python literal
 COMPLEX = ("real imag", "re im", "r i")  # fields of compounds that MATLAB, Octave and others write
 DIGEST = "content_sha256"  # attribute of HDF5 files that gsparc wrote
-# What zipfile, zlib, numpy and h5py raise on damaged, truncated, encrypted or absurdly large content.
+# What zipfile, zlib, numpy and h5py raise on damaged, truncated,
+# encrypted or absurdly large content.
 DAMAGED = (
-    *(zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, ValueError, TypeError, KeyError),
+    *(
+        zipfile.BadZipFile,
+        zlib.error,
+        struct.error,
+        OSError,
+        EOFError,
+        ValueError,
+        TypeError,
+        KeyError,
+    ),
     TokenError,  # of a header that ends within a quotation, from Python 3.12 on
     *(RuntimeError, ArithmeticError, MemoryError),  # the first includes NotImplementedError
 )
@@ -55,7 +65,8 @@ class Raw:
         attributes: numbers and strings about the whole file.
         units: unit of an array where the file gives one.
         notes: how it was understood and what of it was left out, for the user, one line each.
-        explain: what there is to say of the measurements that these became, and (S,) the row of each, from 0.
+        explain: what there is to say of the measurements that these became, and (S,) the row of
+            each, from 0.
     """
 
     arrays: dict[str, np.ndarray]
@@ -75,7 +86,9 @@ def read_raw(path: str | Path) -> Raw:
     if not path.is_file():
         raise DataError(f"{absent(path)}; expected *.npz, *.h5 or *.mat")
     readers = {".npz": _read_npz, ".mat": _read_mat}
-    readers |= dict.fromkeys(HDF5_SUFFIXES, _read_hdf5) | dict.fromkeys(NETCDF_SUFFIXES, _read_netcdf)
+    readers |= dict.fromkeys(HDF5_SUFFIXES, _read_hdf5) | dict.fromkeys(
+        NETCDF_SUFFIXES, _read_netcdf
+    )
     if path.suffix.lower() not in readers:
         suffix, endings = path.suffix or "no ending", ", ".join(readers)
         raise DataError(f"{path}: expected a name ending in one of {endings}; found {suffix}")
@@ -91,12 +104,15 @@ def write_raw(path: str | Path, raw: Raw) -> None:
     """
     path = Path(path)
     if path.suffix.lower() not in (".npz", *HDF5_SUFFIXES):
-        raise DataError(f"{path}: cannot be written as {path.suffix!r}; name it *.npz, *.h5 or *.hdf5")
+        raise DataError(
+            f"{path}: cannot be written as {path.suffix!r}; name it *.npz, *.h5 or *.hdf5"
+        )
     write = _write_npz if path.suffix.lower() == ".npz" else _write_hdf5
     try:
         with whole_file(path) as partial:
             write(partial, raw)
-    except (OSError, RuntimeError) as error:  # libhdf5 makes the second of the first when it closes a file
+    except (OSError, RuntimeError) as error:
+        # libhdf5 makes the second of the first when it closes a file
         match = re.search(r"error message = '([^']+)'", str(error))
         why = match[1] if match else getattr(error, "strerror", None) or explain_error(error)
         raise DataError(f"{path}: cannot be written ({why}); what was there is kept") from error
@@ -115,7 +131,9 @@ def _write_hdf5(path: Path, raw: Raw) -> None:
             data = np.char.encode(array, "utf-8") if array.dtype.kind == "U" else array
             if data.dtype.kind == "S":
                 data = data.astype(h5py.string_dtype("utf-8", data.dtype.itemsize))
-            stored = file.create_dataset(name, data=data, fletcher32=data.ndim > 0 and data.size > 0)
+            stored = file.create_dataset(
+                name, data=data, fletcher32=data.ndim > 0 and data.size > 0
+            )
             if name in raw.units:
                 stored.attrs["units"] = np.bytes_(raw.units[name], "utf-8")
         for name, value in raw.attributes.items():
@@ -155,8 +173,8 @@ def is_archive(path: Path) -> bool:
 def verified_archive(path: Path) -> BytesIO:
     """Return what `torch.save` wrote, written anew from bytes whose checksums are right.
 
-    torch looks at no checksum, takes entries marked as folders for read, and inflates what is deflated
-    whatever its size.
+    torch looks at no checksum, takes entries marked as folders for read, and inflates what is
+    deflated whatever its size.
 
     Raises:
         ValueError: it is damaged, or nothing that torch writes.
@@ -171,7 +189,9 @@ def verified_archive(path: Path) -> BytesIO:
             stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
             stored &= sum(entry.file_size for entry in entries) <= path.stat().st_size
             faults = {
-                "an archive, but not a gsparc checkpoint": not any(n.endswith("/data.pkl") for n in names),
+                "an archive, but not a gsparc checkpoint": not any(
+                    n.endswith("/data.pkl") for n in names
+                ),
                 "damaged (an entry is there twice)": len(names) < len(entries),
                 "damaged (entries are compressed, or larger than the file)": not stored,
             }
@@ -202,7 +222,10 @@ def _read_npz(path: Path) -> Raw:
     except DAMAGED as error:
         fault = f"damaged or not an npz file ({explain_error(error)})"
         if "allow_pickle" in str(error):
-            fault = "holds Python objects; expected plain arrays: numpy.savez(FILE, rx_position=..., csi=...)"
+            fault = (
+                "holds Python objects; expected plain arrays: numpy.savez(FILE, "
+                "rx_position=..., csi=...)"
+            )
         raise DataError(f"{path}, {name}: {fault}") from None
     # An npz has no attributes; ours keeps them as JSON text in an entry of that name.
     text = arrays.pop("attributes", None)
@@ -213,33 +236,45 @@ def _read_npz(path: Path) -> Raw:
         attributes = json.loads(str(text))
         units = attributes.pop("units", {}) if isinstance(attributes, dict) else None
         if not isinstance(units, dict):
-            raise TypeError(f"found a {type(attributes).__name__}" if units is None else "units is no table")
+            raise TypeError(
+                f"found a {type(attributes).__name__}" if units is None else "units is no table"
+            )
     return Raw(arrays, attributes, {str(k): str(v) for k, v in units.items()})
 
 
 def _stated_npz(path: Path) -> Stated:
     stated = {}
-    with suppress(*DAMAGED), zipfile.ZipFile(path) as archive:  # what is damaged is said where it is read
+    # What is damaged is said where it is read
+    with suppress(*DAMAGED), zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
             with suppress(*DAMAGED, *UNREADABLE), archive.open(entry) as file:
                 file.seek(len(MAGIC_PREFIX))
                 shape, _, dtype = (header_1 if file.read(2)[0] == 1 else header_2)(file)
-                stated[entry.filename.removesuffix(".npy")] = shape, math.prod(shape) * dtype.itemsize
+                stated[entry.filename.removesuffix(".npy")] = (
+                    shape,
+                    math.prod(shape) * dtype.itemsize,
+                )
     return stated
 
 
 @contextmanager
-def _datasets(path: Path, to_disk: bool = False) -> Iterator[tuple[h5py.File, dict[str, h5py.Dataset]]]:
+def _datasets(
+    path: Path, to_disk: bool = False
+) -> Iterator[tuple[h5py.File, dict[str, h5py.Dataset]]]:
     """An HDF5 file and its datasets by name, none larger than it can hold."""
     fault = hdf5_text_error(path)
     if fault is not None:
         raise DataError(f"{path}: damaged ({fault}); write it again, text best with a fixed length")
     with h5py.File(path, "r") as file:
         # h5py hands out bytes when a name is not UTF-8
-        items = {str(_plain(name)): one for name, one in file.items() if isinstance(one, h5py.Dataset)}
+        items = {
+            str(_plain(name)): one for name, one in file.items() if isinstance(one, h5py.Dataset)
+        }
         arrays = {name: one for name, one in items.items() if one.size is not None}
         # What lies in one piece takes nothing that is not in the file.
-        stated = {name: (d.shape, 0 if d.id.get_offset() else d.nbytes) for name, d in arrays.items()}
+        stated = {
+            name: (d.shape, 0 if d.id.get_offset() else d.nbytes) for name, d in arrays.items()
+        }
         check_array_sizes(path, stated, to_disk)
         yield file, items
 
@@ -250,22 +285,28 @@ def _read_hdf5(path: Path) -> Raw:
         with _datasets(path, to_disk=True) as (file, items):
             for name, item in items.items():
                 plain = not h5py.check_string_dtype(item.dtype) and not item.dtype.names
-                arrays[name] = map_from_disk(item) if plain and is_big(item) else _values(item, fixed=True)
+                arrays[name] = (
+                    map_from_disk(item) if plain and is_big(item) else _values(item, fixed=True)
+                )
                 if "units" in item.attrs:
                     units[name] = _plain(item.attrs["units"])
-                if _plain(item.attrs.get("MATLAB_class")) == "char":  # columns first, as all of MATLAB's
+                # Columns first, as all of MATLAB's
+                if _plain(item.attrs.get("MATLAB_class")) == "char":
                     arrays[name] = np.array([*map(chr, arrays[name].T.ravel())])
             attributes = {_plain(key): _plain(value) for key, value in file.attrs.items()}
     except DataError:
         raise
     except DAMAGED as error:
-        raise DataError(f"{path}, {name}: damaged or not an HDF5 file ({explain_error(error)})") from None
+        raise DataError(
+            f"{path}, {name}: damaged or not an HDF5 file ({explain_error(error)})"
+        ) from None
     arrays = {k: v.astype(str) if v.dtype == object else v for k, v in arrays.items()}
     written = attributes.pop(DIGEST, None)
     raw = Raw(arrays, attributes, units)
     if written is not None and written != _digest(raw):
         raise DataError(
-            f"{path}: its content is not what was written; take a good copy, or, if you have changed it "
+            f"{path}: its content is not what was written; take a good copy, or, if you have "
+            "changed it "
             f"yourself, delete the attribute {DIGEST}"
         )
     return raw
@@ -279,14 +320,22 @@ def _read_mat(path: Path) -> Raw:
         with readable(path, "damaged or not a MATLAB file", (*DAMAGED, IndexError)):
             content = loadmat(path)
         arrays = {name: array for name, array in content.items() if not name.startswith("__")}
-    words = {name: "".join(array.ravel()) for name, array in arrays.items() if array.dtype.kind == "U"}
+    words = {
+        name: "".join(array.ravel()) for name, array in arrays.items() if array.dtype.kind == "U"
+    }
     for name in [name for name, array in arrays.items() if array.dtype.kind in "OV"]:
-        raise DataError(f"{path}, {name}: cells or structures; expected plain arrays: rx_position, csi, ...")
-    return Raw({name: array.squeeze() for name, array in arrays.items() if name not in words}, words)
+        raise DataError(
+            f"{path}, {name}: cells or structures; expected plain arrays: rx_position, csi, ..."
+        )
+    return Raw(
+        {name: array.squeeze() for name, array in arrays.items() if name not in words}, words
+    )
 
 
 def _values(item: h5py.Dataset, fixed: bool = False) -> np.ndarray:
-    """Values of a dataset; text of variable length, and `fixed` where wanted, as text, compounds complex."""
+    """Values of a dataset; text of variable length, and `fixed` where wanted, as text,
+    compounds complex.
+    """
     text = h5py.check_string_dtype(item.dtype)
     if item.dtype.names and " ".join(item.dtype.names).lower() in COMPLEX:
         parts = item[()]
@@ -301,13 +350,17 @@ def _plain(value: Any) -> Any:
 
 
 LARGEST = 2**40  # bytes of a file's arrays, ten times the largest campaign that is published
-MOST_PACKED = 1100  # times a file's bytes, as deflate packs 1,032 to one at best: the rest was never written
-SPARE = 2**30  # bytes of disk that other programs keep; of memory half, for what is made of the arrays
-Stated = dict[str, tuple[tuple[int, ...], int]]  # shapes, and bytes that are taken when they are read
+# Times a file's bytes, as deflate packs 1,032 to one at best: the rest was never written
+MOST_PACKED = 1100
+# Bytes of disk that other programs keep; of memory half, for what is made of the arrays
+SPARE = 2**30
+# Shapes, and bytes that are taken when they are read
+Stated = dict[str, tuple[tuple[int, ...], int]]
 
 
 def check_array_sizes(path: Path, stated: Stated, to_disk: bool = False) -> None:
-    """Raise DataError before an array is read that the file cannot hold, or for which there is no room.
+    """Raise DataError before an array is read that the file cannot hold,
+    or for which there is no room.
 
     Args:
         path: of the file.
@@ -316,14 +369,21 @@ def check_array_sizes(path: Path, stated: Stated, to_disk: bool = False) -> None
     """
     rows = Counter(shape[0] for shape, _ in stated.values() if shape)
     name, (shape, size) = max(stated.items(), key=lambda item: item[1][1], default=("", ((), 0)))
-    total, packed, disk = sum(one for _, one in stated.values()), path.stat().st_size, tempfile.gettempdir()
+    total, packed, disk = (
+        sum(one for _, one in stated.values()),
+        path.stat().st_size,
+        tempfile.gettempdir(),
+    )
     copied = sum(one for _, one in stated.values() if one >= BIG) * to_disk
     most, room = min(max(BIG, MOST_PACKED * packed), LARGEST), max(BIG, machine_memory() / 2)
     memory = total - copied
     faults = {
         f"a file of {packed:,} bytes does not hold that": total > most,
-        f"no other array has {shape[:1]} rows": size >= BIG and rows[shape[0]] < 2 and name[:5] != "path_",
-        f"{disk} has no room; set TMPDIR to a larger disk": copied > max(disk_usage(disk).free - SPARE, 0),
+        f"no other array has {shape[:1]} rows": size >= BIG
+        and rows[shape[0]] < 2
+        and name[:5] != "path_",
+        f"{disk} has no room; set TMPDIR to a larger disk": copied
+        > max(disk_usage(disk).free - SPARE, 0),
         f"too little memory for {memory:,}; HDF5 without a mask may stay on disk": memory > room,
     }
     for fault in (text for text, holds in faults.items() if holds):
@@ -336,7 +396,9 @@ def numbered_rows(count: int) -> np.ndarray:
 
 
 def rename_arrays(raw: Raw, names: Mapping[str, str]) -> Raw:
-    """Return the same content with arrays and their units renamed from the keys to the values of `names`."""
+    """Return the same content with arrays and their units renamed from the keys
+    to the values of `names`.
+    """
     arrays = {names.get(k, k): v for k, v in raw.arrays.items()}
     return replace(raw, arrays=arrays, units={names.get(k, k): v for k, v in raw.units.items()})
 
@@ -345,11 +407,15 @@ NEVER_WRITTEN = 9e36  # default fill value of NetCDF's floating point numbers is
 
 
 def _read_netcdf(path: Path) -> Raw:
-    """Every variable of the root group; text as text, fill values of floating point numbers as NaN."""
+    """Every variable of the root group; text as text,
+    fill values of floating point numbers as NaN.
+    """
     with path.open("rb") as file:
         start = file.read(4)
     if start == b"CDF\x05":
-        raise DataError(f"{path}: NetCDF classic of 64-bit data is not read; convert with nccopy -k nc4")
+        raise DataError(
+            f"{path}: NetCDF classic of 64-bit data is not read; convert with nccopy -k nc4"
+        )
     read = _classic if start[:3] == b"CDF" else _hdf5 if start == b"\x89HDF" else None
     if read is None:
         raise DataError(f"{path}: neither NetCDF3 nor NetCDF4; its first bytes are {start!r}")
@@ -363,7 +429,9 @@ def _read_netcdf(path: Path) -> Raw:
 def _classic(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
     with netcdf_file(str(path), "r", mmap=False) as file:
         variables = file.variables.items()
-        return {name: (np.array(one.data), getattr(one, "_FillValue", None)) for name, one in variables}
+        return {
+            name: (np.array(one.data), getattr(one, "_FillValue", None)) for name, one in variables
+        }
 
 
 def _hdf5(path: Path) -> dict[str, tuple[np.ndarray, Any]]:

@@ -40,8 +40,8 @@ def parse_table(
 
     Args:
         path: *.csv, *.tsv, *.txt or *.parquet.
-        columns: column by quantity (`heads.KINDS`) where a guess will not do; a number stands for all rows,
-            a pattern with a `*` for a column per station.
+        columns: column by quantity (`heads.KINDS`) where a guess will not do; a number stands for
+            all rows, a pattern with a `*` for a column per station.
         stations_file: a second table: name, x, y, z or latitude, longitude, height of each station.
         stations: names in place of such a list: where heads hold them, no others are levels.
 
@@ -51,9 +51,12 @@ def parse_table(
     sheet = unfold_tones(unfold_slots(read_sheet(path), {str(value) for value in columns.values()}))
     listed = None
     if stations_file is not None:
-        listed = places.read_stations(replace(read_sheet(stations_file, sheet.problems), notes=sheet.notes))
+        listed = places.read_stations(
+            replace(read_sheet(stations_file, sheet.problems), notes=sheet.notes)
+        )
         sheet.problems.raise_if_any()
-    # The list of stations comes before the columns: heads that hold its names are levels of stations.
+    # The list of stations comes before the columns:
+    # heads that hold its names are levels of stations.
     labelled: dict[str, str] = {}
     if listed is not None:
         parts = {head: heads.station_in_head(head) for head in sheet.heads}
@@ -71,14 +74,21 @@ def parse_table(
     if power is not None and "rssi_db" in chosen:
         about["level_unit"] = power.schema_unit
     # A column that is scaled has the schema's unit.
-    if power is not None and power.unit is not None and power.unit.name in WATTS and not power.unit.times:
+    if (
+        power is not None
+        and power.unit is not None
+        and power.unit.name in WATTS
+        and not power.unit.times
+    ):
         about["unit"] = power.unit.name
     explain = partial(say_effects, sheet, chosen)
     return Raw(arrays, about, notes=tuple(sheet.notes), explain=explain)
 
 
 def _name_levels(sheet: Sheet, stations: Collection[str]) -> tuple[Sheet, dict[str, str]]:
-    """Return a table with levels of these stations alone, if heads name any, and names by these heads."""
+    """Return a table with levels of these stations alone, if heads name any,
+    and names by these heads.
+    """
     roles = {head: heads.parse_head(head).role for head in sheet.heads}
     free = [head for head, role in roles.items() if role in (*heads.LEVELS, "station", None)]
     parts = {head: (heads.station_in_head(head), head) for head in free}
@@ -86,14 +96,18 @@ def _name_levels(sheet: Sheet, stations: Collection[str]) -> tuple[Sheet, dict[s
     others = [head for head in free if found and head not in found and roles[head] in heads.LEVELS]
     if others:
         which = list_first([*map(repr, others)])
-        sheet.notes.append(Caution(f"columns {which} are of no station that was measured, and not used"))
+        sheet.notes.append(
+            Caution(f"columns {which} are of no station that was measured, and not used")
+        )
     frame = sheet.frame.drop(columns=others)
-    if len(found) == 1 and "station" not in roles.values():  # a single column is of no station by itself
+    # A single column is of no station by itself
+    if len(found) == 1 and "station" not in roles.values():
         frame = frame.assign(station=next(iter(found.values())))
     return replace(sheet, frame=frame), found
 
 
-UNKNOWN_ASU, MOST_GSM = 99, 31  # arbitrary strength units (3GPP TS 27.007, 8.5); LTE counts up to 97
+# Arbitrary strength units (3GPP TS 27.007, 8.5); LTE counts up to 97
+UNKNOWN_ASU, MOST_GSM = 99, 31
 MOST_NAMED = 3  # stations that a list lacks, each with a line of its own
 
 
@@ -109,7 +123,8 @@ class Builder:
     def build(self) -> dict[str, np.ndarray]:
         """Return all arrays; what is wrong is in `sheet.problems`."""
         measured = self._measurement()
-        # Ends after the measurement: columns of several stations decide whether a station's column is needed.
+        # Ends after the measurement: columns of several stations decide whether a station's column
+        # is needed.
         self._ends(measured)
         for role in ("sensitivity_db", "frequency_hz", "spacing_hz"):
             if role in self.chosen and len(self.chosen[role][0].value) < 2:
@@ -120,7 +135,8 @@ class Builder:
             if role in self.chosen:
                 self.arrays[role] = self.sheet.joined(column.head for column in self.chosen[role])
         self._times([column.head or "" for column in self.chosen.get("time_s", ())])
-        # Without names rows are called by their line in the file, so that messages survive dropped rows.
+        # Without names rows are called by their line in the file,
+        # so that messages survive dropped rows.
         self.arrays.setdefault("row_name", np.array(self.sheet.rows))
         return self.arrays
 
@@ -146,14 +162,19 @@ class Builder:
                 if "asu" in heads.words_of(head):
                     asu = pd.to_numeric(self.sheet.frame[head], errors="coerce")
                     how = f"of LTE: {say_column('rssi_db', f'{head}-140')}"
-                    if (asu[asu != UNKNOWN_ASU] <= MOST_GSM).all():  # of LTE these would all be weak
+                    # Of LTE these would all be weak
+                    if (asu[asu != UNKNOWN_ASU] <= MOST_GSM).all():
                         how = f"of GSM: {say_column('rssi_db', f'{head}*2-113')}; if weak, {how}"
                     return self.refuse(f"{fault}; {head!r} is ASU, {how}")
                 if {"quality", "percent", "pct"} & set(heads.words_of(head)):
                     return self.refuse(f"{fault}; {head!r} is {heads.PERCENT}")
             numbered = Counter(re.sub(r"\d+(?=\D*$)", "*", head) for head in self.sheet.heads)
             family, count = numbered.most_common(1)[0]
-            alike = f"'{family}' (levels) or .csi_amp='{family}' (amplitudes)" if count > 1 else "COLUMN"
+            alike = (
+                (f"'{family}' (levels) or .csi_amp='{family}' (amplitudes)")
+                if count > 1
+                else "COLUMN"
+            )
             return self.refuse(f"{fault}; say dataset.columns.rssi_db={alike}")
         if role not in heads.LEVELS:
             self._channels(heads.CHANNELS if role in heads.CHANNELS else heads.POLAR)
@@ -168,39 +189,53 @@ class Builder:
             self.refuse("no value in any row", columns[0].head or "")
         for text, count in self.sheet.marks.items():
             note = f"{count} of {values.size} levels are {text!r}: taken as not heard"
-            self.notes.append(Caution(f"{note}, below the weakest; dataset.not_heard=[] refuses them"))
+            self.notes.append(
+                Caution(f"{note}, below the weakest; dataset.not_heard=[] refuses them")
+            )
         first = columns[0]
         guessed = role == "rssi_db" and first.unit is None and first.word not in ("", role)
-        # Received levels in dBm are below 0: a column without one is a power, a share, or lost its sign.
+        # Received levels in dBm are below 0: a column without one is a power, a share,
+        # or lost its sign.
         if guessed and not (values < 0).any():  # the head says neither decibels nor watts
             choices = " or ".join(say_column(name, first.head or "") for name in heads.LEVELS)
-            fault = f"no value below 0: dBm or W, per cent, or dBm without a minus sign? say {choices}"
-            self.refuse(f"{fault}, or {say_column('rssi_db', f'{first.head}*-1')}", first.head or "")
+            fault = (
+                f"no value below 0: dBm or W, per cent, or dBm without a minus sign? say {choices}"
+            )
+            self.refuse(
+                f"{fault}, or {say_column('rssi_db', f'{first.head}*-1')}", first.head or ""
+            )
         size = np.median(np.abs(np.unique(values[np.isfinite(values)])))  # a mark counts once
         if role == "rssi_db" and size > MOST_DB and first.head and first.unit is None:
             how = say_column(role, f"{first.head}*{10.0 ** -np.ceil(np.log10(size / MOST_DB)):g}")
-            self.refuse(f"most of it is beyond {MOST_DB} dB: in parts of a dB? say {how}", first.head)
+            self.refuse(
+                f"most of it is beyond {MOST_DB} dB: in parts of a dB? say {how}", first.head
+            )
         self.arrays[role] = values[:, 0] if len(columns) == 1 else values
         return role
 
     def _channels(self, names: tuple[str, str]) -> None:
         """Add channels of columns of real and imaginary parts, or of amplitudes and phases."""
         pairs = [self._tones(part) for part in names]
-        # A tone may lack one of its two columns: both sets are joined, so that the lacking one is named.
+        # A tone may lack one of its two columns: both sets are joined,
+        # so that the lacking one is named.
         amplitudes = names == heads.POLAR and not pairs[1]
         self.tones = np.array(sorted(set(pairs[0]) | set(pairs[1])))
         for name, tones, other in zip(names, pairs, pairs[::-1], strict=True):
             for tone in [] if amplitudes else sorted(set(other) - set(tones)):
                 fault = f"{other[tone].head!r} has no {name} beside it"
                 self.refuse(f"{fault}; say dataset.columns.{name}=COLUMN")
-        parts = [[part[tone].numbers(self.sheet) for tone in sorted(part)] for part in pairs if part]
+        parts = [
+            [part[tone].numbers(self.sheet) for tone in sorted(part)] for part in pairs if part
+        ]
         if self.sheet.problems:
             return
         if amplitudes:
             self.arrays["csi"] = np.stack([v for v in parts[0] if v is not None], axis=1)
             if (self.arrays["csi"] < 0).any():
                 head = pairs[0][self.tones[0]].head or ""
-                self.refuse("amplitudes below 0: levels? say dataset.columns.rssi_db='NAME_*'", head)
+                self.refuse(
+                    "amplitudes below 0: levels? say dataset.columns.rssi_db='NAME_*'", head
+                )
             return
         first, second = (np.stack([v for v in part if v is not None], axis=1) for part in parts)
         csi = first + 1j * second
@@ -234,13 +269,19 @@ class Builder:
         every = places.read_ends(self.sheet, self.chosen, strict=False)
         ends = dict(every)
         # Said beside what is wrong with levels: one look at the file mends both.
-        coordinates = {f"{end}{axis}" for end in heads.ENDS[:-1] for axis in heads.AXES if axis != "z"}
+        coordinates = {
+            f"{end}{axis}" for end in heads.ENDS[:-1] for axis in heads.AXES if axis != "z"
+        }
         if coordinates.isdisjoint(self.chosen):
-            fault = f"no coordinates among {self.sheet.first_heads()}; say dataset.columns.x=COLUMN and .y"
+            fault = (
+                f"no coordinates among {self.sheet.first_heads()}; say "
+                "dataset.columns.x=COLUMN and .y"
+            )
             return self.refuse(f"{fault}, or .lat, .lon")
         if self.sheet.problems:
             return
-        # Two named ends and one without a name: nothing says which of the named ones it would replace.
+        # Two named ends and one without a name: nothing says which
+        # of the named ones it would replace.
         if len(ends) == 3:
             fault = "coordinates of rx, of tx and of an end without a name"
             return self.refuse(f"{fault}; expected two ends, rename one")
@@ -249,25 +290,35 @@ class Builder:
             return
         stay = next((end for end in every if end not in ends), "")
         moving, where = self._moving(ends, stay)
-        others = {str(OTHER[moving]): ends.popitem()[1]} if ends else {}  # where there are no stations
+        # Where there are no stations
+        others = {str(OTHER[moving]): ends.popitem()[1]} if ends else {}
         if stations is not None:
             self.arrays["station_name"] = np.array(stations.names)
-            self.arrays |= {} if stations.label is None else {"station_label": np.array(stations.label)}
-            self.arrays |= {} if stations.index is None else {"station": stations.index.astype(np.int64)}
-            # A list in degrees does not go with rows that are apart in metres, of which nobody knows where.
+            self.arrays |= (
+                {} if stations.label is None else {"station_label": np.array(stations.label)}
+            )
+            self.arrays |= (
+                {} if stations.index is None else {"station": stations.index.astype(np.int64)}
+            )
+            # A list in degrees does not go with rows that are apart in metres,
+            # of which nobody knows where.
             by_row = any(column.by_row for column in self.chosen.get(f"{moving}_x", ()))
             others["station"] = Places.unknown(len(stations.names)) if by_row else stations.places
         self._add_places(moving, where)
         for name, other in others.items():
             if other.degrees != where.degrees:
                 rows, rest = ("degrees", "metres") if where.degrees else ("metres", "degrees")
-                fault = f"{rows}, those of {ENDS.get(name, 'stations')} in {rest}; expected one of them"
+                fault = (
+                    f"{rows}, those of {ENDS.get(name, 'stations')} in {rest}; expected one of them"
+                )
                 return self.refuse(f"the places of rows are in {fault}")
             still = name != "station" and len(np.unique(other.all(), axis=0)) == 1
             self._add_places(name, other.take(np.array([0])) if still else other, still=still)
 
     def _moving(self, ends: dict[str, Places], stay: str) -> tuple[str, Places]:
-        """Which end the rows are places of, where `stay` are stations; it is taken out of `ends`."""
+        """Which end the rows are places of, where `stay` are stations;
+        it is taken out of `ends`.
+        """
         named: list[str] = [end for end in ("rx_", "tx_") if end in ends]
         if "" in ends:
             named = named or [stay] * bool(stay)
@@ -279,8 +330,12 @@ class Builder:
             if not named:
                 other = "tx" if moving == "rx" else "rx"
                 axis = "latitude" if ends[""].degrees else "x"
-                rename = f"name them {other}_{axis}, ..., or say {say_column(f'{other}_{axis}', '...')}"
-                self.notes.append(f"the coordinates are taken as the {ENDS[moving]}'s; if not, {rename}")
+                rename = (
+                    f"name them {other}_{axis}, ..., or say {say_column(f'{other}_{axis}', '...')}"
+                )
+                self.notes.append(
+                    f"the coordinates are taken as the {ENDS[moving]}'s; if not, {rename}"
+                )
             return moving, ends.pop("")
         # Both ends are named and the receiver never moves: the rows are places of the transmitter.
         if len(named) == 2 and len(np.unique(ends["rx_"].all(), axis=0)) == 1:
@@ -288,7 +343,9 @@ class Builder:
         return named[0][:2], ends.pop(named[0])
 
     def _stations(self, measured: str | None, end_places: dict[str, Places]) -> StationList | None:
-        """The stations, where there are; an end that is their place is taken out of `end_places`."""
+        """The stations, where there are; an end that is their place is taken out of
+        `end_places`.
+        """
         where = places.read_places(self.sheet, self.chosen, "station_")
         labels = tuple(c.label for c in self.chosen[measured]) if measured in heads.LEVELS else ()
         for label in [label for i, label in enumerate(labels) if label in labels[:i]]:
@@ -303,7 +360,11 @@ class Builder:
             if self.listed is not None:
                 fault = "no column says which station a row is of"
                 return self.refuse(f"{fault}; say dataset.columns.station=COLUMN")
-            if where is None and len(end_places) > 1 and all(end.degrees for end in end_places.values()):
+            if (
+                where is None
+                and len(end_places) > 1
+                and all(end.degrees for end in end_places.values())
+            ):
                 # Stations are fewer than the places that were measured at, whichever end they are.
                 few = min(end_places, key=lambda end: len(np.unique(end_places[end].all(), axis=0)))
                 where = end_places.pop(few)
@@ -313,12 +374,16 @@ class Builder:
             plain = self.sheet.joined([head])
             listed, joined = self.listed.use_names_of(plain), self.listed.use_names_of(words)
             exact = columns[0].label == JOINED and bool(columns[0].word)
-            # Where the list knows the names without what other columns add to them, these are taken.
+            # Where the list knows the names without what other columns add to them,
+            # these are taken.
             is_listed = set(plain) <= set(listed.names)
             words = plain if exact and is_listed else words
-            # What other columns add to a listed name stands where that does: antennas, carriers, devices.
+            # What other columns add to a listed name stands where that does: antennas, carriers,
+            # devices.
             is_finer = is_listed and not set(words) <= set(joined.names)
-            self.listed = listed.part_by(plain, words) if is_finer else listed if words is plain else joined
+            self.listed = (
+                listed.part_by(plain, words) if is_finer else listed if words is plain else joined
+            )
         nameless = f"no station; expected its name{self._complete_names()}"
         self.sheet.refuse_rows(head, np.flatnonzero(words == ""), nameless)
         if self.listed is not None:
@@ -333,7 +398,8 @@ class Builder:
             return None
         ends = [end for end in ("tx_", "rx_") if end in end_places] if len(end_places) > 1 else []
         for end in ends:
-            # A place that differs among a station's rows is no error yet: the other end may be the station's.
+            # A place that differs among a station's rows is no error yet:
+            # the other end may be the station's.
             each = places.place_per_station(self.sheet, end_places[end], index, names, ask=True)
             if each is not None:
                 end_places.pop(end)
@@ -345,25 +411,37 @@ class Builder:
             return None  # the only transmitter: dataset.tx_position says where it is
         if measured in heads.LEVELS:
             return self._nowhere(names, next(iter(end_places.values())).degrees, index)
-        fault = "stations without places; add columns station_x, station_y, station_z (or station_lat, "
+        fault = (
+            "stations without places; add columns station_x, station_y, station_z (or station_lat, "
+        )
         return self.refuse(fault + "station_lon), or say dataset.stations_file=FILE")
 
     def _complete_names(self) -> str:
-        """The setting of columns that name a station in every row, for messages; empty without any."""
+        """The setting of columns that name a station in every row, for messages;
+        empty without any.
+        """
         full = [head for head in self.sheet.heads if (self.sheet.words(head) != "").all()]
         for head in full:
-            for parts in [heads.TOGETHER[word] for word in heads.words_of(head) if word in heads.TOGETHER]:
+            for parts in [
+                heads.TOGETHER[word] for word in heads.words_of(head) if word in heads.TOGETHER
+            ]:
                 names = [head, *[other for other in full if parts & {*heads.words_of(other)}]]
                 if len(names) > 1:
                     return f", or {say_column('station', '+'.join(names))}, which no row lacks"
         return ""
 
-    def _nowhere(self, names: tuple[str, ...], degrees: bool, index: np.ndarray | None = None) -> StationList:
+    def _nowhere(
+        self, names: tuple[str, ...], degrees: bool, index: np.ndarray | None = None
+    ) -> StationList:
         """Stations at places that nobody gave."""
-        self.notes.append("no places of the stations: unknown; dataset.stations_file=FILE gives them")
+        self.notes.append(
+            "no places of the stations: unknown; dataset.stations_file=FILE gives them"
+        )
         return StationList(names, Places.unknown(len(names), degrees), index=index)
 
-    def _wide(self, labels: tuple[str, ...], where: Places | None, degrees: bool) -> StationList | None:
+    def _wide(
+        self, labels: tuple[str, ...], where: Places | None, degrees: bool
+    ) -> StationList | None:
         if self.listed is None and where is not None:
             fault = f"{len(labels)} columns of stations in one place for all columns"
             return self.refuse(f"{fault}; say dataset.stations_file=FILE (name, x, y, z)")
@@ -371,7 +449,11 @@ class Builder:
             return self._nowhere(labels, degrees)
         self._all_listed(np.array(labels), None)
         names = self.listed.label or self.listed.names
-        silent = [title for title, name in zip(names, self.listed.names, strict=True) if name not in labels]
+        silent = [
+            title
+            for title, name in zip(names, self.listed.names, strict=True)
+            if name not in labels
+        ]
         used = used_heads(self.chosen)
         for name in silent:
             # Heads that are used belong to other stations; 0.6 is difflib's own cutoff.
@@ -380,7 +462,8 @@ class Builder:
         if self.sheet.problems:
             return None
         self._note_silent("without a column, and left out", silent)
-        # The list's order and that of the columns differ: levels stay, facts of stations are reordered.
+        # The list's order and that of the columns differ: levels stay,
+        # facts of stations are reordered.
         order = np.array([self.listed.names.index(label) for label in labels])
         for role in PER_STATION:
             if role in self.listed.extra:
@@ -432,7 +515,10 @@ class Builder:
         """Add positions [m], or degrees and heights."""
         height = places.UNKNOWN_HEIGHT if where.height is None else where.height
         if where.height is None:
-            note = f"no height of the {ENDS.get(name, 'stations')}: taken as {places.UNKNOWN_HEIGHT:g} m"
+            note = (
+                f"no height of the {ENDS.get(name, 'stations')}: taken as "
+                f"{places.UNKNOWN_HEIGHT:g} m"
+            )
             self.notes.append(note if name in ENDS else Caution(note))
         # Equal heights are kept as one: schema arrays of shape () hold for all rows.
         elif len(np.unique(where.height)) == 1:
@@ -462,8 +548,11 @@ class Builder:
         ends = self.chosen["frequency_hz"][0].value if "frequency_hz" in self.chosen else ()
         if len(ends) == 2:
             if not channels or len(self.tones) == 1:
-                return self.refuse(f"dataset.columns.frequency_hz: two frequencies {ends} for one tone")
-            # First and last frequency stand for the first and the last tone; gaps between them stay gaps.
+                return self.refuse(
+                    f"dataset.columns.frequency_hz: two frequencies {ends} for one tone"
+                )
+            # First and last frequency stand for the first and the last tone;
+            # gaps between them stay gaps.
             self.arrays["frequency_hz"] = np.interp(self.tones, self.tones[[0, -1]], ends)
             if np.ptp(np.diff(self.tones)):
                 self.notes.append("frequency_hz: spaced as the numbers of the tones are, with gaps")
@@ -479,10 +568,18 @@ class Builder:
         # Stations are told apart by their carriers: a row without one would be of none.
         unknown = np.flatnonzero(np.isnan(values))
         self.sheet.refuse_rows(column.head, unknown, "no value; expected a frequency")
-        # Numbers of 100 to 1e5 without a unit are MHz in the logs of phones and scanners; GHz are below 100.
-        if column.unit is None and column.word and np.nanmin(values) >= 100 and np.nanmax(values) < LOWEST_HZ:
+        # Numbers of 100 to 1e5 without a unit are MHz in the logs of phones and scanners;
+        # GHz are below 100.
+        if (
+            column.unit is None
+            and column.word
+            and np.nanmin(values) >= 100
+            and np.nanmax(values) < LOWEST_HZ
+        ):
             values = 1e6 * values
-            self.notes.append(f"column {column.head!r}: values below {LOWEST_HZ:g} are taken as MHz")
+            self.notes.append(
+                f"column {column.head!r}: values below {LOWEST_HZ:g} are taken as MHz"
+            )
         self.arrays["carrier_hz"] = values
         # Only a single tone lies at the carrier itself.
         if channels and not np.ndim(values) and self.arrays["csi"].ndim == 1:

@@ -15,8 +15,10 @@ from gsparc.base.files import check_content, check_depth, refuse_repeated
 from gsparc.base.limits import MOST_VALUES
 
 POINTS = {"trkpt", "wpt", "Placemark"}  # of GPX and KML
-DEGREES, METRES = ["longitude", "latitude", "height"], ["x", "y", "z"]  # as GeoJSON and KML order coordinates
-# Of cells with a place: whether latitudes come first; over how many degrees places that are none reach.
+# As GeoJSON and KML order coordinates
+DEGREES, METRES = ["longitude", "latitude", "height"], ["x", "y", "z"]
+# Of cells with a place: whether latitudes come first;
+# over how many degrees places that are none reach.
 PLACES = {"coordinates": (False, 360), "point": (False, 3), "pair": (True, 3)}
 
 
@@ -32,16 +34,22 @@ def read_records(path: Path) -> pd.DataFrame:
     check_content(path, text, "[{<\n")
     check_depth(path, text)
     frame = pd.json_normalize(_of_xml(text) if text.lstrip().startswith("<") else _of_json(text))
-    while (name := next((name for name in frame if frame[name].map(_holds_records).any()), None)) is not None:
+    while (
+        name := next((name for name in frame if frame[name].map(_holds_records).any()), None)
+    ) is not None:
         frame = frame.explode(name, ignore_index=True)
         inner = pd.json_normalize([one if isinstance(one, dict) else {} for one in frame.pop(name)])
         frame = frame.join(inner.add_prefix(f"{name}."))
     frame = unfold_places(frame)
     lengths = frame.map(lambda value: len(value) if isinstance(value, list) else 0).max()
     for name in lengths.index[lengths > MOST_VALUES]:
-        raise ValueError(f"more than {MOST_VALUES:,} values in {name!r} of one record; expected one in each")
+        raise ValueError(
+            f"more than {MOST_VALUES:,} values in {name!r} of one record; expected one in each"
+        )
     short = Counter(name.rpartition(".")[2] for name in frame)
-    return frame.rename(columns=lambda name: last if short[last := name.rpartition(".")[2]] == 1 else name)
+    return frame.rename(
+        columns=lambda name: last if short[last := name.rpartition(".")[2]] == 1 else name
+    )
 
 
 def unfold_places(frame: pd.DataFrame) -> pd.DataFrame:
@@ -51,7 +59,9 @@ def unfold_places(frame: pd.DataFrame) -> pd.DataFrame:
         padded = [([*one] if isinstance(one, list) else []) + 3 * [None] for one in frame.pop(name)]
         places = pd.DataFrame([one[:3] for one in padded]).apply(pd.to_numeric, errors="coerce")
         (turned, most), across = PLACES[how], places[[0, 1]]
-        degrees = (across.abs().max() <= 360).all() and (np.ptp(across.dropna(), axis=0) < most).all()
+        degrees = (across.abs().max() <= 360).all() and (
+            np.ptp(across.dropna(), axis=0) < most
+        ).all()
         heads = DEGREES if degrees else METRES
         heads = [heads[1], heads[0], heads[2]] if degrees and turned else heads
         places.columns = [before + dot + head for head in heads]
@@ -84,21 +94,28 @@ def _of_line(line: str, number: int) -> Any:
     try:
         return json.loads(line, object_pairs_hook=refuse_repeated)
     except json.JSONDecodeError as fault:
-        raise ValueError(f"line {number}, column {fault.colno}: {fault.msg}; is it cut off?") from None
+        raise ValueError(
+            f"line {number}, column {fault.colno}: {fault.msg}; is it cut off?"
+        ) from None
 
 
 def _of_columns(content: dict[str, Any]) -> list[dict[str, Any]]:
     """Records of what pandas writes but lists of records; else none.
 
-    {column: {row: value}}, {row: {column: value}}, {column: [value]}, or columns beside rows of data.
+    {column: {row: value}}, {row: {column: value}}, {column: [value]},
+    or columns beside rows of data.
     """
-    if isinstance(rows := content.get("data"), list) and isinstance(heads := content.get("columns"), list):
+    if isinstance(rows := content.get("data"), list) and isinstance(
+        heads := content.get("columns"), list
+    ):
         return [dict(zip(heads, row, strict=True)) for row in rows]
     values = [*content.values()]
     if all(isinstance(one, dict) for one in values) and all(map(str.isdigit, content)):
         return values if len(values) > 1 else []
     columns = [list(c.values()) if isinstance(c, dict) else c for c in values]
-    if len(columns) < 2 or not all(isinstance(c, list) and len(c) == len(columns[0]) > 1 for c in columns):
+    if len(columns) < 2 or not all(
+        isinstance(c, list) and len(c) == len(columns[0]) > 1 for c in columns
+    ):
         return []
     return [dict(zip(content, row, strict=True)) for row in zip(*columns, strict=True)]
 

@@ -19,18 +19,25 @@ HEADS = {text: name for name, texts in SHEET["sectors"].items() for text in text
 # 3GPP TS 36.101, table 5.7.3-1: lowest downlink frequency [MHz] of a band, and its first EARFCN.
 BANDS = pd.DataFrame(read_shipped_table(__package__, "bands.csv")).astype(float).set_index("band")
 TILTS = ("total", "mechanical", "electrical")
-# Lowest and highest that there is, and what the largest reaches unless all are 0; the kind of their unit.
+# Lowest and highest that there is, and what the largest reaches unless all are 0;
+# the kind of their unit.
 RANGES = {
-    "station_azimuth": (-360, 360, 1, "angle"), "station_width": (0, 360, 1, "angle"),
-    "station_thickness": (0, 360, 1, "angle"), **dict.fromkeys(TILTS, (-90, 90, 0.1, "angle")),
-    "station_power_db": (-50, 100, 1, "power"), "height": (-500, 9000, 0.3, "length"),
+    "station_azimuth": (-360, 360, 1, "angle"),
+    "station_width": (0, 360, 1, "angle"),
+    "station_thickness": (0, 360, 1, "angle"),
+    **dict.fromkeys(TILTS, (-90, 90, 0.1, "angle")),
+    "station_power_db": (-50, 100, 1, "power"),
+    "height": (-500, 9000, 0.3, "length"),
     "carrier_hz": (2e8, 1.1e11, 0, "frequency"),
-}  # fmt: skip
+}
 # Lowest and highest that are usual, and how far single ones are from the middle of all, at most.
 USUAL = {
-    "station_width": (6.3, 360, 360), "station_thickness": (2, 180, 180), "height": (0, 9000, 500),
-    **dict.fromkeys(TILTS, (0, 30, 12)), "station_power_db": (-20, 80, 15),
-}  # fmt: skip
+    "station_width": (6.3, 360, 360),
+    "station_thickness": (2, 180, 180),
+    "height": (0, 9000, 500),
+    **dict.fromkeys(TILTS, (0, 30, 12)),
+    "station_power_db": (-20, 80, 15),
+}
 UNSAID_DBM = 30  # a lower power, where nobody says its unit, may be in watts
 FEW, LEAST = 0.2, 3  # share of a column up to which values are single ones; radians beside degrees
 CELL = re.compile(r"(?i)^\s*[bn]?([-+]?\d*\.?\d+(?:e[-+]?\d+)?)\s*([a-zµμ%°]*)(?:\s.*)?$")
@@ -45,12 +52,16 @@ MHZ = 1e6
 
 def sector_quantity(head: str) -> str | None:
     """Return what a head of a list says of a sector; None: nothing."""
-    words = " ".join(word for word in words_of(unit_of(head)[0]) if word not in LISTS["sector_beside"])
+    words = " ".join(
+        word for word in words_of(unit_of(head)[0]) if word not in LISTS["sector_beside"]
+    )
     return HEADS.get(words)
 
 
 def earfcn_hz(channel: np.ndarray) -> np.ndarray:
-    """Return downlink frequencies [Hz] of LTE or NR channel numbers (n,), NaN of none (TS 36.101, 5.7.3)."""
+    """Return downlink frequencies [Hz] of LTE or NR channel numbers (n,),
+    NaN of none (TS 36.101, 5.7.3).
+    """
     lowest, first = BANDS.sort_values("first_earfcn").to_numpy().T
     at = np.searchsorted(first, np.nan_to_num(channel, nan=-1), side="right") - 1
     offset = channel - first[at]
@@ -63,7 +74,9 @@ def earfcn_hz(channel: np.ndarray) -> np.ndarray:
 
 
 def band_hz(band: np.ndarray) -> np.ndarray:
-    """Return lowest downlink frequencies [Hz] of LTE bands (n,), or of [MHz] that name one; NaN of none."""
+    """Return lowest downlink frequencies [Hz] of LTE bands (n,), or of [MHz] that name one;
+    NaN of none.
+    """
     band_mhz = BANDS["lowest_mhz"].reindex(np.nan_to_num(band).astype(int)).to_numpy()
     lowest = BANDS["lowest_mhz"].to_numpy()
     names = (abs(np.nan_to_num(band)[:, None] / lowest - 1) < NEAR_BAND).any(axis=1)
@@ -71,7 +84,8 @@ def band_hz(band: np.ndarray) -> np.ndarray:
 
 
 def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndarray]:
-    """Read arrays (T,) by name of a list's sectors, `height` and `carrier_hz` among them; with notes.
+    """Read arrays (T,) by name of a list's sectors, `height` and `carrier_hz` among them;
+    with notes.
 
     Args:
         sheet: the list.
@@ -97,7 +111,9 @@ def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndar
         if name in empty and (values == 0).any():
             values, meaning = np.where(values == 0, np.nan, values), f"{name}, 0 unknown"
         if name in TILTS and (values < 0).any() and not (values > 0).any():
-            notes.append(Caution(f"{sheet.source}: {head!r} are all below 0: read as below the horizon"))
+            notes.append(
+                Caution(f"{sheet.source}: {head!r} are all below 0: read as below the horizon")
+            )
             values = -values
         _doubt(sheet, head, name, values, written, unit is None)
         found[name] = values
@@ -114,7 +130,9 @@ def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndar
                 in_mhz = [f"{one / MHZ:g} MHz" for one in np.unique(carrier)]
                 notes.append(f"{sheet.source}: carriers by {name}: {list_first(in_mhz, 4)}")
             elif "carrier_hz" not in found:
-                notes.append(Caution(f"{sheet.source}: {name}: some of it names no frequency; not read"))
+                notes.append(
+                    Caution(f"{sheet.source}: {name}: some of it names no frequency; not read")
+                )
     if heads:
         notes.append(f"{sheet.source}: of sectors {', '.join(heads)}")
     if unread:
@@ -123,10 +141,21 @@ def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndar
     return found
 
 
-def _read_cells(sheet: Sheet, head: str, name: str | None) -> tuple[np.ndarray, np.ndarray, Unit | None]:
-    """Read values (T,) in the schema's unit, by each cell's or the head's; those without; the head's unit."""
-    cells = pd.Series(sheet.words(head) if name else np.zeros(0, str)).str.replace(",", ".").str.extract(CELL)
-    numbers, units = pd.to_numeric(cells[0]).to_numpy(float), cells[1].fillna("").str.lower().to_numpy()
+def _read_cells(
+    sheet: Sheet, head: str, name: str | None
+) -> tuple[np.ndarray, np.ndarray, Unit | None]:
+    """Read values (T,) in the schema's unit, by each cell's or the head's; those without;
+    the head's unit.
+    """
+    cells = (
+        pd.Series(sheet.words(head) if name else np.zeros(0, str))
+        .str.replace(",", ".")
+        .str.extract(CELL)
+    )
+    numbers, units = (
+        pd.to_numeric(cells[0]).to_numpy(float),
+        cells[1].fillna("").str.lower().to_numpy(),
+    )
     unit = unit_of(head)[1] or UNITS.get(words_of(head)[-1])
     written, values = np.where(units == "", numbers, np.nan), np.full(len(units), np.nan)
     if name == "carrier_hz" and unit is None:  # their range is narrower than the steps of units
@@ -134,7 +163,9 @@ def _read_cells(sheet: Sheet, head: str, name: str | None) -> tuple[np.ndarray, 
         unit = next((one for one in hertz if _fits(one, written, name)), hertz[0])
     for text in np.unique(units):
         one = UNITS.get(text) if text else unit or UNITS["m"]
-        kinds = (RANGES[name][3], *["level"] * (name == "station_power_db")) if name in RANGES else ()
+        kinds = (
+            (RANGES[name][3], *["level"] * (name == "station_power_db")) if name in RANGES else ()
+        )
         if one is not None and (one.kind in kinds or not (text or unit)):
             values[units == text] = _convert(one, numbers[units == text])
     return values, written, unit
@@ -151,30 +182,47 @@ def _fits(unit: Unit, values: np.ndarray, name: str) -> bool:
     """Whether values (n,) that are in a unit can be those of a quantity of `RANGES`."""
     low, high, least, _ = RANGES[name]
     trial = _convert(unit, values[np.isfinite(values)])
-    return not trial.any() or bool(((trial >= low) & (trial <= high)).all() and np.abs(trial).max() >= least)
+    return not trial.any() or bool(
+        ((trial >= low) & (trial <= high)).all() and np.abs(trial).max() >= least
+    )
 
 
-def _doubt(sheet: Sheet, head: str, name: str, values: np.ndarray, written: np.ndarray, unsaid: bool) -> None:
-    """Refuse values (T,) that cannot be (DataError), doubt rare ones, and name the unit that fits."""
+def _doubt(
+    sheet: Sheet, head: str, name: str, values: np.ndarray, written: np.ndarray, unsaid: bool
+) -> None:
+    """Refuse values (T,) that cannot be (DataError), doubt rare ones,
+    and name the unit that fits.
+    """
     if name not in RANGES or np.isnan(values).all():
         return
-    (least, most, _, kind), (low, high, spread) = RANGES[name], USUAL.get(name, (*RANGES[name][:2], np.inf))
+    (least, most, _, kind), (low, high, spread) = (
+        RANGES[name],
+        USUAL.get(name, (*RANGES[name][:2], np.inf)),
+    )
     low, middle = UNSAID_DBM if unsaid and kind == "power" else low, np.nanmedian(values)
     refused, off = not _fits(UNITS["m"], values, name), (values < least) | (values > most)
     if not off.any():
         off = refused & np.isfinite(values) | (values < low) | (values > high)
-        turned = (values % 1 != 0) & (np.abs(values) < 2 * np.pi)  # degrees of azimuths are seldom as small
-        off |= turned & (name == "station_azimuth") & (turned.sum() >= max(LEAST, FEW * len(values)))
+        # Degrees of azimuths are seldom as small
+        turned = (values % 1 != 0) & (np.abs(values) < 2 * np.pi)
+        off |= (
+            turned & (name == "station_azimuth") & (turned.sum() >= max(LEAST, FEW * len(values)))
+        )
         single = np.abs(values - middle) > spread
         off |= single & (single.sum() <= FEW * len(values))
     if not off.any():
         return
     rest = values[~off & np.isfinite(values)]
     middle = float(np.median(rest)) if off.sum() <= FEW * len(values) and len(rest) else np.nan
-    others = [one for one in UNITS.values() if one.kind == kind and (one.changes or kind == "power")]
+    others = [
+        one for one in UNITS.values() if one.kind == kind and (one.changes or kind == "power")
+    ]
     least_usual, written = USUAL.get(name, (least,))[0], written[off]
     trials = {one.name: _convert(one, written) for one in others}
-    usual = {one: (v >= least_usual) & (v <= high) & ~(abs(v - middle) > spread) for one, v in trials.items()}
+    usual = {
+        one: (v >= least_usual) & (v <= high) & ~(abs(v - middle) > spread)
+        for one, v in trials.items()
+    }
     fitting = [one for one, holds in usual.items() if holds.all()]
     cells = [f"{values[i]:g} in {sheet.rows[i]}" for i in np.flatnonzero(off)]
     fault = f"{sheet.source}: column {head!r} holds {list_first(cells, 3)}; expected {name} of "
@@ -191,9 +239,13 @@ def _doubt(sheet: Sheet, head: str, name: str, values: np.ndarray, written: np.n
 
 
 def number_sites(sheet: Sheet) -> tuple[str, np.ndarray] | None:
-    """Return the head of a column that names the sites of a list, and their numbers (T,) float64, if any."""
+    """Return the head of a column that names the sites of a list, and their numbers (T,) float64,
+    if any.
+    """
     for head in sheet.heads:
-        words = sheet.words(head) if " ".join(words_of(head)) in SHEET["sites"] else np.zeros(0, str)
+        words = (
+            sheet.words(head) if " ".join(words_of(head)) in SHEET["sites"] else np.zeros(0, str)
+        )
         number, names = pd.factorize(words)
         if 1 < len(names) < len(words) and (words != "").all():
             return head, number.astype(np.float64)

@@ -1,4 +1,6 @@
-"""A table as it was written: heads, cells and what people call the rows; nothing is interpreted here."""
+"""A table as it was written: heads, cells and what people call the rows;
+nothing is interpreted here.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ SEXAGESIMAL = re.compile(
 )
 
 INVISIBLE = "[\u200b-\u200d\u2060\ufeff]"  # spaces of no width, which names are pasted with
-WHOLE = re.compile(r"^(\d+)\.0+$")  # 379.0 is 379: a name that a join of tables turned into a number
+# 379.0 is 379: a name that a join of tables turned into a number
+WHOLE = re.compile(r"^(\d+)\.0+$")
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,8 @@ class Sheet:
         rows: what a message calls each row: `line 2`, `row 0`.
         decimal: `.` or `,`, of numbers that are text.
         problems: takes what is wrong.
-        marks: texts that stand for "not heard" among levels that were read, and how often each does.
+        marks: texts that stand for "not heard" among levels that were read, and how often each
+            does.
         notes: how it was understood, for the user, one line each.
     """
 
@@ -71,10 +75,14 @@ class Sheet:
 
     def refuse_rows(self, head: str | None, rows: np.ndarray, what: str) -> Any:
         """Note `what` for rows (n,) of a column; returns None."""
-        return self.problems.add_rows(self.describe_column(head or ""), (self.rows[i] for i in rows), what)
+        return self.problems.add_rows(
+            self.describe_column(head or ""), (self.rows[i] for i in rows), what
+        )
 
     def words(self, head: str) -> np.ndarray:
-        """Return text (S,) of a column, without surrounding spaces; empty where there is no value."""
+        """Return text (S,) of a column, without surrounding spaces;
+        empty where there is no value.
+        """
         column = self.frame[head]
         missing = column.isna().to_numpy()
         if pd.api.types.is_float_dtype(column.dtype) and (column[~missing] % 1 == 0).all():
@@ -117,15 +125,21 @@ class Sheet:
         else:
             cells = [str(cell) for cell in column]
             if self.decimal == ",":
-                # A point in such a file is a second sort of mark, or stands between thousands: refused.
+                # A point in such a file is a second sort of mark, or stands between thousands:
+                # refused.
                 cells = ["x0" if "." in cell else cell.replace(",", ".") for cell in cells]
-            values = pd.to_numeric(np.array(cells, dtype=object), errors="coerce").astype(np.float64)
+            values = pd.to_numeric(np.array(cells, dtype=object), errors="coerce").astype(
+                np.float64
+            )
             bad = ~np.isfinite(values)
             if bad.any():
                 bad[bad] = self.words(head)[bad] != ""
                 counts = Counter(cells[i] for i in np.flatnonzero(bad))
                 before = len(self.problems)
-                read = {text: self._read(text, count * levels, suits, head) for text, count in counts.items()}
+                read = {
+                    text: self._read(text, count * levels, suits, head)
+                    for text, count in counts.items()
+                }
                 if len(self.problems) > before:
                     return None
         values = values if unit is None else unit.convert(values)
@@ -136,20 +150,31 @@ class Sheet:
         if bad.any():
             cells = column.astype(str).to_numpy(dtype=object)[bad]
             texts = (repr(cell if len(cell) <= 40 else cell[:37] + "...") for cell in cells)
-            rows = (f"{self.rows[i]}: {cell}" for i, cell in zip(np.flatnonzero(bad), texts, strict=True))
+            rows = (
+                f"{self.rows[i]}: {cell}"
+                for i, cell in zip(np.flatnonzero(bad), texts, strict=True)
+            )
             mark = "commas" if self.decimal == "," else "points, and no marks between thousands"
-            hint = f"; this table has decimal {mark}" if any("," in c or "." in c for c in cells) else ""
+            hint = (
+                f"; this table has decimal {mark}"
+                if any("," in c or "." in c for c in cells)
+                else ""
+            )
             what = f"is no finite number{hint}; or leave it empty"
             return self.problems.add_rows(self.describe_column(head), rows, what)
         return values
 
-    def _read(self, text: str, count: int, suits: Callable[[Unit], bool], head: str) -> float | None:
-        """The number of a cell with a unit, or of degrees, minutes and seconds; None where it is none.
+    def _read(
+        self, text: str, count: int, suits: Callable[[Unit], bool], head: str
+    ) -> float | None:
+        """The number of a cell with a unit, or of degrees, minutes and seconds;
+        None where it is none.
 
         Text that `count` cells of a level hold may stand for "not heard": minus infinity.
         """
         plain = text.strip().lower()
-        # Any text without digits that repeats among levels stands for it, others by their words alone.
+        # Any text without digits that repeats among levels stands for it,
+        # others by their words alone.
         repeats = count >= REPEATS and (plain[:1] == "<" or not re.search(r"\d", plain))
         if count and (repeats or NOT_HEARD.fullmatch(plain)):
             self.marks[text.strip()] += count

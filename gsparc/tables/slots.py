@@ -1,4 +1,6 @@
-"""Slots of scanners, `Serving PCI, Serving RSRP, N1 PCI, N1 RSRP, ...`, as rows; rows of tones as columns."""
+"""Slots of scanners, `Serving PCI, Serving RSRP, N1 PCI, N1 RSRP, ...`, as rows;
+rows of tones as columns.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ NEEDED, LEAST = {"PCI", "RSRP"}, 2  # of a slot; slots
 
 
 def find_slots(heads: tuple[str, ...]) -> dict[str, dict[str, str]]:
-    """Return heads of each slot by what they hold, by the slot's name; empty where there are not several."""
+    """Return heads of each slot by what they hold, by the slot's name;
+    empty where there are not several.
+    """
     found: dict[str, dict[str, str]] = {}
     for head in heads:
         words = words_of(unit_of(head)[0])
@@ -46,11 +50,17 @@ def unfold_slots(sheet: Sheet, said: Container[str]) -> Sheet:
     # What else is of one slot says nothing of the others.
     slot_words = [{*name.split()} for name in slots if name]
     rest = [head for head in sheet.heads if head not in used]
-    common = [h for h in rest if h in said or not any(words <= {*words_of(h)} for words in slot_words)]
+    common = [
+        h for h in rest if h in said or not any(words <= {*words_of(h)} for words in slot_words)
+    ]
     parts = []
     for slot in slots.values():
         has_cell = (sheet.words(slot["PCI"]) != "") & (sheet.words(slot["RSRP"]) != "")
-        of_slot = {head: name for part, name in names.items() if (head := slot.get(part, shared)) is not None}
+        of_slot = {
+            head: name
+            for part, name in names.items()
+            if (head := slot.get(part, shared)) is not None
+        }
         parts.append(sheet.frame.loc[has_cell, [*common, *of_slot]].rename(columns=of_slot))
     whole = pd.concat(parts).sort_index(kind="stable")
     rows = tuple(sheet.rows[i] for i in whole.index)
@@ -60,7 +70,9 @@ def unfold_slots(sheet: Sheet, said: Container[str]) -> Sheet:
 
 
 def unfold_tones(sheet: Sheet) -> Sheet:
-    """Return one row, with columns of all tones, for rows of one place that are of a tone each; noted."""
+    """Return one row, with columns of all tones, for rows of one place that are of a tone each;
+    noted.
+    """
     roles = {head: parse_head(head) for head in sheet.heads}
     parts = {head: read.role for head, read in roles.items() if str(read.role).startswith("csi_")}
     if len(parts) != 2 or any(roles[head].label for head in parts):

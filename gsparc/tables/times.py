@@ -1,4 +1,6 @@
-"""When rows of a table were measured: a column of times as tools write them, or a date and a clock in two."""
+"""When rows of a table were measured: a column of times as tools write them,
+or a date and a clock in two.
+"""
 
 from __future__ import annotations
 
@@ -12,16 +14,27 @@ import pandas as pd
 from gsparc.tables.heads import LISTS, words_of
 from gsparc.tables.sheet import Sheet
 
-DATE, CLOCK = r"\d{1,4}([-/. ])(?:\d{1,2}|[A-Za-z]{3})\1\d{1,4}", r"\d{1,2}:\d{2}(?::\d{2})?(?:[.,:]\d+)?"
-WRITTEN = re.compile(rf"(?:{DATE})?(?:(?:^|[T ]+){CLOCK})?(?: ?[AaPp][Mm])?(?: ?(?:Z|UTC|[-+]\d\d:?\d\d))?")
-EPOCHS = (1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0)  # least numbers since 1970, their units [s]
-PLAIN = LISTS["time"] | {"s", "sec", "seconds", "gps", "unix"}  # words of heads whose numbers are seconds
+DATE, CLOCK = (
+    r"\d{1,4}([-/. ])(?:\d{1,2}|[A-Za-z]{3})\1\d{1,4}",
+    r"\d{1,2}:\d{2}(?::\d{2})?(?:[.,:]\d+)?",
+)
+WRITTEN = re.compile(
+    rf"(?:{DATE})?(?:(?:^|[T ]+){CLOCK})?(?: ?[AaPp][Mm])?(?: ?(?:Z|UTC|[-+]\d\d:?\d\d))?"
+)
+# Least numbers since 1970, their units [s]
+EPOCHS = (1e17, 1e-9), (1e14, 1e-6), (1e11, 1e-3), (1e8, 1.0)
+# Words of heads whose numbers are seconds
+PLAIN = LISTS["time"] | {"s", "sec", "seconds", "gps", "unix"}
 HALF_DAY_S = 43_200.0
 
 
 def find_times(sheet: Sheet, used: Container[str | None]) -> tuple[str, ...]:
-    """Return the head of a column not `used` that holds times, or of a date and a clock; none: ()."""
-    heads = [head for head in sheet.heads if head not in used and LISTS["time"] & set(words_of(head))]
+    """Return the head of a column not `used` that holds times, or of a date and a clock; none:
+    ().
+    """
+    heads = [
+        head for head in sheet.heads if head not in used and LISTS["time"] & set(words_of(head))
+    ]
     texts = {head: pd.Series(sheet.words(head)) for head in heads}
     dates, clocks = ([h for h in heads if _all_match(texts[h], part)] for part in (DATE, CLOCK))
     pairs = [(dates[0], clocks[0])] if dates and clocks else []
@@ -30,10 +43,11 @@ def find_times(sheet: Sheet, used: Container[str | None]) -> tuple[str, ...]:
 
 
 def read_times(sheet: Sheet, heads: Iterable[str]) -> tuple[np.ndarray, str] | None:
-    """Return seconds (S,) of columns that hold times together, NaN where none is, and what they were.
+    """Return seconds (S,) of columns that hold times together, NaN where none is,
+    and what they were.
 
-    Dates count from 1970, clocks without one from midnight of their first day, other numbers as they do. None
-    where some are no times.
+    Dates count from 1970, clocks without one from midnight of their first day, other numbers as
+    they do. None where some are no times.
     """
     text = pd.Series(sheet.joined(heads))
     found = _read_numbers(text, " ".join(heads)) or _read_text(text)
@@ -69,7 +83,9 @@ def _read_text(text: pd.Series) -> tuple[np.ndarray, str] | None:
         seconds = pd.to_timedelta(whole, errors="coerce").dt.total_seconds().to_numpy(copy=True)
         finite = np.isfinite(seconds)
         # A clock that falls by half a day has passed midnight.
-        seconds[finite] += 2 * HALF_DAY_S * np.cumsum(np.diff(seconds[finite], prepend=0.0) < -HALF_DAY_S)
+        seconds[finite] += (
+            2 * HALF_DAY_S * np.cumsum(np.diff(seconds[finite], prepend=0.0) < -HALF_DAY_S)
+        )
         return seconds, "clock times of a day that is not named"
     first, middle = text.str.extract(r"^(\d+)[-/. ](\d+)").apply(pd.to_numeric).max().tolist()
     day_first = first <= 31 and not (middle > 12 or text.str.contains("[AaPp][Mm]$").any())

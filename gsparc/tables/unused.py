@@ -6,13 +6,21 @@ import numpy as np
 
 from gsparc.base.errors import Caution
 from gsparc.data.schema import Measurements
-from gsparc.tables.checks.column_effects import LEAST_ROWS, LevelsAtPlaces, find_effects, find_filled
+from gsparc.tables.checks.column_effects import (
+    LEAST_ROWS,
+    LevelsAtPlaces,
+    find_effects,
+    find_filled,
+)
 from gsparc.tables.columns import Chosen, say_column, used_heads
 from gsparc.tables.sheet import Sheet
 
 
-def say_effects(sheet: Sheet, chosen: Chosen, data: Measurements, file_row: np.ndarray) -> list[str]:
-    """Return a caution for each column that explains what places and stations do not, and how to use it.
+def say_effects(
+    sheet: Sheet, chosen: Chosen, data: Measurements, file_row: np.ndarray
+) -> list[str]:
+    """Return a caution for each column that explains what places and stations do not,
+    and how to use it.
 
     Args:
         sheet: the table.
@@ -24,7 +32,8 @@ def say_effects(sheet: Sheet, chosen: Chosen, data: Measurements, file_row: np.n
         return []
     links, measured = LevelsAtPlaces.of(data)
     row = file_row[measured]
-    used = used_heads(chosen) - {column.head for column in chosen.get("time_s", ())}  # levels may drift
+    # Levels may drift
+    used = used_heads(chosen) - {column.head for column in chosen.get("time_s", ())}
     words = {head: sheet.words(head) for head in sheet.heads if head not in used}
     names = [column.head or "" for column in chosen.get("station", ())]
     devices = list[str]()
@@ -32,11 +41,19 @@ def say_effects(sheet: Sheet, chosen: Chosen, data: Measurements, file_row: np.n
     times = f"*{power.unit.times}" if power.unit is not None and power.unit.times else ""
     power_text = f"{power.head}{times}"
     if words and len(links) < LEAST_ROWS:
-        few = f"columns that are not used are asked what they say of levels from {LEAST_ROWS} links on"
-        return [f"{few}, here are {len(links)}: devices, powers or other transmitters would pass unseen"]
+        few = (
+            f"columns that are not used are asked what they say of levels from {LEAST_ROWS} "
+            "links on"
+        )
+        return [
+            f"{few}, here are {len(links)}: devices, powers or other transmitters would pass unseen"
+        ]
     for head, value in find_filled(links, row, words).items():
         other = next(word for word in words[head][row] if word != value)
-        note = f"column {head!r}: levels of rows where it is {value!r} follow their neighbours, without noise"
+        note = (
+            f"column {head!r}: levels of rows where it is {value!r} follow their neighbours, "
+            "without noise"
+        )
         how = f"{say_column('run', head)} 'dataset.runs=[\"{other}\"]' leaves them out"
         notes.append(Caution(f"{note}: filled in, not measured? {how}"))
     for effect in find_effects(links, row, words):

@@ -19,7 +19,8 @@ from gsparc.training.effort import Effort
 from gsparc.training.race import Race
 
 if TYPE_CHECKING:
-    from gsparc.datasets.datamodule import DataModule  # imports Lightning, which a loaded model does without
+    # Imports Lightning, which a loaded model does without
+    from gsparc.datasets.datamodule import DataModule
 
 log = logging.getLogger(__name__)
 
@@ -34,8 +35,8 @@ class FitReport:
         seconds: that it took, validations too [s].
         notes: what a reader must know (early stop, dropped components), one line each.
         cost: of each stage.
-        cpu_s: processor seconds, of all threads [s]; a method says those alone that were spent elsewhere, as
-            by the run that it went on from: `fit_or_resume` adds what it took here.
+        cpu_s: processor seconds, of all threads [s]; a method says those alone that were spent
+            elsewhere, as by the run that it went on from: `fit_or_resume` adds what it took here.
     """
 
     seconds: float
@@ -57,18 +58,23 @@ class FitContext(Checked):
         run_dir: where the fit may write; empty: nowhere.
         seed: of whatever is random and has no seed of its own.
         effort: that all counts of `Effort` are multiplied by.
-        stations: of several, whether `each` has a model or all are one's `together`; `auto` as the method's
-            `choose_stations` says.
+        stations: of several, whether `each` has a model or all are one's `together`; `auto` as the
+            method's `choose_stations` says.
         split: how the test rows were cut off, for choosing on rows cut off alike; None: at random.
-        leave_out: groups of training rows; searches leave them out by turns, for errors of rows held out.
+        leave_out: groups of training rows; searches leave them out by turns, for errors of rows
+            held out.
         race: the best of other solutions on these groups: searches end that fall behind.
         beside: solutions that were fitted before this one, by name.
-        fold: what is learned, in the run's own numbers of rows; None: the fold that a method is given.
-        resume: what an interrupted run left, to go on from: a file, or the folder of a run of parts.
+        fold: what is learned, in the run's own numbers of rows; None: the fold that a method is
+            given.
+        resume: what an interrupted run left, to go on from: a file, or the folder of a run of
+            parts.
         init_from: a checkpoint of the same model whose weights training starts from.
         batch_size: rows of a step of gradient training, where no `datamodule` says so.
-        datamodule: the run's `DataModule`, whose loaders gradient training on its measurements goes through.
-        trainer: makes a Lightning Trainer from further options; None: as `gsparc.field.gradient_stage` does.
+        datamodule: the run's `DataModule`, whose loaders gradient training on its measurements goes
+            through.
+        trainer: makes a Lightning Trainer from further options; None: as
+            `gsparc.field.gradient_stage` does.
         callbacks: makes fresh Lightning callbacks.
         loggers: made once per run, closed by the caller.
         terms: further terms of powers (`gsparc.processes.term.Columns`).
@@ -98,19 +104,30 @@ class FitContext(Checked):
     config_yaml: str = ""
 
     def for_part(self, folder: str, **changes: Any) -> FitContext:
-        """Return the context of a part of the fit, which may write to a folder of its own in `run_dir`."""
+        """Return the context of a part of the fit,
+        which may write to a folder of its own in `run_dir`.
+        """
         changes = {"fold": None, **changes}
         if self.loggers:
             from gsparc.training.tracking import PartLogger  # imports Lightning
 
             changes = {"loggers": [PartLogger(one, folder) for one in self.loggers], **changes}
         # No folder stays none: below an empty path lies the working directory.
-        return replace(self, run_dir=self.run_dir / folder if self.run_dir != Path() else Path(), **changes)
+        return replace(
+            self, run_dir=self.run_dir / folder if self.run_dir != Path() else Path(), **changes
+        )
 
     def log_curve(
-        self, seconds: float, what: str, error: float | None = None, step: int | None = None, **figures: Any
+        self,
+        seconds: float,
+        what: str,
+        error: float | None = None,
+        step: int | None = None,
+        **figures: Any,
     ) -> None:
-        """Add a point to the learning curve, in the folder and the loggers; see `curve.curve_row`."""
+        """Add a point to the learning curve, in the folder and the loggers;
+        see `curve.curve_row`.
+        """
         row = curve.curve_row(seconds, what, error, step, **figures)
         # All rows again: a file that appears by renaming cannot be appended to.
         curve.write_curve(self.run_dir, [*curve.read_curve(self.run_dir), row])

@@ -1,4 +1,6 @@
-"""Where the seconds of a fit went: what was tried, what it cost, what of it had no weight in the end."""
+"""Where the seconds of a fit went: what was tried, what it cost,
+what of it had no weight in the end.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,11 @@ class Cost:
             parts += [f"{name} {spent:.1f} s{unused}"] if spent >= LEAST_S else []
         total = f"{self.seconds:.1f} s"
         share = self.unused_s / max(self.seconds, LEAST_S)
-        total = f"{share:.0%} of {total} spent on what is not used" if self.unused else f"{total} in all"
+        total = (
+            (f"{share:.0%} of {total} spent on what is not used")
+            if self.unused
+            else f"{total} in all"
+        )
         return f"{', '.join(parts)}; {total}"
 
 

@@ -1,4 +1,6 @@
-"""The learning curve of a fit: held-out error against the seconds that it cost, a row of CSV a point."""
+"""The learning curve of a fit: held-out error against the seconds that it cost,
+a row of CSV a point.
+"""
 
 from __future__ import annotations
 
@@ -29,8 +31,15 @@ def curve_row(
     """
     # What is not finite is not known.
     has_error = error is not None and math.isfinite(error)
-    row = {"seconds": round(seconds, 3), "what": what, "error": error if has_error else "", "step": step}
-    return {name: "" if (row | figures).get(name) is None else (row | figures)[name] for name in COLUMNS}
+    row = {
+        "seconds": round(seconds, 3),
+        "what": what,
+        "error": error if has_error else "",
+        "step": step,
+    }
+    return {
+        name: "" if (row | figures).get(name) is None else (row | figures)[name] for name in COLUMNS
+    }
 
 
 def write_curve(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
@@ -38,7 +47,10 @@ def write_curve(folder: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     if folder == Path():
         return
     # By renaming: a killed run leaves a whole table.
-    with whole_file(folder / FILE) as partial, partial.open("w", newline="", encoding="utf-8") as file:
+    with (
+        whole_file(folder / FILE) as partial,
+        partial.open("w", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.DictWriter(file, COLUMNS)
         writer.writeheader()
         writer.writerows(rows)
@@ -55,6 +67,8 @@ def read_curve(folder: Path) -> list[dict[str, Any]]:
 
 def log_row(loggers: Iterable[Any], row: Mapping[str, Any]) -> None:
     """Give the point to dashboards, which draw it over the steps."""
-    figures = {f"curve/{name}": float(row[name]) for name in ("seconds", "error") if row[name] != ""}
+    figures = {
+        f"curve/{name}": float(row[name]) for name in ("seconds", "error") if row[name] != ""
+    }
     for logger in loggers:
         logger.log_metrics(figures, step=int(row["step"] or 0))

@@ -11,7 +11,8 @@ from gsparc.base.limits import SettingError
 LEAST_ROWS = 150  # that settings are chosen on, however little the effort
 GONE = ("budget_s", "budget_clock", "budgets")
 INSTEAD = (
-    "no seconds end a fit: effort=.3 counts less (gsparc compare: efforts=[.3]), rounds_s= ends timings,"
+    "no seconds end a fit: effort=.3 counts less (gsparc compare: efforts=[.3]), rounds_s= ends "
+    "timings,"
 )
 INSTEAD += " trainer.max_time=00:00:01:00 ends gradient steps after a minute"
 
@@ -21,13 +22,14 @@ class Effort:
     """How much a fit counts before it ends.
 
     Attributes:
-        chosen_on: rows that settings are chosen on, of more; each look at them factors a covariance.
+        chosen_on: rows that settings are chosen on, of more; each look at them factors a
+            covariance.
         term_rows: rows that powers of the terms of a channel field are learned on.
         evaluations: of a search for sources: factors of covariances and blocks of candidates.
         fringes: coherent solutions of powers.
         restarts: of spectra that no neighbour solves, times the starts of each.
-        steps, steps_after_solving: of gradient, where neither model nor Trainer is given a number; after a
-            start in closed form.
+        steps, steps_after_solving: of gradient, where neither model nor Trainer is given a number;
+            after a start in closed form.
         factor: of all of it, for what counts by itself.
     """
 
@@ -41,7 +43,9 @@ class Effort:
     factor: float = 1.0
 
     def scale_by(self, factor: float) -> Effort:
-        """Return all of it times `factor`; rows times its cube root, as a covariance of n rows takes n^3."""
+        """Return all of it times `factor`; rows times its cube root,
+        as a covariance of n rows takes n^3.
+        """
         counts = {one.name: factor * getattr(self, one.name) for one in fields(self)}
         rows = {name: max(factor ** (1 / 3) * getattr(self, name), LEAST_ROWS) for name in ROWS}
         whole = {name: max(round(count), 1) for name, count in {**counts, **rows}.items()}

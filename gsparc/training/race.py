@@ -1,10 +1,12 @@
-"""Candidates race on rows that all left out: one ends where its mean with the best could gain too little.
+"""Candidates race on rows that all left out:
+one ends where its mean with the best could gain too little.
 
-Of errors x of the best and y of a candidate their mean of weight w has x + w (y - x). As a candidate learns,
-its own part of y falls, and what both miss stays. So does x y, and |x|^2 - x y is the most that a mean may
-gain, however far behind the candidate is now: errors say little about that (J. M. Bates and
-C. W. J. Granger, "The combination of forecasts", 1969, weigh by both). A candidate has settled where the last
-third of its looks moved its error by less than the standard error: then it is weighed as it is.
+Of errors x of the best and y of a candidate their mean of weight w has x + w (y - x). As a
+candidate learns, its own part of y falls, and what both miss stays. So does x y, and |x|^2 - x y is
+the most that a mean may gain, however far behind the candidate is now: errors say little about that
+(J. M. Bates and C. W. J. Granger, "The combination of forecasts", 1969, weigh by both). A candidate
+has settled where the last third of its looks moved its error by less than the standard error:
+then it is weighed as it is.
 """
 
 from __future__ import annotations
@@ -22,7 +24,8 @@ LEAST_GAIN = 0.03  # of the squared error of the best, by a mean with a candidat
 SURE = 1.0  # standard errors of paired rows
 FAR = 5.0  # times the error of the best: what stalls there has a part of its own that will not fall
 LEAST_THIRD = 2  # looks
-STALLED = 0.8  # of a candidate's error a look ago: what falls more may yet learn what the best misses, too
+# Of a candidate's error a look ago: what falls more may yet learn what the best misses, too
+STALLED = 0.8
 
 
 class FellBehind(ValueError):
@@ -46,8 +49,12 @@ class Race:
     note: Callable[[str, float], None]
 
     @staticmethod
-    def from_mean(rows: np.ndarray, mean: Tensor, target: Tensor, note: Callable[[str, float], None]) -> Race:
-        """Return a candidate that predicts `mean` (n, ...) at rows (n,), where `target` was measured."""
+    def from_mean(
+        rows: np.ndarray, mean: Tensor, target: Tensor, note: Callable[[str, float], None]
+    ) -> Race:
+        """Return a candidate that predicts `mean` (n, ...) at rows (n,),
+        where `target` was measured.
+        """
         missed = (mean - target).detach()
         return Race(rows, missed, mean_square(missed) / max(mean_square(target), 1e-30), note)
 
@@ -62,8 +69,8 @@ class Race:
             before: what was returned at earlier looks; empty at the first.
 
         Raises:
-            FellBehind: it is `STALLED` while `FAR` behind, or weighing it gains less than `LEAST_GAIN`, even
-                `SURE` errors above.
+            FellBehind: it is `STALLED` while `FAR` behind, or weighing it gains less than
+                `LEAST_GAIN`, even `SURE` errors above.
         """
         now = mean_square(missed)
         self.note(name, now)
@@ -80,14 +87,20 @@ class Race:
         gain, error = float(gains.sum()), standard_error(gains.numpy()) * len(gains)
         reference = f"the best so far (error {self.error:.3f} of the energy of rows held out)"
         if now > FAR * mean_square(best):
-            raise FellBehind(f"{name}: {now / mean_square(best):.0f} times the error of {reference}")
+            raise FellBehind(
+                f"{name}: {now / mean_square(best):.0f} times the error of {reference}"
+            )
         if gain + SURE * error < LEAST_GAIN:
-            raise FellBehind(f"{name}: averaging it with {reference} gains {gain:.0%} ± {error:.0%}")
+            raise FellBehind(
+                f"{name}: averaging it with {reference} gains {gain:.0%} ± {error:.0%}"
+            )
         return now
 
 
 def has_settled(errors: Sequence[float], missed: Tensor) -> bool:
-    """Tell whether the last third of looks lowered the error by less than its standard error over rows."""
+    """Tell whether the last third of looks lowered the error by less
+    than its standard error over rows.
+    """
     third, squares = len(errors) // 3, missed.abs().double().square().mean(1)
     if third < LEAST_THIRD:
         return False

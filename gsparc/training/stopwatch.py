@@ -17,14 +17,16 @@ class Stopwatch:
     """
 
     def __init__(self, before: float = 0.0, cpu_before: float = 0.0) -> None:
-        self._since = time.monotonic() - before  # the machine's clock: another process reads it alike
+        # The machine's clock: another process reads it alike
+        self._since = time.monotonic() - before
         self._cpu_since, self.cpu_elsewhere = time.process_time(), cpu_before
 
     def __getstate__(self) -> dict[str, float]:
         return {**vars(self), "cpu_elsewhere": self.cpu_seconds}
 
     def __setstate__(self, state: dict[str, float]) -> None:
-        vars(self).update(state, _cpu_since=time.process_time())  # another process has a count of its own
+        # Another process has a count of its own
+        vars(self).update(state, _cpu_since=time.process_time())
 
     @property
     def seconds(self) -> float:

@@ -1,4 +1,6 @@
-"""Dashboards: Weights & Biases, which stays offline unless its user has logged in, and TensorBoard."""
+"""Dashboards: Weights & Biases, which stays offline unless its user has logged in,
+and TensorBoard.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +29,9 @@ NAME = 120  # characters
 
 
 class PartLogger(Logger):
-    """The dashboard of a run for a part of it, a refit or a fold: figures under its name, a series each."""
+    """The dashboard of a run for a part of it, a refit or a fold: figures under its name,
+    a series each.
+    """
 
     def __init__(self, whole: Logger, part: str) -> None:
         super().__init__()
@@ -41,7 +45,9 @@ class PartLogger(Logger):
 
     def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
         """Log figures under the part's name."""
-        self.whole.log_metrics({f"{self.part}/{name}": value for name, value in metrics.items()}, step)
+        self.whole.log_metrics(
+            {f"{self.part}/{name}": value for name, value in metrics.items()}, step
+        )
 
     def log_image(self, name: str, files: Sequence[str], step: int | None = None) -> None:
         """Show a picture under the part's name, where the dashboard shows any."""
@@ -60,13 +66,16 @@ def refuse_missing_loggers(config: DictConfig) -> None:
     """
     if "tensorboard" in (config.get("logger") or {}) and not find_spec("tensorboard"):
         raise ValueError(
-            'logger=tensorboard: TensorBoard is not installed; say pip install "gsparc[tensorboard]"'
+            "logger=tensorboard: TensorBoard is not installed; say pip install "
+            '"gsparc[tensorboard]"'
         )
 
 
 @contextmanager
 def open_loggers(config: DictConfig) -> Iterator[list[Logger]]:
-    """Yield loggers of `config.logger`, told the whole resolved `config`, closed whatever happens."""
+    """Yield loggers of `config.logger`, told the whole resolved `config`,
+    closed whatever happens.
+    """
     loggers: list[Logger] = []
     settings: Any = OmegaConf.to_container(config, resolve=True)
     status = "failed"
@@ -79,7 +88,8 @@ def open_loggers(config: DictConfig) -> Iterator[list[Logger]]:
         status = "success"
     finally:
         for logger in loggers:
-            if isinstance(logger, CSVLogger):  # now: its folder is opened by the process that trains
+            # Now: its folder is opened by the process that trains
+            if isinstance(logger, CSVLogger):
                 logger.log_hyperparams(settings)
             logger.finalize(status)
             if hasattr(logger, "experiment") and hasattr(logger.experiment, "finish"):
@@ -90,9 +100,10 @@ def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
     """Return a logger for `logger=wandb`.
 
     Args:
-        offline: None keeps the run on disk (`wandb sync` sends it later) unless `wandb login` was done;
-            WANDB_MODE of the environment wins.
-        **settings: of Lightning's `WandbLogger`; name, group and tags that are null follow from the job.
+        offline: None keeps the run on disk (`wandb sync` sends it later) unless `wandb login` was
+            done; WANDB_MODE of the environment wins.
+        **settings: of Lightning's `WandbLogger`; name, group and tags that are null follow from the
+            job.
     """
     import wandb  # slow to import, and few runs need it
     from lightning.pytorch.loggers import WandbLogger
@@ -102,8 +113,8 @@ def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
         stays = not wandb.login(prompt=False) if offline is None else offline
         mode = "offline" if stays else None
     arguments = {name: value for name, value in settings.items() if value}
-    # `mode` as an argument: Lightning's `offline` sets a variable that wandb, asked for a login, warns of
-    # and does not read; of `anonymous` it warns whatever the value.
+    # `mode` as an argument: Lightning's `offline` sets a variable that wandb, asked for a login,
+    # warns of and does not read; of `anonymous` it warns whatever the value.
     logger = WandbLogger(offline=mode == "offline", **{**_job_tags(), **arguments, "mode": mode})
     logger._offline = False
     logger._wandb_init.pop("anonymous", None)
@@ -111,7 +122,9 @@ def wandb_logger(offline: bool | None = None, **settings: Any) -> WandbLogger:
 
 
 def _job_tags() -> dict[str, Any]:
-    """What runs are sorted by: choices of groups, and of a job its multirun and what it differs in."""
+    """What runs are sorted by: choices of groups,
+    and of a job its multirun and what it differs in.
+    """
     if not HydraConfig.initialized():
         return {}
     hydra = HydraConfig.get()
@@ -123,8 +136,14 @@ def _job_tags() -> dict[str, Any]:
         overrides = yaml.safe_load(file.read_text(encoding="utf-8"))["hydra"]["overrides"]["task"]
     every = OverridesParser.create().parse_overrides(overrides)
     varies = {one.key_or_group: one.is_sweep_override() for one in every}
-    changes = " ".join(o for o in hydra.overrides.task if varies.get(o.lstrip("+~").partition("=")[0], True))
-    return {"name": f"{hydra.job.num} {changes}"[:NAME], "group": Path(hydra.sweep.dir).name, "tags": tags}
+    changes = " ".join(
+        o for o in hydra.overrides.task if varies.get(o.lstrip("+~").partition("=")[0], True)
+    )
+    return {
+        "name": f"{hydra.job.num} {changes}"[:NAME],
+        "group": Path(hydra.sweep.dir).name,
+        "tags": tags,
+    }
 
 
 def tensorboard_logger(save_dir: str, name: str = "tensorboard") -> TensorBoardLogger:
@@ -137,7 +156,8 @@ def tensorboard_logger(save_dir: str, name: str = "tensorboard") -> TensorBoardL
 def log_final(loggers: Iterable[Any], figures: Mapping[str, float]) -> None:
     """Give the dashboards the figures of the whole run."""
     for logger in loggers:
-        if hasattr(logger, "hparams"):  # TensorBoard sorts runs by settings and figures that come together
+        # TensorBoard sorts runs by settings and figures that come together
+        if hasattr(logger, "hparams"):
             logger.log_hyperparams(logger.hparams, dict(figures))
         else:
             logger.log_metrics(dict(figures))
@@ -152,10 +172,14 @@ def log_picture(loggers: Iterable[Any], name: str, path: Path, step: int | None 
             from PIL import Image
 
             with Image.open(path) as image:
-                logger.experiment.add_image(name, np.asarray(image.convert("RGB")), step, dataformats="HWC")
+                logger.experiment.add_image(
+                    name, np.asarray(image.convert("RGB")), step, dataformats="HWC"
+                )
 
 
-def log_table(loggers: Iterable[Any], name: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+def log_table(
+    loggers: Iterable[Any], name: str, heads: Sequence[str], rows: Sequence[Sequence[str]]
+) -> None:
     """Give a table to the dashboards that show tables."""
     for logger in loggers:
         if hasattr(logger, "log_table"):
@@ -166,6 +190,8 @@ def log_table(loggers: Iterable[Any], name: str, heads: Sequence[str], rows: Seq
 
 
 def log_event(trainer: L.Trainer, module: L.LightningModule, figures: Mapping[str, float]) -> None:
-    """Give the loggers the figures of an event, at the number of steps taken, not the schedule's."""
+    """Give the loggers the figures of an event, at the number of steps taken,
+    not the schedule's.
+    """
     for logger in trainer.loggers:
         logger.log_metrics(dict(figures), step=module.global_step)

@@ -14,7 +14,9 @@ from omegaconf import DictConfig, open_dict
 
 
 class RayLauncher(Launcher):
-    """A job has `threads` cores, one where these are null; `workers` and `address` are as of `engine=ray`."""
+    """A job has `threads` cores, one where these are null;
+    `workers` and `address` are as of `engine=ray`.
+    """
 
     def __init__(self, workers: int | None = None, address: str | None = None) -> None:
         self.workers, self.address = workers, address
@@ -23,8 +25,12 @@ class RayLauncher(Launcher):
         """Take Hydra's `hydra_context`, `task_function` and `config`."""
         self.given = given
 
-    def launch(self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int) -> list[JobReturn]:
-        """Do the jobs; one that fails leaves the others alone, one whose process dies is begun again."""
+    def launch(
+        self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
+    ) -> list[JobReturn]:
+        """Do the jobs; one that fails leaves the others alone,
+        one whose process dies is begun again.
+        """
         import torch  # seconds, and Hydra imports all launchers whatever is chosen
 
         from gsparc.base import executor
@@ -52,5 +58,9 @@ class RayLauncher(Launcher):
         return [found[number] for number in range(len(jobs))]
 
 
-target = {"_target_": f"{RayLauncher.__module__}.{RayLauncher.__name__}", "workers": None, "address": None}
+target = {
+    "_target_": f"{RayLauncher.__module__}.{RayLauncher.__name__}",
+    "workers": None,
+    "address": None,
+}
 ConfigStore.instance().store(group="hydra/launcher", name="ray", node=target, provider="gsparc")

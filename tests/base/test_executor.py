@@ -1,4 +1,6 @@
-"""Pieces of work: the same results wherever they are done, each stored once though its process dies."""
+"""Pieces of work: the same results wherever they are done,
+each stored once though its process dies.
+"""
 
 import logging
 import os
@@ -29,7 +31,9 @@ ELSEWHERE = [
 
 
 class Stored:
-    """Stores the square of a piece and who began it; the `killed` one ends its process, once or always."""
+    """Stores the square of a piece and who began it; the `killed` one ends its process,
+    once or always.
+    """
 
     def __init__(self, folder: Path, killed: int | None = None, always: bool = False) -> None:
         self.folder, self.killed, self.always = folder, killed, always
@@ -111,7 +115,9 @@ def test_a_piece_that_always_ends_its_process_ends_the_work(tmp_path, engine, el
     elsewhere(engine)
     with pytest.raises(Exception) as raised:
         list(run_each(Stored(tmp_path, killed=2, always=True), range(4)))
-    assert isinstance(raised.value, BrokenProcessPool) or type(raised.value).__module__.startswith("ray.")
+    assert isinstance(raised.value, BrokenProcessPool) or type(raised.value).__module__.startswith(
+        "ray."
+    )
     assert all((tmp_path / f"{n}.npy").exists() for n in (0, 1))
     tried = (tmp_path / "2.begun").read_text().split()
     assert executor.TRIES <= len(tried) <= executor.TRIES + 1
@@ -175,7 +181,9 @@ def test_an_interrupt_ends_the_work(tmp_path, engine):
 
 
 def test_threads_ended_in_compiled_code_at_an_interrupt():
-    """`gsparc map` aborted (exit status -6) at Ctrl-C: what had begun was left to the end of the process."""
+    """`gsparc map` aborted (exit status -6) at Ctrl-C:
+    what had begun was left to the end of the process.
+    """
     ended = []
 
     def work(piece):

@@ -43,7 +43,8 @@ def test_of_two_makers_of_a_folder_the_first_wins(tmp_path):
 BOMBS = {
     "billion": "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
     + "".join(
-        f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True)
+        f"{b}: &{b} [{', '.join([f'*{a}'] * 10)}]\n"
+        for a, b in zip("abcdefgh", "bcdefghi", strict=True)
     ),
     "inside": "a: &a\n  b: *a\n",
     "merged": "a: &a {x: 1}\nb: &b [*a, *a]\nc: &c [*b, *b, *c]\n",
@@ -56,7 +57,9 @@ def test_aliases_of_a_config_folder_did_not_end(tmp_path, text):
     (tmp_path / "mine" / "dataset" / "bomb.yaml").write_text(text)
     for option in (["--config-dir", str(tmp_path / "mine")], [f"-cd={tmp_path / 'mine'}"]):
         answer = knock(
-            COMMANDS["train"].run, "train", [*option, "dataset=bomb", f"hydra.run.dir={tmp_path / 'r'}"]
+            COMMANDS["train"].run,
+            "train",
+            [*option, "dataset=bomb", f"hydra.run.dir={tmp_path / 'r'}"],
         )
         assert_refused(answer, r"bomb\.yaml: YAML whose aliases repeat without end")
     with pytest.raises(DataError, match="YAML whose aliases repeat without end"):

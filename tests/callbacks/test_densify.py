@@ -21,7 +21,9 @@ EMISSION = EmissionSettings(EncodingSettings("raw"), hidden=2, activation="sigmo
 @pytest.fixture
 def model(campaign) -> GaussianModel:
     torch.manual_seed(0)
-    settings = ModelSettings(field=FieldSettings(count=10, placement="sphere", scale=0.1), emission=EMISSION)
+    settings = ModelSettings(
+        field=FieldSettings(count=10, placement="sphere", scale=0.1), emission=EMISSION
+    )
     return GaussianModel(settings, campaign("spectrum").site, RECEIVER)
 
 
@@ -37,7 +39,11 @@ def at(model: GaussianModel, step: int, total: int) -> SimpleNamespace:
 def with_gradient(densify: Densify, wanting: list[int], count: int = 10) -> Densify:
     gradient = torch.zeros(count)
     gradient[wanting] = 1.0
-    densify.statistics = {"gradient": gradient, "seen": torch.ones(count), "radius": torch.ones(count)}
+    densify.statistics = {
+        "gradient": gradient,
+        "seen": torch.ones(count),
+        "radius": torch.ones(count),
+    }
     return densify
 
 
@@ -74,7 +80,9 @@ def test_wide_ones_are_pruned_when_asked(model):
 
 @pytest.mark.parametrize("share", [1.0, 0.0])
 def test_never_more_than_allowed_and_the_neediest_first(model, share):
-    densify = with_gradient(Densify(grad_threshold=0.5, size_share=share, max_gaussians=14), range(10))
+    densify = with_gradient(
+        Densify(grad_threshold=0.5, size_share=share, max_gaussians=14), range(10)
+    )
     densify.statistics["gradient"] = torch.arange(10.0) + 1
     edit = densify.plan(model, draws())
     assert int(edit.keep.sum()) + len(edit.parents) == 14
@@ -83,11 +91,15 @@ def test_never_more_than_allowed_and_the_neediest_first(model, share):
 
 def rendering(model, rendered, share=1.0):
     batch = SimpleNamespace(share=share, rx=SimpleNamespace(batched=True))
-    return SimpleNamespace(model=model, total_steps=100, rendered=rendered, batch=batch, global_step=0)
+    return SimpleNamespace(
+        model=model, total_steps=100, rendered=rendered, batch=batch, global_step=0
+    )
 
 
 def statistics(model, gradient, visible=True, shares=(1.0,)) -> dict[str, torch.Tensor]:
-    """What is gathered from gradients (B, 10, 2), once for each share that a process has of the batch."""
+    """What is gathered from gradients (B, 10, 2),
+    once for each share that a process has of the batch.
+    """
     seen = torch.full(gradient.shape[:2], visible)
     raster = SimpleNamespace(means2d=SimpleNamespace(grad=gradient), visible=seen, radii=2.0 * seen)
     densify = Densify()
@@ -153,7 +165,10 @@ def test_an_edit_is_said_and_given_to_the_trackers(model, caplog):
     seen = []
     tracker = SimpleNamespace(log_metrics=lambda figures, step: seen.append((figures, step)))
     optimizer = optimizer_for(model, OptimizerSettings())
-    trainer, module = SimpleNamespace(optimizers=[optimizer], loggers=[tracker]), at(model, 200, 400)
+    trainer, module = (
+        SimpleNamespace(optimizers=[optimizer], loggers=[tracker]),
+        at(model, 200, 400),
+    )
     densify = with_gradient(Densify(0.25, 0.75, 0.125, grad_threshold=0.5, size_share=1.0), [2, 7])
     densify.on_train_batch_start(trainer, module)
     assert seen == [({"densify/removed": 0, "densify/added": 2}, 200)]
@@ -166,7 +181,9 @@ def test_a_cap_that_leaves_no_room_was_not_said(model, caplog):
         Densify(grad_threshold=0.5, size_share=1.0, max_gaussians=10, interval=1, start=0), [2, 7]
     )
     module = at(model, 600, 1000)
-    trainer = SimpleNamespace(optimizers=[optimizer_for(model, OptimizerSettings())], loggers=[], logger=None)
+    trainer = SimpleNamespace(
+        optimizers=[optimizer_for(model, OptimizerSettings())], loggers=[], logger=None
+    )
     densify.on_train_batch_start(trainer, module)
     with_gradient(densify, [2])
     densify.on_train_batch_start(trainer, module)

@@ -16,18 +16,27 @@ def clock(monkeypatch):
 
 def trainer(callbacks=(), **figures) -> SimpleNamespace:
     return SimpleNamespace(
-        callbacks=list(callbacks), callback_metrics=figures, sanity_checking=False, is_global_zero=True,
-        global_step=7, loggers=[], state=SimpleNamespace(fn="fit"),
-    )  # fmt: skip
+        callbacks=list(callbacks),
+        callback_metrics=figures,
+        sanity_checking=False,
+        is_global_zero=True,
+        global_step=7,
+        loggers=[],
+        state=SimpleNamespace(fn="fit"),
+    )
 
 
 @pytest.fixture
 def module(tmp_path):
     figures = {"val/error": 0.25, "val/psnr_db": 21.5}
     return SimpleNamespace(
-        run_dir=tmp_path / "new", train_seconds=0.0, prepared_seconds=0.0, figures=figures, count=40,
+        run_dir=tmp_path / "new",
+        train_seconds=0.0,
+        prepared_seconds=0.0,
+        figures=figures,
+        count=40,
         start="start",
-    )  # fmt: skip
+    )
 
 
 def test_validation_and_pictures_are_not_billed(clock, module):

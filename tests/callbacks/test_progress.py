@@ -22,7 +22,9 @@ FIGURES = {"train/task_loss": 0.0123, "val/ssim_gauss": 0.9315, "val/psnr_db": 2
 
 
 def run(step: int = 400) -> tuple[SimpleNamespace, SimpleNamespace]:
-    trainer = SimpleNamespace(max_steps=400, global_step=step, callback_metrics=FIGURES, is_global_zero=True)
+    trainer = SimpleNamespace(
+        max_steps=400, global_step=step, callback_metrics=FIGURES, is_global_zero=True
+    )
     return trainer, SimpleNamespace(count=500, run_dir=Path("run"), pace=None)
 
 
@@ -56,7 +58,9 @@ def test_an_exception_gives_the_terminal_back(screen):
 
 
 def test_minutes_were_promised_before_a_field_grew(screen, monkeypatch):
-    """5 minutes were said after 50 steps of 1,000 Gaussians, 15 it took with the 4,000 they grew to."""
+    """5 minutes were said after 50 steps of 1,000 Gaussians,
+    15 it took with the 4,000 they grew to.
+    """
     clock = iter([0.0, 50 * 0.1, 50 * 0.1 + 950 * 0.5, 1e4, 2e4])
     monkeypatch.setattr(progress.time, "perf_counter", lambda: next(clock))
     bar, (trainer, module) = StepProgress(), run()
@@ -65,5 +69,7 @@ def test_minutes_were_promised_before_a_field_grew(screen, monkeypatch):
     for trainer.global_step in (1, 51, 1001):
         bar.on_train_batch_end(trainer, module)
     bar.on_train_end(trainer, module)
-    said = re.findall(r"4,004 steps, (\d+) ms each here: about (\d+) min to go", screen.export_text())
+    said = re.findall(
+        r"4,004 steps, (\d+) ms each here: about (\d+) min to go", screen.export_text()
+    )
     assert said == [("100", "7"), ("500", "25")]

@@ -29,7 +29,9 @@ def trainer(module, step: int) -> SimpleNamespace:
 
 def test_opaque_ones_are_lowered_and_forget_their_momentum(module):
     run = trainer(module, 30)
-    OpacityReset(interval=30, stop=100, ceiling=0.01, least_steps=0).on_train_batch_start(run, module)
+    OpacityReset(interval=30, stop=100, ceiling=0.01, least_steps=0).on_train_batch_start(
+        run, module
+    )
     field = module.model.gaussians
     want = torch.tensor([0.01, 0.01, torch.sigmoid(torch.tensor(-9.0)), 0.01])
     assert torch.allclose(field.opacities, want)
@@ -42,7 +44,9 @@ def test_opaque_ones_are_lowered_and_forget_their_momentum(module):
 def test_no_reset_that_the_run_is_too_short_to_recover_from(module, caplog):
     """The first reset of the paper's recipe took 8 dB from the validation of a short run."""
     caplog.set_level("INFO")
-    OpacityReset(interval=30, stop=100, least_steps=0).on_train_batch_start(trainer(module, 60), module)
+    OpacityReset(interval=30, stop=100, least_steps=0).on_train_batch_start(
+        trainer(module, 60), module
+    )
     assert int(module.model.gaussians.version) == 0
     assert "no opacity reset at step 60: 0 steps are too few to recover in" in caplog.text
 
@@ -55,8 +59,12 @@ def test_no_reset_that_the_run_is_too_short_to_recover_from(module, caplog):
         (30, False, 61),  # of a training too short for any: one at step 60 of 400 took 9 dB of 21.8
     ],
 )
-def test_only_on_schedule_and_never_of_opacities_that_emissions_were_solved_for(module, step, solved, least):
+def test_only_on_schedule_and_never_of_opacities_that_emissions_were_solved_for(
+    module, step, solved, least
+):
     before, module.solved = module.model.gaussians.opacity_logits.detach().clone(), solved
-    OpacityReset(interval=30, stop=100, least_steps=least).on_train_batch_start(trainer(module, step), module)
+    OpacityReset(interval=30, stop=100, least_steps=least).on_train_batch_start(
+        trainer(module, step), module
+    )
     assert torch.equal(module.model.gaussians.opacity_logits, before)
     assert int(module.model.gaussians.version) == 0

@@ -25,7 +25,9 @@ def field(spectra_file, tmp_path_factory) -> TrainedRun:
 
 @pytest.fixture(scope="session")
 def halfway(spectra_file, tmp_path_factory) -> TrainedRun:
-    """The same on the training rows alone; beside its model lies the training state of step 15 of 20."""
+    """The same on the training rows alone; beside its model lies the training state
+    of step 15 of 20.
+    """
     often = "callbacks.checkpoint.interval=15"
     config = compose(*brief(spectra_file, "model.refit=false", often))
     return train(config, tmp_path_factory.mktemp("halfway"))[1]

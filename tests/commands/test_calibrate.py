@@ -30,7 +30,9 @@ from gsparc.runs.open_runs import Unseen
 
 
 def _evidence(count: int = 900, seed: int = 0) -> Evidence:
-    """Errors grow with the distance from the middle; `learned` knows it up to noise, `distance` does not."""
+    """Errors grow with the distance from the middle; `learned` knows it up to noise,
+    `distance` does not.
+    """
     rng = np.random.default_rng(seed)
     position = rng.uniform(-1, 1, (count, 3))
     error = 10 ** (-2 + 2 * np.linalg.norm(position[:, :2], axis=1) + rng.normal(0, 0.3, count))
@@ -42,7 +44,9 @@ def _evidence(count: int = 900, seed: int = 0) -> Evidence:
 
 
 def test_auto_chose_another_confidence_by_chance() -> None:
-    """Of thirteen rows the least area is mostly luck: a gain within the paired standard error is none."""
+    """Of thirteen rows the least area is mostly luck:
+    a gain within the paired standard error is none.
+    """
     evidence = _evidence()
     noise = np.random.default_rng(1).normal(0, 0.01, len(evidence))
     alike = {"learned": evidence.scores["learned"], "expected": evidence.scores["learned"] + noise}
@@ -56,9 +60,13 @@ def test_auto_chose_another_confidence_by_chance() -> None:
 def test_few_good_rows_promised_nothing_as_no_level_accepted_enough() -> None:
     """The laxest of levels from six scores mostly accepts fewer than eleven of thirteen others."""
     good, promise = replace(_evidence(32), error=np.full(32, 0.01)), Guarantee(0.0, alpha=0.2)
-    accepted = [calibrate_threshold(good, promise, "auto", False, seed)[1].accepted for seed in range(50)]
+    accepted = [
+        calibrate_threshold(good, promise, "auto", False, seed)[1].accepted for seed in range(50)
+    ]
     assert min(accepted) >= least_accepted(0.2, 0.1)  # 19 of 50 accepted none
-    assert explain_too_few(13, promise).startswith("13 test positions are too few: alpha=0.2, delta=0.1 with")
+    assert explain_too_few(13, promise).startswith(
+        "13 test positions are too few: alpha=0.2, delta=0.1 with"
+    )
     assert explain_too_few(14, promise) is None and "44 in all" in explain_too_few(32, promise, 0.1)
     assert explain_too_few(13, promise, 0.9) == explain_too_few(13, promise)
 
@@ -77,12 +85,17 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
     better = float(re.search(r"limit_db=(\S+) would be kept", said)[1])
     assert -25 < better < 0
     stored, said = unseen.calibrate_and_store(Guarantee(better), *how)
-    assert f"confidence={stored.kind}, chosen by the mean error of the surest 1, 2, ... of 180 rows: " in said
+    assert (
+        f"confidence={stored.kind}, chosen by the mean error of the surest 1, 2, ... of 180 rows: "
+    ) in said
     assert "before: the model's own; accepted from" in said and len(kept) == 1
-    assert re.search(r"accepted from \S+, \d+% of 900 test positions: at most 10% of the accepted are", said)
+    assert re.search(
+        r"accepted from \S+, \d+% of 900 test positions: at most 10% of the accepted are", said
+    )
     assert said.endswith("which fails in at most 10% of cases; threshold stored in a.ckpt")
     assert "no threshold" in unseen.calibrate_and_store(Guarantee(better - 1), *how)[1]
-    # Fewer than alpha were bad, and a confidence was blamed; rows of patches that err together were too few.
+    # Fewer than alpha were bad, and a confidence was blamed;
+    # rows of patches that err together were too few.
     evidence.error[:] = np.where(np.arange(900) % 8 == 0, 10.0, 0.01)
     said = unseen.calibrate_and_store(Guarantee(alpha=0.144), "auto", False, 2)[1]
     assert "too few rows to show that at most alpha=0.144 are" in said
@@ -95,11 +108,14 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
 
 @pytest.mark.parametrize("how", ["random", "spatial"])
 def test_promise_holds_over_two_hundred_calibration_sets(how) -> None:
-    trial = run_trials(_evidence(), Guarantee(limit_db=-5, alpha=0.2, delta=0.1), how == "spatial", 200)
+    trial = run_trials(
+        _evidence(), Guarantee(limit_db=-5, alpha=0.2, delta=0.1), how == "spatial", 200
+    )
     facts = trial.summarise()
     assert trial.kind == "learned" and trial.coverage.mean() > 0.2
     # Resampled from one pool: the share itself scatters by about 0.02.
-    # Test cells are few and unlike: what is realised in them scatters more than the promise's own doubt.
+    # Test cells are few and unlike: what is realised in them scatters more
+    # than the promise's own doubt.
     assert facts["broken"] <= (0.16 if how == "random" else 0.2)
     assert facts["realised"] < 0.2
 
@@ -110,7 +126,8 @@ def test_parts_are_disjoint_and_cells_stay_whole() -> None:
     assert len(np.unique(np.concatenate(parts))) == sum(map(len, parts)) == len(evidence)
     cell = np.floor((evidence.position[:, :2] - evidence.position[:, :2].min(0)) / (2 / 6) * 0.9999)
     names = [set(map(tuple, cell[part])) for part in parts]
-    assert len(names[1] & names[2]) < 8  # only where the cells above differ by rounding at their edges
+    # Only where the cells above differ by rounding at their edges
+    assert len(names[1] & names[2]) < 8
 
 
 MUTE = Trial("learned", "random", np.full(3, np.nan), np.zeros(3), 0.1)
@@ -124,7 +141,9 @@ def test_nobody_accepted_is_no_promise_kept() -> None:
     assert facts["silent"] == 1 / 3 and facts["broken"] == 0.5 and facts["broken_of_all"] == 1 / 3
     assert facts["broken_low"] < 0.5 < facts["broken_high"]
     facts = MUTE.summarise()
-    assert facts["broken"] is facts["broken_low"] is facts["realised"] is None and facts["silent"] == 1
+    assert (
+        facts["broken"] is facts["broken_low"] is facts["realised"] is None and facts["silent"] == 1
+    )
 
 
 def test_a_picture_of_nobody_accepted(tmp_path) -> None:
@@ -139,7 +158,9 @@ def test_few_positions_or_patches_are_refused_in_words() -> None:
     two = _evidence(40)
     two.position[:] = np.where(np.arange(40)[:, None] < 20, 0.0, 5.0)
     assert len(split_choose_calibrate_test(two, False, rng)[2]) == 16
-    with pytest.raises(ValueError, match=r"2 patches of the plane cannot be parted .* spatial=false"):
+    with pytest.raises(
+        ValueError, match=r"2 patches of the plane cannot be parted .* spatial=false"
+    ):
         split_choose_calibrate_test(two, True, rng)
     refused("2 positions cannot be parted", split_choose_calibrate_test, _evidence(2), False, rng)
 
@@ -160,7 +181,9 @@ def test_a_confidence_that_cannot_save_anything_has_no_saving() -> None:
 
 
 def test_trials_beside_a_promise_of_other_trials_read_as_a_broken_one() -> None:
-    """14% of accepting trials stood beside a promise about all; fewer answers than above had no reason."""
+    """14% of accepting trials stood beside a promise about all;
+    fewer answers than above had no reason.
+    """
     promise = Guarantee(limit_db=-5, alpha=0.2)
     facts = calibration_facts(_evidence(), [run_trials(_evidence(), promise, False, 5)], promise)
     trials = calibration_tables(facts | {"dataset/name": "d", "model/name": "m"})[1]
@@ -185,8 +208,12 @@ def test_an_interrupted_training_calibrates_and_scores_its_own_rows_alone(tmp_pa
     for path in (tmp_path / "run" / "last.ckpt", tmp_path / "run" / "refit" / "last.ckpt"):
         assert len(Unseen.open(str(path), {}, {}).evidence) == len(objects.split.folds[0].test)
         found, _, _ = evaluate_files([path], split={"redraw": True, "seed": 5})
-        assert re.match(r"another split \(random\): [1-9]\d* of these 8 test", found.facts["split/foreign"])
-        with pytest.raises(ValueError, match=r"test rows were TRAINED on; calibrate with the data and split"):
+        assert re.match(
+            r"another split \(random\): [1-9]\d* of these 8 test", found.facts["split/foreign"]
+        )
+        with pytest.raises(
+            ValueError, match=r"test rows were TRAINED on; calibrate with the data and split"
+        ):
             Unseen.open(str(path), {}, {"name": "sparse"})
 
 
@@ -199,7 +226,10 @@ def test_the_same_campaign_in_another_file_calibrates_nothing_that_was_learned(t
     path, count = str(objects.checkpoints[0]), len(arrays["spectrum"])
 
     def written(name: str, rows: np.ndarray, shift: float | np.ndarray = 0.0) -> dict[str, str]:
-        moved = {"spectrum": arrays["spectrum"][rows], "tx_position": arrays["tx_position"][rows] + shift}
+        moved = {
+            "spectrum": arrays["spectrum"][rows],
+            "tx_position": arrays["tx_position"][rows] + shift,
+        }
         np.savez(tmp_path / f"{name}.npz", **{**arrays, **moved})
         return {"file": str(tmp_path / f"{name}.npz")}
 
@@ -252,11 +282,15 @@ def test_a_threshold_of_distances_accepted_none_of_the_test_positions(tmp_path) 
 
 
 def test_rows_that_were_learned_from_calibrate_nothing(tmp_path) -> None:
-    """With another split, or one whose file is gone, a threshold was chosen on rows that were fitted to."""
+    """With another split, or one whose file is gone,
+    a threshold was chosen on rows that were fitted to.
+    """
     objects = _trained(tmp_path)
     path, rows = str(objects.checkpoints[0]), len(objects.split.folds[0].test)
     assert len(Unseen.open(path, {}, {}).evidence) == rows
-    with pytest.raises(ValueError, match=r"test rows were TRAINED on; calibrate with the data and split"):
+    with pytest.raises(
+        ValueError, match=r"test rows were TRAINED on; calibrate with the data and split"
+    ):
         Unseen.open(path, {}, {"name": "corner"})
     split = tmp_path / "run" / "split.json"
     path = str(_trained(tmp_path, "split=file", f"split.path={split}", run="other").checkpoints[0])

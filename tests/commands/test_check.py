@@ -24,21 +24,41 @@ def _said(path):
 def test_good_file_is_described(tmp_path, arrays):
     write_own(tmp_path / "a.npz", arrays)
     assert "unknown; give frequency_hz" in _said(tmp_path / "a.npz")[1]
-    write_own(tmp_path / "hall [b].h5", {**arrays, "frequency_hz": np.array(3e9), "junk": np.ones(2)})
+    write_own(
+        tmp_path / "hall [b].h5", {**arrays, "frequency_hz": np.array(3e9), "junk": np.ones(2)}
+    )
     good, text = _said(tmp_path / "hall [b].h5")
     assert good
-    for words in ("10 images of 9 x 36", "the receiver, at (4.000, 1.000, 2.000) m", "wavelengths",
-                  "3 GHz", "elevations 0 to 80 degrees", "closing the circle", "junk: not part of the schema",
-                  "hall [b].h5: good"):  # fmt: skip
+    for words in (
+        "10 images of 9 x 36",
+        "the receiver, at (4.000, 1.000, 2.000) m",
+        "wavelengths",
+        "3 GHz",
+        "elevations 0 to 80 degrees",
+        "closing the circle",
+        "junk: not part of the schema",
+        "hall [b].h5: good",
+    ):
         assert words in text, text
 
 
-@pytest.mark.parametrize(("change", "warning"), [
-    ({"grid_deg": np.array([0, -np.pi, np.pi / 18, np.pi / 18])}, "a full circle in radians"),
-    ({"array_position": np.array([[0.0, 0, 0], [160.0, 0, 0]]), "carrier_hz": np.array(9e8)}, ": in mm?"),
-    ({"spectrum": None, "rssi_db": np.geomspace(1e-9, 1e-5, 10)}, "if they are linear, call them rssi"),
-])  # fmt: skip
-def test_suspicious_units_are_said_by_check_and_by_training(tmp_path, arrays, change, warning, caplog):
+@pytest.mark.parametrize(
+    ("change", "warning"),
+    [
+        ({"grid_deg": np.array([0, -np.pi, np.pi / 18, np.pi / 18])}, "a full circle in radians"),
+        (
+            {"array_position": np.array([[0.0, 0, 0], [160.0, 0, 0]]), "carrier_hz": np.array(9e8)},
+            ": in mm?",
+        ),
+        (
+            {"spectrum": None, "rssi_db": np.geomspace(1e-9, 1e-5, 10)},
+            "if they are linear, call them rssi",
+        ),
+    ],
+)
+def test_suspicious_units_are_said_by_check_and_by_training(
+    tmp_path, arrays, change, warning, caplog
+):
     """Radians in grid_deg, an array of 160 m and powers called rssi_db were good without a word."""
     kept = {name: value for name, value in {**arrays, **change}.items() if value is not None}
     write_own(tmp_path / "a.npz", kept)
@@ -52,24 +72,37 @@ def test_suspicious_units_are_said_by_check_and_by_training(tmp_path, arrays, ch
 
 def test_runs_of_powers_had_unknown_complex_factors(tmp_path, arrays):
     run, levels = np.repeat([0, 1], 5), np.linspace(-90, -50, 10)
-    for name, measured, said in (("a", {"rssi_db": levels}, False), ("b", {"csi": 1j * levels}, True)):
+    for name, measured, said in (
+        ("a", {"rssi_db": levels}, False),
+        ("b", {"csi": 1j * levels}, True),
+    ):
         ends = {**arrays, "run": run, "frequency_hz": np.array(3e9), **measured}
-        write_own(tmp_path / f"{name}.npz", {key: value for key, value in ends.items() if key != "spectrum"})
+        write_own(
+            tmp_path / f"{name}.npz",
+            {key: value for key, value in ends.items() if key != "spectrum"},
+        )
         text = " ".join(_said(tmp_path / f"{name}.npz")[1].split())
         assert "runs 2" in text and ("of unknown factors" in text) == said
 
 
 def test_a_place_without_a_fix_is_left_out_and_named(tmp_path):
-    """It was refused for its 11,000 km in metres, later by the number of the first such row alone."""
+    """It was refused for its 11,000 km in metres,
+    later by the number of the first such row alone.
+    """
     rng = np.random.default_rng(0)
     fix = {"latitude": rng.uniform(40.76, 40.8, 50), "longitude": rng.uniform(-111.84, -111.8, 50)}
     fix["latitude"][[7, 8, 9, 20]] = fix["longitude"][[7, 8, 9, 20]] = 0
     arrays = {**fix, "rx_height": np.array(1.5), "rssi_db": rng.uniform(-90, -60, 50)}
     assert len(write_own(tmp_path / "a.npz", arrays)) == 46
-    assert "rows 7 to 9, row 20: latitude and longitude are 0: no fix" in _said(tmp_path / "a.npz")[1]
-    at_sea = {name: fix[name] - middle for name, middle in (("latitude", 40.78), ("longitude", -111.82))}
+    assert ("rows 7 to 9, row 20: latitude and longitude are 0: no fix") in _said(
+        tmp_path / "a.npz"
+    )[1]
+    at_sea = {
+        name: fix[name] - middle for name, middle in (("latitude", 40.78), ("longitude", -111.82))
+    }
     at_sea["latitude"][7] = at_sea["longitude"][7] = 0
-    assert len(write_own(tmp_path / "b.npz", {**arrays, **at_sea})) == 50  # measured around that very place
+    # Measured around that very place
+    assert len(write_own(tmp_path / "b.npz", {**arrays, **at_sea})) == 50
 
 
 def test_receivers_in_one_plane_are_noted(tmp_path, arrays):
@@ -89,7 +122,8 @@ def test_path_that_is_not_utf8(tmp_path):
 
 def test_each_problem_is_one_line(tmp_path, arrays):
     arrays["spectrum"][4, 0, 0] = np.nan
-    arrays["tx_position"][7], arrays["tx_position"][8] = np.inf, np.nan  # one alone would be left out
+    # One alone would be left out
+    arrays["tx_position"][7], arrays["tx_position"][8] = np.inf, np.nan
     np.savez(tmp_path / "bad.npz", **arrays, maks=np.ones(3))
     good, text = _said(tmp_path / "bad.npz")
     lines = text.strip().splitlines()
@@ -144,11 +178,15 @@ def test_the_second_file_of_a_stem_was_drawn_over_the_first(tmp_path, arrays, mo
 
 
 def test_a_planner_was_told_scales_wavelengths_and_phases_of_powers(tmp_path, arrays):
-    """`scale -88 dB is taken off`, and effects that need the phase; levels were once said to be divided."""
+    """`scale -88 dB is taken off`, and effects that need the phase;
+    levels were once said to be divided.
+    """
     rng = np.random.default_rng(0)
     powers = {name: arrays[name] for name in ("rx_position", "tx_position")}
     for number, more in enumerate(({}, {"carrier_hz": np.array(8e8)})):
-        write_own(tmp_path / f"{number}.npz", {**powers, **more, "rssi_db": rng.uniform(-90, -53, 10)})
+        write_own(
+            tmp_path / f"{number}.npz", {**powers, **more, "rssi_db": rng.uniform(-90, -53, 10)}
+        )
         said = _said(tmp_path / f"{number}.npz")[1]
         for words in ("then stored", " wavelengths", "phase"):
             assert words not in said
@@ -173,17 +211,29 @@ def test_advice_of_a_refusal_was_refused(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("text", "value"),
-    [("./x", "./x"), ("[A,B]", ["A", "B"]), ("-50dBm", "-50dBm"), ("[1, 2e3]", [1, 2000]), ("2.4e9", 2.4e9),
-     ("[]", []), ("null", None), ("{roof: [3]}", {"roof": [3]})],
-)  # fmt: skip
+    [
+        ("./x", "./x"),
+        ("[A,B]", ["A", "B"]),
+        ("-50dBm", "-50dBm"),
+        ("[1, 2e3]", [1, 2000]),
+        ("2.4e9", 2.4e9),
+        ("[]", []),
+        ("null", None),
+        ("{roof: [3]}", {"roof": [3]}),
+    ],
+)
 def test_a_setting_with_dots_or_a_unit_was_a_number(text, value):
-    """`dataset.root=./x` ended in a traceback, `2.4GHz` was 2.4; `[]` was a list of an empty word."""
+    """`dataset.root=./x` ended in a traceback, `2.4GHz` was 2.4;
+    `[]` was a list of an empty word.
+    """
     assert read_settings([f"dataset.not_heard={text}"])["not_heard"] == value
 
 
 def _table(path):
     rng = np.random.default_rng(0)
-    rows = [f"{x:.2f},{y:.2f},{-100 if x < 20 else -60 - x:.1f}" for x, y in rng.uniform(0, 30, (60, 2))]
+    rows = [
+        f"{x:.2f},{y:.2f},{-100 if x < 20 else -60 - x:.1f}" for x, y in rng.uniform(0, 30, (60, 2))
+    ]
     path.write_text("x,y,lev\n" + "\n".join(rows) + "\n")
     return str(path)
 
@@ -191,9 +241,13 @@ def _table(path):
 def test_unknown_settings_were_taken_for_conventions(tmp_path, capsys):
     """dataset.sensitivity_db=-111, advised by a warning, was to be true, false or null."""
     file = _table(tmp_path / "a.csv")
-    assert main([file, "--no-draw", "dataset.columns.rssi_db=lev", "dataset.sensitivity_db=-111"]) == 1
+    assert (
+        main([file, "--no-draw", "dataset.columns.rssi_db=lev", "dataset.sensitivity_db=-111"]) == 1
+    )
     said = capsys.readouterr().err
-    assert "dataset.sensitivity_db: no such setting; did you mean 'dataset.columns.sensitivity_db'?" in said
+    assert (
+        "dataset.sensitivity_db: no such setting; did you mean 'dataset.columns.sensitivity_db'?"
+    ) in said
     assert main([file, "--no-draw", "dataset.not_hard=[]"]) == 1
     assert "did you mean 'dataset.not_heard'?" in capsys.readouterr().err
 
@@ -226,9 +280,13 @@ def test_a_file_in_radians_ended_in_good(tmp_path):
 
 
 def test_check_said_nothing_of_azimuths(tmp_path):
-    """Training named wrong ones and those that no row tells; who looked before it was told of none."""
+    """Training named wrong ones and those that no row tells;
+    who looked before it was told of none.
+    """
     write_own(tmp_path / "right.npz", network(1, moments=220, asked=120).arrays(6))
     write_own(tmp_path / "wrong.npz", network(1, wrong=2, moments=220, asked=120).arrays(6))
     text = " ".join(_said(tmp_path / "right.npz")[1].split())
     assert "the drive would not show an error" in text and "contradicted" not in text
-    assert "warning azimuths are contradicted by levels" in " ".join(_said(tmp_path / "wrong.npz")[1].split())
+    assert "warning azimuths are contradicted by levels" in " ".join(
+        _said(tmp_path / "wrong.npz")[1].split()
+    )

@@ -29,14 +29,25 @@ def test_without_a_command_all_are_listed():
     assert [line.split()[0] for line in done.out if line.startswith("  ")] == list(COMMANDS)
 
 
-@pytest.mark.parametrize("words", [("--version",), ("train", "--help"), ("study", "-h"), ("check", "--help")])
+@pytest.mark.parametrize(
+    "words", [("--version",), ("train", "--help"), ("study", "-h"), ("check", "--help")]
+)
 def test_help_waited_seconds_for_torch(words):
-    """`gsparc train --help` took up to 13 s on a busy machine; `gsparc --version` was no command."""
-    code = "import atexit, sys; atexit.register(lambda: print('torch' in sys.modules, file=sys.stderr));"
+    """`gsparc train --help` took up to 13 s on a busy machine;
+    `gsparc --version` was no command.
+    """
+    code = (
+        "import atexit, sys; atexit.register(lambda: print('torch' in sys.modules, "
+        "file=sys.stderr));"
+    )
     code += "from gsparc.__main__ import main; main()"
     done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "False\n")
-    said = {"--version": r"^gsparc \d+\.\d+", "train": r"model=.*\|gsparc\|", "study": r"kind=effects\|"}
+    said = {
+        "--version": r"^gsparc \d+\.\d+",
+        "train": r"model=.*\|gsparc\|",
+        "study": r"kind=effects\|",
+    }
     assert re.search(said.get(words[0], "usage: gsparc check"), done.stdout)
 
 
@@ -79,7 +90,9 @@ def test_help_says_what_a_command_does_and_what_its_settings_mean(command):
 def test_a_reader_that_leaves_early_is_no_error(words):
     """`gsparc train --help | head -1` once ended in a traceback."""
     command = [sys.executable, "-m", "gsparc", *words, "--help"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as running:
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as running:
         running.stdout.close()
         err = running.stderr.read()
     assert (err, running.returncode) == ("", READER_LEFT)
@@ -88,14 +101,18 @@ def test_a_reader_that_leaves_early_is_no_error(words):
 def test_files_need_no_name_where_a_command_is_about_files(tmp_path):
     given = ["a b", "c", "title=x", "-m"]
     assert COMMANDS["report"].arguments(given) == ["title=x", "-m", "runs=['a b','c']"]
-    assert compose(*COMMANDS["report"].arguments(["it's, here"]), config="report").runs == ["it's, here"]
+    assert compose(*COMMANDS["report"].arguments(["it's, here"]), config="report").runs == [
+        "it's, here"
+    ]
     assert COMMANDS["evaluate"].arguments(["a b"]) == ["a b"]
     answer = gsparc("check", str(tmp_path / "absent.npz"))
     assert answer.status == 1 and "no such file" in answer.out[0]
 
 
 def while_a_library_cleans_up(config):
-    """An interrupt inside OmegaConf left a list half changed: its clean-up's error hid the interrupt."""
+    """An interrupt inside OmegaConf left a list half changed:
+    its clean-up's error hid the interrupt.
+    """
     try:
         raise KeyboardInterrupt
     finally:
@@ -110,7 +127,9 @@ def in_compiled_code(config):
 
 
 def while_it_logs(config):
-    """The lock of `logging` stayed taken for good: every other thread that logged, as a server's, hung."""
+    """The lock of `logging` stayed taken for good: every other thread that logged, as a server's,
+    hung.
+    """
     lock = logging._lock
 
     class Interrupted:
@@ -143,13 +162,16 @@ def with_advice(config):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("task", "line"), [
-    (while_a_library_cleans_up, "error: interrupted"),
-    (in_compiled_code, "error: interrupted: Invalid bounding box"),
-    (while_it_logs, "error: interrupted"),
-    (while_a_log_waits_for_its_reader, "error: interrupted"),
-    (with_advice, "error: go on with ckpt_path=last.ckpt"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("task", "line"),
+    [
+        (while_a_library_cleans_up, "error: interrupted"),
+        (in_compiled_code, "error: interrupted: Invalid bounding box"),
+        (while_it_logs, "error: interrupted"),
+        (while_a_log_waits_for_its_reader, "error: interrupted"),
+        (with_advice, "error: go on with ckpt_path=last.ckpt"),
+    ],
+)
 def test_ctrl_c_while_a_command_runs_is_said_with_status_130(task, line, monkeypatch, tmp_path):
     monkeypatch.setattr("gsparc.commands.train.task", task)
     before = signal.getsignal(signal.SIGINT)
@@ -157,7 +179,9 @@ def test_ctrl_c_while_a_command_runs_is_said_with_status_130(task, line, monkeyp
     assert answer.status == 130 and answer.err[-1] == line
     assert signal.getsignal(signal.SIGINT) is before
     with ThreadPoolExecutor() as other:
-        other.submit(logging.getLogger("gsparc.never.asked.either").isEnabledFor, 20).result(timeout=5)
+        other.submit(logging.getLogger("gsparc.never.asked.either").isEnabledFor, 20).result(
+            timeout=5
+        )
 
 
 def test_ctrl_c_in_a_multirun_was_told_to_go_on_with_one_of_its_jobs(monkeypatch, tmp_path):
@@ -170,7 +194,9 @@ def test_ctrl_c_in_a_multirun_was_told_to_go_on_with_one_of_its_jobs(monkeypatch
 
 
 def test_ctrl_c_while_plugins_are_looked_for_was_a_traceback(monkeypatch):
-    monkeypatch.setattr("gsparc.commands.shared.cli.offer_plugins", Mock(side_effect=KeyboardInterrupt))
+    monkeypatch.setattr(
+        "gsparc.commands.shared.cli.offer_plugins", Mock(side_effect=KeyboardInterrupt)
+    )
     answer = gsparc("train", "dataset=rfid", "model=gsparc")
     assert (answer.status, answer.err) == (130, ["error: interrupted"])
 

@@ -20,10 +20,14 @@ FILLED = re.compile(r"own/\S+: \S+ \S+ after ")  # a line of each cell
 
 def words(tmp_path, *more: str) -> list[str]:
     return [
-        f"+datasets.own.file={tmp_path / 'own.npz'}", "splits.random.datasets=[own]", "threads=1",
-        "efforts=[0.005]", f"cells={tmp_path / 'cells'}",
-        f"hydra.run.dir={tmp_path / 'run'}", *more,
-    ]  # fmt: skip
+        f"+datasets.own.file={tmp_path / 'own.npz'}",
+        "splits.random.datasets=[own]",
+        "threads=1",
+        "efforts=[0.005]",
+        f"cells={tmp_path / 'cells'}",
+        f"hydra.run.dir={tmp_path / 'run'}",
+        *more,
+    ]
 
 
 def compare(tmp_path, *more: str) -> tuple[int, str]:
@@ -39,7 +43,9 @@ def test_a_comparison_left_files_that_its_page_did_not_name(tmp_path):
     drawn = ["splits.drawn.datasets=[own]", "splits.drawn.draws=2", "latency=false"]
     for only, picture in (("random", "compare.png"), ("drawn", "own.png")):
         run = tmp_path / only
-        status, said = compare(tmp_path, f"only=[own/{only}/mean/*]", *drawn, f"hydra.run.dir={run}")
+        status, said = compare(
+            tmp_path, f"only=[own/{only}/mean/*]", *drawn, f"hydra.run.dir={run}"
+        )
         assert status == 0 and (run / picture).exists(), said
         assert compare_files("compare", run) == ([], [])
     cell = tmp_path / "cells/own/random/mean/any/any"
@@ -66,7 +72,8 @@ def test_cells_are_filled_once_and_reported_again(tmp_path):
         status, said = compare(tmp_path, only, f"hydra.run.dir={tmp_path / 'other'}")
     assert status == 1 and "another run writes here; wait for its end" in said
     assert "give another cells=" in said and not (tmp_path / "other" / "compare.md").exists()
-    # A cell whose result is not whole does not count, nor does one of other data under the same name.
+    # A cell whose result is not whole does not count,
+    # nor does one of other data under the same name.
     (tmp_path / "cells/own/random/mean/any/any/summary.json").write_text("{")
     assert "3 cells, 2 already done" in compare(tmp_path, only, "latency=false")[1]
     spectra(tmp_path / "own.npz", rows=44)
@@ -77,7 +84,9 @@ PLAIN = "only=[own/random/nearest/*,own/random/gp/*]", "latency=false"
 
 
 def figures(folder) -> list[dict]:
-    facts = [json.loads(file.read_text()) for file in sorted((folder / "cells").rglob("summary.json"))]
+    facts = [
+        json.loads(file.read_text()) for file in sorted((folder / "cells").rglob("summary.json"))
+    ]
     return [{key: value for key, value in one.items() if key.startswith("test/")} for one in facts]
 
 
@@ -96,7 +105,13 @@ def filled_here(tmp_path_factory) -> list[dict]:
 def test_cells_filled_elsewhere_are_the_same(filled_here, tmp_path, engine):
     pytest.importorskip(engine, reason=f"{engine} is not installed")
     spectra(tmp_path / "own.npz")
-    command = [sys.executable, "-m", "gsparc", "compare", *words(tmp_path, *PLAIN, f"engine={engine}")]
+    command = [
+        sys.executable,
+        "-m",
+        "gsparc",
+        "compare",
+        *words(tmp_path, *PLAIN, f"engine={engine}"),
+    ]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0 and len(FILLED.findall(done.stdout)) == 2, done.stderr
     assert figures(tmp_path) == filled_here and min(map(len, filled_here)) > 1

@@ -25,7 +25,9 @@ from gsparc.models.registry import build, built_in_methods, method_class
 
 CONF = Path(gsparc.conf.__path__[0])
 GROUPS = ("dataset", "split", "trainer", "callbacks", "logger")  # of train.yaml
-CHOICES = [sorted(f"{group}={file.stem}" for file in (CONF / group).glob("*.yaml")) for group in GROUPS]
+CHOICES = [
+    sorted(f"{group}={file.stem}" for file in (CONF / group).glob("*.yaml")) for group in GROUPS
+]
 CHOICES += [[f"model={name}" for name in built_in_methods()]]
 OWN = ["dataset=own", "dataset.file=x.npz"]
 NEEDED = {"dataset=own": OWN[1:], "dataset=newrf": OWN[1:], "split=file": ["split.path=split.json"]}
@@ -50,10 +52,14 @@ def assert_builds(config) -> MethodFactory:
 
 @pytest.mark.parametrize("row", range(max(map(len, CHOICES))))
 def test_every_choice_composes_and_builds(row, monkeypatch):
-    """One of each group at once; a model has the settings of its class, which `baselines=[NAME]` trains."""
+    """One of each group at once; a model has the settings of its class,
+    which `baselines=[NAME]` trains.
+    """
     chosen = [choices[row] for choices in CHOICES if row < len(choices)]
     own = [] if any(one.startswith("dataset=") for one in chosen) else OWN
-    config = composed(monkeypatch, *chosen, *own, *(word for one in chosen for word in NEEDED.get(one, ())))
+    config = composed(
+        monkeypatch, *chosen, *own, *(word for one in chosen for word in NEEDED.get(one, ()))
+    )
     method, name = assert_builds(config), CHOICES[-1][row][6:]
     for key, value in vars(method_class(name)()).items():
         if isinstance(value, (int, float, str, tuple)) or is_dataclass(value):
@@ -67,18 +73,29 @@ def said_in(file: Path) -> dict:
     own = yaml.safe_load(file.read_text())
     below = [one for one in own.pop("defaults", []) if isinstance(one, str) and one != "_self_"]
     under = OmegaConf.merge(
-        *(said_in((CONF if one[0] == "/" else file.parent) / f"{one.lstrip('/')}.yaml") for one in below), own
+        *(
+            said_in((CONF if one[0] == "/" else file.parent) / f"{one.lstrip('/')}.yaml")
+            for one in below
+        ),
+        own,
     )
     return OmegaConf.to_container(under)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "file", [f for group in ("experiment", "paper") for f in sorted((CONF / group).rglob("*.yaml"))], ids=str
+    "file",
+    [f for group in ("experiment", "paper") for f in sorted((CONF / group).rglob("*.yaml"))],
+    ids=str,
 )
 def test_what_an_experiment_says_is_what_is_done(file, monkeypatch):
-    """`threads: 1` and `baselines: [nearest, gp]` of ablations never acted: train.yaml had the last word."""
-    group, choice = file.relative_to(CONF).parts[0], file.relative_to(CONF / file.relative_to(CONF).parts[0])
+    """`threads: 1` and `baselines: [nearest, gp]` of ablations never acted:
+    train.yaml had the last word.
+    """
+    group, choice = (
+        file.relative_to(CONF).parts[0],
+        file.relative_to(CONF / file.relative_to(CONF).parts[0]),
+    )
     link = file.stem in ("mcs", "pusch")
     command = "link" if link else "compare" if choice.parts[0] == "results" else "train"
     config = composed(monkeypatch, f"{group}={choice.with_suffix('')}", command=command)
@@ -91,7 +108,12 @@ def test_what_an_experiment_says_is_what_is_done(file, monkeypatch):
 
 def test_all_settings_of_a_model_are_printed_and_kept(tmp_path):
     """Also those that its file leaves to its class."""
-    given = "model=idw", "model.power=3", "dataset=own", f"dataset.file={spectra(tmp_path / 'own.npz')}"
+    given = (
+        "model=idw",
+        "model.power=3",
+        "dataset=own",
+        f"dataset.file={spectra(tmp_path / 'own.npz')}",
+    )
     said = knock(COMMANDS["train"].run, "train", [*given, "--cfg", "job"])
     assert {"  power: 3", "  neighbours: 8"} < set(said.out)
     done = knock(main, "train.py", [*given, "baselines=[]", f"hydra.run.dir={tmp_path / 'run'}"])
@@ -101,7 +123,9 @@ def test_all_settings_of_a_model_are_printed_and_kept(tmp_path):
 
 def test_overrides_behind_cfg_were_unrecognized_arguments():
     said = knock(
-        COMMANDS["train"].run, "train", ["model=idw", "--cfg", "job", "dataset=own", "model.power=3"]
+        COMMANDS["train"].run,
+        "train",
+        ["model=idw", "--cfg", "job", "dataset=own", "model.power=3"],
     )
     assert said.status == 0 and {"  power: 3", "  name: own"} < set(said.out)
 
@@ -132,4 +156,8 @@ def test_guesses_of_callbacks_that_are_left_out_were_said():
     """`densification from step none to none every none`."""
     given = "paper=gsparc", "callbacks.densify=null", "callbacks.reset=null"
     whole, without = (build(compose(*options).model).guesses for options in (given[:1], given))
-    assert len(whole) == 13 and len(without) == 9 and not any("None" in guess for guess in [*whole, *without])
+    assert (
+        len(whole) == 13
+        and len(without) == 9
+        and not any("None" in guess for guess in [*whole, *without])
+    )

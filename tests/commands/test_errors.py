@@ -40,15 +40,22 @@ REFUSED = [
     ("serve ckpt=none.ckpt host=0.0.0.0", "others reach it; set GSPARC_TOKEN, or say token=WORD"),
     ("serve ckpt=none.ckpt host=example.org", "others reach it"),
     # Without baselines it was an AttributeError, after every combination had been made.
-    ("tradeoff ckpt={spectra} baselines=[] eval_on=tset", "eval_on='tset' is none of train, val, test"),
+    (
+        "tradeoff ckpt={spectra} baselines=[] eval_on=tset",
+        "eval_on='tset' is none of train, val, test",
+    ),
     (f"{COMPARE} only=[own/random/meen/*]", "matches no cell"),
     (f"{COMPARE} only=[own/random/mean/*] train=false", "no cell is filled"),
     (f"{MAP} step_m=0", "step_m=0: a number above 0"),
     (f"{MAP} plan_points=[[0,0,0,0],[1,1,1,1]]", "goes with an image"),
     (f"{MAP} promise.share=1.5", "share=1.5"),
     (f"{MAP} dataset.file=gone.npz renew=true", "gone.npz"),
-    # As of all nine that open data: settings beside name, root and file were refused, and unknown ones are.
-    (f"{MAP} dataset.nonsense=1 promised=false", "dataset.nonsense: no such setting of dataset=own"),
+    # As of all nine that open data: settings beside name, root and file were refused,
+    # and unknown ones are.
+    (
+        f"{MAP} dataset.nonsense=1 promised=false",
+        "dataset.nonsense: no such setting of dataset=own",
+    ),
     ("view ckpt={town} save=page.html dataset.nonsense=1", "dataset.nonsense: no such setting"),
     ("calibrate ckpt={town} dataset.nonsense=1", "dataset.nonsense: no such setting"),
     ("plan ckpt={town} count=0", "at least 1"),
@@ -79,7 +86,7 @@ def prints(fingerprints, tmp_path_factory) -> Path:
     changes = {
         "walks": {},
         "others": {"access_point": np.array([f"x{name}" for name in fingerprints["access_point"]])},
-    }  # fmt: skip
+    }
     for name, change in changes.items():
         np.savez(folder / f"{name}.npz", **(fingerprints | change))
     return folder

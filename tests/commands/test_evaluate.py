@@ -55,7 +55,9 @@ def test_every_command_repeated_how_columns_are_read(tmp_path, monkeypatch):
 
     def said(command, *given):
         monkeypatch.setattr(ConsoleHandler, "read", set())  # as a process of its own begins
-        done = knock(COMMANDS[command].run, command, [*given, f"hydra.run.dir={tmp_path / command}"])
+        done = knock(
+            COMMANDS[command].run, command, [*given, f"hydra.run.dir={tmp_path / command}"]
+        )
         assert done.status == 0, done
         return [line for line in done.out if "taken as" in line]
 
@@ -63,7 +65,9 @@ def test_every_command_repeated_how_columns_are_read(tmp_path, monkeypatch):
     own = "dataset=own", f"dataset.file={first}", "model=idw", "threads=1", "baselines=[]"
     assert len(said("train", *own)) == 3
     assert said("evaluate", model, "baselines=[]") == [] == said("map", model, "step_m=5")
-    (other,) = said("evaluate", model, "baselines=[]", f"dataset.file={drive('b.csv', 'x,y,rssi_dbm')}")
+    (other,) = said(
+        "evaluate", model, "baselines=[]", f"dataset.file={drive('b.csv', 'x,y,rssi_dbm')}"
+    )
     assert "column 'rssi_dbm' taken as rssi_db" in other
 
 
@@ -74,7 +78,9 @@ def test_a_last_fit_from_all_rows_tests_nothing_and_serves_all_the_same(tmp_path
     assert done.status == 0, done
     facts = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert (facts["split/train"] + facts["split/val"], facts["split/test"]) == (80, 0)
-    assert facts["time/train_s"] > 0 and not any(name.startswith(("test/", "baseline/")) for name in facts)
+    assert facts["time/train_s"] > 0 and not any(
+        name.startswith(("test/", "baseline/")) for name in facts
+    )
     said = "\n".join(done.out)
     assert "nothing was tested: all 80 rows were learned from (split=none)" in said
     # A count of three parts stood above it, and a table of dashes.
@@ -97,11 +103,19 @@ def test_evaluate_took_no_settings_of_the_data(tmp_path):
     ckpt = towns.trained(tmp_path / "first.csv", "idw", heads, "threads=1")
 
     def evaluated(*more):
-        given = f"ckpt={ckpt}", f"hydra.run.dir={tmp_path / 'run'}", "threads=1", "baselines=[]", *more
+        given = (
+            f"ckpt={ckpt}",
+            f"hydra.run.dir={tmp_path / 'run'}",
+            "threads=1",
+            "baselines=[]",
+            *more,
+        )
         return knock(COMMANDS["evaluate"].run, "evaluate", given)
 
     second = f"dataset.file={tmp_path / 'second.csv'}", "dataset.columns.rssi_db=rx_level"
-    assert (done := evaluated(*second, "dataset.absent=unknown", "dataset.max_rows=40")).status == 0, done
+    assert (
+        done := evaluated(*second, "dataset.absent=unknown", "dataset.max_rows=40")
+    ).status == 0, done
     facts = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert facts["dataset/rows"] == 40
     assert_refused(evaluated("dataset.absnt=unknown"), "dataset=own; did you mean 'absent'")
@@ -134,7 +148,9 @@ def test_another_subset_and_split(trained, caplog):
     assert found.facts["val/samples"] == found.facts["split/val"] and "TRAINED" not in caplog.text
     found, _, split = evaluate_files([trained], split={"name": "corner"})
     assert split.name == "corner" and "were TRAINED on" in caplog.text
-    said = re.match(r"another split \(random\): (\d+) of these (\d+) test", found.facts["split/foreign"])
+    said = re.match(
+        r"another split \(random\): (\d+) of these (\d+) test", found.facts["split/foreign"]
+    )
     assert 0 < int(said[1]) < int(said[2]) == found.facts["split/test"]
     assert any("were TRAINED on" in line for line in remarks(found.facts))
 
@@ -146,7 +162,9 @@ def test_a_checkpoint_that_names_no_rows_is_marked_unless_its_settings_do(traine
     checkpoint.save(bare, method, stored.config)
     assert evaluate_files([bare])[0].facts["split/foreign"] is None
     said = evaluate_files([bare], split={"name": "corner"})[0].facts["split/foreign"]
-    assert re.match(r"another split \(random\): [1-9]\d* of these \d+ test rows were TRAINED on", said)
+    assert re.match(
+        r"another split \(random\): [1-9]\d* of these \d+ test rows were TRAINED on", said
+    )
     checkpoint.save(bare, method)
     said = evaluate_files([bare], stored.configuration["dataset"], {"name": "random"})[0].facts[
         "split/foreign"
@@ -163,14 +181,18 @@ def test_folds_need_their_checkpoints(trained, tmp_path):
     refused("fold 4 was trained, split=random has 1 folds", evaluate_files, [fold])
 
 
-def test_another_file_was_tested_on_a_fifth_beside_baselines_that_had_learned_its_rest(tmp_path, caplog):
+def test_another_file_was_tested_on_a_fifth_beside_baselines_that_had_learned_its_rest(
+    tmp_path, caplog
+):
     """The baselines knew the new file, the model did not."""
     (tmp_path / "later").mkdir()
     file, later = channels(tmp_path / "own.npz"), tmp_path / "later" / "own.npz"
     model = towns.trained(file, "nearest")
     with np.load(file) as stored:
         moved = stored["rx_position"] + [0.02, 0.01, 0]
-        np.savez(later, **{**stored, "rx_position": moved, "csi": np.roll(stored["csi"], 1, axis=0)})
+        np.savez(
+            later, **{**stored, "rx_position": moved, "csi": np.roll(stored["csi"], 1, axis=0)}
+        )
     found, data, split = evaluate_files([model], {"file": str(later)}, {"name": None})
     assert split.name == "whole" and found.facts["split/foreign"] is None
     assert not any("TRAINED" in one.message for one in caplog.records if one.levelname == "WARNING")
@@ -181,15 +203,21 @@ def test_another_file_was_tested_on_a_fifth_beside_baselines_that_had_learned_it
     assert found.facts["split/without_baselines"] is None
     same, *_ = evaluate_files([model], {"file": str(file)}, baselines=["nearest"])
     assert same.facts["split/name"] == "random" and same.facts["split/foreign"] is None
-    asked, _, split = evaluate_files([model], {"file": str(later)}, {"name": "corner"}, baselines=["nearest"])
-    assert split.name == "corner" and asked.facts["test/nmse"] == asked.facts["baseline/nearest/nmse"]
+    asked, _, split = evaluate_files(
+        [model], {"file": str(later)}, {"name": "corner"}, baselines=["nearest"]
+    )
+    assert (
+        split.name == "corner" and asked.facts["test/nmse"] == asked.facts["baseline/nearest/nmse"]
+    )
     with pytest.raises(ValueError, match="eval_on=val: the split has no val rows"):
         evaluate_files([model], {"file": str(later)}, eval_on="val")
     file.unlink()
     found, *_ = evaluate_files([model], {"file": str(later)}, baselines=None)
     assert not [name for name in found.facts if name.startswith("baseline/")]
     assert found.facts["test/nmse"] > 0.5
-    assert "no baselines: the file that the model was trained on is gone, or another" in remarks(found.facts)
+    assert ("no baselines: the file that the model was trained on is gone, or another") in remarks(
+        found.facts
+    )
 
 
 @pytest.fixture
@@ -203,7 +231,9 @@ def mirror(monkeypatch):
     ("secret", "refused"),
     [("${oc.env:GSPARC_TOKEN}", r"has \$\{\.\.\.\}"), ("plain", "plain.parquet: no such file")],
 )
-def test_a_stranger_s_checkpoint_sent_secrets_away(trained, tmp_path, monkeypatch, mirror, secret, refused):
+def test_a_stranger_s_checkpoint_sent_secrets_away(
+    trained, tmp_path, monkeypatch, mirror, secret, refused
+):
     """A stored `dataset.file=http://HOST/${oc.env:NAME}.parquet` was asked for, twice."""
     monkeypatch.setenv("GSPARC_TOKEN", "very-secret")
     address = os.environ[MIRROR].rstrip("/")
@@ -212,15 +242,30 @@ def test_a_stranger_s_checkpoint_sent_secrets_away(trained, tmp_path, monkeypatc
     config["dataset"] |= {"file": f"{address}/{secret}.parquet"}
     bad = tmp_path / "bad.ckpt"
     checkpoint.save(bad, method, yaml.safe_dump(config), dict(stored.extra))
-    for command, more in (("evaluate", []), ("map", ["step_m=1"]), ("calibrate", []), ("locate", [])):
+    for command, more in (
+        ("evaluate", []),
+        ("map", ["step_m=1"]),
+        ("calibrate", []),
+        ("locate", []),
+    ):
         given = [f"ckpt={bad}", f"hydra.run.dir={tmp_path / command}", "threads=1", *more]
         assert_refused(knock(COMMANDS[command].run, command, given), refused)
     assert not mirror.asked
 
 
-@pytest.mark.parametrize("name", ["calibrate", "link", "locate", "tradeoff", "map", "place", "plan", "view"])
+@pytest.mark.parametrize(
+    "name", ["calibrate", "link", "locate", "tradeoff", "map", "place", "plan", "view"]
+)
 def test_settings_of_data_were_refused_beside_their_file(name):
-    """`dataset.not_heard: no such setting; there are file, name, root`, where `evaluate` took it."""
+    """`dataset.not_heard: no such setting; there are file, name, root`,
+    where `evaluate` took it.
+    """
     given = "ckpt=model.ckpt", "dataset.not_heard=[100]", "dataset.columns.lat=B"
     found = compose(*given, config=name).dataset
-    assert found == {"name": None, "root": None, "file": None, "not_heard": [100], "columns": {"lat": "B"}}
+    assert found == {
+        "name": None,
+        "root": None,
+        "file": None,
+        "not_heard": [100],
+        "columns": {"lat": "B"},
+    }

@@ -1,4 +1,6 @@
-"""A sweep through a launcher loses a job: the same command goes on with it, and nothing is done twice."""
+"""A sweep through a launcher loses a job: the same command goes on with it,
+and nothing is done twice.
+"""
 
 import json
 import subprocess
@@ -65,7 +67,12 @@ def test_a_killed_job_is_gone_on_with_and_nothing_is_done_twice(tmp_path, monkey
 def test_jobs_on_ray_return_what_jobs_here_do_and_are_not_done_again(tmp_path):
     pytest.importorskip("ray", reason="ray is not installed")
     spectra(tmp_path / "own.npz")
-    settings = ("dataset=own", f"dataset.file='{tmp_path / 'own.npz'}'", "model=mean,nearest", "threads=1")
+    settings = (
+        "dataset=own",
+        f"dataset.file='{tmp_path / 'own.npz'}'",
+        "model=mean,nearest",
+        "threads=1",
+    )
     found = []
     for launcher, folder in (("basic", "here"), ("ray", "there"), ("basic", "there")):
         where = (f"hydra.sweep.dir={tmp_path / folder}", f"hydra/launcher={launcher}")

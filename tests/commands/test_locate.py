@@ -30,7 +30,9 @@ def trained(spectra_gp, tmp_path):
 def hall(fingerprints, tmp_path):
     """Overrides that locate walks through a hall; beside their file the same at unknown places."""
     np.savez(tmp_path / "walks.npz", **fingerprints)
-    np.savez(tmp_path / "unplaced.npz", **{k: v for k, v in fingerprints.items() if k != "position"})
+    np.savez(
+        tmp_path / "unplaced.npz", **{k: v for k, v in fingerprints.items() if k != "position"}
+    )
     return "dataset=fingerprints", f"dataset.file={tmp_path}/walks.npz", "dataset.split=walks"
 
 
@@ -81,7 +83,9 @@ def test_a_table_was_refused_and_after_the_calibration(tmp_path):
     for name, part in (("a", rows[:100]), ("b", rows[100:])):
         (tmp_path / f"{name}.csv").write_text("x,y,AP1,AP2,AP3\n" + "\n".join(part) + "\n")
     ckpt = towns.trained(tmp_path / "a.csv", "gp")
-    facts, found = located(tmp_path / "run", f"ckpt={ckpt}", f"data='{tmp_path}/b.csv'", "calibrate=0")
+    facts, found = located(
+        tmp_path / "run", f"ckpt={ckpt}", f"data='{tmp_path}/b.csv'", "calibrate=0"
+    )
     assert len(found) == 20 and facts["locate/median_m"] < 3
     with pytest.raises(DataError, match="no such file"):  # at once
         located(tmp_path / "run", f"ckpt={ckpt}", f"data='{tmp_path}/c.csv'")
@@ -89,7 +93,9 @@ def test_a_table_was_refused_and_after_the_calibration(tmp_path):
 
 @pytest.fixture(scope="module")
 def roofs(tmp_path_factory):
-    """A model of all rows of a table in degrees with listed stations, and a phone's log of levels."""
+    """A model of all rows of a table in degrees with listed stations,
+    and a phone's log of levels.
+    """
     folder, rng = tmp_path_factory.mktemp("roofs"), np.random.default_rng(0)
     east_north, masts = rng.uniform(0, 300, (120, 2)), np.array([[0, 0], [300, 0], [150, 300.0]])
     level = -40 - 20 * np.log10(5 + np.linalg.norm(east_north[:, None] - masts, axis=2))
@@ -101,7 +107,10 @@ def roofs(tmp_path_factory):
     names = "roof-1,roof-2,roof-3"
     listed = [f"roof-{i + 1},{a:.7f},{b:.7f},30" for i, (a, b) in enumerate(degrees(masts))]
     (folder / "masts.csv").write_text("\n".join(["name,latitude,longitude,height", *listed]) + "\n")
-    log = [f"{i},{a:.2f},{'' if i == 3 else f'{b:.2f}'},{c:.2f}" for i, (a, b, c) in enumerate(level[100:])]
+    log = [
+        f"{i},{a:.2f},{'' if i == 3 else f'{b:.2f}'},{c:.2f}"
+        for i, (a, b, c) in enumerate(level[100:])
+    ]
     (folder / "phone.csv").write_text("\n".join([f"scan,{names}", *log]) + "\n")
     known = np.hstack([degrees(east_north), np.full((120, 1), 1.5), level])[:100]
     head = f"latitude,longitude,height,{names}"
@@ -113,9 +122,13 @@ def roofs(tmp_path_factory):
 
 @pytest.mark.slow
 def test_a_phones_log_without_places_was_refused(roofs, tmp_path):
-    """`no coordinates among ...; say dataset.columns.x=COLUMN`, where Python located the same levels."""
+    """`no coordinates among ...; say dataset.columns.x=COLUMN`,
+    where Python located the same levels.
+    """
     ckpt, folder, true = roofs
-    facts, found = located(tmp_path / "run", f"ckpt={ckpt}", f"data='{folder}/phone.csv'", "calibrate=0")
+    facts, found = located(
+        tmp_path / "run", f"ckpt={ckpt}", f"data='{folder}/phone.csv'", "calibrate=0"
+    )
     assert set(found[0]) == UNPLACED - {"volume_m3"} | {"area_m2", "latitude", "longitude"}
     assert "locate/median_m" not in facts
     assert [row["row"] for row in found] == [f"line {number + 2}" for number in range(20)]
@@ -128,30 +141,57 @@ def test_a_phones_log_without_places_was_refused(roofs, tmp_path):
 
 @pytest.mark.slow
 def test_a_long_log_was_refused_though_it_has_times(roofs, tmp_path, caplog):
-    """`which are of one moment? expected one row a moment`, though rows of one scan have one time."""
+    """`which are of one moment? expected one row a moment`,
+    though rows of one scan have one time.
+    """
     ckpt, folder, _ = roofs
     head, *rows = [row.split(",") for row in (folder / "phone.csv").read_text().splitlines()]
     links = [
-        (int(row[0]), name, level) for row in rows for name, level in zip(head[1:], row[1:], strict=True)
+        (int(row[0]), name, level)
+        for row in rows
+        for name, level in zip(head[1:], row[1:], strict=True)
     ]
 
     def log(name, columns, line):
-        (tmp_path / f"{name}.csv").write_text("\n".join([columns, *(line(*link) for link in links)]) + "\n")
+        (tmp_path / f"{name}.csv").write_text(
+            "\n".join([columns, *(line(*link) for link in links)]) + "\n"
+        )
         return f"ckpt={ckpt}", f"data='{tmp_path}/{name}.csv'", "calibrate=0"
 
     timed = log("timed", "date,time,cell,rssi", lambda i, a, b: f"2026-11-27,10:00:{i:02d},{a},{b}")
-    wide = located(tmp_path / "wide", f"ckpt={ckpt}", f"data='{folder}/phone.csv'", "calibrate=0")[1]
+    wide = located(tmp_path / "wide", f"ckpt={ckpt}", f"data='{folder}/phone.csv'", "calibrate=0")[
+        1
+    ]
     with caplog.at_level("INFO"):
         found = located(tmp_path / "run", *timed)[1]
     assert "20 snapshots in 59 rows" in caplog.text
     # Of one column of times, which was read as x.
-    stamped = log("stamped", "Timestamp,cell,rssi", lambda i, a, b: f"2026-11-27 10:00:{i:02d},{a},{b}")
+    stamped = log(
+        "stamped", "Timestamp,cell,rssi", lambda i, a, b: f"2026-11-27 10:00:{i:02d},{a},{b}"
+    )
     assert located(tmp_path / "stamped", *stamped)[1] == found
-    assert [[row[axis] for axis in "xy"] for row in found] == [[row[axis] for axis in "xy"] for row in wide]
+    assert [[row[axis] for axis in "xy"] for row in found] == [
+        [row[axis] for axis in "xy"] for row in wide
+    ]
     for name, columns, line, said in (
-        ("scan", "scan,cell,rssi", lambda i, a, b: f"{i},{a},{b}", "expected a column of times, or one row"),
-        ("day", "date,cell,rssi", lambda i, a, b: f"2026-11-27,{a},{b}", "'date' has 1 values in 60 rows"),
-        ("each", "time,cell,rssi", lambda i, a, b: f"{i}.{a[-1]},{a},{b}", "'time' has 60 values in 60 rows"),
+        (
+            "scan",
+            "scan,cell,rssi",
+            lambda i, a, b: f"{i},{a},{b}",
+            "expected a column of times, or one row",
+        ),
+        (
+            "day",
+            "date,cell,rssi",
+            lambda i, a, b: f"2026-11-27,{a},{b}",
+            "'date' has 1 values in 60 rows",
+        ),
+        (
+            "each",
+            "time,cell,rssi",
+            lambda i, a, b: f"{i}.{a[-1]},{a},{b}",
+            "'time' has 60 values in 60 rows",
+        ),
         (
             "gap",
             "time,cell,rssi",
@@ -200,11 +240,16 @@ def test_200_snapshots_left_out_were_each_sought_twice_from_the_coarse_grid_on(
     counted = lambda *given: before.append(given[3:]) or search(*given)  # noqa: E731
     monkeypatch.setattr(locator.Locator, "search_cells", counted)
     with caplog.at_level("INFO"):
-        facts, _ = located(tmp_path / "run", f"ckpt={ckpt}", "eval_on=train", "rows=1", "calibrate=2")
-    assert facts["locate/calibrated_on"] == 20 and "calibrated on 20 left-out snapshots" in caplog.text
-    assert [bool(one and one[0]) for one in before[:48]] == [False] * 8 + [True] * 8 + [False] * 12 + [
-        True
-    ] * 20
+        facts, _ = located(
+            tmp_path / "run", f"ckpt={ckpt}", "eval_on=train", "rows=1", "calibrate=2"
+        )
+    assert (
+        facts["locate/calibrated_on"] == 20
+        and ("calibrated on 20 left-out snapshots") in caplog.text
+    )
+    assert [bool(one and one[0]) for one in before[:48]] == [False] * 8 + [True] * 8 + [
+        False
+    ] * 12 + [True] * 20
 
 
 @pytest.mark.slow
@@ -218,9 +263,14 @@ def test_the_log_showed_trust_as_an_object(roofs, tmp_path, monkeypatch, caplog)
 
 @pytest.mark.slow
 def test_a_calibration_of_another_plan_or_prior_was_taken(roofs, tmp_path, monkeypatch, caplog):
-    """A plan that changed under its name was not noticed, and `calibrate=0` took whatever was stored."""
+    """A plan that changed under its name was not noticed,
+    and `calibrate=0` took whatever was stored.
+    """
     monkeypatch.setattr(locator, "HELD_OUT", 6)
-    ckpt, paper = shutil.copy(roofs[0], tmp_path / "model.ckpt"), np.full((40, 40, 3), 255, np.uint8)
+    ckpt, paper = (
+        shutil.copy(roofs[0], tmp_path / "model.ckpt"),
+        np.full((40, 40, 3), 255, np.uint8),
+    )
     low, high = (site := checkpoint.read(ckpt).site).moving_box[:, :2] + site.origin[:2]
     points = f"plan_points=[[0,40,{low[0]},{low[1]}],[40,40,{high[0]},{low[1]}]]"
     given = f"ckpt={ckpt}", "eval_on=train", "rows=1", f"plan='{tmp_path}/plan.png'", points
@@ -231,10 +281,14 @@ def test_a_calibration_of_another_plan_or_prior_was_taken(roofs, tmp_path, monke
         caplog.clear()
         with caplog.at_level("INFO"):
             located(tmp_path / str(number), *given, "calibrate=2")
-        said += [[word in caplog.text for word in ("calibrated before", "calibration was of cells=")]]
+        said += [
+            [word in caplog.text for word in ("calibrated before", "calibration was of cells=")]
+        ]
     assert said == [[False, False], [True, False], [False, True]]
     located(tmp_path / "stored", *given, "calibrate=0")
-    with pytest.raises(ValueError, match=r"was calibrated with plan=.*, plan_points=.*, cells=\w{8}: "):
+    with pytest.raises(
+        ValueError, match=r"was calibrated with plan=.*, plan_points=.*, cells=\w{8}: "
+    ):
         located(tmp_path / "box", *given[:3], "calibrate=0")
 
 
@@ -251,22 +305,34 @@ def test_ctrl_c_lost_all_that_was_located(tmp_path):
 
 
 @pytest.mark.slow
-def test_what_was_heard_beyond_the_trained_places_was_located_at_their_edge_unsaid(tmp_path, capsys):
+def test_what_was_heard_beyond_the_trained_places_was_located_at_their_edge_unsaid(
+    tmp_path, capsys
+):
     """Areas of 90 % held none of 35 places of a hall's other part, without a word."""
     rng = np.random.default_rng(0)
     place = rng.uniform(0, 30, (160, 2)) * [1, 0.5]
-    level = -40 - 25 * np.log10(1 + np.linalg.norm(place[:, None] - [[0, 0], [15, 20], [18, -5]], axis=2))
+    level = -40 - 25 * np.log10(
+        1 + np.linalg.norm(place[:, None] - [[0, 0], [15, 20], [18, -5]], axis=2)
+    )
     rows = np.hstack([place, level + rng.normal(0, 0.5, level.shape)])
     far = place[:, 0] > 20
     for name, part in (("a", rows[~far]), ("b", rows[far])):
-        np.savetxt(tmp_path / f"{name}.csv", part, "%.3f", ",", header="x,y,AP1,AP2,AP3", comments="")
+        np.savetxt(
+            tmp_path / f"{name}.csv", part, "%.3f", ",", header="x,y,AP1,AP2,AP3", comments=""
+        )
     ckpt = towns.trained(tmp_path / "a.csv", "gp")
-    facts, found = located(tmp_path / "run", f"ckpt={ckpt}", f"data='{tmp_path}/b.csv'", "calibrate=0")
+    facts, found = located(
+        tmp_path / "run", f"ckpt={ckpt}", f"data='{tmp_path}/b.csv'", "calibrate=0"
+    )
     beyond = [row["doubt"] == "beyond the trained places" for row in found]
     assert facts["locate/beyond"] == sum(beyond) > 0.6 * len(found)
-    assert facts["locate/median_m"] < 0.3 * facts["baseline/nearest/median_m"], "sought beyond the edge"
+    assert facts["locate/median_m"] < 0.3 * facts["baseline/nearest/median_m"], (
+        "sought beyond the edge"
+    )
     said = capsys.readouterr().out
-    assert f"{sum(beyond)} of {len(found)} snapshots are beyond the trained places: no promise" in said
+    assert (
+        f"{sum(beyond)} of {len(found)} snapshots are beyond the trained places: no promise"
+    ) in said
     assert f"{len(found)} true places lie outside" in said
     facts, found = located(tmp_path / "own", f"ckpt={ckpt}", "calibrate=0")
     assert facts["locate/beyond"] <= 0.2 * len(found)
@@ -303,7 +369,9 @@ def test_fingerprints_from_a_file_to_places(hall, tmp_path):
 
 def test_a_mean_of_milliseconds_was_called_a_median(hall, tmp_path):
     facts, _ = located(tmp_path, *hall, "against=[]")
-    assert facts["time/locate_ms"] > 0 and "time/locate_ms_p50" not in facts, "all are located at once"
+    assert facts["time/locate_ms"] > 0 and "time/locate_ms_p50" not in facts, (
+        "all are located at once"
+    )
 
 
 def test_fingerprints_of_unknown_places(hall, tmp_path):

@@ -16,7 +16,9 @@ def logged(tmp_path_factory):
     given, channel = packets.robot()
     tones = given["frequency_hz"] - given["frequency_hz"].mean()
     del given["run"]
-    np.savez(folder / "logged.npz", **given, csi=packets.logged(channel, tones, 0).astype(np.complex64))
+    np.savez(
+        folder / "logged.npz", **given, csi=packets.logged(channel, tones, 0).astype(np.complex64)
+    )
     return folder
 
 
@@ -26,8 +28,11 @@ def test_a_default_run_is_ahead_of_every_plain_method(logged, tmp_path):
         "dataset=own", f"dataset.file={logged / 'logged.npz'}", "model=gsparc", "logger=none"
     )
     facts, objects = train(config, tmp_path)
-    assert facts["dataset/kind"] == "aligned csi" and facts["dataset/unknown_factor"] == "phase+delay"
-    assert facts["test/nmse_aligned"] < 0.05 and facts["test/tone_rmse_db"] < 2.6  # at random, seed 0
+    assert (
+        facts["dataset/kind"] == "aligned csi" and facts["dataset/unknown_factor"] == "phase+delay"
+    )
+    # At random, seed 0
+    assert facts["test/nmse_aligned"] < 0.05 and facts["test/tone_rmse_db"] < 2.6
     for name in ("mean", "nearest", "idw"):
         assert facts["test/nmse_aligned"] < facts[f"baseline/{name}/nmse_aligned"]
     assert facts["test/nmse_scalar"] is not None and "aligned" in objects.methods[0].description

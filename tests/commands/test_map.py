@@ -1,4 +1,6 @@
-"""`gsparc map` and `gsparc plan`: files whole, a promise kept with the model, errors in one line."""
+"""`gsparc map` and `gsparc plan`: files whole, a promise kept with the model,
+errors in one line.
+"""
 
 import json
 import os
@@ -22,7 +24,9 @@ from gsparc.commands.listing import COMMANDS
 
 
 def run(command, *settings, folder):
-    return knock(COMMANDS[command].run, command, [*settings, f"hydra.run.dir={folder}", "threads=1"])
+    return knock(
+        COMMANDS[command].run, command, [*settings, f"hydra.run.dir={folder}", "threads=1"]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -43,8 +47,16 @@ def mapped(model, tmp_path_factory):
 @pytest.mark.slow
 def test_every_layer_and_a_table(mapped):
     folder, said = mapped
-    layers = ("power", "best_server", "sinr", "outage", "expected_error", "width", "stations/power_west",
-              "stations/power_east")  # fmt: skip
+    layers = (
+        "power",
+        "best_server",
+        "sinr",
+        "outage",
+        "expected_error",
+        "width",
+        "stations/power_west",
+        "stations/power_east",
+    )
     assert all((folder / f"{name}.png").stat().st_size > 5000 for name in layers)
     facts = json.loads((folder / "summary.json").read_text())
     assert facts["promise/calibrated"] == 1 and 0.8 < facts["promise/held/share"] <= 1
@@ -69,7 +81,9 @@ def test_the_promise_stays_with_the_model(mapped, model):
 
 
 def test_a_plan_from_the_model(mapped, model, tmp_path):
-    """Places were in the order of gains without a way between them, unless somebody said `route=true`."""
+    """Places were in the order of gains without a way between them,
+    unless somebody said `route=true`.
+    """
     done = run("plan", f"ckpt={model}", "count=6", "area=[-20,0,80,60]", folder=tmp_path)
     assert done.status == 0, done
     (said,) = [line for line in done.out if "6 places: expected error" in line]
@@ -78,7 +92,9 @@ def test_a_plan_from_the_model(mapped, model, tmp_path):
     assert 0 < facts["plan/expected_error_db"] < facts["plan/expected_error_before_db"]
     lines = (tmp_path / "plan.csv").read_text().splitlines()
     assert len(lines) == 7 and lines[0].endswith(",way_m") and (tmp_path / "plan.png").exists()
-    assert any("a way of" in one and "; rows logged on the way do not count" in one for one in done.out)
+    assert any(
+        "a way of" in one and "; rows logged on the way do not count" in one for one in done.out
+    )
     how = [f"ckpt={model}", "count=1", "promised=false"]
     done = run("plan", *how, "threshold_db=-80", folder=tmp_path)
     assert any("of the strongest station, where -80 is in doubt" in one for one in done.out), done
@@ -89,7 +105,9 @@ def test_a_plan_from_the_model(mapped, model, tmp_path):
 def test_a_plan_did_not_say_how_many_stations_a_place_lists(mapped, model, tmp_path, monkeypatch):
     monkeypatch.setattr("gsparc.apps.maps.promise.Promise.stations_of_place", lambda self: 1)
     done = run("plan", f"ckpt={model}", "count=1", "area=[-20,0,80,60]", folder=tmp_path)
-    assert any(", if a place lists the 1 strongest of 2; plan written" in line for line in done.out), done
+    assert any(
+        ", if a place lists the 1 strongest of 2; plan written" in line for line in done.out
+    ), done
 
 
 def test_the_file_of_a_way_held_no_stops(model, tmp_path):
@@ -100,7 +118,9 @@ def test_the_file_of_a_way_held_no_stops(model, tmp_path):
     assert length_m == pytest.approx(
         json.loads((tmp_path / "summary.json").read_text())["plan/length_m"], abs=0.01
     )
-    assert [one["properties"] for one in stops] == pd.read_csv(tmp_path / "plan.csv").to_dict("records")
+    assert [one["properties"] for one in stops] == pd.read_csv(tmp_path / "plan.csv").to_dict(
+        "records"
+    )
     assert all(one["geometry"]["type"] == "Point" for one in stops)
     first = stops[0]["properties"]
     assert stops[0]["geometry"]["coordinates"] == [first["x"], first["y"]]
@@ -115,7 +135,9 @@ def test_a_plan_for_some_stations_spoke_of_all(model, tmp_path):
 
 
 def test_a_model_that_cannot_place_was_restored_before_it_said_so(model, tmp_path, monkeypatch):
-    monkeypatch.setattr("gsparc.commands.place.load", lambda path: pytest.fail("all stations are restored"))
+    monkeypatch.setattr(
+        "gsparc.commands.place.load", lambda path: pytest.fail("all stations are restored")
+    )
     answer = run("place", f"ckpt={model}", folder=tmp_path)
     assert_refused(answer, "train with stations=together", tmp_path)
 
@@ -123,7 +145,9 @@ def test_a_model_that_cannot_place_was_restored_before_it_said_so(model, tmp_pat
 @pytest.mark.slow
 def test_an_interval_of_no_width_was_written_where_none_is_known(tmp_path):
     """Two stations, of which none can be left out; gains stood in no file."""
-    path = trained(town_file(tmp_path / "town.npz"), "distance_law", "stations=together", "split=none")
+    path = trained(
+        town_file(tmp_path / "town.npz"), "distance_law", "stations=together", "split=none"
+    )
     how = ("count=4", "threshold_db=-75", "promised=false")
     done = run("place", f"ckpt={path}", *how, folder=tmp_path / "to")
     assert done.status == 0 and any("no interval is known" in line for line in done.out), done
@@ -136,15 +160,22 @@ def test_an_interval_of_no_width_was_written_where_none_is_known(tmp_path):
 
 
 def test_a_best_place_was_not_said_to_be_like_others(tmp_path, monkeypatch):
-    path = trained(town_file(tmp_path / "town.npz"), "distance_law", "stations=together", "split=none")
-    gain, ends = np.array([0.1, 0.09, 0.05, 0.01]), [[0.04, 0.2], [0.03, 0.2], [0.02, 0.1], [0.0, 0.02]]
+    path = trained(
+        town_file(tmp_path / "town.npz"), "distance_law", "stations=together", "split=none"
+    )
+    gain, ends = (
+        np.array([0.1, 0.09, 0.05, 0.01]),
+        [[0.04, 0.2], [0.03, 0.2], [0.02, 0.1], [0.0, 0.02]],
+    )
 
     def with_intervals(*of, **how):
         found = place_station(*of, **how)
         return replace(found, gain=gain, between=np.column_stack([np.full((4, 2), 0.5), ends]))
 
     monkeypatch.setattr("gsparc.apps.maps.placing.place_station", with_intervals)
-    done = run("place", f"ckpt={path}", "count=4", "promised=false", "left_out=0", folder=tmp_path / "to")
+    done = run(
+        "place", f"ckpt={path}", "count=4", "promised=false", "left_out=0", folder=tmp_path / "to"
+    )
     assert any(line.endswith(", gaining 10.0 points") for line in done.out), done
     told = "of the gain 4.0 to 20.0 points, not significantly above 2 of 3 others"
     assert any(told in line for line in done.out)
@@ -152,13 +183,17 @@ def test_a_best_place_was_not_said_to_be_like_others(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_a_single_candidate_was_not_told_apart_from_no_others(tmp_path, monkeypatch):
-    path = trained(town_file(tmp_path / "town.npz"), "distance_law", "stations=together", "split=none")
+    path = trained(
+        town_file(tmp_path / "town.npz"), "distance_law", "stations=together", "split=none"
+    )
 
     def with_an_interval(*of, **how):
         return replace(place_station(*of, **how), between=np.array([[0.4, 0.6, 0.0, 0.2]]))
 
     monkeypatch.setattr("gsparc.apps.maps.placing.place_station", with_an_interval)
-    done = run("place", f"ckpt={path}", "count=1", "promised=false", "left_out=0", folder=tmp_path / "to")
+    done = run(
+        "place", f"ckpt={path}", "count=1", "promised=false", "left_out=0", folder=tmp_path / "to"
+    )
     assert any(line.endswith("of the gain 0.0 to 20.0 points") for line in done.out), done
 
 
@@ -182,7 +217,11 @@ def test_an_interrupt_leaves_no_half_written_file(model, tmp_path, monkeypatch):
         began.append(True)
         os.kill(os.getpid(), signal.SIGINT)
 
-    monkeypatch.setattr("gsparc.commands.map.read_or_gather", lambda *_: Timer(0.3, interrupt).start())
+    monkeypatch.setattr(
+        "gsparc.commands.map.read_or_gather", lambda *_: Timer(0.3, interrupt).start()
+    )
     answer = run("map", f"ckpt={model}", "step_m=0.03", folder=tmp_path)
     assert answer.status == 130 and began, answer
-    assert not [file for file in tmp_path.iterdir() if file.suffix in (".npz", ".png", ".html", ".partial")]
+    assert not [
+        file for file in tmp_path.iterdir() if file.suffix in (".npz", ".png", ".html", ".partial")
+    ]

@@ -27,12 +27,18 @@ COMPOSED = {  # by `tests/test_docs.py` alone, for another reason each
 def _composed(line: tuple[str, ...]) -> bool:
     text = " ".join(line)
     served = line[0] in ("serve", "view") and "save=" not in text  # until Ctrl-C: tests/apps/view
-    unfinished = any(word.startswith("ckpt_path") for word in line)  # tests/hard_cases/test_resume.py
+    # tests/hard_cases/test_resume.py
+    unfinished = any(word.startswith("ckpt_path") for word in line)
     sweep = "experiment=ablation_" in text  # of many trainings
     return (
-        served or sweep or unfinished or line[0] in COMPOSED or bool(COMPOSED.keys() & set(line))
-        or "map=" in text or "walls=" in text
-    )  # fmt: skip
+        served
+        or sweep
+        or unfinished
+        or line[0] in COMPOSED
+        or bool(COMPOSED.keys() & set(line))
+        or "map=" in text
+        or "walls=" in text
+    )
 
 
 RUN = [line for line in commands() if not _composed(line)]

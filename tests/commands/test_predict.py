@@ -73,10 +73,14 @@ def valley(tmp_path_factory):
     rng = np.random.default_rng(0)
     latitude, longitude = 47 + rng.uniform(0, 0.01, 60), 11 + rng.uniform(0, 0.01, 60)
     arrays = {
-        "latitude": latitude, "longitude": longitude, "rx_height": rng.uniform(1, 3, 60),
-        "station_latitude": np.array([47.005]), "station_longitude": np.array([11.005]),
-        "station_height": np.array(30.0), "rssi_db": -60 - 1000 * np.abs(latitude[:, None] - 47.005),
-    }  # fmt: skip
+        "latitude": latitude,
+        "longitude": longitude,
+        "rx_height": rng.uniform(1, 3, 60),
+        "station_latitude": np.array([47.005]),
+        "station_longitude": np.array([11.005]),
+        "station_height": np.array(30.0),
+        "rssi_db": -60 - 1000 * np.abs(latitude[:, None] - 47.005),
+    }
     return fitted(arrays, tmp_path_factory.mktemp("valley"))
 
 
@@ -93,27 +97,41 @@ def answered(model, folder, heads, rows, **how):
     """Rows of the table of predictions at the rows of a table."""
     rows = rows.tolist() if isinstance(rows, np.ndarray) else rows
     count = len(list(folder.glob("*.csv")))
-    return read(predict_file(model, write_table(folder / f"{count}.csv", heads, rows), **how)["out"])
+    return read(
+        predict_file(model, write_table(folder / f"{count}.csv", heads, rows), **how)["out"]
+    )
 
 
 @pytest.mark.slow
 def test_a_drive_test_from_its_file_to_predictions_in_degrees(tmp_path):
-    """Three commands; held-out places of the measured city are predicted better than by the mean."""
+    """Three commands; held-out places of the measured city are predicted better
+    than by the mean.
+    """
     drive = city_drive(tmp_path)
     assert check([str(drive.rows), "--stations-file", str(drive.sites)]) == 0
     settings = [f"dataset.file={drive.rows}", f"dataset.stations_file={drive.sites}", "threads=1"]
-    train(compose("dataset=own", *settings, "model=gp", "baselines=[]", "logger=none"), tmp_path / "run")
-    ours = [f"ckpt={tmp_path / 'run' / 'model.ckpt'}", f"places={drive.places}", f"hydra.run.dir={tmp_path}"]
+    train(
+        compose("dataset=own", *settings, "model=gp", "baselines=[]", "logger=none"),
+        tmp_path / "run",
+    )
+    ours = [
+        f"ckpt={tmp_path / 'run' / 'model.ckpt'}",
+        f"places={drive.places}",
+        f"hydra.run.dir={tmp_path}",
+    ]
     done = knock(COMMANDS["predict"].run, "predict", ours)
     assert done.status == 0 and (tmp_path / "summary.json").exists(), done
     assert any("60 places, 2 stations" in line for line in done.out), done
     found = read(tmp_path / "places.predicted.csv")
     given = read(drive.places)
-    assert [row["Latitude"] for row in found[::2]] == [row["Latitude"] for row in given]  # every digit
+    # Every digit
+    assert [row["Latitude"] for row in found[::2]] == [row["Latitude"] for row in given]
     level, spread = (column(found, name).reshape(-1, 2) for name in ("rssi_db", "rssi_db_std"))
     error = np.sqrt(np.mean((level - drive.level_db) ** 2, axis=0))
     naive = np.sqrt(np.mean((drive.learned_db.mean(axis=0) - drive.level_db) ** 2, axis=0))
-    assert (error < 0.9 * naive).all() and np.sqrt(np.mean(error**2)) < 0.65 * np.sqrt(np.mean(naive**2))
+    assert (error < 0.9 * naive).all() and np.sqrt(np.mean(error**2)) < 0.65 * np.sqrt(
+        np.mean(naive**2)
+    )
     assert np.mean(np.abs(level - drive.level_db) < 2 * spread) > 0.8
 
 
@@ -121,7 +139,9 @@ def test_a_station_was_not_found_by_its_name_in_the_list_of_cells(town, tmp_path
     place = [[5, 5, 1.5]]
     (own,) = answered(town, tmp_path, ["x", "y", "z"], place, station="mast")
     monkeypatch.setitem(vars(town.site.stations), "label", ("A-1", "A-2", "B-1"))
-    assert answered(town, tmp_path, ["x", "y", "z"], place, station="B-1") == [{**own, "cell": "B-1"}]
+    assert answered(town, tmp_path, ["x", "y", "z"], place, station="B-1") == [
+        {**own, "cell": "B-1"}
+    ]
     listed = answered(town, tmp_path, ["x", "y", "z", "station"], [[*place[0], "B-1"]])
     assert [row["rssi_db"] for row in listed] == [own["rssi_db"]]
     assert town.select_station("B-1").site.static_position is not None
@@ -138,7 +158,9 @@ def test_a_column_of_cells_was_renamed(town, tmp_path, monkeypatch, labels):
 
 @pytest.mark.parametrize("labels", [None, ("A-1", "A-2", "B-1")])
 def test_columns_of_predictions_changed_with_those_of_places(town, tmp_path, monkeypatch, labels):
-    """Of places with a column `cell` there was no `station`, and one of any other head replaced it."""
+    """Of places with a column `cell` there was no `station`,
+    and one of any other head replaced it.
+    """
     monkeypatch.setitem(vars(town.site.stations), "label", labels)
     (plain,) = answered(town, tmp_path, ["x", "y", "z"], [[5, 5, 1.5]], station="mast")
     for head in ("station", "cell", "PCI"):
@@ -151,7 +173,11 @@ def test_coordinates_were_written_anew_under_other_heads(valley, tmp_path):
     (row,) = answered(
         valley, tmp_path, ["Longitude", "Latitude", "Height"], [["11.0010", "47.003000", "2.0"]]
     )
-    assert [*row.items()][:3] == [("Longitude", "11.0010"), ("Latitude", "47.003000"), ("Height", "2.0")]
+    assert [*row.items()][:3] == [
+        ("Longitude", "11.0010"),
+        ("Latitude", "47.003000"),
+        ("Height", "2.0"),
+    ]
     assert [*row][3:5] == ["station", "rssi_db"]
 
 
@@ -182,7 +208,15 @@ def test_rows_about_one_station_each_and_about_one_only(town, tmp_path):
         answered(town, tmp_path, heads, [*table[:2], [1, 1, 1, "roof-2"]])
     with pytest.raises(DataError, match=r"station=mats: no such station; did you mean 'mast'"):
         answered(town, tmp_path, "xyz", places, station="mats")
-    refused(r"no row of .*\.csv is about it", answered, town, tmp_path, heads, table[:1], station="roof-0")
+    refused(
+        r"no row of .*\.csv is about it",
+        answered,
+        town,
+        tmp_path,
+        heads,
+        table[:1],
+        station="roof-0",
+    )
 
 
 def test_stations_called_by_numbers_answered_for_each_other(tmp_path):
@@ -194,12 +228,15 @@ def test_stations_called_by_numbers_answered_for_each_other(tmp_path):
 
 @pytest.mark.parametrize(("names", "asked"), [(NAMES.tolist(), "0"), (["212", "33", "7"], "1")])
 def test_a_number_that_names_no_station_was_an_index(tmp_path, names, asked):
-    """`0` in a table of places answered as `roof-0`, and an unknown cell id below T as another cell."""
+    """`0` in a table of places answered as `roof-0`,
+    and an unknown cell id below T as another cell.
+    """
     model = fitted(stations(station_name=np.array(names)), tmp_path)
     rows = [[5, 5, 1.5, names[0]], [8, 8, 1.5, asked]]
     with pytest.raises(DataError, match=f"line 3: '{asked}' is no station of the model"):
         answered(model, tmp_path, ["x", "y", "z", "cell"], rows)
-    if "mast" not in names:  # names that are numbers leave none for counting, from Python and in settings too
+    # Names that are numbers leave none for counting, from Python and in settings too
+    if "mast" not in names:
         with pytest.raises(ValueError, match="no station 1; there are 212, 33, 7"):
             model.select_station(1)
 
@@ -227,7 +264,9 @@ def test_stations_at_unknown_places(tmp_path):
     data = from_arrays(arrays)
     rows = np.arange(len(data))
     method = wrap_per_station(method_class("gp")(), data)
-    with pytest.raises(ValueError, match="places of stations are unknown, it needs them; say stations=each"):
+    with pytest.raises(
+        ValueError, match="places of stations are unknown, it needs them; say stations=each"
+    ):
         method.fit(data, Fold(rows, rows[:0], rows[:5]), FitContext(tmp_path, stations="together"))
     heard, name = rows[data.station[rows] != 1], data.site.stations.name[1]
     with pytest.raises(ValueError, match=rf"for those without training rows \({name}\)"):
@@ -241,7 +280,9 @@ def test_a_height_that_is_not_given(town, valley, tmp_path, caplog):
     assert "no height of the receiver: taken as 1.5 m" in caplog.text
     assert column(found, "z").tolist() == [1.5] * 6
     hill = ["lat", "lon"], [[47.003, 11.004]]
-    with pytest.raises(DataError, match=r"measured at heights from 1\.\d+ to 2\.\d+ m; say columns.height="):
+    with pytest.raises(
+        DataError, match=r"measured at heights from 1\.\d+ to 2\.\d+ m; say columns.height="
+    ):
         answered(valley, tmp_path, *hill)
     assert answered(valley, tmp_path, *hill, columns={"height": 2.0})[0]["height"] == "2.0"
 
@@ -262,7 +303,11 @@ def test_degrees_and_metres_are_one_place(valley, tmp_path):
 
 
 def test_watts_were_answered_in_decibels(tmp_path):
-    arrays = {"tx_position": walk(), "rx_position": POSTS[0], "rssi": 10 ** (powers(walk())[:, 0] / 10)}
+    arrays = {
+        "tx_position": walk(),
+        "rx_position": POSTS[0],
+        "rssi": 10 ** (powers(walk())[:, 0] / 10),
+    }
     fitted(arrays, tmp_path)
     file, level = write_table(tmp_path / "a.csv", "xyz", walk()[:4].tolist()), powers(walk())[:4, 0]
     watts = 10 ** (level / 10)
@@ -274,22 +319,29 @@ def test_watts_were_answered_in_decibels(tmp_path):
         assert list(found[0])[3:] == [head, f"{head}_std", "confidence"]
         assert facts["predict/unit"] == (unit or "W")
         assert facts[f"predict/highest_{head[5:]}"] == pytest.approx(column(found, head).max())
-        assert np.allclose(column(found, head), wanted, atol=1 if head == "rssi_db" else 0, rtol=0.2)
+        assert np.allclose(
+            column(found, head), wanted, atol=1 if head == "rssi_db" else 0, rtol=0.2
+        )
     settings = [f"ckpt={tmp_path / 'model.ckpt'}", f"places={file}", "overwrite=true", "unit=dBm"]
     done = knock(COMMANDS["predict"].run, "predict", [*settings, f"hydra.run.dir={tmp_path}"])
     assert done.status == 0 and any(" dBm; predictions in" in line for line in done.out), done
 
 
 BAD_TABLES = {
-    "latitude 95": ("lat,lon,height\n47,11,2\n95,11,2\n", r"line 3: latitude 95 is outside -90 to 90"),
+    "latitude 95": (
+        "lat,lon,height\n47,11,2\n95,11,2\n",
+        r"line 3: latitude 95 is outside -90 to 90",
+    ),
     "no value": ("lat,lon,height\n47,,2\n", r"column 'lon', line 2: no value"),
-    "no coordinates": ("time,speed\n1,2\n",
-        r"no coordinates of the receiver among 'time', 'speed'; say columns\.lat"),
+    "no coordinates": (
+        "time,speed\n1,2\n",
+        r"no coordinates of the receiver among 'time', 'speed'; say columns\.lat",
+    ),
     "half": ("lat,height\n47,2\n", r"and none is longitude; say columns\.lon=COLUMN"),
     "far": ("x,y,z\n1,1,2\n2e7,0,2\n", r"line 3: \(2e\+07, 0, 2\) is more than 10000 km"),
     "another end": ("tx_lat,tx_lon\n47,11\n", r"no coordinates of the receiver"),
     "no station": ("lat,lon,height,cell\n47,11,2,\n", r"column 'cell', line 2: no station"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", BAD_TABLES)
@@ -316,14 +368,22 @@ def test_where_the_answers_go(town, tmp_path):
     predict_file(town, file, tmp_path / "b.npz")
     with np.load(tmp_path / "b.npz") as stored:
         assert stored["station"].tolist() == NAMES.tolist() and stored["rssi_db"].shape == (3,)
-    refused(r"expected a table \(csv, parquet", predict_file, town, tmp_path / "b.npz", tmp_path / "c.csv")
+    refused(
+        r"expected a table \(csv, parquet",
+        predict_file,
+        town,
+        tmp_path / "b.npz",
+        tmp_path / "c.csv",
+    )
     refused("no such file", predict_file, town, tmp_path / "absent.csv")
     with pytest.raises(DataError, match="places in degrees, but arrays was measured in metres"):
         predict_file(town, write_table(tmp_path / "d.csv", ["lat", "lon"], [[47, 11]]))
 
 
 def test_places_far_outside_are_counted(town, tmp_path, caplog):
-    file = write_table(tmp_path / "a.csv", "xyz", [[5, 5, 1.5], [21, 5, 1.5], [5, 500, 1.5], [5, 5, 90]])
+    file = write_table(
+        tmp_path / "a.csv", "xyz", [[5, 5, 1.5], [21, 5, 1.5], [5, 500, 1.5], [5, 5, 90]]
+    )
     assert predict_file(town, file)["predict/far_outside"] == 2
     assert "2 of 4 places lie more than" in caplog.text and "the first in line 4" in caplog.text
 
@@ -335,14 +395,22 @@ def test_heights_above_the_sea_were_only_outside_the_box(town, tmp_path, caplog)
 
 
 def test_columns_of_a_users_own_were_left_out_of_the_predictions(town, tmp_path):
-    (tmp_path / "a.csv").write_text("note,station,x,rssi_db,y,z\nwall,mast,1,-70,2,1.5\n,roof-0,3,,4,1.5\n")
+    (tmp_path / "a.csv").write_text(
+        "note,station,x,rssi_db,y,z\nwall,mast,1,-70,2,1.5\n,roof-0,3,,4,1.5\n"
+    )
     predict_file(town, tmp_path / "a.csv")
     rows = read(tmp_path / "a.predicted.csv")
     heads = ["note", "station", "x", "rssi_db (given)", "y", "z", "rssi_db"]
-    assert list(rows[0])[:7] == heads and rows[0]["note"] == "wall" and rows[0]["rssi_db (given)"] == "-70"
+    assert (
+        list(rows[0])[:7] == heads
+        and rows[0]["note"] == "wall"
+        and rows[0]["rssi_db (given)"] == "-70"
+    )
 
 
-@pytest.mark.parametrize(("names", "found"), [(("7 1", "7 2", "8 1"), "7 2"), (("7", "8", "9"), "7")])
+@pytest.mark.parametrize(
+    ("names", "found"), [(("7 1", "7 2", "8 1"), "7 2"), (("7", "8", "9"), "7")]
+)
 def test_stations_of_several_columns_are_asked_as_they_were_learned(tmp_path, names, found):
     model = fitted(stations(station_name=np.array(names)), tmp_path)
     (tmp_path / "a.csv").write_text("x,y,z,PCI,EARFCN\n2,3,1.5,7,2\n")
@@ -354,8 +422,12 @@ def test_stations_of_several_columns_are_asked_as_they_were_learned(tmp_path, na
 def test_degrees_or_kilometres_as_metres_were_one_place_without_a_word(
     town, tmp_path, caplog, factor, warned
 ):
-    """All of them lay within millimetres, in the middle of what was measured, and were predicted alike."""
-    answered(town, tmp_path, "xyz", [[11 + x * factor, 4 + x * factor, 1 + x / 9] for x in range(19)])
+    """All of them lay within millimetres, in the middle of what was measured,
+    and were predicted alike.
+    """
+    answered(
+        town, tmp_path, "xyz", [[11 + x * factor, 4 + x * factor, 1 + x / 9] for x in range(19)]
+    )
     assert ("degrees or km as x and y?" in caplog.text) == warned
 
 
@@ -366,7 +438,12 @@ def test_channels(tmp_path, shape, heads):
     rng = np.random.default_rng(0)
     channel = rng.normal(size=(60, *shape)) + 1j * rng.normal(size=(60, *shape))
     frequency = 2.4e9 + 1e6 * np.arange(shape[-1] if shape else 1)
-    arrays = {"tx_position": walk(), "rx_position": POSTS[0], "csi": channel, "frequency_hz": frequency}
+    arrays = {
+        "tx_position": walk(),
+        "rx_position": POSTS[0],
+        "csi": channel,
+        "frequency_hz": frequency,
+    }
     found = answered(fitted(arrays, tmp_path, "nearest"), tmp_path, "xyz", walk()[:3])
     assert set(heads) <= set(found[0])
     first = np.array([column(found, name) for name in found[0] if name.startswith("csi_re")]).T
@@ -375,11 +452,15 @@ def test_channels(tmp_path, shape, heads):
 
 TONES = {"frequency_hz": 2.4e9 + 1e6 * np.arange(5)}
 UNTABLED = {
-    "csi": ({"csi": np.ones((60, 4, 5), complex), **TONES},
-        r"4 antennas x 5 subcarriers are more than 16 .*say out=FILE\.npz"),
-    "spectrum": ({"spectrum": np.random.default_rng(0).uniform(0, 1, (60, 12, 24))},
-        r"spectra of 12 x 24 directions are no columns; say out=FILE\.npz"),
-}  # fmt: skip
+    "csi": (
+        {"csi": np.ones((60, 4, 5), complex), **TONES},
+        r"4 antennas x 5 subcarriers are more than 16 .*say out=FILE\.npz",
+    ),
+    "spectrum": (
+        {"spectrum": np.random.default_rng(0).uniform(0, 1, (60, 12, 24))},
+        r"spectra of 12 x 24 directions are no columns; say out=FILE\.npz",
+    ),
+}
 
 
 @pytest.mark.parametrize("kind", UNTABLED)
@@ -399,7 +480,9 @@ def test_both_ends_move(tmp_path):
     rng = np.random.default_rng(0)
     tx, rx = rng.uniform(0, 20, (2, 80, 3))
     level = -20 * np.log10(np.linalg.norm(tx - rx, axis=1))
-    model = fitted({"tx_position": tx, "rx_position": rx, "rssi_db": level}, tmp_path, "distance_law")
+    model = fitted(
+        {"tx_position": tx, "rx_position": rx, "rssi_db": level}, tmp_path, "distance_law"
+    )
     heads, table = ["tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z"], np.hstack([tx, rx])[:4]
     found = answered(model, tmp_path, heads, table)
     assert list(found[0])[:6] == heads and np.abs(column(found, "rssi_db") - level[:4]).max() < 2
@@ -407,7 +490,11 @@ def test_both_ends_move(tmp_path):
     same = answered(model, tmp_path, plain, table)
     assert [row["rssi_db"] for row in same] == [row["rssi_db"] for row in found]
     for wrong, rows, message in (
-        (heads[:3], table[:, :3], r"no coordinates of the receiver among .*say columns\.rx_x=COLUMN"),
+        (
+            heads[:3],
+            table[:, :3],
+            r"no coordinates of the receiver among .*say columns\.rx_x=COLUMN",
+        ),
         ("xyz", table[:, :3], "no coordinates of the receiver"),
         (["tx_lat", "tx_lon", "tx_z", "rx_lat", "rx_lon", "rx_z"], table, "places in degrees, but"),
     ):
@@ -418,7 +505,9 @@ def test_an_end_that_stood_still_is_where_it_was(town, tmp_path, caplog):
     caplog.set_level(logging.INFO)
     heads = ["rx_x", "rx_y", "rx_z", "tx_x", "tx_y", "tx_z"]
     found = answered(town, tmp_path, heads, [[5, 5, 1.5, 9, 9, 9]], station="mast")
-    assert "not used: coordinates of the transmitter; that end is where it was measured" in caplog.text
+    assert (
+        "not used: coordinates of the transmitter; that end is where it was measured"
+    ) in caplog.text
     assert len(found) == 1 and column(found, "rx_x")[0] == 5
 
 
@@ -444,7 +533,9 @@ def test_predict_answered_where_maps_refuse_and_its_deviations_held_79_of_90(tmp
     own = np.full(count, 1.5)
     level, none, block = 2 * own * rng.normal(size=count), np.zeros(count), np.arange(count) // 4
     of = rng.integers(0, 3, count)
-    evidence = HeldOutLevels(level, none, own, rng.uniform(0, 5, count), block, of, none.astype(np.int8))
+    evidence = HeldOutLevels(
+        level, none, own, rng.uniform(0, 5, count), block, of, none.astype(np.int8)
+    )
     known = np.repeat(walk() - town.site.origin, 3, 0)
     places = np.array([[10.0, 10, 1.5], [5, 15, 1.5], [10, 300, 1.5]])
     file = write_table(tmp_path / "asked.csv", "xyz", places.tolist())
@@ -458,9 +549,15 @@ def test_predict_answered_where_maps_refuse_and_its_deviations_held_79_of_90(tmp
     assert [int(row["refused"]) for row in after] == far.astype(int).tolist()
     assert column(after, "rssi_db") == pytest.approx(column(before, "rssi_db"))
     # Of refused ones the model's own.
-    own = [(a["rssi_db_std"], b["rssi_db_std"]) for a, b, one in zip(after, before, far, strict=True) if one]
+    own = [
+        (a["rssi_db_std"], b["rssi_db_std"])
+        for a, b, one in zip(after, before, far, strict=True)
+        if one
+    ]
     assert all(float(a) == pytest.approx(float(b)) for a, b in own)
     near = [row for row, one in zip(after, far, strict=True) if not one]
     own = [row for row, one in zip(before, far, strict=True) if not one]
-    assert (column(near, "rssi_db_std") / column(own, "rssi_db_std")).mean() == pytest.approx(2, rel=0.2)
+    assert (column(near, "rssi_db_std") / column(own, "rssi_db_std")).mean() == pytest.approx(
+        2, rel=0.2
+    )
     assert any("3 of 9 predictions are refused" in line for line in (*done.out, *done.err)), done

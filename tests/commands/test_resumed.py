@@ -1,4 +1,6 @@
-"""What a training goes on from and starts from: an interrupt, a checkpoint, the weights of another."""
+"""What a training goes on from and starts from: an interrupt, a checkpoint,
+the weights of another.
+"""
 
 import re
 from dataclasses import replace
@@ -34,7 +36,8 @@ ROOT = Path(__file__).parents[2]
         ("model.field.count=41", r"model\.field\.count=\d+ \(here 41\)"),
         ("model.emission.hidden=7", r"model\.emission\.hidden=\d+ \(here 7\)"),
         ("dataset.batch_size=5", r"dataset\.batch_size=\d+ \(here 5\)"),
-        ("stations=together", r"stations=auto \(here together\)"),  # a model of each was shown as one of all
+        # A model of each was shown as one of all
+        ("stations=together", r"stations=auto \(here together\)"),
         ("dataset.file={other}", r"dataset\.file=.*own\.npz \(here .*other\.npz\)"),
         # It was ignored; a run that began with it goes on with it, in its coordinates.
         ("init_from={model}", r"init_from=None \(here .*model\.ckpt\)"),
@@ -57,17 +60,25 @@ def test_a_run_goes_on_with_the_same_grid_or_not_at_all(spectra_file, halfway, t
     with np.load(spectra_file) as stored:
         np.savez(tmp_path / "own.npz", **stored, grid_deg=[0.0, 0.0, 3.0, 10.0])
     last = halfway.checkpoints[0].with_name("last.ckpt")
-    with pytest.raises(ValueError, match=r"last\.ckpt: was trained with other grid: go on with the same"):
+    with pytest.raises(
+        ValueError, match=r"last\.ckpt: was trained with other grid: go on with the same"
+    ):
         train(short(tmp_path / "own.npz", f"ckpt_path={last}"), tmp_path / "run")
 
 
-@pytest.mark.parametrize(("what", "change"), [
-    ("other directions or uplink", lambda d: replace(d, directions=[np.ones((2, 3))] * len(d))),
-    ("other directions or uplink", lambda d: replace(d, uplink=np.ones((len(d), 1, 1), np.complex64))),
-    ("other normalisation", lambda d: replace(d, site=replace(d.site, normalisation="power"))),
-    ("other origin", lambda d: replace(d, site=replace(d.site, origin=d.site.origin + 1))),
-    ("other antennas", lambda d: replace(d, site=replace(d.site, antennas=np.arange(2)))),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("what", "change"),
+    [
+        ("other directions or uplink", lambda d: replace(d, directions=[np.ones((2, 3))] * len(d))),
+        (
+            "other directions or uplink",
+            lambda d: replace(d, uplink=np.ones((len(d), 1, 1), np.complex64)),
+        ),
+        ("other normalisation", lambda d: replace(d, site=replace(d.site, normalisation="power"))),
+        ("other origin", lambda d: replace(d, site=replace(d.site, origin=d.site.origin + 1))),
+        ("other antennas", lambda d: replace(d, site=replace(d.site, antennas=np.arange(2)))),
+    ],
+)
 def test_facts_beside_the_content_hash_are_of_an_origin(spectra_file, halfway, what, change):
     data = load_data({"name": "own", "file": str(spectra_file)})
     fold = Fold(np.arange(9), np.arange(9, 12), np.arange(12, 20))
@@ -85,7 +96,8 @@ def test_weights_to_start_from_beside_a_run_to_go_on_from_are_those_it_began_wit
     often, start = "callbacks.checkpoint.interval=10", f"init_from={halfway.checkpoints[0]}"
     with caplog.at_level("WARNING"):
         train(short(spectra_file, start, often), tmp_path / "begun")
-    assert "its model learned from these data" in caplog.text  # validation rows among them, nobody said
+    # Validation rows among them, nobody said
+    assert "its model learned from these data" in caplog.text
     on = f"ckpt_path={tmp_path / 'begun' / 'last.ckpt'}"
     assert train(short(spectra_file, start, on), tmp_path / "on")
     with pytest.raises(ValueError, match=r"was trained with init_from=.*model\.ckpt \(here None\)"):
@@ -108,7 +120,9 @@ def test_a_training_state_that_is_not_finite_is_refused_before_training(
     SPOILT[where](content["extra"]["trainer"])
     del content["sha256"]  # as of an older file: its training state has a guard of its own
     torch.save(content, tmp_path / "spoilt.ckpt")
-    with pytest.raises(ValueError, match=rf"trainer\.{re.escape(where)}.* is NaN or infinite; resume from"):
+    with pytest.raises(
+        ValueError, match=rf"trainer\.{re.escape(where)}.* is NaN or infinite; resume from"
+    ):
         train(short(spectra_file, f"ckpt_path={tmp_path / 'spoilt.ckpt'}"), tmp_path / "run")
     assert not (tmp_path / "run" / "learning_curve.csv").exists()
 
@@ -126,13 +140,17 @@ def test_processor_seconds_of_the_run_that_was_interrupted_count(spectra_file, h
     content["extra"]["trainer"]["callbacks"]["ReportSteps"]["cpu_seconds"] = 70.0
     del content["sha256"]
     torch.save(content, tmp_path / "last.ckpt")
-    facts, made = train(short(spectra_file, f"ckpt_path={tmp_path / 'last.ckpt'}"), tmp_path / "run")
+    facts, made = train(
+        short(spectra_file, f"ckpt_path={tmp_path / 'last.ckpt'}"), tmp_path / "run"
+    )
     assert 570.0 < facts["time/train_cpu_s"] < 600.0
     assert checkpoint.read(made.checkpoints[0]).extra["train_cpu_s"] == facts["time/train_cpu_s"]
 
 
 def test_training_starts_from_given_weights_on_rows_of_another_campaign(halfway, tmp_path):
-    """Another campaign's box, and with it the origin of local coordinates, is never quite the same."""
+    """Another campaign's box, and with it the origin of local coordinates,
+    is never quite the same.
+    """
     new = spectra(tmp_path / "new.npz", rows=55)
     before = weights(halfway.checkpoints[0])
     after: dict = {}
@@ -166,16 +184,22 @@ def others(halfway, spectra_file, tmp_path_factory) -> dict[str, Path]:
     ("changes", "message"),
     [
         (["ckpt_path={model}"], r"resume from last\.ckpt instead"),
-        # It was taken for an interrupted run: `gsparc has not been trained: call fit() or load a checkpoint`.
+        # It was taken for an interrupted run:
+        # `gsparc has not been trained: call fit() or load a checkpoint`.
         (["ckpt_path={nearest}"], r"resume from last\.ckpt instead"),
         (["ckpt_path=gone.ckpt"], r"gone\.ckpt: no such file"),
         (["init_from=none.ckpt"], r"init_from=none\.ckpt: .*no such checkpoint"),
         (["init_from={model}", "dataset.file={rx}"], "init_from=.*trained with static_end rx"),
-        (["init_from={model}", "model=nearest"], "init_from: nearest takes no weights to start from"),
+        (
+            ["init_from={model}", "model=nearest"],
+            "init_from: nearest takes no weights to start from",
+        ),
         (["trainer.devices=2"], "say trainer=ddp"),  # several devices need processes that end
     ],
 )
-def test_what_cannot_be_trained_is_refused_in_one_line(spectra_file, others, tmp_path, changes, message):
+def test_what_cannot_be_trained_is_refused_in_one_line(
+    spectra_file, others, tmp_path, changes, message
+):
     settings = brief(spectra_file, "model.refit=false")
     if "model=nearest" in changes:
         settings = [s for s in settings if not s.startswith("model.")]
@@ -191,7 +215,9 @@ def test_the_module_of_a_checkpoint_predicts_what_gsparc_load_does(name, spectra
     data = datamodule({"name": "own", "file": str(spectra_file)}).measurements
     rows = np.arange(20)
     loaded = Loaded(data, 8).use(Fold(rows, rows[:0], rows))
-    trainer = Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, enable_checkpointing=False)
+    trainer = Trainer(
+        accelerator="cpu", logger=False, enable_progress_bar=False, enable_checkpointing=False
+    )
     predicted = torch.cat(trainer.predict(module, loaded))
     expected = gsparc.load(path).spectrum(tx=data.tx[rows] + data.site.origin)
     assert predicted.shape == (20, 16, 32) and np.abs(predicted.numpy() - expected).max() < 1e-5
@@ -206,7 +232,9 @@ def test_a_method_without_a_field_has_no_module(others):
 def test_the_folder_of_a_run_is_all_it_takes_to_go_on(spectra_file, tmp_path):
     """The settings it did not name were the defaults, and each of them stood in the refusal."""
     stopped = "callbacks.stop={_target_: lost.Interrupt, step: 15}"
-    begun = brief(spectra_file, "model.refit=false", f"+{stopped}", f"hydra.run.dir={tmp_path / 'run'}")
+    begun = brief(
+        spectra_file, "model.refit=false", f"+{stopped}", f"hydra.run.dir={tmp_path / 'run'}"
+    )
     answer, last = knock(main, "train.py", begun), tmp_path / "run" / "last.ckpt"
     assert answer.status == 130 and answer.err[-1].endswith(f"go on with ckpt_path={last}"), answer
     assert not any("Traceback" in line for line in answer.err)
@@ -214,8 +242,12 @@ def test_the_folder_of_a_run_is_all_it_takes_to_go_on(spectra_file, tmp_path):
     others = [f"model.emission.{name}=0.5" for name in ("init_scale", "init_bias")] + ["seed=3"]
     others += [f"model.effects.{name}=auto" for name in ("array", "phase", "power", "residual")]
     answer = knock(main, "train.py", [*on, *others, "+callbacks.stop=null"])
-    assert_refused(answer, r"trained with seed=0 \(here 3\)(, \S+ \(here \S+\)){4} and 2 more: go on with")
+    assert_refused(
+        answer, r"trained with seed=0 \(here 3\)(, \S+ \(here \S+\)){4} and 2 more: go on with"
+    )
     assert knock(main, "train.py", [*on, "+callbacks.stop=null"]).status == 0
     resumed = checkpoint.read(tmp_path / "run" / "model.ckpt").configuration
-    assert resumed["dataset"]["file"] == str(spectra_file) and resumed["model"]["field"]["count"] == 40
+    assert (
+        resumed["dataset"]["file"] == str(spectra_file) and resumed["model"]["field"]["count"] == 40
+    )
     assert resumed["seed"] == 0 and resumed["trainer"]["max_steps"] == 20

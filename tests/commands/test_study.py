@@ -18,7 +18,7 @@ LINES = {
     "effects": ([], ["none"]),
     "positions": (["kind.errors_m=[0.1]"], ["none", "query", "train", "train_known"]),
     "measurements": (["kind.keep=[1,0.5]", "rounds=1"], ["keep", "keep"]),
-}  # fmt: skip
+}
 
 
 @pytest.mark.slow
@@ -27,10 +27,19 @@ def test_a_study_leaves_a_table_a_figure_and_a_summary(kind, tmp_path, monkeypat
     runs_in(monkeypatch, tmp_path)
     more, conditions = LINES[kind]
     config = compose(
-        "dataset=own", f"dataset.file='{spectra(tmp_path / 'own.npz')}'", f"kind={kind}", "threads=1",
-        "~variants", f"+variants={{plain: {PLAIN}}}", "baselines=[mean]", "query_s=0.5",
-        "trainer.max_steps=6", "trainer.val_check_interval=3", *more, config="study",
-    )  # fmt: skip
+        "dataset=own",
+        f"dataset.file='{spectra(tmp_path / 'own.npz')}'",
+        f"kind={kind}",
+        "threads=1",
+        "~variants",
+        f"+variants={{plain: {PLAIN}}}",
+        "baselines=[mean]",
+        "query_s=0.5",
+        "trainer.max_steps=6",
+        "trainer.val_check_interval=3",
+        *more,
+        config="study",
+    )
     with HYDRA():
         rows = task(config)
     assert list(rows.what) == 2 * conditions

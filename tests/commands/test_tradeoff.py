@@ -29,21 +29,28 @@ def swept(field, tmp_path_factory):
     ckpt = folder / "model.ckpt"
     shutil.copy(field.checkpoints[0], ckpt)
     config = compose(
-        f"ckpt='{ckpt}'", "threads=[1]", "rounds=5",
+        f"ckpt='{ckpt}'",
+        "threads=[1]",
+        "rounds=5",
         "grid.stride=[1,2]",
-        "baselines=[mean,distance_law]", config="tradeoff",
-    )  # fmt: skip
+        "baselines=[mean,distance_law]",
+        config="tradeoff",
+    )
     with pytest.MonkeyPatch.context() as patch:
         runs_in(patch, folder)
         said: list[tuple] = []
-        patch.setattr(tracking, "log_table", lambda loggers, *table: said.append((len(loggers), *table)))
+        patch.setattr(
+            tracking, "log_table", lambda loggers, *table: said.append((len(loggers), *table))
+        )
         config.logger = {"any": {"_target_": "lightning.pytorch.loggers.logger.DummyLogger"}}
         facts = task(config)
         monkey = {"in_multirun": lambda: True, "_swept": None}  # which is not called
         with pytest.MonkeyPatch.context() as second:
             for name, value in monkey.items():
                 second.setattr(f"gsparc.commands.tradeoff.{name}", value)
-            assert task(config) == facts, "a job of a multirun is done once, though the front is in its ckpt"
+            assert task(config) == facts, (
+                "a job of a multirun is done once, though the front is in its ckpt"
+            )
         return facts, folder, ckpt, said
 
 
@@ -60,7 +67,8 @@ def test_it_leaves_a_table_a_picture_and_a_summary(swept):
     with (folder / "tradeoff.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == facts["tradeoff/points"] == 3  # as trained, 2 without confidence
-    assert len({row["closeness_db"] for row in rows}) == 2  # fewer pixels are not as near as the full model
+    # Fewer pixels are not as near as the full model
+    assert len({row["closeness_db"] for row in rows}) == 2
     times = [float(row["render_ms_p50"]) for row in rows]
     assert times == sorted(times)
     assert all(float(row["render_ms_p95"]) >= t for row, t in zip(rows, times, strict=True))
@@ -82,8 +90,15 @@ def test_the_front_is_kept_with_the_model_which_stays_what_it_was(swept, field):
     _, _, ckpt, _ = swept
     before, after = checkpoint.read(field.checkpoints[0]), checkpoint.read(ckpt)
     points, measured = operating_point.stored_points(after.extra)
-    assert points and "receiver" in measured and operating_point.stored_points(before.extra) == ([], {})
-    assert after.config == before.config and set(after.extra) == {*before.extra, operating_point.KEY}
+    assert (
+        points
+        and "receiver" in measured
+        and operating_point.stored_points(before.extra) == ([], {})
+    )
+    assert after.config == before.config and set(after.extra) == {
+        *before.extra,
+        operating_point.KEY,
+    }
     place = field.data.site.origin + 0.1
     same = [gsparc.load(path).spectrum(tx=place) for path in (field.checkpoints[0], ckpt)]
     assert np.array_equal(*same)
@@ -94,7 +109,8 @@ def test_what_is_kept_is_decided_without_a_measurement(swept, field):
     with (folder / "tradeoff.csv").open() as file:
         rows = [row for row in csv.DictReader(file) if row["kept_with_model"] == "1"]
     close = [float(row["closeness_db"]) for row in rows]
-    assert close == sorted(close) and close[-1] == 100.0  # the last is as near as the full model itself
+    # The last is as near as the full model itself
+    assert close == sorted(close) and close[-1] == 100.0
     data = field.data
     blind = dataclasses.replace(data, target=np.zeros_like(data.target))
     told = [], []
@@ -109,11 +125,18 @@ def test_a_budget_picks_the_most_accurate_that_fits(swept, monkeypatch):
     _, _, ckpt, _ = swept
     points, _ = operating_point.stored_points(checkpoint.read(ckpt).extra)
     pretended = {i: np.full(8, 1.0 + i) for i in range(len(points))}
-    monkeypatch.setattr(operating_point, "time_interleaved", lambda calls, clock, threads: pretended)
+    monkeypatch.setattr(
+        operating_point, "time_interleaved", lambda calls, clock, threads: pretended
+    )
     best = max(points, key=lambda p: p.score)
     assert gsparc.load(ckpt, budget_ms=1e6).point == best
     assert gsparc.load(ckpt, budget_ms=1.5).point == points[0]
-    refused(r"budget_ms=0.5: no operating point .* fastest .* takes 1 ms", gsparc.load, ckpt, budget_ms=0.5)
+    refused(
+        r"budget_ms=0.5: no operating point .* fastest .* takes 1 ms",
+        gsparc.load,
+        ckpt,
+        budget_ms=0.5,
+    )
 
 
 def test_a_budget_is_met_here_and_confidence_is_still_given(swept):
@@ -121,8 +144,12 @@ def test_a_budget_is_met_here_and_confidence_is_still_given(swept):
     threads = torch.get_num_threads()
     predictor = gsparc.load(ckpt, budget_ms=1000)
     place = predictor.site.origin + 0.1
-    assert predictor.spectrum(tx=place).shape == (16, 32) and 0 <= predictor.confidence(tx=place) <= 1
-    times = time_interleaved({0: lambda n: predictor.spectrum(tx=place)}, ClockSettings(rounds=5), {0: 1})
+    assert (
+        predictor.spectrum(tx=place).shape == (16, 32) and 0 <= predictor.confidence(tx=place) <= 1
+    )
+    times = time_interleaved(
+        {0: lambda n: predictor.spectrum(tx=place)}, ClockSettings(rounds=5), {0: 1}
+    )
     assert np.median(times[0]) <= 1000
     torch.set_num_threads(threads)
 
@@ -137,7 +164,9 @@ def test_a_model_that_cannot_be_reduced_showed_one_point_without_a_word():
     whole = gsparc.load(town_model())
     method, single = whole.method, whole.select_station("west").method
     assert "of several stations is asked as it was trained" in why_irreducible(method)[0]
-    assert "no Gaussians, sources" in why_irreducible(DistanceLaw())[0] and not why_irreducible(single)
+    assert "no Gaussians, sources" in why_irreducible(DistanceLaw())[0] and not why_irreducible(
+        single
+    )
 
 
 def test_a_model_of_several_stations_could_not_be_timed():
@@ -167,5 +196,10 @@ def test_silent_rows_did_not_count_beside_other_methods(tmp_path, monkeypatch):
     np.savez(file, **arrays, sensitivity_db=level)
     path = trained(file, "gp", "threads=1")
     runs_in(monkeypatch, tmp_path)
-    facts = task(compose(f"ckpt='{path}'", "threads=[1]", "rounds=3", "baselines=[idw]", config="tradeoff"))
-    assert facts["tradeoff/figure"] == "rmse_db_with_silent" and facts["tradeoff/front_beaten_by_others"] == 0
+    facts = task(
+        compose(f"ckpt='{path}'", "threads=[1]", "rounds=3", "baselines=[idw]", config="tradeoff")
+    )
+    assert (
+        facts["tradeoff/figure"] == "rmse_db_with_silent"
+        and facts["tradeoff/front_beaten_by_others"] == 0
+    )

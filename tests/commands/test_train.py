@@ -28,12 +28,18 @@ def steps(folder: Path) -> list[int]:
 
 def test_a_run_leaves_facts_and_files(spectra_file, tmp_path):
     """What `evaluate` finds, and beside it what a training alone knows."""
-    facts, objects = train(compose(*brief(spectra_file, "baselines=[nearest,mean,gp]")), tmp_path / "run")
+    facts, objects = train(
+        compose(*brief(spectra_file, "baselines=[nearest,mean,gp]")), tmp_path / "run"
+    )
     stored = json.loads((tmp_path / "run" / "summary.json").read_text())
     assert {"seed", "git", "versions", "memory/peak_mb", "test/skill"} <= set(stored)
     assert all(value is None or isinstance(value, (int, float, str)) for value in stored.values())
-    assert stored["model/num_gaussians"] == 40 and stored["time/train_s"] > 0 and stored["seed"] == 0
-    assert stored["machine/threads"] == 1 and stored["dataset/name"] == facts["dataset/name"] == "own"
+    assert (
+        stored["model/num_gaussians"] == 40 and stored["time/train_s"] > 0 and stored["seed"] == 0
+    )
+    assert (
+        stored["machine/threads"] == 1 and stored["dataset/name"] == facts["dataset/name"] == "own"
+    )
     assert isinstance(objects, TrainedRun) and isinstance(objects.methods[0], LearnedField)
     written = {path.name for path in (tmp_path / "run").iterdir()}
     assert {"model.ckpt", "per_sample.csv", "split.json", "learning_curve.csv"} <= written
@@ -99,7 +105,9 @@ def test_the_simulated_stand_in_says_so(tmp_path):
 @pytest.mark.parametrize("fails", [False, True])
 def test_loggers_are_closed_whatever_happens(spectra_file, tmp_path, monkeypatch, fails):
     closed, told = [], []
-    monkeypatch.setattr(CSVLogger, "log_metrics", lambda self, metrics, step=None: told.append(metrics))
+    monkeypatch.setattr(
+        CSVLogger, "log_metrics", lambda self, metrics, step=None: told.append(metrics)
+    )
     monkeypatch.setattr(CSVLogger, "finalize", lambda self, status: closed.append(status))
     config = plain(spectra_file, "mean", "logger=csv", f"logger.csv.save_dir='{tmp_path}'")
     if fails:
@@ -108,19 +116,26 @@ def test_loggers_are_closed_whatever_happens(spectra_file, tmp_path, monkeypatch
             train(config, tmp_path)
     else:
         train(config, tmp_path)
-        assert told[-1]["final/test/psnr_db"] and not [k for k in told[-1] if not k.startswith("final/")]
+        assert told[-1]["final/test/psnr_db"] and not [
+            k for k in told[-1] if not k.startswith("final/")
+        ]
     assert closed == ["failed" if fails else "success"]
 
 
-# -- options of the Trainer, and Lightning's own way to a model -------------------------------------------
+# -- options of the Trainer, and Lightning's own way to a model ------------------------------------
 
 
-@pytest.mark.parametrize(("options", "validated"), [
-    (["trainer=debug"], [1]),
-    (["trainer.precision=bf16-mixed", "+trainer.profiler=simple"], [10, 20]),
-    (["trainer.gradient_clip_val=1.0", "trainer.val_check_interval=7"], [7, 14]),
-])  # fmt: skip
-def test_an_option_of_the_trainer_is_an_override(options, validated, spectra_file, tmp_path, caplog):
+@pytest.mark.parametrize(
+    ("options", "validated"),
+    [
+        (["trainer=debug"], [1]),
+        (["trainer.precision=bf16-mixed", "+trainer.profiler=simple"], [10, 20]),
+        (["trainer.gradient_clip_val=1.0", "trainer.val_check_interval=7"], [7, 14]),
+    ],
+)
+def test_an_option_of_the_trainer_is_an_override(
+    options, validated, spectra_file, tmp_path, caplog
+):
     caplog.set_level(logging.INFO)
     facts, _ = train(short(spectra_file, *options), tmp_path)
     assert facts["test/psnr_db"] > 20 and steps(tmp_path) == validated
@@ -146,7 +161,9 @@ def test_the_curve_of_a_closed_form_had_no_held_out_error(spectra_file, tmp_path
 
 
 def test_options_without_effect_are_said_and_stored(spectra_file, tmp_path, monkeypatch, caplog):
-    """`effects.array=true effort=.5`, or `trainer.max_steps=3` of a plain method, went without a word."""
+    """`effects.array=true effort=.5`, or `trainer.max_steps=3` of a plain method,
+    went without a word.
+    """
     given = {name: f"{name}=3" for name in ("trainer.max_steps", "effort", "seed")}
     monkeypatch.setattr(options, "command_line_options", lambda: given)
     train(plain(spectra_file, "nearest"), tmp_path)
@@ -156,7 +173,7 @@ def test_options_without_effect_are_said_and_stored(spectra_file, tmp_path, monk
     assert record.levelno == logging.WARNING and "(nearest counts nothing)" in record.message
 
 
-# -- the objective of a search --------------------------------------------------------------------------
+# -- the objective of a search ---------------------------------------------------------------------
 
 
 def test_the_folder_of_one_run_was_ignored_in_a_sweep(tmp_path, monkeypatch):
@@ -170,15 +187,21 @@ def test_the_folder_of_one_run_was_ignored_in_a_sweep(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("way", [(), ("-m", "seed=0,1")], ids=["a run", "a sweep"])
 def test_the_objective_is_for_searches_alone(tmp_path, way):
-    """One power heard of sixty: everything was written, then `error: objective=test/rmse_db`, exit 1."""
+    """One power heard of sixty: everything was written, then `error: objective=test/rmse_db`,
+    exit 1.
+    """
     where, heard = np.random.default_rng(0).uniform(0, 20, (60, 3)), np.full(60, np.nan)
     heard[7] = -60.0
     powers = {"rssi_db": heard, "sensitivity_db": -90.0}
     np.savez(tmp_path / "own.npz", rx_position=where, tx_position=np.zeros(3), **powers)
     folder = [f"hydra.run.dir={tmp_path / 'run'}", f"hydra.sweep.dir={tmp_path / 'run'}"]
     given = ["dataset=own", f"dataset.file={tmp_path / 'own.npz'}", "model=mean", "baselines=[]"]
-    answer = knock(main, "train.py", [*way, *given, *folder, "logger=none", "threads=1", "split.seed=0"])
-    assert answer.status == 0 and not [line for line in answer.err if line.startswith("error")], answer
+    answer = knock(
+        main, "train.py", [*way, *given, *folder, "logger=none", "threads=1", "split.seed=0"]
+    )
+    assert answer.status == 0 and not [line for line in answer.err if line.startswith("error")], (
+        answer
+    )
     written = list((tmp_path / "run").glob("*/summary.json" if way else "summary.json"))
     assert len(written) == (2 if way else 1)
     assert all(json.loads(file.read_text())["test/rmse_db"] is None for file in written)
@@ -188,7 +211,9 @@ def test_the_objective_is_for_searches_alone(tmp_path, way):
 def said_of_a_draw(folder: Path, **rows: np.ndarray) -> str:
     """The log of a training on split.seed=2 of a file with those `rows`."""
     places, file = np.random.default_rng(0).uniform(0, 20, (60, 3)), folder / "own.npz"
-    np.savez(file, rx_position=places, tx_position=np.zeros(3), rssi_db=-50.0 - places[:, 0], **rows)
+    np.savez(
+        file, rx_position=places, tx_position=np.zeros(3), rssi_db=-50.0 - places[:, 0], **rows
+    )
     given = ["dataset=own", f"dataset.file={file}", "model=mean", "baselines=[]", "split.seed=2"]
     given += [f"hydra.run.dir={folder / 'run'}", "logger=none", "threads=1"]
     assert knock(main, "train.py", given).status == 0
@@ -204,4 +229,6 @@ def test_the_title_named_a_seed_where_the_release_named_the_test_rows(tmp_path):
     """`split random (split.seed=2)`, and the seed had moved validation rows alone."""
     said = said_of_a_draw(tmp_path, split_train=np.arange(40), split_test=np.arange(40, 60))
     assert "split random (test rows named by its files), test, seed 0" in said
-    assert "random (test rows named by its files): 36 training" in said and "(split.seed" not in said
+    assert (
+        "random (test rows named by its files): 36 training"
+    ) in said and "(split.seed" not in said

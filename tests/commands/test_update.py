@@ -28,7 +28,13 @@ SOAK_S = int(os.environ.get("GSPARC_SOAK_S", "15"))
 @pytest.fixture(scope="module")
 def before(tmp_path_factory):
     folder = tmp_path_factory.mktemp("later")
-    gsparc.fit(rx=PLACES, tx=[9.0, 9.0, 2.6], rssi=levels(PLACES, 0), model="gp", save=folder / "before.ckpt")
+    gsparc.fit(
+        rx=PLACES,
+        tx=[9.0, 9.0, 2.6],
+        rssi=levels(PLACES, 0),
+        model="gp",
+        save=folder / "before.ckpt",
+    )
     return folder / "before.ckpt"
 
 
@@ -41,7 +47,9 @@ def update(folder, *words):
 
 def test_rows_of_a_file_are_told_and_taken_back(before, tmp_path):
     new, out = room_file(tmp_path / "new.npz", 40, change=-12.0), tmp_path / "after.ckpt"
-    done, facts = update(tmp_path / "run", f"ckpt={before}", f"data={new}", f"out={out}", "batch=10")
+    done, facts = update(
+        tmp_path / "run", f"ckpt={before}", f"data={new}", f"out={out}", "batch=10"
+    )
     assert any("update: 40 rows added, " in line for line in done.out)  # of all batches
     assert facts["update/rows_kept"] == 40 and facts["update/versions"] == 5
     old, after = gsparc.load(before), gsparc.load(out)
@@ -56,7 +64,12 @@ def test_rows_of_a_file_are_told_and_taken_back(before, tmp_path):
 
 def test_a_file_that_is_told_twice_is_taken_once_unless_it_is_said(before, tmp_path):
     new, out = room_file(tmp_path / "new.npz", 40), tmp_path / "after.ckpt"
-    assert update(tmp_path / "run", f"ckpt={before}", f"data={new}", f"out={out}", "batch=30")[0].status == 0
+    assert (
+        update(tmp_path / "run", f"ckpt={before}", f"data={new}", f"out={out}", "batch=30")[
+            0
+        ].status
+        == 0
+    )
     (tmp_path / "copy.npz").write_bytes(new.read_bytes())  # by content, whatever it is called
     answer, _ = update(tmp_path / "twice", f"ckpt={out}", f"data={tmp_path}/copy.npz")
     assert answer.status != 0 and "again=true tells them once more" in " ".join(answer.err)
@@ -67,7 +80,9 @@ def test_a_file_that_is_told_twice_is_taken_once_unless_it_is_said(before, tmp_p
 
 def test_rows_of_another_site_are_refused(before, tmp_path):
     places, file = PLACES[:5] + np.array([2e6, 0, 0]), tmp_path / "far.npz"
-    np.savez(file, rx_position=places, tx_position=np.array([9.0, 9.0, 2.6]), rssi_db=levels(places, 0))
+    np.savez(
+        file, rx_position=places, tx_position=np.array([9.0, 9.0, 2.6]), rssi_db=levels(places, 0)
+    )
     answer, _ = update(tmp_path / "run", f"ckpt={before}", f"data={file}")
     assert answer.status != 0 and "km from all rows" in " ".join(answer.err)
 
@@ -83,7 +98,10 @@ def test_changes_are_listed_where_they_are(before, tmp_path):
 
 
 def test_neither_rows_nor_steps_back_and_no_version(before, tmp_path):
-    for words, said in (([], "say data=FILE to add rows, or undo=COUNT"), (["undo=1"], "1 back, 0 are kept")):
+    for words, said in (
+        ([], "say data=FILE to add rows, or undo=COUNT"),
+        (["undo=1"], "1 back, 0 are kept"),
+    ):
         answer, _ = update(tmp_path, f"ckpt={before}", *words)
         assert answer.status != 0 and said in " ".join(answer.err + answer.out)
 
@@ -92,7 +110,12 @@ def test_a_model_of_channels_was_refused_for_the_name_of_its_new_rows(tmp_path):
     """A folder was `no file; expected a table`; `update(csi=...)` had an unexpected keyword."""
     csi = np.exp(1j * np.arange(20))
     waves = gsparc.fit(
-        rx=PLACES[:20], tx=[9.0, 9.0, 2.6], csi=csi, frequency_hz=1e9, model="mean", save=tmp_path / "a.ckpt"
+        rx=PLACES[:20],
+        tx=[9.0, 9.0, 2.6],
+        csi=csi,
+        frequency_hz=1e9,
+        model="mean",
+        save=tmp_path / "a.ckpt",
     )
     answer, _ = update(tmp_path, f"ckpt={tmp_path / 'a.ckpt'}", f"data={tmp_path}")
     said = "models of channels cannot be updated: train again on all rows"
@@ -130,7 +153,9 @@ def test_rows_that_came_while_a_file_was_read_were_overwritten(before, tmp_path)
 @pytest.mark.slow
 @pytest.mark.timeout(200 + SOAK_S)
 def test_rows_that_were_acknowledged_were_lost(tmp_path, capsys):
-    """83 of 218 that a server and `gsparc update` took in a minute; `GSPARC_SOAK_S=60`: for a minute."""
+    """83 of 218 that a server and `gsparc update` took in a minute; `GSPARC_SOAK_S=60`:
+    for a minute.
+    """
     pytest.importorskip("uvicorn", reason="the extra `serve` is not installed")
     counts = Soak(tmp_path, SOAK_S, alive_s=5).counts()
     with capsys.disabled():
@@ -147,7 +172,8 @@ def test_a_kill_leaves_a_whole_file(before, tmp_path):
     script = (
         "import gsparc\nfrom gsparc.models import checkpoint\n"
         "from gsparc.prediction.updating import versions_extra\nimport numpy as np, sys\n"
-        f"new = np.load({str(new)!r})\npredictor = gsparc.load({str(out)!r})\nprint('ready', flush=True)\n"
+        f"new = np.load({str(new)!r})\npredictor = gsparc.load({str(out)!r})\nprint('ready', "
+        "flush=True)\n"
         "while True:\n"
         "    predictor.update(rx=new['rx_position'][:3], rssi=new['rssi_db'][:3])\n"
         f"    checkpoint.update_extra({str(out)!r}, versions_extra(predictor.versions))\n"
@@ -171,7 +197,9 @@ def test_lists_of_the_strongest_raised_all_levels(tmp_path):
     masts = np.c_[np.linspace(0, 700, 8), np.tile([20.0, -20], 4), np.full(8, 10.0)]
     place = np.c_[rng.uniform(0, 700, 200), rng.uniform(-5, 5, 200), np.full(200, 1.5)]
     level = (
-        -20 - 35 * np.log10(np.linalg.norm(place[:, None] - masts, axis=-1)) + 3 * rng.normal(size=(200, 8))
+        -20
+        - 35 * np.log10(np.linalg.norm(place[:, None] - masts, axis=-1))
+        + 3 * rng.normal(size=(200, 8))
     )
     moment, station = np.nonzero(np.argsort(np.argsort(-level, 1), 1) < 3)
     arrays = {"station": station, "station_position": masts}
@@ -180,4 +208,6 @@ def test_lists_of_the_strongest_raised_all_levels(tmp_path):
     file = tmp_path / "model.ckpt"
     gsparc.fit(rx=drive["rx_position"], rssi=drive["rssi_db"], **arrays, model="gp", save=file)
     done, _ = update(tmp_path / "run", f"ckpt={file}", f"data={tmp_path}/drive.npz")
-    assert done.status == 1 and any("lists of the strongest hold what is strong" in line for line in done.err)
+    assert done.status == 1 and any(
+        "lists of the strongest hold what is strong" in line for line in done.err
+    )

@@ -32,7 +32,9 @@ def library() -> cuda_library.Library:
     KEPT.mkdir(parents=True, exist_ok=True)
     with FileLock(path.with_suffix(".lock")):  # of processes of tests one builds
         if not path.exists():
-            cuda_library.compile_to(path, ["g++", *FLAGS, *INCLUDES, *cuda_library.cuda_sources(), str(SHIM)])
+            cuda_library.compile_to(
+                path, ["g++", *FLAGS, *INCLUDES, *cuda_library.cuda_sources(), str(SHIM)]
+            )
     return cuda_library.Library(path)
 
 
@@ -46,7 +48,9 @@ def gpu() -> cuda_library.Library:
 
 
 def on_gpu(run: Callable) -> Callable:
-    """`launch` for tensors in main memory: what it reads and writes goes to the GPU and comes back."""
+    """`launch` for tensors in main memory: what it reads and writes goes
+    to the GPU and comes back.
+    """
 
     def there(name, like, *tensors, **options):
         moved = [None if t is None else t.cuda() for t in tensors]

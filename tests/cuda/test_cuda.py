@@ -10,7 +10,9 @@ BOTH = pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["fl
 
 
 def crowd(n: int = 700) -> Scene:
-    """Wide Gaussians on a few tiles: a block walks its list several times, and light ends inside."""
+    """Wide Gaussians on a few tiles: a block walks its list several times,
+    and light ends inside.
+    """
     scene = random_scene(n=n, seed=12, size=1.5)
     scene.opacities[:] *= 0.6
     return scene
@@ -27,10 +29,14 @@ def test_long_lists_equal_the_reference(where, dtype, projection):
 
 
 def test_order_of_the_threads_does_not_matter(where):
-    """A missing barrier shows when a block's threads run in the opposite order; on a GPU, run it twice."""
+    """A missing barrier shows when a block's threads run in the opposite order; on a GPU,
+    run it twice.
+    """
     scene = crowd(200).to(torch.float32)
     first = render(scene, poses(3), GRIDS["hemisphere"])
-    turned = calls.libraries["cpu"]._loaded.gsparc_shim_backwards if where == "shim" else lambda on: None
+    turned = (
+        calls.libraries["cpu"]._loaded.gsparc_shim_backwards if where == "shim" else lambda on: None
+    )
     turned(1)
     second = render(scene, poses(3), GRIDS["hemisphere"])
     turned(0)
@@ -84,7 +90,15 @@ def test_captured_plan_without_room_is_nan_never_wrong(where, monkeypatch):
     monkeypatch.setattr(cuda, "_is_capturing", lambda tensor: True)
     monkeypatch.setattr(cuda, "_capacity_with_headroom", lambda entries: 5)
     got = render(scene, poses(0), grid)
-    for name in ("image", "transmittance", "d_means", "d_quats", "d_scales", "d_opacities", "d_features"):
+    for name in (
+        "image",
+        "transmittance",
+        "d_means",
+        "d_quats",
+        "d_scales",
+        "d_opacities",
+        "d_features",
+    ):
         assert torch.isnan(got[name]).all(), name
 
 

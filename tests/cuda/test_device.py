@@ -101,8 +101,11 @@ def test_a_million_gaussians_stay_within_the_bound():
     n = 1_000_000
     means = 5 * torch.randn(n, 3, device="cuda")
     model = (
-        means, torch.randn(n, 4, device="cuda"), torch.full((n, 3), 0.3).cuda(), torch.full((n,), 0.3).cuda(),
-    )  # fmt: skip
+        means,
+        torch.randn(n, 4, device="cuda"),
+        torch.full((n, 3), 0.3).cuda(),
+        torch.full((n,), 0.3).cuda(),
+    )
     torch.cuda.reset_peak_memory_stats()
     before = torch.cuda.memory_allocated()
     plan = make_plan(*model, poses(0).to("cuda"), GRID)

@@ -1,7 +1,7 @@
 """A model that was moved keeps everything on its device, shown without a GPU by tensors on `meta`.
 
-They hold no data and mix with a CPU's as little as a GPU's do. The rasterizer's place is taken by one of the
-right shapes, differentiable in the features alone.
+They hold no data and mix with a CPU's as little as a GPU's do. The rasterizer's place is taken by
+one of the right shapes, differentiable in the features alone.
 """
 
 import numpy as np
@@ -26,7 +26,9 @@ class Shapes:
     @staticmethod
     def composite(plan, gaussians, features, means2d):
         means, quats, scales, opacities = gaussians
-        one = (features.sum(1) + (means + scales).sum() + quats.sum() + opacities.sum())[..., None, None]
+        one = (features.sum(1) + (means + scales).sum() + quats.sum() + opacities.sum())[
+            ..., None, None
+        ]
         image = one.expand(*one.shape[:2], plan.grid.height, plan.grid.width)
         return image, means.new_empty(plan.num_poses, plan.grid.height, plan.grid.width)
 
@@ -41,7 +43,9 @@ def unlooked(pose: Pose, means: torch.Tensor) -> Pose:
 
 
 @pytest.mark.parametrize("kind", ["spectrum", "csi"])
-def test_a_training_loss_and_its_gradients_stay_on_the_models_device(kind, campaign, tmp_path, monkeypatch):
+def test_a_training_loss_and_its_gradients_stay_on_the_models_device(
+    kind, campaign, tmp_path, monkeypatch
+):
     monkeypatch.setattr(backends, "choose_backend", lambda name, device: Shapes)
     monkeypatch.setattr(backends, "backend_named", lambda name: Shapes)
     monkeypatch.setattr(validation, "check_poses", unlooked)

@@ -1,4 +1,6 @@
-"""Finding and building the library: nothing happens at import, and absence is explained in one line."""
+"""Finding and building the library: nothing happens at import,
+and absence is explained in one line.
+"""
 
 import ctypes
 import re
@@ -94,9 +96,13 @@ def test_a_gpu_newer_than_the_compiler_gets_code_that_the_driver_translates(tmp_
     nvcc = nvcc_of(tmp_path, "compute_75", "compute_90", "compute_90a", "compute_100")
     assert cuda_library.arch_option(nvcc, "90") == "-gencode=arch=compute_90,code=sm_90"
     assert cuda_library.arch_option(nvcc, "120") == "-gencode=arch=compute_100,code=compute_100"
-    with pytest.raises(cuda_library.LibraryUnavailable, match=r"sm_70 and .* builds for sm_75 and newer"):
+    with pytest.raises(
+        cuda_library.LibraryUnavailable, match=r"sm_70 and .* builds for sm_75 and newer"
+    ):
         cuda_library.arch_option(nvcc, "70")
-    assert cuda_library.arch_option(nvcc_of(tmp_path), "61") == "-gencode=arch=compute_61,code=sm_61"
+    assert (
+        cuda_library.arch_option(nvcc_of(tmp_path), "61") == "-gencode=arch=compute_61,code=sm_61"
+    )
 
 
 def test_every_gpu_of_the_machine_is_built_for(monkeypatch):
@@ -121,7 +127,9 @@ def test_a_driver_older_than_the_toolkit_is_said_when_the_library_is_loaded(monk
     kept = cuda_library.library_path("90")
     kept.parent.mkdir()
     kept.touch()
-    assert "built with CUDA 13.0 and the driver is of CUDA 12.8: update the driver" in explained(monkeypatch)
+    assert ("built with CUDA 13.0 and the driver is of CUDA 12.8: update the driver") in explained(
+        monkeypatch
+    )
     assert not kept.exists()  # another toolkit is asked next time
 
 
@@ -143,14 +151,19 @@ def test_the_shim_reports_barriers_that_not_all_threads_meet_and_grids_that_no_g
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "1"
     loaded = ctypes.CDLL(str(library))
-    assert loaded.gsparc_steps() == 2  # a launch after one that failed would work on what is not there
+    # A launch after one that failed would work on what is not there
+    assert loaded.gsparc_steps() == 2
     for function in (loaded.gsparc_rows, loaded.gsparc_blocks):
         function.argtypes, function.restype = [ctypes.c_int64], ctypes.c_int64
-    assert loaded.gsparc_rows(65535) == 0 and loaded.gsparc_rows(65536) == 2 == loaded.gsparc_blocks(2**31)
+    assert loaded.gsparc_rows(65535) == 0 and loaded.gsparc_rows(
+        65536
+    ) == 2 == loaded.gsparc_blocks(2**31)
 
 
 def resources(told: str) -> dict[str, dict[str, int]]:
-    """What ptxas -v says of each kernel of ours: bytes on the stack and spilled, registers, shared memory."""
+    """What ptxas -v says of each kernel of ours: bytes on the stack and spilled, registers,
+    shared memory.
+    """
     found, name = {}, ""
     for line in told.splitlines():
         if match := re.search(r"Compiling entry function '(\w+)'", line):
@@ -165,9 +178,13 @@ def resources(told: str) -> dict[str, dict[str, int]]:
 @pytest.mark.slow
 @pytest.mark.parametrize("arch", [pytest.param("75", marks=pytest.mark.rare), "90"])
 def test_compiles(arch, tmp_path, monkeypatch):
-    """The whole library for an old and a new GPU, without one; every kernel fits there as it was meant to."""
+    """The whole library for an old and a new GPU, without one;
+    every kernel fits there as it was meant to.
+    """
     if cuda_library.compiler() is None:
-        pytest.skip("there is no nvcc here, so the CUDA sources were only compiled for the host shim")
+        pytest.skip(
+            "there is no nvcc here, so the CUDA sources were only compiled for the host shim"
+        )
     path, run, told = tmp_path / "kernels.so", subprocess.run, []
 
     def kept(command, **options):
@@ -184,17 +201,28 @@ def test_compiles(arch, tmp_path, monkeypatch):
     narrow: list[str] = []
     for name, numbers in kernels.items():
         assert numbers["stack frame"] == numbers["spill stores"] == 0, f"{name} spills: {numbers}"
-        assert numbers.get("smem", 0) <= 48 * 1024, f"{name}: no more is there without asking: {numbers}"
-        assert numbers["registers"] * 128 <= 65536 // 2, f"two blocks of 128 do not fit: {name} {numbers}"
+        assert numbers.get("smem", 0) <= 48 * 1024, (
+            f"{name}: no more is there without asking: {numbers}"
+        )
+        assert numbers["registers"] * 128 <= 65536 // 2, (
+            f"two blocks of 128 do not fit: {name} {numbers}"
+        )
         if arch == "90" and re.search(r"composite_kernelIfNS0_\d+\w+ELi[14]E", name):
             narrow.append(name)
-            # Eight blocks on a multiprocessor, a KiB of each the system's: 132 take a whole image at once.
+            # Eight blocks on a multiprocessor, a KiB of each the system's:
+            # 132 take a whole image at once.
             assert numbers["registers"] <= 64, f"{name} {numbers}"
             assert 8 * (numbers["smem"] + 1024) <= 228 * 1024, f"{name} {numbers}"
     assert len(narrow) == (4 if arch == "90" else 0)  # two projections, two widths
-    listed = subprocess.run(["nm", "-D", str(path)], capture_output=True, text=True, check=True).stdout
-    functions = [f"gsparc_{name}" for name in ("plan", "bin", "composite_backward", "weights", "thaw")]
+    listed = subprocess.run(
+        ["nm", "-D", str(path)], capture_output=True, text=True, check=True
+    ).stdout
+    functions = [
+        f"gsparc_{name}" for name in ("plan", "bin", "composite_backward", "weights", "thaw")
+    ]
     assert all(f" T {name}" in listed for name in functions)
     if shutil.which("ldd"):
-        linked = subprocess.run(["ldd", str(path)], capture_output=True, text=True, check=True).stdout
+        linked = subprocess.run(
+            ["ldd", str(path)], capture_output=True, text=True, check=True
+        ).stdout
         assert "torch" not in linked and "python" not in linked

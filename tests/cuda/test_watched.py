@@ -1,8 +1,8 @@
 """The CUDA kernels on the host shim under sanitizers: races within a block, memory beside a tensor.
 
-ThreadSanitizer is told which of a block's threads runs and what a barrier orders, so it reports memory that
-two of them share without a barrier between, whatever the order they happened to run in. A shuffle orders
-nothing.
+ThreadSanitizer is told which of a block's threads runs and what a barrier orders, so it reports
+memory that two of them share without a barrier between, whatever the order they happened to run in.
+A shuffle orders nothing.
 """
 
 import os
@@ -63,14 +63,18 @@ def compiled(path: Path, watch: tuple[str, ...], *sources: str) -> Path:
         instrument = () if source == str(SHIM) else watch
         command = [*common, *defines, *instrument, "-x", "c++", "-c", source, "-o", parts[-1]]
         subprocess.run(command, check=True, capture_output=True, text=True)
-    subprocess.run([*common, *watch, *parts, "-o", str(path)], check=True, capture_output=True, text=True)
+    subprocess.run(
+        [*common, *watch, *parts, "-o", str(path)], check=True, capture_output=True, text=True
+    )
     return path
 
 
 def ends(*command: str) -> subprocess.CompletedProcess[str]:
     """How a watched program ends; ThreadSanitizer does not bear memory laid out at random."""
     still = [shutil.which("setarch") or "setarch", "-R"]
-    return subprocess.run([*still, *command], capture_output=True, text=True, env={**os.environ, **ENDS})
+    return subprocess.run(
+        [*still, *command], capture_output=True, text=True, env={**os.environ, **ENDS}
+    )
 
 
 @contextmanager
@@ -81,7 +85,9 @@ def recording(path: Path) -> Iterator[None]:
     def kept(name, like, *tensors, **numbers):
         call = calls.make_call(like, **numbers)
         with path.open("ab") as file:
-            file.write(name.encode().ljust(32, b"\0") + bytes(call) + len(tensors).to_bytes(8, "little"))
+            file.write(
+                name.encode().ljust(32, b"\0") + bytes(call) + len(tensors).to_bytes(8, "little")
+            )
             for tensor in tensors:
                 flat = None if tensor is None else tensor.detach().reshape(-1).view(torch.uint8)
                 size = -1 if flat is None else len(flat)
@@ -95,14 +101,18 @@ def recording(path: Path) -> Iterator[None]:
 
 
 def everything(dtype: torch.dtype) -> None:
-    """Each kernel: both projections, one pose and several, few and many channels, long and short lists."""
+    """Each kernel: both projections, one pose and several, few and many channels,
+    long and short lists.
+    """
     for projection in ("tangent", "equirect"):
         for count in (0, 3):
             scene = random_scene(n=30).to(dtype)
             render(scene, poses(count), GRIDS["patch"], projection=projection)
         scene = random_scene(n=150, seed=12, size=1.5).to(dtype)
         model = (scene.means, scene.quats, scene.scales, 0.3 * scene.opacities)
-        plan = make_plan(*model, origin(), SMALL, projection=projection, ids=torch.arange(150).flip(0))
+        plan = make_plan(
+            *model, origin(), SMALL, projection=projection, ids=torch.arange(150).flip(0)
+        )
         leaves = [tensor.clone().requires_grad_() for tensor in model]
         seen = mean_weights(plan, *leaves)
         (seen.mean.sum() + seen.share.sum()).backward()

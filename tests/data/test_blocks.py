@@ -1,4 +1,6 @@
-"""Measurements too large for memory: read from where they are, block by block, and the same as in memory."""
+"""Measurements too large for memory: read from where they are, block by block,
+and the same as in memory.
+"""
 
 import hashlib
 import multiprocessing
@@ -25,10 +27,13 @@ from gsparc.tables.own import load_own, write_own
 def arrays(rows: int = 40) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     return {
-        "rx_position": rng.uniform(0, 5, (rows, 3)), "tx_position": np.array([9.0, 0, 2]),
-        "csi": (rng.normal(size=(rows, 4, 8)) + 1j * rng.normal(size=(rows, 4, 8))).astype(np.complex64),
+        "rx_position": rng.uniform(0, 5, (rows, 3)),
+        "tx_position": np.array([9.0, 0, 2]),
+        "csi": (rng.normal(size=(rows, 4, 8)) + 1j * rng.normal(size=(rows, 4, 8))).astype(
+            np.complex64
+        ),
         "frequency_hz": 3.5e9 + 1e6 * np.arange(8),
-    }  # fmt: skip
+    }
 
 
 @pytest.fixture
@@ -40,7 +45,11 @@ def small(monkeypatch):
 
 def spectra(kind) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
-    values = rng.uniform(0, 3, (20, 12, 16)) if kind is not np.uint8 else rng.integers(0, 256, (20, 12, 16))
+    values = (
+        rng.uniform(0, 3, (20, 12, 16))
+        if kind is not np.uint8
+        else rng.integers(0, 256, (20, 12, 16))
+    )
     places = {"rx_position": rng.uniform(0, 5, (20, 3)), "tx_position": np.array([9.0, 0, 2])}
     return {**places, "spectrum": values.astype(kind)}
 
@@ -65,7 +74,9 @@ def test_tones_that_are_zero_in_a_block_alone_were_not_measured_there(small):
 @pytest.mark.parametrize("write", [write_own, unchunked])
 @pytest.mark.parametrize("kind", [np.complex64, np.uint8, np.float32, np.float64])
 def test_measurements_stay_on_disk_and_are_the_same(tmp_path, small, monkeypatch, kind, write):
-    """Spectra of floating point were three copies in memory, of a byte a mask as large as they are."""
+    """Spectra of floating point were three copies in memory,
+    of a byte a mask as large as they are.
+    """
     path = tmp_path / "own.h5"
     write(path, arrays() if kind is np.complex64 else spectra(kind))
     there = load_own(path)
@@ -74,7 +85,9 @@ def test_measurements_stay_on_disk_and_are_the_same(tmp_path, small, monkeypatch
         here = load_own(path)
     assert isinstance(there.target, np.memmap) and not isinstance(here.target, np.memmap)
     assert there.target.dtype == here.target.dtype and np.array_equal(there.target, here.target)
-    assert there.site.sha256 == here.site.sha256 and there.site.target_scale == here.site.target_scale
+    assert (
+        there.site.sha256 == here.site.sha256 and there.site.target_scale == here.site.target_scale
+    )
     rows = np.array([7, 3, 3, 19])
     assert np.array_equal(there.batch(rows).target, here.batch(rows).target)
 
@@ -102,8 +115,12 @@ def test_the_hash_is_that_of_all_bytes_as_it_was(small):
     assert content_hash(named) == digest.hexdigest()
 
 
-def test_a_folder_of_pictures_stays_on_disk_and_so_do_rows_to_learn_from(tmp_path, small, monkeypatch):
-    """50,000 pictures were 1.6 GB in memory, and as much again for each method that copied its rows."""
+def test_a_folder_of_pictures_stays_on_disk_and_so_do_rows_to_learn_from(
+    tmp_path, small, monkeypatch
+):
+    """50,000 pictures were 1.6 GB in memory,
+    and as much again for each method that copied its rows.
+    """
     root = write_release(tmp_path / "release")
     there = load_rfid(root)
     with monkeypatch.context() as patch:
@@ -129,8 +146,11 @@ def test_a_process_that_is_started_opens_the_file_itself(tmp_path):
     process.start()
     process.join(60)
     said = (tmp_path / "said").read_text().splitlines()
-    assert said == [f"{own} {one.tolist()}" for own, one in zip((True, True, False), arrays, strict=True)]
-    assert np.array_equal(pickle.loads(pickle.dumps(nameless)), nameless)  # elsewhere a copy, as ever
+    assert said == [
+        f"{own} {one.tolist()}" for own, one in zip((True, True, False), arrays, strict=True)
+    ]
+    # Elsewhere a copy, as ever
+    assert np.array_equal(pickle.loads(pickle.dumps(nameless)), nameless)
 
 
 def unwritten(path, rows=10**12, **more):
@@ -144,14 +164,23 @@ def unwritten(path, rows=10**12, **more):
     return path
 
 
-@pytest.mark.parametrize(("rows", "more", "says"), [
-    (10**12, {"csi": "c8"},
-        r"csi: shape .1000000000000,., 8,000,000,000,000 bytes: a file of .* does not hold"),
-    (10**11, {"csi": "f4", "rx_position": "f8"}, "rx_position: shape .* does not hold that"),
-    (10**11, {"row_name": h5py.string_dtype()}, "row_name: shape .* does not hold that"),
-    (10**8, {f"extra{n}": "u1" for n in range(40)},
-        "shape .100000000,., 100,000,000 bytes: .* does not hold"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("rows", "more", "says"),
+    [
+        (
+            10**12,
+            {"csi": "c8"},
+            r"csi: shape .1000000000000,., 8,000,000,000,000 bytes: a file of .* does not hold",
+        ),
+        (10**11, {"csi": "f4", "rx_position": "f8"}, "rx_position: shape .* does not hold that"),
+        (10**11, {"row_name": h5py.string_dtype()}, "row_name: shape .* does not hold that"),
+        (
+            10**8,
+            {f"extra{n}": "u1" for n in range(40)},
+            "shape .100000000,., 100,000,000 bytes: .* does not hold",
+        ),
+    ],
+)
 @pytest.mark.parametrize("name", ["own.h5", "own.nc"])
 def test_an_array_that_was_never_written_filled_the_disk(
     tmp_path, monkeypatch, refused, rows, more, says, name
@@ -167,16 +196,22 @@ def test_an_array_that_was_never_written_filled_the_disk(
 
 
 def test_an_npz_that_inflates_without_end_took_all_memory(tmp_path, monkeypatch, refused):
-    zeros = {**arrays(), "csi": np.zeros((2**18, 40), np.complex64)}  # 80 MiB in an eighth of a megabyte
+    # 80 MiB in an eighth of a megabyte
+    zeros = {**arrays(), "csi": np.zeros((2**18, 40), np.complex64)}
     np.savez_compressed(tmp_path / "own.npz", **zeros)
     monkeypatch.setattr(raw, "BIG", 2**26)
-    monkeypatch.setattr(np, "load", lambda *unused, **named: pytest.fail("read before it was refused"))
+    monkeypatch.setattr(
+        np, "load", lambda *unused, **named: pytest.fail("read before it was refused")
+    )
     refused("csi: shape .* no other array has .262144,. rows", load_own, tmp_path / "own.npz")
     zeros |= {"rx_position": np.zeros((2**18, 3))}
     np.savez_compressed(tmp_path / "own.npz", **zeros)
     monkeypatch.setattr(raw, "machine_memory", lambda: 2**27)
     refused("csi: .* too little memory for 90,", load_own, tmp_path / "own.npz")
-    with zipfile.ZipFile(tmp_path / "lies.npz", "w") as archive, archive.open("csi.npy", "w") as entry:
+    with (
+        zipfile.ZipFile(tmp_path / "lies.npz", "w") as archive,
+        archive.open("csi.npy", "w") as entry,
+    ):
         head = {"descr": "<c8", "fortran_order": False, "shape": (10**15,)}
         np.lib.format.write_array_header_1_0(entry, head)
     refused("csi: shape .* does not hold that", load_own, tmp_path / "lies.npz")

@@ -9,7 +9,8 @@ from gsparc.data.georeference import Georeference
 
 
 @pytest.mark.parametrize(
-    "latitude, longitude", [(40.76, -111.84), (0, 0), (-33.9, 151.2), (0, 180), (89.99, 12), (-90, 0)]
+    "latitude, longitude",
+    [(40.76, -111.84), (0, 0), (-33.9, 151.2), (0, 180), (89.99, 12), (-90, 0)],
 )
 def test_there_and_back_over_100_km(latitude, longitude):
     origin = Georeference(latitude, longitude)
@@ -36,23 +37,30 @@ def test_the_antimeridian_and_the_poles_are_places():
     across = Georeference(90, 0).from_degrees([89.9, 89.9], [0, 180])
     assert np.linalg.norm(across[1] - across[0]) == pytest.approx(22338.8, abs=0.1)
     np.testing.assert_allclose(
-        Georeference(10, 1).from_degrees(10, 359.5), Georeference(10, 1).from_degrees(10, -0.5), atol=1e-6
+        Georeference(10, 1).from_degrees(10, 359.5),
+        Georeference(10, 1).from_degrees(10, -0.5),
+        atol=1e-6,
     )
 
 
 def test_the_origin_is_the_rounded_median():
-    origin = Georeference.from_coordinates([40.76521977, 40.7, 40.8], [-111.83475621, -111.0, -112.0])
+    origin = Georeference.from_coordinates(
+        [40.76521977, 40.7, 40.8], [-111.83475621, -111.0, -112.0]
+    )
     assert origin == Georeference(40.7652, -111.8348)
     assert pickle.loads(pickle.dumps(origin)) == origin
 
 
-@pytest.mark.parametrize("latitude, longitude, said", [
-    (91, 0, "latitude 91 is outside -90 to 90"),
-    (-111.8, 40.7, "are latitude and longitude swapped"),
-    (0, 400, "longitude 400"),
-    (np.nan, 0, "latitude nan"),
-    (0, np.inf, "longitude inf"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "latitude, longitude, said",
+    [
+        (91, 0, "latitude 91 is outside -90 to 90"),
+        (-111.8, 40.7, "are latitude and longitude swapped"),
+        (0, 400, "longitude 400"),
+        (np.nan, 0, "latitude nan"),
+        (0, np.inf, "longitude inf"),
+    ],
+)
 def test_what_is_not_on_earth_is_refused(latitude, longitude, said, refused):
     refused(said, Georeference, latitude, longitude)
     refused(said, Georeference(0, 0).from_degrees, [latitude], [longitude])

@@ -57,8 +57,12 @@ def test_they_are_of_training_rows_alone_and_a_pure_function(name):
     tested = np.unique(np.concatenate([fold.test for fold in inner.folds]))
     assert (inner.unit[tested] != NOT_TESTED).all()
     again, other = both(name, positions)[1], both(name, positions, seed=1)[1]
-    assert all(np.array_equal(a.test, b.test) for a, b in zip(inner.folds, again.folds, strict=True))
-    assert any(not np.array_equal(a.test, b.test) for a, b in zip(inner.folds, other.folds, strict=True))
+    assert all(
+        np.array_equal(a.test, b.test) for a, b in zip(inner.folds, again.folds, strict=True)
+    )
+    assert any(
+        not np.array_equal(a.test, b.test) for a, b in zip(inner.folds, other.folds, strict=True)
+    )
 
 
 @pytest.mark.parametrize("side", [SIDE, None])
@@ -121,14 +125,18 @@ def test_of_stations_learned_together_squares_are_those_of_what_moves():
     walk = floor(90) * [20, 20, 1]
     posts = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])
     far = np.linalg.norm(walk[:, None] - posts, axis=-1)
-    data = from_arrays({"rx_position": walk, "station_position": posts, "rssi_db": -20 * np.log10(far)})
+    data = from_arrays(
+        {"rx_position": walk, "station_position": posts, "rssi_db": -20 * np.log10(far)}
+    )
     settings = SplitSettings("blocks", side_m=5.0)
     outer = make_split(data.moving, settings, place=data.place, station=data.station).folds[0]
     together = data.subset(np.arange(len(data)), station_site(data.site, UNHEARD))
     assert together.moving.shape[1] == 6
     inner, plain = (cut_folds(d, outer, settings, 3, 0) for d in (together, data))
     assert inner.name == "blocks"
-    assert all(np.array_equal(a.test, b.test) for a, b in zip(inner.folds, plain.folds, strict=True))
+    assert all(
+        np.array_equal(a.test, b.test) for a, b in zip(inner.folds, plain.folds, strict=True)
+    )
 
 
 @pytest.mark.parametrize("name", ["random", "blocks"])

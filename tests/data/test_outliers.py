@@ -73,7 +73,22 @@ def test_they_are_left_out_when_the_user_says_so(split, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "rows", ["outlier", "", [-1], [1.5], [999], 3, None, True, [True], [[3]], {"3": 4}, [10**20], np.array(3)]
+    "rows",
+    [
+        "outlier",
+        "",
+        [-1],
+        [1.5],
+        [999],
+        3,
+        None,
+        True,
+        [True],
+        [[3]],
+        {"3": 4},
+        [10**20],
+        np.array(3),
+    ],
 )
 def test_rows_that_cannot_be_left_out_are_refused(rows, tmp_path, refused):
     """A single number, null and a number beyond 64 bits ended in words of Python and NumPy."""
@@ -102,14 +117,20 @@ def test_real_dynamics_are_no_outliers():
 
 def test_a_row_beyond_float32_is_refused(tmp_path, refused):
     """Its target would be infinite, in units of the other rows."""
-    refused(r"csi, row 5: beyond float32 in units of the other rows", spoilt, "csi", tmp_path, 5, 1e200)
+    refused(
+        r"csi, row 5: beyond float32 in units of the other rows", spoilt, "csi", tmp_path, 5, 1e200
+    )
 
 
 @pytest.mark.parametrize(
-    "others", [np.full(60, -200.0), -174 + np.sin(np.arange(60.0))], ids=["sentinel", "thermal floor"]
+    "others",
+    [np.full(60, -200.0), -174 + np.sin(np.arange(60.0))],
+    ids=["sentinel", "thermal floor"],
 )
 def test_rows_with_signal_are_no_outliers_among_rows_without(others):
-    """Where most rows stood at a floor, all rows with signal were called outliers and left out of scale."""
+    """Where most rows stood at a floor, all rows with signal were called outliers
+    and left out of scale.
+    """
     heard = np.linspace(-95, -50, 40)
     assert not find_strong_outliers(10 ** (np.concatenate([others, heard]) / 20)).any()
     assert find_strong_outliers(10 ** (np.append(heard, 20.0) / 20)).sum() == 1

@@ -25,4 +25,6 @@ def test_codes_know_more_of_the_place_than_chance() -> None:
     assert errors[0] < errors[1]
     other = data.uplink.copy()
     other[test] *= 3
-    np.testing.assert_array_equal(encode_positions(other, rows.train)[rows.train], codes[rows.train])
+    np.testing.assert_array_equal(
+        encode_positions(other, rows.train)[rows.train], codes[rows.train]
+    )

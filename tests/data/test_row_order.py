@@ -21,12 +21,16 @@ NONE = np.zeros(0, np.int64)
 
 
 def measurements(arrays: dict[str, np.ndarray], order: np.ndarray):
-    return from_arrays({name.lstrip("_"): a if name[0] == "_" else a[order] for name, a in arrays.items()})
+    return from_arrays(
+        {name.lstrip("_"): a if name[0] == "_" else a[order] for name, a in arrays.items()}
+    )
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_any_order_of_the_file_is_one_order(kind):
-    """Rows for learning were drawn by their numbers: a drive reversed was answered otherwise by 1 dB."""
+    """Rows for learning were drawn by their numbers:
+    a drive reversed was answered otherwise by 1 dB.
+    """
     arrays, every = rows_of(kind), []
     for order in (np.arange(60), np.arange(60)[::-1], np.random.default_rng(1).permutation(60)):
         data = measurements(arrays, order)
@@ -45,18 +49,27 @@ def test_any_order_of_the_file_is_one_order(kind):
     "copied", [lambda n: np.tile(n, 2), lambda n: np.repeat(n, 2), lambda n: np.r_[n, n[:20]]]
 )
 def test_rows_that_stand_twice_count_once(kind, copied):
-    """A packet logged twice told of coherence, noise and lengths; lists of the strongest were not seen."""
+    """A packet logged twice told of coherence, noise and lengths;
+    lists of the strongest were not seen.
+    """
     arrays, rows = rows_of(kind), np.arange(60)
     once, more = measurements(arrays, rows), measurements(arrays, copied(rows))
-    assert len(more) == len(once) and np.array_equal(np.sort(once.moving, 0), np.sort(more.moving, 0))
+    assert len(more) == len(once) and np.array_equal(
+        np.sort(once.moving, 0), np.sort(more.moving, 0)
+    )
     assert dict(describe(once)).get("phases") == dict(describe(more)).get("phases")
     note = f"copies of other rows (same places, station and values): {len(copied(rows)) - 60}"
-    raw = Raw({name.lstrip("_"): a if name[0] == "_" else a[copied(rows)] for name, a in arrays.items()}, {})
+    raw = Raw(
+        {name.lstrip("_"): a if name[0] == "_" else a[copied(rows)] for name, a in arrays.items()},
+        {},
+    )
     assert any(one.startswith(note[:40]) for one in interpret(raw, "file").notes)
 
 
 def test_equal_whole_decibels_of_visits_are_measurements():
-    """A place visited ten times hears the same whole decibel again: evidence, unless all is doubled."""
+    """A place visited ten times hears the same whole decibel again: evidence,
+    unless all is doubled.
+    """
     rng = np.random.default_rng(0)
     place = np.repeat(np.arange(20), 10)
     level = np.round(rng.normal(-70, 1, 200))
@@ -77,10 +90,13 @@ def test_two_devices_that_read_the_same_level_are_two_measurements():
 
 
 OPTIONS = {
-    "device": lambda i, rng: f"phone {i % 3}", "run": lambda i, rng: f"day {i // 90}",
-    "time_s": lambda i, rng: f"{rng.uniform(0, 1e4):.3f}", "sensitivity_db": lambda i, rng: "-110",
-    "carrier_hz": lambda i, rng: f"{1e9 + 1e9 * (i % 2):g}", "row_name": lambda i, rng: f"r{rng.integers(9)}",
-}  # fmt: skip
+    "device": lambda i, rng: f"phone {i % 3}",
+    "run": lambda i, rng: f"day {i // 90}",
+    "time_s": lambda i, rng: f"{rng.uniform(0, 1e4):.3f}",
+    "sensitivity_db": lambda i, rng: "-110",
+    "carrier_hz": lambda i, rng: f"{1e9 + 1e9 * (i % 2):g}",
+    "row_name": lambda i, rng: f"r{rng.integers(9)}",
+}
 
 
 def test_every_option_of_columns_that_is_of_rows_is_shuffled_here():
@@ -92,16 +108,22 @@ def test_every_option_of_columns_that_is_of_rows_is_shuffled_here():
 @pytest.mark.parametrize("options", [*((name,) for name in OPTIONS), ("device", "run", "time_s")])
 @pytest.mark.parametrize("stations", [1, 3])
 def test_rows_of_a_table_shuffled_with_any_columns_are_one_order(write, options, stations):
-    """Visits of a place were counted in the order of the file: other rows of devices were drawn, .1 dB."""
+    """Visits of a place were counted in the order of the file: other rows of devices were drawn,
+    .1 dB.
+    """
     rng, lines = np.random.default_rng(0), []
     for i in range(270):
         place, station = i // 9, i % stations
         more = [OPTIONS[name](i, rng) for name in options]
         lines.append(
-            ",".join([f"{place * 7 % 30},{place},1.5,{-60 - rng.integers(40)}", f"s{station}", *more])
+            ",".join(
+                [f"{place * 7 % 30},{place},1.5,{-60 - rng.integers(40)}", f"s{station}", *more]
+            )
         )
     heads = ",".join(["x_m,y_m,z_m,rsrp_dbm,station", *options])
-    listed = write("name,x_m,y_m,z_m\n" + "".join(f"s{t},{40 * t},5,9\n" for t in range(3)), "stations.csv")
+    listed = write(
+        "name,x_m,y_m,z_m\n" + "".join(f"s{t},{40 * t},5,9\n" for t in range(3)), "stations.csv"
+    )
     every = []
     for order in (np.arange(270), np.arange(270)[::-1], rng.permutation(270)):
         file = write("\n".join([heads, *(lines[i] for i in order)]))
@@ -128,7 +150,9 @@ def test_answers_of_devices_at_visits_of_places_did_not_stay_the_same_when_shuff
     rows = {"rx": place, "rssi": level, "station": station, "device": np.array(list("abc"))[device]}
     answers = []
     for order in (kept, rng.permutation(kept)):
-        model = gsparc.fit(**{k: v[order] for k, v in rows.items()}, station_position=POSTS, model="gp")
+        model = gsparc.fit(
+            **{k: v[order] for k, v in rows.items()}, station_position=POSTS, model="gp"
+        )
         answers.append(model.rssi(rx=place[::9]))
     assert np.abs(answers[0] - answers[1]).max() < 1e-3
 
@@ -139,10 +163,16 @@ def test_a_drive_reversed_is_answered_alike(caplog):
     arrays = rows_of("channels")
     asked = arrays["rx_position"][:9] + 0.1
     answers = [
-        gsparc.fit(rx=arrays["rx_position"][order], tx=POSTS[0], csi=arrays["csi"][order],
-                   frequency_hz=arrays["_frequency_hz"], model="complex_gp", align="none").csi(rx=asked)
+        gsparc.fit(
+            rx=arrays["rx_position"][order],
+            tx=POSTS[0],
+            csi=arrays["csi"][order],
+            frequency_hz=arrays["_frequency_hz"],
+            model="complex_gp",
+            align="none",
+        ).csi(rx=asked)
         for order in (np.arange(60), np.arange(60)[::-1])
-    ]  # fmt: skip
+    ]
     assert np.abs(answers[0] - answers[1]).max() < 1e-6 * np.abs(answers[0]).std()
 
 
@@ -157,5 +187,6 @@ def test_errors_that_drift_are_seen_in_the_order_of_the_file():
         assert len(groups) == 3
         for group in groups:
             np.testing.assert_array_equal(
-                group.places[np.argsort(group.order)], data.moving[data.station == group.slot.station]
+                group.places[np.argsort(group.order)],
+                data.moving[data.station == group.slot.station],
             )

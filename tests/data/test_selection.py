@@ -1,5 +1,6 @@
-"""Parts of a campaign: which rows and links stay, what is said of the others, which settings cannot be."""
-# ruff: noqa: E501 (a case is a row of a table)
+"""Parts of a campaign: which rows and links stay, what is said of the others,
+which settings cannot be.
+"""
 
 import numpy as np
 import pytest
@@ -30,8 +31,14 @@ def wide() -> Raw:
     """Fifteen places heard by four named stations, with two values missing."""
     arrays = ble_arrays()
     arrays["rssi_db"][[2, 5], [1, 3]] = np.nan
-    names = {"mobile_position": "tx_position", "station": "station_name", "frequency_hz": "carrier_hz"}
-    return Raw({names.get(name, name): array for name, array in arrays.items()}, {}, {"tx_position": "m"})
+    names = {
+        "mobile_position": "tx_position",
+        "station": "station_name",
+        "frequency_hz": "carrier_hz",
+    }
+    return Raw(
+        {names.get(name, name): array for name, array in arrays.items()}, {}, {"tx_position": "m"}
+    )
 
 
 def long() -> Raw:
@@ -47,7 +54,9 @@ def long() -> Raw:
 def channels() -> Raw:
     """Twelve places in two runs."""
     arrays = techtile_arrays()
-    return Raw({"station_position" if n == "rx_antenna_position" else n: a for n, a in arrays.items()})
+    return Raw(
+        {"station_position" if n == "rx_antenna_position" else n: a for n, a in arrays.items()}
+    )
 
 
 def plain(rows: int = 40, **more: np.ndarray) -> Raw:
@@ -112,7 +121,10 @@ def test_low_powers_are_left_out():
     powers = {**plain().arrays, "rssi": 10 ** (plain().arrays["rssi_db"] / 10)}
     del powers["rssi_db"]
     assert len(part(Raw(powers), min_rssi_db=-50.0001).data) == 11
-    everywhere, least = wide().arrays["rssi_db"], float(np.nanquantile(wide().arrays["rssi_db"], 0.1))
+    everywhere, least = (
+        wide().arrays["rssi_db"],
+        float(np.nanquantile(wide().arrays["rssi_db"], 0.1)),
+    )
     assert len(part(wide(), min_rssi_db=least).data) == (everywhere >= least).sum()
 
 
@@ -146,34 +158,71 @@ def test_the_file_s_split_follows_its_rows():
 
 def test_paths_follow_their_rows():
     raw = plain(
-        4, path_offsets=np.array([0, 2, 2, 5, 6]), path_gain=np.arange(6.0),
+        4,
+        path_offsets=np.array([0, 2, 2, 5, 6]),
+        path_gain=np.arange(6.0),
         path_last_point=np.arange(18.0).reshape(6, 3),
-    )  # fmt: skip
+    )
     kept = take_rows(raw, np.array([0, 2]))
-    assert kept["path_offsets"].tolist() == [0, 2, 5] and kept["path_gain"].tolist() == [0, 1, 2, 3, 4]
+    assert kept["path_offsets"].tolist() == [0, 2, 5] and kept["path_gain"].tolist() == [
+        0,
+        1,
+        2,
+        3,
+        4,
+    ]
     assert kept["path_last_point"].shape == (5, 3)
 
 
 CANNOT = {
-    "misspelt station": (wide, {"stations": ["senor42"]}, "no station senor42 in file; did you mean 'sensor42'?"),
-    "station beyond the last": (wide, {"stations": [4]}, "dataset.stations=4: no station 4 in file"),
-    "name without names": (channels, {"stations": ["A05"]}, "dataset.stations=A05: no station A05 in file; there are 0, 1, 2"),
-    "a table of them": (wide, {"stations": [__file__]}, f"; a table of them is dataset.stations_file={__file__}"),
+    "misspelt station": (
+        wide,
+        {"stations": ["senor42"]},
+        "no station senor42 in file; did you mean 'sensor42'?",
+    ),
+    "station beyond the last": (
+        wide,
+        {"stations": [4]},
+        "dataset.stations=4: no station 4 in file",
+    ),
+    "name without names": (
+        channels,
+        {"stations": ["A05"]},
+        "dataset.stations=A05: no station A05 in file; there are 0, 1, 2",
+    ),
+    "a table of them": (
+        wide,
+        {"stations": [__file__]},
+        f"; a table of them is dataset.stations_file={__file__}",
+    ),
     "no stations": (plain, {"stations": [0]}, "file has no stations; expected station_position"),
     "misspelt run": (channels, {"runs": ["EXP05"]}, "did you mean 'EXP005'?"),
     "no runs": (wide, {"runs": ["EXP005"]}, "file names no runs; expected an array run"),
     "no powers": (channels, {"min_rssi_db": -80}, "file holds csi; expected powers"),
     "all below": (plain, {"min_rssi_db": 0}, "dataset.min_rssi_db=0: 0 rows of file are left"),
     "all of several below": (wide, {"min_rssi_db": 0}, "rssi_db: nothing was measured"),
-    "level in words": (plain, {"min_rssi_db": "low"}, "min_rssi_db='low': a number, or null is needed"),
-    "no rows": (plain, {"max_rows": 0}, "max_rows=0: a whole number of at least 2, or null is needed"),
-    "no measurement": (lambda: Raw({"rx_position": np.zeros((3, 3))}), {"max_rows": 2}, "found none of them"),
+    "level in words": (
+        plain,
+        {"min_rssi_db": "low"},
+        "min_rssi_db='low': a number, or null is needed",
+    ),
+    "no rows": (
+        plain,
+        {"max_rows": 0},
+        "max_rows=0: a whole number of at least 2, or null is needed",
+    ),
+    "no measurement": (
+        lambda: Raw({"rx_position": np.zeros((3, 3))}),
+        {"max_rows": 2},
+        "found none of them",
+    ),
     "no steps": (wide, {"level_steps": {"sensor11": []}}, "first rows after steps by station"),
     "columns of other stations": (
-        lambda: Raw({**wide().arrays, "rssi_db": np.zeros((15, 5))}), {"stations": [0]},
+        lambda: Raw({**wide().arrays, "rssi_db": np.zeros((15, 5))}),
+        {"stations": [0]},
         "rssi_db: expected shape (S, 4, ...), a column for each station",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", CANNOT)
@@ -196,7 +245,9 @@ def test_the_faulty_rows_of_the_measured_plane():
     assert level(read.data).min() > -75 and len(read.data) == 5000
     # Fewer rows reach as far as all do, in centimetres.
     for end in (np.min, np.max):
-        whole, some = (end(one[:, :2], axis=0) for one in (raw.arrays["rx_position"], read.data.rx_position))
+        whole, some = (
+            end(one[:, :2], axis=0) for one in (raw.arrays["rx_position"], read.data.rx_position)
+        )
         assert np.abs(whole - some - read.data.site.origin[:2]).max() < 0.03
 
 
@@ -207,9 +258,10 @@ def test_a_packet_logged_twice_beside_its_place_counted_as_two(jitter):
     place = np.c_[rng.uniform(0, 3000, (300, 2)), np.full(300, 1.5)]
     level = rng.normal(-80, 6, 300).round(2)
     arrays = {
-        "rx_position": np.r_[place, place + np.array([jitter, 0, 0])], "tx_position": np.zeros((600, 3)),
+        "rx_position": np.r_[place, place + np.array([jitter, 0, 0])],
+        "tx_position": np.zeros((600, 3)),
         "rssi_db": np.r_[level, level],
-    }  # fmt: skip
+    }
     reading = part(Raw(arrays))
     assert len(reading.data) == 300
     assert any("copies of other rows" in note for note in reading.notes)

@@ -60,7 +60,9 @@ def test_grouped_keeps_whole_stretches_apart():
     positions = _walk()
     split = make_split(positions, SplitSettings("grouped"))
     assert len(split.folds) == 5
-    np.testing.assert_array_equal(np.sort(np.concatenate([f.test for f in split.folds])), np.arange(400))
+    np.testing.assert_array_equal(
+        np.sort(np.concatenate([f.test for f in split.folds])), np.arange(400)
+    )
     for fold in split.folds:
         assert fold.test[-1] - fold.test[0] == len(fold.test) - 1
         kept = np.concatenate([fold.train, fold.val])
@@ -124,9 +126,11 @@ def test_bad_index_files_are_refused(tmp_path, refused):
     write_split(path, make_split(_walk(), SplitSettings()), rows=400)
     refused("made for 400 rows, the dataset has 399", read_split, path, 399)
     content = json.loads(path.read_text())
-    edits = {"edited or damaged": ("test", content["folds"][0]["test"][1:]),
-             "names a row twice": ("test", content["folds"][0]["train"]),
-             "outside 0 to 399": ("test", [400])}  # fmt: skip
+    edits = {
+        "edited or damaged": ("test", content["folds"][0]["test"][1:]),
+        "names a row twice": ("test", content["folds"][0]["train"]),
+        "outside 0 to 399": ("test", [400]),
+    }
     for pattern, (part, rows) in edits.items():
         spoilt = json.loads(json.dumps(content))
         spoilt["folds"][0][part] = rows
@@ -134,16 +138,19 @@ def test_bad_index_files_are_refused(tmp_path, refused):
         refused(pattern, read_split, path, 400)
 
 
-@pytest.mark.parametrize("settings, pattern", [
-    ({"name": "grouped", "folds": 1}, "folds=1: a whole number of at least 2"),
-    ({"name": "groupd"}, "did you mean 'grouped'"),
-    ({"val_fraction": 1.0}, "val_fraction=1.0"),
-    ({"test_fraction": 0.0}, "test_fraction=0.0"),
-    ({"thin": 0.0}, "thin=0.0"),
-    ({"train_count": 0}, "train_count=0"),
-    ({"buffer_m": float("nan")}, "buffer_m=nan"),
-    ({"corner": "north"}, "corner='north'"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "settings, pattern",
+    [
+        ({"name": "grouped", "folds": 1}, "folds=1: a whole number of at least 2"),
+        ({"name": "groupd"}, "did you mean 'grouped'"),
+        ({"val_fraction": 1.0}, "val_fraction=1.0"),
+        ({"test_fraction": 0.0}, "test_fraction=0.0"),
+        ({"thin": 0.0}, "thin=0.0"),
+        ({"train_count": 0}, "train_count=0"),
+        ({"buffer_m": float("nan")}, "buffer_m=nan"),
+        ({"corner": "north"}, "corner='north'"),
+    ],
+)
 def test_impossible_settings_are_refused(settings, pattern, refused):
     refused(pattern, SplitSettings, **settings)
 
@@ -173,9 +180,13 @@ def test_an_index_file_takes_no_setting_without_a_word(rfid_folder, tmp_path, re
     kept = split_for({"name": "file", "path": path, "leave_out": gone}, data)
     for before, after in zip(split.folds, kept.folds, strict=True):
         for part in ("train", "val", "test"):
-            np.testing.assert_array_equal(getattr(after, part), np.setdiff1d(getattr(before, part), gone))
+            np.testing.assert_array_equal(
+                getattr(after, part), np.setdiff1d(getattr(before, part), gone)
+            )
     assert kept.sha256 != split.sha256
-    with pytest.raises(DataError, match=r"split\.train_count: no such setting of split=file; there are"):
+    with pytest.raises(
+        DataError, match=r"split\.train_count: no such setting of split=file; there are"
+    ):
         split_for({"name": "file", "path": path, "train_count": 5}, data)
     refused(r"split\.path is not set", split_for, {"name": "file"}, data)
     with pytest.raises(DataError, match=r"split\.leave_out: row 999 of rows 0 to"):
@@ -190,7 +201,9 @@ def test_thinning_by_distance_leaves_the_test_rows_alone(refused):
     apart = np.linalg.norm(positions[kept][:, None] - positions[kept][None], axis=-1)
     assert apart[~np.eye(len(kept), dtype=bool)].min() >= 0.8
     left = np.setdiff1d(np.concatenate([dense.train, dense.val]), kept)
-    assert np.linalg.norm(positions[left][:, None] - positions[kept][None], axis=-1).min(1).max() < 0.8
+    assert (
+        np.linalg.norm(positions[left][:, None] - positions[kept][None], axis=-1).min(1).max() < 0.8
+    )
     refused("spacing_m", SplitSettings, spacing_m=0.0)
 
 
@@ -212,7 +225,9 @@ def test_a_place_is_held_out_for_all_stations(name):
     alone = make_split(places, SplitSettings(name))
     for fold, other in zip(found.folds, alone.folds, strict=True):
         for part in ("train", "val", "test"):
-            np.testing.assert_array_equal(np.unique(place[getattr(fold, part)]), getattr(other, part))
+            np.testing.assert_array_equal(
+                np.unique(place[getattr(fold, part)]), getattr(other, part)
+            )
             assert len(getattr(fold, part)) == 4 * len(getattr(other, part))
 
 
@@ -280,7 +295,9 @@ def test_a_place_visited_again_was_learned_from_and_tested_on(other_end):
 
 @pytest.mark.parametrize("apart", [1e-9, 1e-6, 1e-3, 1e-2])
 @pytest.mark.parametrize("visits", [2, 12])
-def test_places_visited_again_within_a_hundredth_of_the_step_were_split_apart(apart, visits, caplog):
+def test_places_visited_again_within_a_hundredth_of_the_step_were_split_apart(
+    apart, visits, caplog
+):
     """.63 dB where 3.92 was right: what was tested had been learned a millimetre away."""
     caplog.set_level("INFO")
     rng = np.random.default_rng(1)
@@ -292,18 +309,25 @@ def test_places_visited_again_within_a_hundredth_of_the_step_were_split_apart(ap
         {"rx_position": places, "tx_position": POST, "rssi_db": -60 - rng.normal(size=len(places))}
     )
     for name in ("random", "sparse", "blocks"):
-        fold = split_for({"name": name, **({"side_m": 9.0} if name == "blocks" else {})}, data).folds[0]
+        fold = split_for(
+            {"name": name, **({"side_m": 9.0} if name == "blocks" else {})}, data
+        ).folds[0]
         inner = inner_folds(data.moving, fold, SplitSettings(name, side_m=9.0), 2, 0).folds[0]
         for one in (fold, inner):
-            known, unseen = (data.moving[part] for part in (np.concatenate([one.train, one.val]), one.test))
+            known, unseen = (
+                data.moving[part] for part in (np.concatenate([one.train, one.val]), one.test)
+            )
             assert np.linalg.norm(known[:, None] - unseen, axis=-1).min() > 0.02
-    assert f"{60 * visits} rows are of 61 places: those within a hundredth of the usual step" in caplog.text
+    assert (
+        f"{60 * visits} rows are of 61 places: those within a hundredth of the usual step"
+    ) in caplog.text
 
 
 def test_rows_a_tenth_of_a_step_apart_are_places_of_their_own():
     walk = np.cumsum(np.random.default_rng(0).uniform(0.1, 2, (500, 3)) * [1, 1, 0], axis=0)
     assert group_visits(walk) is None
-    arrays = walk[::10, None] + np.linspace(0, 0.6, 6)[:, None] * [1, 0, 0]  # six antennas at every place
+    # Six antennas at every place
+    arrays = walk[::10, None] + np.linspace(0, 0.6, 6)[:, None] * [1, 0, 0]
     assert group_visits(arrays.reshape(-1, 3)) is None
 
 
@@ -314,11 +338,19 @@ def test_squares_moved_with_the_place_of_the_station(side_m):
     grid = np.stack(np.meshgrid(np.arange(20), np.arange(15), [12]), -1).reshape(-1, 3) / 10
     for places in (rng.uniform(0, 3, (300, 3)), grid):
         for station in ([0.1, 0.2, 2], [9.7, 3.3, 2], [-100.37, 7, 2]):
-            given = {"rx_position": places, "tx_position": np.array(station), "rssi_db": rng.normal(size=300)}
+            given = {
+                "rx_position": places,
+                "tx_position": np.array(station),
+                "rssi_db": rng.normal(size=300),
+            }
             data = from_arrays(given)
             split = split_for({"name": "blocks", "side_m": side_m, "seed": 4}, data)
-            inner = inner_folds(data.moving, split.folds[0], SplitSettings("blocks", side_m=side_m), 2, 0)
-            tests.append([*(part.tolist() for part in vars(split.folds[0]).values()), inner.unit.tolist()])
+            inner = inner_folds(
+                data.moving, split.folds[0], SplitSettings("blocks", side_m=side_m), 2, 0
+            )
+            tests.append(
+                [*(part.tolist() for part in vars(split.folds[0]).values()), inner.unit.tolist()]
+            )
     assert tests[0] == tests[1] == tests[2] and tests[3] == tests[4] == tests[5]
     assert 60 <= len(tests[0][2]) < 90
 
@@ -335,15 +367,23 @@ def test_splits_of_shared_data_keep_their_rows():
 
 
 def test_a_survey_whose_transmitters_were_rarely_heard_had_no_table(caplog):
-    """A dozen access points at unknown places, some heard twice: every baseline refused its test rows."""
+    """A dozen access points at unknown places, some heard twice:
+    every baseline refused its test rows.
+    """
     rng, heard = np.random.default_rng(0), [60, 40, 20, 3, 2, 1]
     spots = rng.uniform(0, 50, (60, 2)).tolist()
-    rows = [(*spots[i], t) for t, count in enumerate(heard) for i in rng.choice(60, count, replace=False)]
+    rows = [
+        (*spots[i], t)
+        for t, count in enumerate(heard)
+        for i in rng.choice(60, count, replace=False)
+    ]
     x, y, station = np.array(rows).T
     arrays = {
-        "rx_position": np.stack([x, y, np.ones(len(x))], 1), "station": station.astype(int),
-        "station_position": np.full((6, 3), np.nan), "rssi_db": rng.normal(-70, 5, len(x)),
-    }  # fmt: skip
+        "rx_position": np.stack([x, y, np.ones(len(x))], 1),
+        "station": station.astype(int),
+        "station_position": np.full((6, 3), np.nan),
+        "rssi_db": rng.normal(-70, 5, len(x)),
+    }
     data = from_arrays(arrays)
     split = split_for({"name": "random", "test_fraction": 0.4}, data)
     (fold,) = split.folds
@@ -362,7 +402,9 @@ def test_a_survey_whose_transmitters_were_rarely_heard_had_no_table(caplog):
 @pytest.mark.parametrize("side_m", [None, 3.0])
 def test_places_of_a_lift_were_told_to_take_smaller_squares(side_m):
     lift = np.tile([2.5, 4.0, 0.0], (40, 1)) + np.linspace(0, 60, 40)[:, None] * [0, 0, 1]
-    with pytest.raises(DataError, match="all positions are one above the other, there are no squares"):
+    with pytest.raises(
+        DataError, match="all positions are one above the other, there are no squares"
+    ):
         make_split(lift, SplitSettings("blocks", side_m=side_m))
 
 
@@ -370,7 +412,9 @@ def test_later_tests_on_the_rows_that_were_taken_last_at_any_place():
     rng = np.random.default_rng(0)
     positions, taken = np.repeat(rng.uniform(0, 9, (25, 3)), 4, 0), rng.permutation(100)
     place = np.repeat(np.arange(25), 4)
-    (fold,) = make_split(positions, SplitSettings("later", leave_out=[5]), place=place, order=taken).folds
+    (fold,) = make_split(
+        positions, SplitSettings("later", leave_out=[5]), place=place, order=taken
+    ).folds
     last = np.setdiff1d(np.argsort(taken), [5], assume_unique=True)[-20:]
     assert set(fold.test) == set(last) and 5 not in np.r_[fold.train, fold.val]
     assert len(fold.train) + len(fold.val) == 79

@@ -39,7 +39,8 @@ def test_bytes_of_images_are_shares_of_255():
 
 @pytest.mark.parametrize("kind", SHAPES)
 def test_variances_in_the_unit_of_errors_are_those_of_numbers(kind):
-    # There and back again: a variance per real number is the squared error per entry, and of powers in dB.
+    # There and back again: a variance per real number is the squared error per entry,
+    # and of powers in dB.
     target = TARGETS[kind]
     mean, variance = torch.from_numpy(stored(kind)), torch.full((5,), 1e-4)
     entry = target.entry_variance(variance, mean)

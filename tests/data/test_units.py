@@ -11,10 +11,18 @@ from gsparc.tables.own import from_arrays
 # Of a stored power of 2 that times 3 has a level in the unit of levels: its value in another unit.
 DB = 10 * np.log10(6)
 VALUES = {
-    ("dBm", "dBm"): DB, ("dBm", "dBW"): DB - 30, ("dBm", "mW"): 6, ("dBm", "W"): 6e-3, ("dBm", "uw"): 6e3,
-    ("dBW", "dBm"): DB + 30, ("dBW", "fW"): 6e15, ("dBW", LINEAR): 6, ("dB", LINEAR): 6, ("dB", "dB"): DB,
+    ("dBm", "dBm"): DB,
+    ("dBm", "dBW"): DB - 30,
+    ("dBm", "mW"): 6,
+    ("dBm", "W"): 6e-3,
+    ("dBm", "uw"): 6e3,
+    ("dBW", "dBm"): DB + 30,
+    ("dBW", "fW"): 6e15,
+    ("dBW", LINEAR): 6,
+    ("dB", LINEAR): 6,
+    ("dB", "dB"): DB,
     ("dB", "dBm"): DB,  # the user says what nobody said
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("level", "unit"), VALUES)
@@ -28,12 +36,18 @@ def test_values_deviations_and_back(level, unit):
     torch.testing.assert_close(wanted.stored(value), power.double(), rtol=1e-6, atol=0)
 
 
-@pytest.mark.parametrize(("level", "unit", "levels", "said"), [
-    ("dBm", "dBi", False, "unit=dBi: of powers in dBm expected dBm, dBW, linear, W, mW"),
-    ("dBm", "dB", False, "expected dBm"), ("dB", "mW", False, "of powers in dB expected dBm, dBW, linear$"),
-    ("dBm", "mW", True, "expected dBm, dBW$"), ("dBm", LINEAR, True, "expected dBm, dBW$"),
-    ("dBm", "m", False, "expected dBm"), ("dBm", 3, False, "unit=3"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("level", "unit", "levels", "said"),
+    [
+        ("dBm", "dBi", False, "unit=dBi: of powers in dBm expected dBm, dBW, linear, W, mW"),
+        ("dBm", "dB", False, "expected dBm"),
+        ("dB", "mW", False, "of powers in dB expected dBm, dBW, linear$"),
+        ("dBm", "mW", True, "expected dBm, dBW$"),
+        ("dBm", LINEAR, True, "expected dBm, dBW$"),
+        ("dBm", "m", False, "expected dBm"),
+        ("dBm", 3, False, "unit=3"),
+    ],
+)
 def test_what_is_no_unit_of_these_powers_is_refused(level, unit, levels, said):
     with pytest.raises(ValueError, match=said):
         PowerUnit.from_name(unit, level, levels=levels)
@@ -47,11 +61,18 @@ def test_silence_has_no_level():
 PLACES = {"rx_position": np.c_[np.arange(4.0), np.zeros(4), np.ones(4)], "tx_position": np.ones(3)}
 
 
-@pytest.mark.parametrize(("name", "about", "level", "unit"), [
-    ("rssi", {}, "dBW", "W"), ("rssi", {"unit": "nW"}, "dBW", "nW"), ("rssi_db", {}, "dB", "dB"),
-    ("rssi", {"level_unit": "dBm"}, "dBm", LINEAR), ("rssi", {"level_unit": "dB"}, "dB", LINEAR),
-    ("rssi_db", {"level_unit": "dBm"}, "dBm", "dBm"), ("rssi_db", {"level_unit": "dBuV"}, "dBuV", "dBuV"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "about", "level", "unit"),
+    [
+        ("rssi", {}, "dBW", "W"),
+        ("rssi", {"unit": "nW"}, "dBW", "nW"),
+        ("rssi_db", {}, "dB", "dB"),
+        ("rssi", {"level_unit": "dBm"}, "dBm", LINEAR),
+        ("rssi", {"level_unit": "dB"}, "dB", LINEAR),
+        ("rssi_db", {"level_unit": "dBm"}, "dBm", "dBm"),
+        ("rssi_db", {"level_unit": "dBuV"}, "dBuV", "dBuV"),
+    ],
+)
 def test_powers_in_watts_had_levels_in_db(name, about, level, unit):
     """Maps of watts said dB, and could not be compared with files in dBm."""
     data = from_arrays({**PLACES, name: np.arange(1.0, 5)}, about)

@@ -37,7 +37,9 @@ def test_aligning_takes_phase_and_timing_and_nothing_else() -> None:
     csi = np.load(folder() / "csidata.npy")[:10].astype(np.complex128)
     tones = np.array(TONES, dtype=float)
     moved = csi * np.exp(1j * (1.3 - 0.2 * tones))
-    assert np.allclose(remove_uplink_offsets(moved, tones), remove_uplink_offsets(csi, tones), atol=1e-12)
+    assert np.allclose(
+        remove_uplink_offsets(moved, tones), remove_uplink_offsets(csi, tones), atol=1e-12
+    )
     assert np.allclose(np.abs(remove_uplink_offsets(csi, tones)), np.abs(csi))
 
 
@@ -50,9 +52,12 @@ def test_aligning_takes_phase_and_timing_and_nothing_else() -> None:
         (lambda p: np.save(p / "csidata.npy", np.zeros((4, 8, 52), complex)), "uplink is silent"),
         (lambda p: (p / "base-station.yml").write_text("base_station: [1, 2]"), "expected 8 x 3"),
         (lambda p: (p / "base-station.yml").write_text("- 1"), "expected `base_station:`"),
-        (lambda p: [(p / f"{n}_index.txt").write_text("0 1") for n in ("train", "test")], "also in train"),
+        (
+            lambda p: [(p / f"{n}_index.txt").write_text("0 1") for n in ("train", "test")],
+            "also in train",
+        ),
     ],
-)  # fmt: skip
+)
 def test_bad_folders_are_refused_in_words(tmp_path, change, words, refused) -> None:
     place = _copy(tmp_path)
     change(place)
@@ -61,14 +66,18 @@ def test_bad_folders_are_refused_in_words(tmp_path, change, words, refused) -> N
 
 def test_no_such_antenna_or_positions(tmp_path, refused) -> None:
     refused("at least 0 and at most 63, or all", city, 64)
-    refused("true positions exist in the stand-in only", load_argos, _copy(tmp_path), positions="true")
+    refused(
+        "true positions exist in the stand-in only", load_argos, _copy(tmp_path), positions="true"
+    )
 
 
 def _without_third(places: np.ndarray) -> np.ndarray:
     return np.where(np.arange(len(places))[:, None] == 2, np.nan, places)
 
 
-@pytest.mark.parametrize(("change", "words"), [(_without_third, "row 2"), (np.transpose, r"transposed\?")])
+@pytest.mark.parametrize(
+    ("change", "words"), [(_without_third, "row 2"), (np.transpose, r"transposed\?")]
+)
 def test_positions_that_are_none_are_refused(tmp_path, change, words, refused) -> None:
     place = shutil.copytree(folder(), tmp_path / "city")
     np.save(place / "positions.npy", change(np.load(place / "positions.npy")))

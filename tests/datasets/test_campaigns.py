@@ -1,5 +1,6 @@
-"""Layouts of measured campaigns: what is read and measured, and what is refused with array and row."""
-# ruff: noqa: E501 (a case is a row of a table)
+"""Layouts of measured campaigns: what is read and measured,
+and what is refused with array and row.
+"""
 
 import numpy as np
 import pytest
@@ -51,7 +52,9 @@ def test_techtile_release(tmp_path, kind):
 @EVERY_KIND
 def test_techtile_release_of_one_experiment(tmp_path, kind):
     variables = {
-        name: (dimensions[1:], values[0]) if dimensions[0] == "experiment_id" else (dimensions, values)
+        name: (dimensions[1:], values[0])
+        if dimensions[0] == "experiment_id"
+        else (dimensions, values)
         for name, (dimensions, values) in release_variables().items()
     }
     del variables["experiment_id"]
@@ -61,7 +64,10 @@ def test_techtile_release_of_one_experiment(tmp_path, kind):
 
 def test_techtile_release_without_flags(tmp_path):
     variables = {n: v for n, v in release_variables().items() if not n.endswith("_available")}
-    masks = [read_techtile(write_release(tmp_path, "netcdf3", v)).arrays["mask"] for v in (None, variables)]
+    masks = [
+        read_techtile(write_release(tmp_path, "netcdf3", v)).arrays["mask"]
+        for v in (None, variables)
+    ]
     assert np.array_equal(*masks)
 
 
@@ -76,25 +82,36 @@ def test_techtile_antennas_lie_elsewhere_or_in_the_file(tmp_path, refused):
 
 
 TECHTILE = {
-    "missing": ({"csi_imag": None, "rover_z": None}, "csi.nc, csi_imag: missing; expected real numbers (E, C, H)"),
-    "one experiment of two": ({"csi_real": (("h", "c"), np.zeros((3, 8)))},
-        "csi.nc, csi_imag: expected shape (E, C, H)"),
+    "missing": (
+        {"csi_imag": None, "rover_z": None},
+        "csi.nc, csi_imag: missing; expected real numbers (E, C, H)",
+    ),
+    "one experiment of two": (
+        {"csi_real": (("h", "c"), np.zeros((3, 8)))},
+        "csi.nc, csi_imag: expected shape (E, C, H)",
+    ),
     "transposed": (
         {"csi_imag": (("h", "c", "e"), np.zeros((3, 8, 2)))},
         "csi.nc, csi_imag: expected shape (E, C, H), here (2, 8, 3), found (3, 8, 2); transposed?",
     ),
-    "another host": ({"hostname": (("hostname",), np.array(["A05", "A06", "G99"]))},
-        "techtile_antenna_locations.yml: no antenna of the tiles G99"),
-    "no position": ({"position_available": (("experiment_id", "cycle_id"), np.zeros((2, CYCLES), np.int8))},
-        "csi.nc: no cycle has both a position and a channel"),
-}  # fmt: skip
+    "another host": (
+        {"hostname": (("hostname",), np.array(["A05", "A06", "G99"]))},
+        "techtile_antenna_locations.yml: no antenna of the tiles G99",
+    ),
+    "no position": (
+        {"position_available": (("experiment_id", "cycle_id"), np.zeros((2, CYCLES), np.int8))},
+        "csi.nc: no cycle has both a position and a channel",
+    ),
+}
 
 
 @pytest.mark.parametrize("case", TECHTILE)
 def test_spoilt_techtile_releases(tmp_path, refused, case):
     change, says = TECHTILE[case]
     variables = {
-        name: value for name, value in {**release_variables(), **change}.items() if value is not None
+        name: value
+        for name, value in {**release_variables(), **change}.items()
+        if value is not None
     }
     refused(says, read_techtile, write_release(tmp_path, variables=variables))
 
@@ -102,18 +119,21 @@ def test_spoilt_techtile_releases(tmp_path, refused, case):
 ONE_CHANNEL, NAN_CHANNEL = "channels: [{x: 1, y: 2, z: 3}]", "channels: {1: {x: .nan, y: 2, z: 3}}"
 
 
-@pytest.mark.parametrize(("text", "says"), [
-    ("antennes: 3", "expected `antennes:` with a list"),
-    ("antennes:\n- tile: A05\n", "no antenna of the tiles A06, B05"),
-    *(
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("antennes: 3", "expected `antennes:` with a list"),
+        ("antennes:\n- tile: A05\n", "no antenna of the tiles A06, B05"),
+        *(
             (
                 "antennes:\n" + "".join(f"- {{tile: {h}, {c}}}\n" for h in HOSTS),
                 "A05: expected x, y, z [m] of channel 1",
             )
             for c in (ONE_CHANNEL, NAN_CHANNEL)
         ),
-    ("[1, 2", "not readable as YAML"),
-])  # fmt: skip
+        ("[1, 2", "not readable as YAML"),
+    ],
+)
 def test_spoilt_tables_of_antennas(tmp_path, refused, text, says):
     path = write_release(tmp_path)
     (tmp_path / "techtile_antenna_locations.yml").write_text(text)
@@ -142,7 +162,9 @@ def test_powder_stations_without_a_place_are_left_out(tmp_path):
     raw = read_powder(
         write_walk(tmp_path, table="{'ebc-nuc1-b210': (40.7677, -111.83816), 'bus-6186': None}")
     )
-    assert raw.arrays["station_name"].tolist() == ["ebc-nuc1-b210"] and raw.arrays["rssi_db"].shape == (20, 1)
+    assert raw.arrays["station_name"].tolist() == ["ebc-nuc1-b210"] and raw.arrays[
+        "rssi_db"
+    ].shape == (20, 1)
     assert "madsen-nuc2-b210" in raw.notes[0]
 
 
@@ -155,30 +177,66 @@ def test_noise_of_powder_receivers_could_not_be_told_from_levels(tmp_path, refus
     side = after.censored_side(np.arange(len(after)))
     assert before.censored is None and set(after.station[side > 0]) == {0}
     assert ((side == 0) & (after.station == 0)).sum() == np.isfinite(level[5:]).sum()
-    refused("sensitivity_db='ebc': one of", lambda _: load({**own, "sensitivity_db": {"ebc": -90}}), tmp_path)
+    refused(
+        "sensitivity_db='ebc': one of",
+        lambda _: load({**own, "sensitivity_db": {"ebc": -90}}),
+        tmp_path,
+    )
 
 
 SWAPPED = ("tx_x_coord,tx_y_coord", "tx_y_coord,tx_x_coord")
 WALKS = {  # what is replaced in the walk (None: all of it), the table of stations, and what is said
     "empty": (None, TABLE, "single_tx.csv: empty; expected a line of heads"),
     "no latitude": (("tx_x_coord", "east"), TABLE, "line 1: no column tx_x_coord; "),
-    "swapped degrees": (SWAPPED, TABLE, " is outside -90 to 90 degrees; are latitude and longitude swapped?"),
-    "a word": ((":01,-101,-1,-1,-", ":01,-101,-1,-1,loud-"), TABLE, "column 'ebc-nuc1-b210', line 3: 'loud-"),
-    "no degrees": ((f",{powder_arrays()['longitude'][-1]!s}\n", ",nan\n"), TABLE, "column 'tx_y_coord', line 21: no value"),
-    "two transmitters": (("tx_x_coord,tx_y", "tx1_x_coord,tx2_x"), TABLE, "line 1: no column tx_x_coord and tx_y_coord"),
+    "swapped degrees": (
+        SWAPPED,
+        TABLE,
+        " is outside -90 to 90 degrees; are latitude and longitude swapped?",
+    ),
+    "a word": (
+        (":01,-101,-1,-1,-", ":01,-101,-1,-1,loud-"),
+        TABLE,
+        "column 'ebc-nuc1-b210', line 3: 'loud-",
+    ),
+    "no degrees": (
+        (f",{powder_arrays()['longitude'][-1]!s}\n", ",nan\n"),
+        TABLE,
+        "column 'tx_y_coord', line 21: no value",
+    ),
+    "two transmitters": (
+        ("tx_x_coord,tx_y", "tx1_x_coord,tx2_x"),
+        TABLE,
+        "line 1: no column tx_x_coord and tx_y_coord",
+    ),
     "column twice": ((STATIONS[1], STATIONS[0]), TABLE, "are both named 'ebc-nuc1-b210'"),
     "no station": (("", ""), '{"other": [40.0, -111.0]}', "no column is a station of"),
     "stations that drive": (("", ""), '{"ebc-nuc1-b210": None}', "no station with coordinates"),
-    "station in words": (("", ""), '{"ebc-nuc1-b210": ["north", 1]}', "ebc-nuc1-b210: expected latitude and"),
-    "station beyond the pole": (("", ""), '{"ebc-nuc1-b210": [-111.8, 40.7]}', "ebc-nuc1-b210: latitude -111.8 is outside"),
-    "table is code": (("", ""), "__import__('os').getcwd()", "location_coordinates.json: not readable"),
-}  # fmt: skip
+    "station in words": (
+        ("", ""),
+        '{"ebc-nuc1-b210": ["north", 1]}',
+        "ebc-nuc1-b210: expected latitude and",
+    ),
+    "station beyond the pole": (
+        ("", ""),
+        '{"ebc-nuc1-b210": [-111.8, 40.7]}',
+        "ebc-nuc1-b210: latitude -111.8 is outside",
+    ),
+    "table is code": (
+        ("", ""),
+        "__import__('os').getcwd()",
+        "location_coordinates.json: not readable",
+    ),
+}
 
 
 @pytest.mark.parametrize("case", WALKS)
 def test_spoilt_powder_tables(tmp_path, refused, case):
     change, table, says = WALKS[case]
-    refused(says, read_powder, write_walk(tmp_path, lambda t: t.replace(*change) if change else "", table))
+    refused(
+        says,
+        read_powder,
+        write_walk(tmp_path, lambda t: t.replace(*change) if change else "", table),
+    )
 
 
 def test_absent_powder_files(tmp_path, refused):
@@ -210,15 +268,20 @@ def test_powder_is_links_on_the_earth(tmp_path, form):
     heard = 10 * np.log10(data.target[:, 0].astype(float) * data.site.target_scale)
     assert np.allclose(heard, arrays["rssi_db"][data.place, data.station], atol=1e-3)
     walk = np.stack([arrays["latitude"], arrays["longitude"]], axis=-1)[data.place]
-    for place, degrees, height in ((data.moving, walk, 1.5), (data.site.stations.position, DEGREES, 10)):
+    for place, degrees, height in (
+        (data.moving, walk, 1.5),
+        (data.site.stations.position, DEGREES, 10),
+    ):
         world = place + data.site.origin
         found = np.stack(data.site.georeference.to_degrees(world[:, :2]), axis=-1)
         assert np.abs(found - degrees).max() < 1e-7 and np.allclose(world[:, 2], height)
 
 
 MEASURED = {
-    "techtile-csi-920mhz": "techtile", "ble-hall-1": "ble", "techtile-power-reci-rf-1": None,
-}  # fmt: skip
+    "techtile-csi-920mhz": "techtile",
+    "ble-hall-1": "ble",
+    "techtile-power-reci-rf-1": None,
+}
 
 
 @pytest.mark.parametrize(("file", "campaign"), MEASURED.items())
@@ -235,7 +298,9 @@ def test_check_reads_a_measured_campaign_as_its_loader_does(file, campaign):
 def test_own_names_the_campaign_of_a_file(tmp_path, refused):
     file = tmp_path / "hall.npz"
     np.savez(file, mobile_position=np.eye(3), station_position=np.eye(3), rssi_db=np.zeros((3, 3)))
-    refused("this is a file of dataset=ble; say dataset=ble", load, {"name": "own", "file": str(file)})
+    refused(
+        "this is a file of dataset=ble; say dataset=ble", load, {"name": "own", "file": str(file)}
+    )
 
 
 def test_units_of_a_converted_file_were_not_looked_at(tmp_path, refused):
@@ -243,5 +308,7 @@ def test_units_of_a_converted_file_were_not_looked_at(tmp_path, refused):
     with np.load(release("real/ble-hall-1.npz")) as stored:
         write_raw(tmp_path / "hall.npz", Raw(dict(stored), {}, {"mobile_position": "mm"}))
     refused(
-        "tx_position: units are 'mm'; expected 'm'", lambda path: read_any(path).data, tmp_path / "hall.npz"
+        "tx_position: units are 'mm'; expected 'm'",
+        lambda path: read_any(path).data,
+        tmp_path / "hall.npz",
     )

@@ -63,12 +63,19 @@ class _Recorder(pl.LightningModule):
 
 
 def _fit(module, tmp_path, model, steps, ckpt=None, every=None):
-    kept = pl.callbacks.ModelCheckpoint(tmp_path, "{step}", save_top_k=-1, every_n_train_steps=every)
+    kept = pl.callbacks.ModelCheckpoint(
+        tmp_path, "{step}", save_top_k=-1, every_n_train_steps=every
+    )
     trainer = pl.Trainer(
-        max_steps=steps, accelerator="cpu", logger=False, callbacks=[kept] if every else [],
-        enable_checkpointing=bool(every), enable_progress_bar=False, enable_model_summary=False,
+        max_steps=steps,
+        accelerator="cpu",
+        logger=False,
+        callbacks=[kept] if every else [],
+        enable_checkpointing=bool(every),
+        enable_progress_bar=False,
+        enable_model_summary=False,
         default_root_dir=tmp_path,
-    )  # fmt: skip
+    )
     trainer.fit(model, module, ckpt_path=ckpt, weights_only=False)
     return trainer
 
@@ -84,14 +91,18 @@ def test_resume_in_the_middle_of_an_epoch_continues_exactly(data, tmp_path):
 
 
 TYPOS = {"rfdi": "rfid", "newerf": "newrf", "rfid-sim": "rfid_sim", "owm": "own"}
-CONFIGS = {path.stem: path for path in Path(gsparc.conf.__path__[0]).joinpath("dataset").glob("*.yaml")}
+CONFIGS = {
+    path.stem: path for path in Path(gsparc.conf.__path__[0]).joinpath("dataset").glob("*.yaml")
+}
 del CONFIGS["fingerprints"]  # of `gsparc locate` alone
 
 
 @pytest.mark.parametrize("name", sorted(CONFIGS))
 def test_every_config_names_a_data_module_of_its_own(name):
     stored = {"name": name} | ({"file": "x.npz"} if "\nfile:" in CONFIGS[name].read_text() else {})
-    module = datamodule(compose(f"dataset={name}", *(f"dataset.{k}={v}" for k, v in stored.items())).dataset)
+    module = datamodule(
+        compose(f"dataset={name}", *(f"dataset.{k}={v}" for k, v in stored.items())).dataset
+    )
     assert isinstance(module, DataModule) and type(module).__module__.startswith("gsparc.")
     assert (module.name, module.batch_size) == (name, 16)
     short = datamodule(stored, trusted=False)
@@ -106,18 +117,27 @@ NO_MODULE = "is no gsparc.datasets.datamodule.DataModule"
 @pytest.mark.parametrize(
     ("settings", "says"),
     [
-        ({"name": "own", "_target_": "os.system"}, "no gsparc.datasets.datamodule.DataModule|no such setting"),
+        (
+            {"name": "own", "_target_": "os.system"},
+            "no gsparc.datasets.datamodule.DataModule|no such setting",
+        ),
         ({"name": "own", "_target_": "gsparc.models.baselines.mean.Mean"}, NO_MODULE),
         ({"name": "own", "_target_": "gsparc.datasets.own.Onw"}, NO_MODULE),
         ({"name": "own", "_target_": "gsparc.datasets.rfid.RFID"}, "this is dataset=rfid; say"),
         ({"name": "fingerprints", "file": "x.npz"}, "DataModule; only gsparc locate takes it"),
         ({"name": "rfid", "gatway": "x"}, "dataset.gatway: no such setting .*mean .gateway."),
-        ({"name": "own", "file": "x", "batch_size": 0}, "dataset.batch_size=0: a whole number of at least 1"),
+        (
+            {"name": "own", "file": "x", "batch_size": 0},
+            "dataset.batch_size=0: a whole number of at least 1",
+        ),
         *(({"name": typo}, f"did you mean '{name}'") for typo, name in TYPOS.items()),
         ({"name": "own"}, "dataset.file is not set"),
-        ({"name": "ble", "root": "x"}, "dataset.root is not a setting of dataset=ble; say dataset.file=..."),
+        (
+            {"name": "ble", "root": "x"},
+            "dataset.root is not a setting of dataset=ble; say dataset.file=...",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_is_no_dataset_is_refused_in_one_line(refused, settings, says):
     refused(says, datamodule, settings)
 
@@ -151,13 +171,18 @@ def test_a_subclass_needs_load_alone(csi_arrays, tmp_path):
         module.train_dataloader()
     recorder = _Recorder()
     _fit(module.use(FOLD, seed=3), tmp_path, recorder, steps=2)
-    assert recorder.seen == [rows_of_step(3, s, 4, FOLD.train).tolist() for s in range(2)] and Mine.reads == 1
+    assert (
+        recorder.seen == [rows_of_step(3, s, 4, FOLD.train).tolist() for s in range(2)]
+        and Mine.reads == 1
+    )
     assert [b.index.tolist() for b in module.test_dataloader()] == [FOLD.test.tolist()]
 
 
 @pytest.mark.parametrize(("batch", "devices"), [(4, 2), (3, 2), (1, 2), (2, 3)])
 def test_shares_of_a_step_add_up_to_one(data, batch, devices):
-    loaders = [StepLoader(data, FOLD.train, batch, 0, rank=r, devices=devices) for r in range(devices)]
+    loaders = [
+        StepLoader(data, FOLD.train, batch, 0, rank=r, devices=devices) for r in range(devices)
+    ]
     for parts in zip(*loaders, strict=True):
         assert sum(part.share for part in parts) == pytest.approx(1)
         counted = sum(len(part) for part in parts if part.share)
@@ -167,7 +192,10 @@ def test_shares_of_a_step_add_up_to_one(data, batch, devices):
 
 def test_several_devices_take_the_steps_of_one(data):
     one = [b.index.tolist() for b in StepLoader(data, FOLD.train, 4, seed=0)]
-    two = [[b.index.tolist() for b in StepLoader(data, FOLD.train, 4, 0, rank=r, devices=2)] for r in (0, 1)]
+    two = [
+        [b.index.tolist() for b in StepLoader(data, FOLD.train, 4, 0, rank=r, devices=2)]
+        for r in (0, 1)
+    ]
     assert len(two[0]) == len(two[1]) == len(one)
     for whole, *parts in zip(one, *two, strict=True):
         assert parts[0] == whole[0::2] and set(parts[0] + parts[1]) == set(whole)

@@ -32,19 +32,25 @@ def test_archive_is_read(tmp_path):
     assert flat.position.shape == (4, 3) and not flat.position[:, 2].any()
 
 
-@pytest.mark.parametrize("other, said", [
-    ({"position": None}, "position: missing"),
-    ({"position": np.zeros((3, 3))}, "position: expected shape"),
-    ({"position": np.full((4, 3), NAN)}, "finite coordinates"),
-    ({"position": np.zeros((4, 4))}, "2 or 3 coordinates"),
-    ({"rss_dbm": np.full((4, 2), NAN)}, "no row heard an access point"),
-    ({"rss_dbm": np.full((4, 2), 100.0)}, "found 100 in row 0, column 0"),
-    ({"rss_dbm": np.full((4, 2), np.inf)}, "found inf"),
-    ({"floor": np.zeros(3, np.int64)}, r"floor: expected shape \(\) or \(S,\), here \(\) or \(4,\)"),
-    ({"floor": np.zeros(4)}, "floor: expected whole numbers, found dtype float64"),
-    ({"access_point": np.array(["a", "a"])}, "expected each once"),
-    ({"test": np.array(["no"] * 4)}, "test: expected True and False"),  # was a KeyError
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "other, said",
+    [
+        ({"position": None}, "position: missing"),
+        ({"position": np.zeros((3, 3))}, "position: expected shape"),
+        ({"position": np.full((4, 3), NAN)}, "finite coordinates"),
+        ({"position": np.zeros((4, 4))}, "2 or 3 coordinates"),
+        ({"rss_dbm": np.full((4, 2), NAN)}, "no row heard an access point"),
+        ({"rss_dbm": np.full((4, 2), 100.0)}, "found 100 in row 0, column 0"),
+        ({"rss_dbm": np.full((4, 2), np.inf)}, "found inf"),
+        (
+            {"floor": np.zeros(3, np.int64)},
+            r"floor: expected shape \(\) or \(S,\), here \(\) or \(4,\)",
+        ),
+        ({"floor": np.zeros(4)}, "floor: expected whole numbers, found dtype float64"),
+        ({"access_point": np.array(["a", "a"])}, "expected each once"),
+        ({"test": np.array(["no"] * 4)}, "test: expected True and False"),  # was a KeyError
+    ],
+)
 def test_bad_archives_are_refused_in_one_line(tmp_path, other, said, refused):
     refused(said, read_fingerprints, written(tmp_path / "a.npz", **other))
 
@@ -73,7 +79,15 @@ def invented(count: int = 200) -> Fingerprints:
     level = rng.uniform(-90, -40, (count, 3)).astype(np.float32)
     walk = np.arange(count) % 8
     return Fingerprints(
-        level, places, none, none, walk, none, none > 0, none.astype(float), np.array(["a", "b", "c"])
+        level,
+        places,
+        none,
+        none,
+        walk,
+        none,
+        none > 0,
+        none.astype(float),
+        np.array(["a", "b", "c"]),
     )
 
 

@@ -1,5 +1,4 @@
 """Files as their makers published them, beside what was converted from them."""
-# ruff: noqa: E501 (a case is a row of a table)
 
 import pickle
 import sys
@@ -24,7 +23,10 @@ ROOM = "releases/newrf/dataset_conference_ch1_rt_image_fc.pkl"
 
 
 def test_newrf_room_is_what_was_converted_from_it():
-    released, converted = read_newrf(real(ROOM)).arrays, read_newrf(real("newrf-conference.npz")).arrays
+    released, converted = (
+        read_newrf(real(ROOM)).arrays,
+        read_newrf(real("newrf-conference.npz")).arrays,
+    )
     assert len(released["csi"]) == 433
     for name in set(converted) - {"split_train", "split_test"}:
         assert np.abs(released[name].astype(complex) - converted[name]).max() <= 1e-6, name
@@ -38,14 +40,19 @@ def frame(rows: int = 8, **changed):
 
     rng = np.random.default_rng(0)
     columns = {
-        "TxPos": [np.array([-1.5, 0, 1.7])] * rows, "RxPos": [*rng.uniform(0, 3, (rows, 3))],
-        "CSI": [*(rng.normal(size=(rows, 1)) + 1j)], "Frequency": [2.412] * rows,
+        "TxPos": [np.array([-1.5, 0, 1.7])] * rows,
+        "RxPos": [*rng.uniform(0, 3, (rows, 3))],
+        "CSI": [*(rng.normal(size=(rows, 1)) + 1j)],
+        "Frequency": [2.412] * rows,
         "LastXPts": [rng.normal(size=(3, 4)) for _ in range(rows)],
         "RxChanPerRay": [rng.normal(size=(4, 1)) + 0j for _ in range(rows)],
-        "LineOfSight": np.ones(rows, np.uint8), **changed,
-    }  # fmt: skip
+        "LineOfSight": np.ones(rows, np.uint8),
+        **changed,
+    }
     heads = pandas.Index(list(columns), dtype=object)
-    return pandas.DataFrame({name: pandas.Series(columns[name]) for name in heads}).set_axis(heads, axis=1)
+    return pandas.DataFrame({name: pandas.Series(columns[name]) for name in heads}).set_axis(
+        heads, axis=1
+    )
 
 
 def test_newrf_rows_with_a_missing_value_are_left_out(tmp_path):
@@ -54,7 +61,9 @@ def test_newrf_rows_with_a_missing_value_are_left_out(tmp_path):
     table.to_pickle(tmp_path / "room.pkl")
     arrays = read_newrf(tmp_path / "room.pkl").arrays
     assert len(arrays["csi"]) == 7 and arrays["path_offsets"][-1] == 28 == len(arrays["path_gain"])
-    assert arrays["csi"][3] == np.complex64(table["CSI"][4][0]) and arrays["frequency_hz"] == 2.412e9
+    assert (
+        arrays["csi"][3] == np.complex64(table["CSI"][4][0]) and arrays["frequency_hz"] == 2.412e9
+    )
 
 
 class Runs:
@@ -74,15 +83,24 @@ ALTERS_FUNCTIONS = (
     b"cnumpy.core.numeric\n_frombuffer\n(NS'__name__'\nS'mine'\nsdtb."  # BUILD on what is looked up
 )
 SPOILT = {
-    "code": (pickle.dumps(Runs()), r"asks for pathlib\.Path.*, which is neither an array nor a part of a table: not run"),
-    "code in a column": (pickle.dumps([np.ones(3), Asks("open('ran', 'w')")]), r"asks for builtins\.eval"),
+    "code": (
+        pickle.dumps(Runs()),
+        r"asks for pathlib\.Path.*, which is neither an array nor a part of a table: not run",
+    ),
+    "code in a column": (
+        pickle.dumps([np.ones(3), Asks("open('ran', 'w')")]),
+        r"asks for builtins\.eval",
+    ),
     "system": (b"cos\nsystem\n(S'touch ran'\ntR.", r"asks for posix\.system|asks for os\.system"),
-    "a dotted name": (b"\x80\x04\x8c\x05numpy\x8c\x0cndarray.data\x93.", r"asks for numpy\.ndarray\.data"),
+    "a dotted name": (
+        b"\x80\x04\x8c\x05numpy\x8c\x0cndarray.data\x93.",
+        r"asks for numpy\.ndarray\.data",
+    ),
     "a function's name": (ALTERS_FUNCTIONS, "damaged, or no pickle of arrays"),
     "cut short": (pickle.dumps(np.arange(9.0))[:-20], "damaged, or no pickle of arrays"),
     "an array": (pickle.dumps(np.ones(3)), "no pickled pandas table"),
-    "a recursion": (b"(" * 100_000 + b"." , "damaged|no pickle"),
-}  # fmt: skip
+    "a recursion": (b"(" * 100_000 + b".", "damaged|no pickle"),
+}
 
 
 @pytest.mark.parametrize("case", SPOILT)
@@ -98,8 +116,10 @@ def test_a_pickle_runs_nothing(tmp_path, monkeypatch, case):
 @pytest.mark.parametrize("protocol", range(6))
 def test_pickled_arrays_of_every_protocol(tmp_path, protocol):
     held = {
-        "a": np.arange(6.0).reshape(2, 3), "b": np.array([np.ones(2), "x", None], object), "c": np.float32(2),
-    }  # fmt: skip
+        "a": np.arange(6.0).reshape(2, 3),
+        "b": np.array([np.ones(2), "x", None], object),
+        "c": np.float32(2),
+    }
     (tmp_path / "x.pkl").write_bytes(pickle.dumps(held, protocol))
     found = read_pickle(tmp_path / "x.pkl", FRAMES)
     assert np.array_equal(found["a"], held["a"]) and found["c"] == 2 and found["b"][1] == "x"
@@ -119,11 +139,16 @@ def test_newrf_tables_without_a_column_or_of_two_rooms(tmp_path, refused):
 
 
 def test_ble_folder_is_what_was_converted_from_it():
-    released, converted = (read_ble(real(n)).arrays for n in ("releases/ble-hall", "real/ble-hall-1.npz"))
+    released, converted = (
+        read_ble(real(n)).arrays for n in ("releases/ble-hall", "real/ble-hall-1.npz")
+    )
     assert released["rssi_db"].shape == (7, 12)
     assert np.array_equal(released["station_position"], converted["station_position"])
     assert released["station_name"].tolist() == converted["station_name"].tolist()
-    rows = [np.flatnonzero((converted["tx_position"] == place).all(1)) for place in released["tx_position"]]
+    rows = [
+        np.flatnonzero((converted["tx_position"] == place).all(1))
+        for place in released["tx_position"]
+    ]
     assert all(len(row) == 1 for row in rows)
     # The first 25 packets of thousands: their means scatter by the fading of one.
     apart = released["rssi_db"] - converted["rssi_db"][np.concatenate(rows)]
@@ -132,7 +157,10 @@ def test_ble_folder_is_what_was_converted_from_it():
     assert "dataset=ble" in read_any(real("releases/ble-hall")).notes[0]
 
 
-DEVICES = 'Dongles:{"aa": [[7.0, 7.09, 1.22], 1, "sensor10"], "bb": [[7.18, 0.68, 2.3], 2, "sensor11"] }\nBeacons:{}\n'
+DEVICES = (
+    'Dongles:{"aa": [[7.0, 7.09, 1.22], 1, "sensor10"], "bb": [[7.18, 0.68, 2.3], 2, '
+    '"sensor11"] }\nBeacons:{}\n'
+)
 
 
 def hall(root: Path) -> Path:
@@ -157,13 +185,33 @@ def test_ble_sets_and_what_was_not_heard(tmp_path):
 
 BLE = {
     "no sensors": ("cnf/tetam.dev", None, "tetam.dev: missing; expected a first line Dongles:"),
-    "other devices": ("cnf/tetam.dev", "Dongles:{'a': 1}", "tetam.dev, line 1: expected a first line"),
-    "place of two": ("cnf/tetam.dev", DEVICES.replace("7.09, 1.22", "7.09"), "line 1: expected a first line"),
-    "a word": ("hst/set_1/sensor10_10.5_2.0_1.85.mbd", "1,aa,e7,loud\n", "expected lines of time, sensor, beacon and dBm"),
+    "other devices": (
+        "cnf/tetam.dev",
+        "Dongles:{'a': 1}",
+        "tetam.dev, line 1: expected a first line",
+    ),
+    "place of two": (
+        "cnf/tetam.dev",
+        DEVICES.replace("7.09, 1.22", "7.09"),
+        "line 1: expected a first line",
+    ),
+    "a word": (
+        "hst/set_1/sensor10_10.5_2.0_1.85.mbd",
+        "1,aa,e7,loud\n",
+        "expected lines of time, sensor, beacon and dBm",
+    ),
     "three cells": ("hst/set_1/sensor10_10.5_2.0_1.85.mbd", "1,aa,-5\n", "expected lines of time"),
-    "other sensor": ("hst/set_1/sensor99_1_2_3.mbd", "1,aa,e7,-5\n", "no sensor of cnf/tetam.dev is called 'sensor99'"),
-    "place in the name": ("hst/set_1/sensor10_1_2.mbd", "1,aa,e7,-5\n", "expected a name like sensor10_X_Y_Z.mbd"),
-}  # fmt: skip
+    "other sensor": (
+        "hst/set_1/sensor99_1_2_3.mbd",
+        "1,aa,e7,-5\n",
+        "no sensor of cnf/tetam.dev is called 'sensor99'",
+    ),
+    "place in the name": (
+        "hst/set_1/sensor10_1_2.mbd",
+        "1,aa,e7,-5\n",
+        "expected a name like sensor10_X_Y_Z.mbd",
+    ),
+}
 
 
 @pytest.mark.parametrize("case", BLE)
@@ -184,10 +232,14 @@ def test_powder_table_is_what_was_converted_from_it():
     assert len(shared) == 12
     # Every eighth row of the release.
     assert np.array_equal(released["latitude"], converted["latitude"][::8])
-    same = np.isclose(released["rssi_db"], converted["rssi_db"][::8][:, shared], atol=1e-4, equal_nan=True)
+    same = np.isclose(
+        released["rssi_db"], converted["rssi_db"][::8][:, shared], atol=1e-4, equal_nan=True
+    )
     assert same.all()
     for axis in ("latitude", "longitude"):
-        assert np.allclose(released[f"station_{axis}"], converted[f"station_{axis}"][shared], atol=1e-7)
+        assert np.allclose(
+            released[f"station_{axis}"], converted[f"station_{axis}"][shared], atol=1e-7
+        )
 
 
 class PositionerValue:
@@ -209,7 +261,9 @@ def plane(folder: Path, places, powers, module="Positioner") -> Path:
         for kind, name in names.items():
             patch.setattr(kind, "__module__", name)
             patch.setitem(sys.modules, name, SimpleNamespace(**{kind.__name__: kind}))
-        np.save(folder / "17_positions.npy", np.array([PositionerValue(*place) for place in places]))
+        np.save(
+            folder / "17_positions.npy", np.array([PositionerValue(*place) for place in places])
+        )
         np.save(folder / "17_values.npy", np.array([ep_data(power) for power in powers]))
     return folder
 
@@ -217,7 +271,8 @@ def plane(folder: Path, places, powers, module="Positioner") -> Path:
 def test_techtile_power_of_pickled_objects(tmp_path, caplog):
     folder = plane(tmp_path / "RECI-RF-1", np.eye(4, 3) + 3, [58_600_000.0, 1e6, 1e9, 0])
     arrays = read_techtile_power(folder).arrays
-    assert np.allclose(arrays["rssi_db"], [-12.321, -30, 0], atol=1e-3)  # of 58.6, 1 and 1,000 microwatts
+    # Of 58.6, 1 and 1,000 microwatts
+    assert np.allclose(arrays["rssi_db"], [-12.321, -30, 0], atol=1e-3)
     assert np.array_equal(arrays["rx_position"], np.float32(np.eye(3) + 3))
     assert arrays["frequency_hz"] == 920e6
     assert (
@@ -245,7 +300,9 @@ def test_rfid_list_of_our_tables_is_out_of_the_200(tmp_path):
     root = real("rfid-s23-160")
     ours = load_rfid(root)
     rows = list(
-        csv.DictReader(files("gsparc.datasets.public").joinpath("rfid-160.csv").read_text().splitlines())
+        csv.DictReader(
+            files("gsparc.datasets.public").joinpath("rfid-160.csv").read_text().splitlines()
+        )
     )
     (tmp_path / "spectrum").mkdir()
     number = {int(row["spectrum"]): i + 1 for i, row in enumerate(rows)}

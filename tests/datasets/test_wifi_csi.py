@@ -20,7 +20,9 @@ CARRIER = 5.54e9
 
 @pytest.fixture
 def robot(tmp_path) -> Path:
-    """A log of an Intel 5300 with senders and the computer's time, and the way of the robot that wrote it."""
+    """A log of an Intel 5300 with senders and the computer's time,
+    and the way of the robot that wrote it.
+    """
     (tmp_path / "way.csv").write_text("time_s,x,y,z\n1624839900,0,0,1\n1624839960,6,0,1\n")
     content = release(f"releases/wsr/csi_rx_{RUN}.dat").read_bytes()
     (tmp_path / "rx.dat").write_bytes(content)
@@ -41,12 +43,17 @@ def test_a_folder_of_nexmon_with_its_places(caplog):
     raw = read_wifi_csi(folder).arrays
     tone = (raw["frequency_hz"] - 5.24e9) / SPACING_HZ
     assert tone.tolist() == [*range(-26, 0), *range(1, 27)]
-    assert "52 of 64 subcarriers" in caplog.text and "the level of each row is its RSSI" in caplog.text
+    assert (
+        "52 of 64 subcarriers" in caplog.text
+        and ("the level of each row is its RSSI") in caplog.text
+    )
     log = csiread.Nexmon(str(folder / "204_1.pcap"), "43455c0", 20, False)
     log.read()
     shape = np.fft.fftshift(log.csi, axes=1)[:, 32 + tone.astype(int)]
     found = raw["csi"][:12, 0]
-    assert np.allclose(found * shape[:, :1], shape * found[:, :1], rtol=1e-4, atol=1e-6 * np.abs(shape).max())
+    assert np.allclose(
+        found * shape[:, :1], shape * found[:, :1], rtol=1e-4, atol=1e-6 * np.abs(shape).max()
+    )
     level = 10 * np.log10(np.mean(np.abs(raw["csi"][:, 0]) ** 2, axis=1))
     assert np.allclose(level[[0, 12]], [-50, -49], atol=1e-3)
     data = load({"name": "wifi_csi", "file": str(folder)})
@@ -81,8 +88,11 @@ def test_packets_of_an_intel_5300_along_a_track(robot):
 
 def esp32(folder: Path, parts: np.ndarray) -> Path:
     """The log of packets at one place, of their real and imaginary parts (packets, 128)."""
-    head = "CSI_DATA,AP,3C:71:BF:6D:2A:78,{},11,1,0,0,0,0,0,0,0,0,-96,0,{},0,{},0,0,0,0,1.5,128,[{} ]\n"
-    lines = [head.format(-40 - i, 6, 1000 * i, " ".join(map(str, row))) for i, row in enumerate(parts)]
+    head = "CSI_DATA,AP,3C:71:BF:6D:2A:78,{},11,1,0,0,0,0,0,0,0,0,-96,0,{},0,{},0,0,0,0,1.5,"
+    head += "128,[{} ]\n"
+    lines = [
+        head.format(-40 - i, 6, 1000 * i, " ".join(map(str, row))) for i, row in enumerate(parts)
+    ]
     (folder / "walk.csv").write_text("".join(lines))
     (folder / "places.csv").write_text("file,x,y,z\nwalk,1,2,3\n")
     return folder
@@ -94,7 +104,9 @@ def test_an_esp32_and_a_subcarrier_without_a_level(tmp_path):
     raw = read_wifi_csi(esp32(tmp_path, parts)).arrays
     assert raw["frequency_hz"].mean() == pytest.approx(2.437e9, abs=SPACING_HZ)
     tone = ((raw["frequency_hz"] - 2.437e9) / SPACING_HZ).round()
-    assert len(tone) == 51 and 10 not in tone and raw["station_name"].tolist() == ["3C:71:BF:6D:2A:78"]
+    assert (
+        len(tone) == 51 and 10 not in tone and raw["station_name"].tolist() == ["3C:71:BF:6D:2A:78"]
+    )
 
 
 def test_a_packet_of_zeros_made_all_levels_nan(tmp_path, caplog):

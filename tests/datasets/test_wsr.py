@@ -1,5 +1,4 @@
 """Logs of both ends of a Wi-Fi link: squares of the channel, their root along the way."""
-# ruff: noqa: E501 (a case is a row of a table)
 
 import numpy as np
 import pytest
@@ -20,7 +19,10 @@ from gsparc.datasets.wsr import (
 
 def unexplained(found: np.ndarray, truth: np.ndarray) -> float:
     """NMSE with the best common factor."""
-    return 1 - np.abs(np.vdot(found, truth)) ** 2 / (np.vdot(found, found) * np.vdot(truth, truth)).real
+    return (
+        1
+        - np.abs(np.vdot(found, truth)) ** 2 / (np.vdot(found, found) * np.vdot(truth, truth)).real
+    )
 
 
 @pytest.mark.slow
@@ -29,10 +31,13 @@ def test_the_channel_comes_back_up_to_a_factor_for_each_run(tmp_path):
         drive(tmp_path / f"L{i}", f"t{i}", seed=i)
     raw = read_wsr(tmp_path).arrays
     assert len(set(raw["run"])) == 6 and set(raw["station"]) == {0, 1, 2}
-    assert 30 <= np.min(np.unique(raw["run"], return_counts=True)[1]) <= 40  # .6 m in steps of 16 mm
+    # .6 m in steps of 16 mm
+    assert 30 <= np.min(np.unique(raw["run"], return_counts=True)[1]) <= 40
     for run in np.unique(raw["run"]):
         rows = raw["run"] == run
-        truth = true_root(raw["rx_position"][rows], raw["station_position"][raw["station"][rows][0]])
+        truth = true_root(
+            raw["rx_position"][rows], raw["station_position"][raw["station"][rows][0]]
+        )
         assert unexplained(raw["csi"][rows], truth) < 0.03, run
     data = load({"name": "wsr", "file": str(tmp_path), "stations": ["tx3"]})
     assert data.site.kind == "csi" and data.target.shape[1:] == (1, 30) and len(set(data.run)) == 2
@@ -53,7 +58,9 @@ def test_the_root_is_followed_through_a_fade():
 
 
 def test_pieces_of_the_release():
-    """150 records of each end, of a robot that has not started yet: what is behind the archive's first row."""
+    """150 records of each end, of a robot that has not started yet:
+    what is behind the archive's first row.
+    """
     folder = real("releases/wsr")
     robot = read_log(folder / f"csi_rx_{RUN}.dat")
     senders = np.unique(robot.sender)
@@ -64,11 +71,17 @@ def test_pieces_of_the_release():
     assert np.abs(robot.csi[..., 0]).sum() == pytest.approx(7.78434, rel=1e-5)
     for i, tx in enumerate(LOS_SET_A):
         other = read_log(folder / f"csi_{tx}_{RUN}.dat")
-        agree, _, square = max((_square(robot, other, sender) for sender in senders), key=lambda one: one[0])
+        agree, _, square = max(
+            (_square(robot, other, sender) for sender in senders), key=lambda one: one[0]
+        )
         others = sorted(_square(robot, other, sender)[0] for sender in senders)[:2]
         assert len(other.csi) == 150 and len(square) == 49 and agree > 0.94 and max(others) < 0.4
         mean = square.mean(axis=0)
-        alike = np.abs(np.vdot(mean, converted[i])) / np.linalg.norm(mean) / np.linalg.norm(converted[i])
+        alike = (
+            np.abs(np.vdot(mean, converted[i]))
+            / np.linalg.norm(mean)
+            / np.linalg.norm(converted[i])
+        )
         assert alike > 0.7  # 9 mm further on: a third of a wavelength there and back
         assert abs(20 * np.log10(np.linalg.norm(mean) / np.linalg.norm(converted[i]))) < 3.5
 

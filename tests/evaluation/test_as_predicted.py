@@ -1,4 +1,6 @@
-"""What is printed is what `gsparc predict` answers: an error computed from its file is the figure."""
+"""What is printed is what `gsparc predict` answers:
+an error computed from its file is the figure.
+"""
 
 from itertools import product
 
@@ -31,15 +33,19 @@ NONE = np.zeros(0, np.int64)
 
 
 def powers(kind, listed, silent, devices, runs):
-    """Arrays of a drive: lists of the `listed` strongest or all, phones 6 dB apart, days in turn."""
+    """Arrays of a drive: lists of the `listed` strongest or all, phones 6 dB apart,
+    days in turn.
+    """
     phone = np.arange(PLACES) % 2
     level = LEVEL + 6.0 * phone[:, None] * devices
     keep = np.argsort(np.argsort(-level, 1), 1) < listed
     place, station = np.nonzero(keep)
     arrays = {
-        "rx_position": AT[place], "station": station, "station_position": MASTS,
+        "rx_position": AT[place],
+        "station": station,
+        "station_position": MASTS,
         "station_name": np.array([f"m{i}" for i in range(STATIONS)]),
-    }  # fmt: skip
+    }
     values = level[place, station]
     if kind == "rssi_db":
         heard = values > FLOOR_DB if silent else values > -np.inf
@@ -52,7 +58,9 @@ def powers(kind, listed, silent, devices, runs):
 
 
 def fitted(name, data, fold, folder):
-    method, _ = fitting.fit_or_resume(wrap_per_station(method_class(name)(), data), data, fold, FitContext())
+    method, _ = fitting.fit_or_resume(
+        wrap_per_station(method_class(name)(), data), data, fold, FitContext()
+    )
     checkpoint.save(
         folder / "model.ckpt", method, extra=Hearing.from_learned(data, fold.learned()).to_extra()
     )
@@ -127,7 +135,9 @@ def test_the_figure_was_not_of_what_is_answered(tmp_path, case, devices, runs):
     assert require_same(method, other, Split("whole", (Fold(NONE, NONE, rows),)), tmp_path, learned)
 
 
-@pytest.mark.parametrize("several, runs, nulls", product((False, True), (False, True), (False, True)))
+@pytest.mark.parametrize(
+    "several, runs, nulls", product((False, True), (False, True), (False, True))
+)
 def test_channels_are_scored_as_they_are_answered(tmp_path, several, runs, nulls):
     """Runs that were not learned from have one phase each, which numpy finds, too."""
     rng, tones = np.random.default_rng(1), 2.4e9 + 1e6 * np.arange(6)
@@ -174,6 +184,10 @@ def test_a_models_file_answers_as_the_data_beside_it(tmp_path):
     hearing, split = read_hearing(stored.extra), Split("own", (fold,))
     own = Hearing.from_learned(data, fold.learned())
     np.testing.assert_array_equal(hearing.lists.level, own.lists.level)
-    facts = [evaluate(method, 1.0, data, split, baselines=[], timed=False, hearing=one).facts["test/rmse_db"]
-             for one in (None, [hearing])]  # fmt: skip
+    facts = [
+        evaluate(method, 1.0, data, split, baselines=[], timed=False, hearing=one).facts[
+            "test/rmse_db"
+        ]
+        for one in (None, [hearing])
+    ]
     assert facts[0] == facts[1]

@@ -1,4 +1,6 @@
-"""Errors of powers by station, the strongest station at a place, and leads with and without silent rows."""
+"""Errors of powers by station, the strongest station at a place,
+and leads with and without silent rows.
+"""
 
 from dataclasses import replace
 
@@ -35,17 +37,24 @@ def drive():
     """60 places along a line, three stations, the second of which scatters by 8 dB."""
     rng = np.random.default_rng(1)
     place, station = np.repeat(np.arange(PLACES), 3), np.tile(np.arange(3), PLACES)
-    level = -60 - 0.1 * place - 10.0 * station + rng.normal(size=3 * PLACES) * np.where(station == 1, 8, 0.5)
+    level = (
+        -60
+        - 0.1 * place
+        - 10.0 * station
+        + rng.normal(size=3 * PLACES) * np.where(station == 1, 8, 0.5)
+    )
     return listed(place, station, level)
 
 
 def listed(place, station, level):
     """Levels of three stations beside a line."""
     arrays = {
-        "rx_position": np.c_[place, np.zeros((len(place), 2))].astype(float), "station": station,
-        "station_position": np.array([[0.0, 9, 5], [30, 9, 5], [59, 9, 5]]), "rssi_db": level,
+        "rx_position": np.c_[place, np.zeros((len(place), 2))].astype(float),
+        "station": station,
+        "station_position": np.array([[0.0, 9, 5], [30, 9, 5], [59, 9, 5]]),
+        "rssi_db": level,
         "station_name": np.array(NAMES),
-    }  # fmt: skip
+    }
     return from_arrays(arrays, {"absent": "unknown"})
 
 
@@ -59,7 +68,12 @@ def evaluated(data, baselines):
     split = split_of(data)
     quick = ClockSettings(rounds=3, least=2, warmup=1)
     return evaluate(
-        fit_baseline("nearest", data, split).methods, 1.0, data, split, baselines=baselines, clock=quick
+        fit_baseline("nearest", data, split).methods,
+        1.0,
+        data,
+        split,
+        baselines=baselines,
+        clock=quick,
     )
 
 
@@ -67,7 +81,9 @@ def test_errors_of_single_stations_were_nowhere(drive, tmp_path):
     """A planner saw one rmse for all stations, and not which row of per_sample.csv was of which."""
     found = evaluated(drive, ["mean", "idw"])
     found.write(tmp_path, run_id="one")
-    samples, stations = (pd.read_csv(tmp_path / f"{name}.csv") for name in ("per_sample", "by_station"))
+    samples, stations = (
+        pd.read_csv(tmp_path / f"{name}.csv") for name in ("per_sample", "by_station")
+    )
     assert list(stations["station"]) == NAMES and set(samples["station"]) == set(NAMES)
     own = samples.groupby("station")["error_db"]
     rmse = own.apply(lambda error: np.sqrt(np.mean(error**2)))[NAMES]
@@ -80,7 +96,8 @@ def test_errors_of_single_stations_were_nowhere(drive, tmp_path):
     assert heads == ["station", "rows", "nearest", "bias_db of nearest", "mean", "idw"]
     assert rows[0][:2] == ["south", "12"] and len(rows) == 3
     ahead = [
-        int((stations["rmse_db"] < stations[f"baseline/{one}/rmse_db"]).sum()) for one in ("mean", "idw")
+        int((stations["rmse_db"] < stations[f"baseline/{one}/rmse_db"]).sum())
+        for one in ("mean", "idw")
     ]
     better = f"than mean at {ahead[0]}, than idw at {ahead[1]}"
     assert worst.note == f"nearest has the smaller rmse_db {better} of 3 stations (10 rows or more)"
@@ -98,15 +115,24 @@ def test_a_method_was_better_than_itself_at_none_of_the_stations():
 
 
 def test_a_cell_that_lost_ten_decibels_was_said_to_need_another_baseline():
-    columns = {"station": ["A", "B"], "rows": [40, 40], "rmse_db": [3.0, 11.7], "bias_db": [0.2, 11.3]}
+    columns = {
+        "station": ["A", "B"],
+        "rows": [40, 40],
+        "rmse_db": [3.0, 11.7],
+        "bias_db": [0.2, 11.3],
+    }
     (worst,) = worst_stations(columns, "gsparc")
     assert worst.note == "measured levels differ from predicted by one offset: B (-11.3 dB)"
     (worst,) = worst_stations(columns, "gsparc", later=True)
-    assert worst.note.endswith("B (-11.3 dB): gsparc update learns that, but not from lists of the strongest")
+    assert worst.note.endswith(
+        "B (-11.3 dB): gsparc update learns that, but not from lists of the strongest"
+    )
 
 
 def test_the_worst_stations_had_other_names_than_warnings_and_a_bias_of_no_meaning():
-    """`150` of `W03-2 (150)`, and -3.5 dB that was the choice of heard rows, which are judged as such now."""
+    """`150` of `W03-2 (150)`, and -3.5 dB that was the choice of heard rows,
+    which are judged as such now.
+    """
     rows = {"rows": [12, 12], "rmse_db": [5.0, 4.0], "bias_db": [-3.5, -1.0]}
     columns = {"station": ["150", "212"], "cell": ["W03-2", "212"], **rows}
     (listed,) = worst_stations({**columns, "rows_with_silent": [12, 40]}, "gp")
@@ -134,7 +160,9 @@ def scored(data, prediction, error=None):
 
 
 def test_the_strongest_is_told_where_it_is_and_equal_answers_tell_nothing(drive):
-    """Lists begin with the strongest: equal answers, as of `zero`, would be right by their order."""
+    """Lists begin with the strongest: equal answers, as of `zero`,
+    would be right by their order.
+    """
     truth = drive.target[:, 0].astype(float)
     assert best_server(scored(drive, truth), drive) == {"best_server": 1.0}
     assert best_server(scored(drive, -truth), drive) == {"best_server": 0.0}
@@ -142,8 +170,12 @@ def test_the_strongest_is_told_where_it_is_and_equal_answers_tell_nothing(drive)
     assert best_server(scored(drive, truth), replace(drive, station=None)) == {}
     # Each visit to a place names its station again: one right answer, not half of one.
     twice = replace(drive, place=drive.place // 2)
-    strongest = np.array([truth[(twice.place == p) & (twice.station == t)].max()
-                          for p, t in zip(twice.place, twice.station, strict=True)])  # fmt: skip
+    strongest = np.array(
+        [
+            truth[(twice.place == p) & (twice.station == t)].max()
+            for p, t in zip(twice.place, twice.station, strict=True)
+        ]
+    )
     assert best_server(scored(twice, strongest), twice) == {"best_server": 1.0}
 
 
@@ -157,9 +189,13 @@ def test_a_silent_station_that_is_predicted_strongest_is_wrong(drive):
 
 
 def test_a_saturated_station_was_never_the_strongest():
-    """It reports its most, -50 dB, at every second place: right predictions were right at half of them."""
+    """It reports its most, -50 dB, at every second place:
+    right predictions were right at half of them.
+    """
     place, station = np.repeat(np.arange(PLACES), 3), np.tile(np.arange(3), PLACES)
-    level = np.where(station == 0, np.where(place % 2, -80 - 0.1 * place, -50), -60 - 0.1 * place - station)
+    level = np.where(
+        station == 0, np.where(place % 2, -80 - 0.1 * place, -50), -60 - 0.1 * place - station
+    )
     data = listed(place, station, level)
     assert (data.censored == -1).sum() == PLACES // 2
     truth = data.target[:, 0].astype(float)
@@ -172,7 +208,9 @@ def test_errors_equal_at_each_station_ended_in_nan(drive):
     """A root of rounding below 0 ended `split=stations` after training: a summary takes no NaN."""
     for seed in range(9):
         error = np.random.default_rng(seed).normal(0, 10, 3)[drive.station]
-        assert rmse_after_constants(scored(drive, error, error), drive.station) == pytest.approx(0, abs=1e-6)
+        assert rmse_after_constants(scored(drive, error, error), drive.station) == pytest.approx(
+            0, abs=1e-6
+        )
 
 
 def test_stations_of_an_earlier_evaluation_stayed_in_the_folder(drive, tmp_path):
@@ -184,17 +222,26 @@ def test_stations_of_an_earlier_evaluation_stayed_in_the_folder(drive, tmp_path)
 
 
 def test_a_lead_with_silent_rows_hid_a_loss_on_heard_ones():
-    """`gsparc` was called better than all baselines, where kriging had 4.30 for 4.94 dB of heard rows."""
+    """`gsparc` was called better than all baselines,
+    where kriging had 4.30 for 4.94 dB of heard rows.
+    """
     facts = {
-        "dataset/kind": "rssi", "model/label": "gsparc", "test/rmse_db": 4.94,
-        "test/rmse_db_with_silent": 3.0, "baseline/kriging/rmse_db": 4.30,
+        "dataset/kind": "rssi",
+        "model/label": "gsparc",
+        "test/rmse_db": 4.94,
+        "test/rmse_db_with_silent": 3.0,
+        "baseline/kriging/rmse_db": 4.30,
         "baseline/kriging/rmse_db_with_silent": 4.0,
-        "baseline/kriging/ahead_db": -1.0, "baseline/kriging/ahead_error_db": 0.1,
-        "baseline/kriging/ahead_pairs": "900 test rows", "baseline/kriging/ahead_listed_db": 0.64,
-        "baseline/kriging/ahead_listed_error_db": 0.1, "baseline/kriging/ahead_listed_pairs": "300 test rows",
-    }  # fmt: skip
+        "baseline/kriging/ahead_db": -1.0,
+        "baseline/kriging/ahead_error_db": 0.1,
+        "baseline/kriging/ahead_pairs": "900 test rows",
+        "baseline/kriging/ahead_listed_db": 0.64,
+        "baseline/kriging/ahead_listed_error_db": 0.1,
+        "baseline/kriging/ahead_listed_pairs": "300 test rows",
+    }
     assert remarks(facts) == [
-        "gsparc is 1.00 ± 0.10 (standard error) dB better over 900 test rows in rmse_db_with_silent "
+        "gsparc is 1.00 ± 0.10 (standard error) dB better over 900 test rows in "
+        "rmse_db_with_silent "
         "than kriging, the best baseline",
         "the baseline kriging is 0.64 ± 0.10 (standard error) dB better over 300 test rows "
         "in rmse_db of heard rows",
@@ -202,7 +249,9 @@ def test_a_lead_with_silent_rows_hid_a_loss_on_heard_ones():
 
 
 def test_the_strongest_at_the_nearest_moment_was_in_no_table():
-    """Levels of each station's own nearest moments tell a best server worse: 52 for 63 % of a drive."""
+    """Levels of each station's own nearest moments tell a best server worse:
+    52 for 63 % of a drive.
+    """
     near = listed([0, 10, 20, 30], [0, 1, 1, 0], [-70.0, -75, -75, -70])
     rows = np.arange(4)
     split = Split("own", (Fold(rows, rows[:0], rows),))
@@ -246,9 +295,11 @@ def lists_along(seed, off=()):
     level[:, list(off)] = -np.inf
     moment, station = np.nonzero(np.argsort(np.argsort(-level, 1), 1) < 3)
     arrays = {
-        "rx_position": place[moment], "station": station, "station_position": MASTS,
+        "rx_position": place[moment],
+        "station": station,
+        "station_position": MASTS,
         "rssi_db": level[moment, station],
-    }  # fmt: skip
+    }
     return from_arrays(arrays)
 
 
@@ -274,13 +325,17 @@ def test_a_station_that_was_off_went_unseen(off):
     whole = Split("whole", (Fold(none, none, rows),))
     taught = Split("all", (Fold(np.arange(len(learned)), none, none),))
     method = TrueLaw(learned.site)
-    scores = score_methods([method], align_to_site(judged, learned.site), whole, learned=(learned, taught))
+    scores = score_methods(
+        [method], align_to_site(judged, learned.site), whole, learned=(learned, taught)
+    )
     found = unlisted_stations(scores, judged)
     assert found.index.tolist() == list(off)
     said = describe_never_listed(scores, judged)
     assert (said is None) == (not off) and (not off or judged.site.stations.name[3] in said)
     heard = np.flatnonzero(judged.censored_side(rows) == 0)
-    links = pd.DataFrame({"place": judged.place, "station": judged.station, "level": judged.target[:, 0]})
+    links = pd.DataFrame(
+        {"place": judged.place, "station": judged.station, "level": judged.target[:, 0]}
+    )
     strongest = links.loc[links.iloc[heard].groupby("place")["level"].idxmax()]
     told = law_db(judged.moving[strongest.index] + judged.site.origin).argmax(1)
     share = float((strongest.station == told).mean())
@@ -292,12 +347,18 @@ def test_figures_of_a_drive_counted_cells_that_were_off():
     learned, judged = lists_along(0), lists_along(1, (3, 4))
     rows, none = np.arange(len(judged)), np.zeros(0, int)
     whole, taught = (
-        Split("", (Fold(*parts),)) for parts in ((none, none, rows), (np.arange(len(learned)), none, none))
+        Split("", (Fold(*parts),))
+        for parts in ((none, none, rows), (np.arange(len(learned)), none, none))
     )
     facts = evaluate(
-        TrueLaw(learned.site), None, align_to_site(judged, learned.site), whole, baselines=["idw"],
-        learned=(learned, taught), timed=False,
-    ).facts  # fmt: skip
+        TrueLaw(learned.site),
+        None,
+        align_to_site(judged, learned.site),
+        whole,
+        baselines=["idw"],
+        learned=(learned, taught),
+        timed=False,
+    ).facts
     for figure in OF_LISTS[:2]:
         assert facts[f"test/{figure}{WITHOUT_OFF}"] < facts[f"test/{figure}"] - 0.1
     assert facts[f"test/{BEST_SERVER}{WITHOUT_OFF}"] >= facts[f"test/{BEST_SERVER}"]

@@ -11,17 +11,28 @@ from omegaconf import OmegaConf
 
 from gsparc.base.errors import Severe
 from gsparc.datasets.own import Own
-from gsparc.evaluation.console import ConsoleHandler, config_folder, error_in_one_line, repeated_warnings
+from gsparc.evaluation.console import (
+    ConsoleHandler,
+    config_folder,
+    error_in_one_line,
+    repeated_warnings,
+)
 
 
 @pytest.mark.parametrize(
     ("error", "line"),
     [
-        (KeyError("x"), "KeyError: 'x' (HYDRA_FULL_ERROR=1 shows where)"),  # a bug is named by its type
+        (
+            KeyError("x"),
+            "KeyError: 'x' (HYDRA_FULL_ERROR=1 shows where)",
+        ),  # a bug is named by its type
         (ValueError("first line\nsecond"), "first line"),
         (ValueError(), "ValueError:  (HYDRA_FULL_ERROR=1 shows where)"),
         # It was `[Errno 2] No such file or directory: '/proc/x'`.
-        (FileNotFoundError(2, "No such file or directory", "/proc/x"), "/proc/x: No such file or directory"),
+        (
+            FileNotFoundError(2, "No such file or directory", "/proc/x"),
+            "/proc/x: No such file or directory",
+        ),
     ],
 )
 def test_an_error_is_one_line(error, line):
@@ -30,10 +41,15 @@ def test_an_error_is_one_line(error, line):
 
 def test_an_equals_sign_in_a_list_was_not_understood_without_saying_why():
     text = "+splits.squares={choose: [split=blocks, split.side_m=1], draws: 3}"
-    with initialize_config_module("gsparc.conf", version_base="1.3"), pytest.raises(Exception) as error:
+    with (
+        initialize_config_module("gsparc.conf", version_base="1.3"),
+        pytest.raises(Exception) as error,
+    ):
         compose("compare", overrides=[text])
     assert error_in_one_line(error.value).endswith('; inside brackets quote it: "split=..."')
-    quoted = text.replace("split=blocks", '"split=blocks"').replace("split.side_m=1", '"split.side_m=1"')
+    quoted = text.replace("split=blocks", '"split=blocks"').replace(
+        "split.side_m=1", '"split.side_m=1"'
+    )
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         found = compose("compare", overrides=[quoted])
     assert found.splits.squares.choose == ["split=blocks", "split.side_m=1"]
@@ -42,7 +58,9 @@ def test_an_equals_sign_in_a_list_was_not_understood_without_saying_why():
 
 
 def test_evaluate_said_how_every_column_is_read(tmp_path, caplog):
-    """28 lines of columns, of the file and of the one that was learned from, stood before its table."""
+    """28 lines of columns, of the file and of the one that was learned from,
+    stood before its table.
+    """
     (tmp_path / "drive.csv").write_text(
         "x,y,rsrp_dbm\n" + "".join(f"{i},{i * i},{-60 - i}\n" for i in range(9))
     )
@@ -57,29 +75,40 @@ def test_evaluate_said_how_every_column_is_read(tmp_path, caplog):
 
 
 def test_a_setting_of_a_launcher_that_was_not_chosen_had_no_hint():
-    with initialize_config_module("gsparc.conf", version_base="1.3"), pytest.raises(Exception) as error:
+    with (
+        initialize_config_module("gsparc.conf", version_base="1.3"),
+        pytest.raises(Exception) as error,
+    ):
         compose("train", overrides=["hydra.launcher.n_jobs=2"])
     assert error_in_one_line(error.value).endswith("say hydra/launcher=joblib, too, or ray")
 
 
 def test_twelve_stations_wrote_two_hundred_lines(monkeypatch, caplog):
-    """A default run of a city filled five screens: notes of each station, sixty warnings of a kind."""
+    """A default run of a city filled five screens: notes of each station,
+    sixty warnings of a kind.
+    """
     screen = ConsoleHandler(["gsparc.models"], io.StringIO())
     monkeypatch.setattr(logging.getLogger(), "handlers", [screen])
     caplog.set_level(logging.INFO)
     for station in range(12):
         logging.getLogger("gsparc.models.per_station").warning("%g s are too few", 5 - station / 7)
-        logging.getLogger("gsparc.models.per_station").warning("data/a.npz: no level of station s%d", station)
+        logging.getLogger("gsparc.models.per_station").warning(
+            "data/a.npz: no level of station s%d", station
+        )
         logging.getLogger("gsparc.models.per_station").info("station %d of 12", station)
     for _ in range(2):  # the same spectrum each time: it was counted as two warnings
-        logging.getLogger("gsparc.models.vectors").warning("1 spectrum cannot come from this array (see it)")
+        logging.getLogger("gsparc.models.vectors").warning(
+            "1 spectrum cannot come from this array (see it)"
+        )
     logging.getLogger("gsparc.modelling").warning("data/a.npz: 3 places were measured twice")
     logging.getLogger("gsparc.modelling").info("fitting")
     assert screen.stream.getvalue().splitlines() == [
-        "warning: 5 s are too few", "warning: data/a.npz: no level of station s0",
+        "warning: 5 s are too few",
+        "warning: data/a.npz: no level of station s0",
         "warning: 1 spectrum cannot come from this array (see it)",
-        "warning: data/a.npz: 3 places were measured twice", "fitting",
-    ]  # fmt: skip
+        "warning: data/a.npz: 3 places were measured twice",
+        "fitting",
+    ]
     assert repeated_warnings() == [
         "repeated warnings: 12 like '5 s are too few ...', 12 like 'no level of station s0 ...'"
     ]
@@ -92,7 +121,9 @@ def test_a_wrong_convention_was_said_once_far_above_the_table(monkeypatch):
     log.warning("%s: %s", "a.npz", Severe("conjugate=true mends it"))
     log.warning("%s: %s", "a.npz", "3 wild rows")
     # Untrue for powers given as losses: figures of nearest, idw, kriging and mean stayed the same.
-    assert repeated_warnings() == ["this may change the figures above: a.npz: conjugate=true mends it"]
+    assert repeated_warnings() == [
+        "this may change the figures above: a.npz: conjugate=true mends it"
+    ]
 
 
 def test_jobs_of_a_sweep_said_again_how_columns_are_read(monkeypatch):
@@ -120,4 +151,7 @@ def test_the_file_of_a_log_has_every_line_of_which_the_console_shows_some(tmp_pa
         logging.getLogger().setLevel(level)
     assert capsys.readouterr().out == "a line\n"
     text = (tmp_path / "train.log").read_text()
-    assert "[gsparc.models.splat][INFO] - a note" in text and "[gsparc.evaluation][INFO] - a line" in text
+    assert (
+        "[gsparc.models.splat][INFO] - a note" in text
+        and ("[gsparc.evaluation][INFO] - a line") in text
+    )

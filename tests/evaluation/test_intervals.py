@@ -16,21 +16,28 @@ COUNT, LEVEL = 4000, -80.0
 
 @pytest.fixture(scope="module")
 def drawn():
-    """Powers about -80 dB with 6 dB of shadowing, half of them too weak; what is predicted is their law."""
+    """Powers about -80 dB with 6 dB of shadowing, half of them too weak;
+    what is predicted is their law.
+    """
     rng = np.random.default_rng(0)
     mean_db = rng.normal(LEVEL, 8, COUNT)
     truth = mean_db + rng.normal(0, 6, COUNT)
     data = from_arrays(
         {
-            "rx_position": rng.uniform(0, 9, (COUNT, 3)), "tx_position": np.zeros(3), "sensitivity_db": LEVEL,
+            "rx_position": rng.uniform(0, 9, (COUNT, 3)),
+            "tx_position": np.zeros(3),
+            "sensitivity_db": LEVEL,
             "rssi_db": np.where(truth < LEVEL, np.nan, truth),
         }
-    )  # fmt: skip
+    )
     return data, mean_db
 
 
 def given_heard(learned, asked, mean_db, spread_db):
-    hearing, spread = Hearing.from_learned(learned, np.arange(len(learned))), np.full(len(asked), spread_db)
+    hearing, spread = (
+        Hearing.from_learned(learned, np.arange(len(learned))),
+        np.full(len(asked), spread_db),
+    )
     return hearing.given_heard(Kriging(), asked.moving, asked.stations_of(), mean_db, spread)
 
 
@@ -38,7 +45,9 @@ def scored(data, mean_db, spread_db):
     mean = 10 ** (mean_db / 10)
     linear = (np.log(10) / 10 * mean * spread_db / data.site.target_scale) ** 2
     samples = {"prediction": mean} | given_heard(data, data, mean_db, spread_db)
-    return Scores("rssi", np.zeros(COUNT, int), np.arange(COUNT), samples, np.full(COUNT, np.nan), linear)
+    return Scores(
+        "rssi", np.zeros(COUNT, int), np.arange(COUNT), samples, np.full(COUNT, np.nan), linear
+    )
 
 
 def test_a_true_law_is_calibrated(drawn):
@@ -54,7 +63,9 @@ def test_a_true_law_is_calibrated(drawn):
 
 def test_too_sure_and_too_unsure_are_told_apart(drawn):
     data, mean_db = drawn
-    sure, right, unsure = (power_intervals(scored(data, mean_db, s), data) for s in (1.0, 6.0, 30.0))
+    sure, right, unsure = (
+        power_intervals(scored(data, mean_db, s), data) for s in (1.0, 6.0, 30.0)
+    )
     assert sure["interval/coverage_90"] < 0.4 < 0.99 < unsure["interval/coverage_90"]
     assert right["outage/brier"] < min(sure["outage/brier"], unsure["outage/brier"])
     assert right["reduced_chi2"] < 1.1 < 10 < sure["reduced_chi2"]
@@ -63,11 +74,19 @@ def test_too_sure_and_too_unsure_are_told_apart(drawn):
 def test_whether_std_is_right_was_in_no_table():
     """Deviations half as large as the errors, or twice, read the same in every table."""
     rng = np.random.default_rng(0)
-    data = from_arrays({"rx_position": rng.uniform(0, 9, (COUNT, 3)), "tx_position": np.zeros(3),
-                        "csi": np.ones((COUNT, 1, 1), complex), "frequency_hz": 1e9})  # fmt: skip
+    data = from_arrays(
+        {
+            "rx_position": rng.uniform(0, 9, (COUNT, 3)),
+            "tx_position": np.zeros(3),
+            "csi": np.ones((COUNT, 1, 1), complex),
+            "frequency_hz": 1e9,
+        }
+    )
     samples = {"mse": rng.exponential(2.0, COUNT)}  # |e|^2 of complex normal errors
     variance = np.where(np.arange(COUNT) % 100, 2.0, np.nan) / data.site.target_scale**2
-    own = Scores("csi", np.zeros(COUNT, int), np.arange(COUNT), samples, np.full(COUNT, np.nan), variance)
+    own = Scores(
+        "csi", np.zeros(COUNT, int), np.arange(COUNT), samples, np.full(COUNT, np.nan), variance
+    )
     assert reduced_chi_squared(own, data)["reduced_chi2"] == pytest.approx(1, abs=0.05)
     small = replace(own, variance=variance / 4)
     assert reduced_chi_squared(small, data)["reduced_chi2"] == pytest.approx(4, abs=0.2)
@@ -75,7 +94,9 @@ def test_whether_std_is_right_was_in_no_table():
 
 
 def test_silent_rows_counted_nowhere(drawn):
-    """Beside lists of the strongest methods that predict what was heard everywhere had the better rmse."""
+    """Beside lists of the strongest methods that predict what was heard everywhere had the better
+    rmse.
+    """
     data, mean_db = drawn
     heard = data.censored_side(np.arange(COUNT)) == 0
     level = 10 * np.log10(data.target[:, 0] * data.site.target_scale)
@@ -83,7 +104,9 @@ def test_silent_rows_counted_nowhere(drawn):
     honest, other = (
         {"error_db": said - level, **scored(data, said, 6.0).samples} for said in (mean_db, lifted)
     )
-    honest, other = (one | errors_with_silent(one, np.arange(COUNT), data) for one in (honest, other))
+    honest, other = (
+        one | errors_with_silent(one, np.arange(COUNT), data) for one in (honest, other)
+    )
     squares = [float(np.square(one["error_db"][heard]).mean()) for one in (honest, other)]
     both = [replace(scored(data, mean_db, 6.0), samples=one) for one in (honest, other)]
     found = [rmse_with_silent(one, data)["rmse_db_with_silent"] for one in both]
@@ -95,7 +118,9 @@ def test_silent_rows_counted_nowhere(drawn):
 def test_no_variance_no_figures(drawn):
     data, mean_db = drawn
     scores = scored(data, mean_db, 6.0)
-    assert power_intervals(Scores(**{**vars(scores), "variance": np.full(COUNT, np.nan)}), data) == {}
+    assert (
+        power_intervals(Scores(**{**vars(scores), "variance": np.full(COUNT, np.nan)}), data) == {}
+    )
 
 
 def test_levels_of_lists_are_none_of_a_station(drawn):
@@ -103,7 +128,9 @@ def test_levels_of_lists_are_none_of_a_station(drawn):
     data, _ = drawn
     silent = data.subset(np.flatnonzero(data.censored_side(np.arange(COUNT)) > 0))
     west = silent.moving[:, 0] < np.median(data.moving[:, 0])
-    silent = replace(silent, target=np.where(west, 0.1, 10)[:, None].astype(np.float32) * silent.target)
+    silent = replace(
+        silent, target=np.where(west, 0.1, 10)[:, None].astype(np.float32) * silent.target
+    )
     found = given_heard(silent, data, np.full(COUNT, LEVEL), 3.0)
     share = found["heard_share"][np.argsort(data.moving[:, 0])]
     assert share[: COUNT // 4].min() > 0.9 and share[-COUNT // 4 :].max() < 0.1
@@ -125,7 +152,9 @@ def test_rows_of_stations_without_a_level_had_an_outage_of_nan():
     mean = data.target[row, 0].astype(float) * data.site.target_scale
     spread = np.full(len(row), 1e-2) * data.target[row, 0] ** 2
     given = given_heard(data, data.subset(row), 10 * np.log10(mean), 3.0)
-    scores = Scores("rssi", 0 * row, row, {"prediction": mean} | given, np.full(len(row), np.nan), spread)
+    scores = Scores(
+        "rssi", 0 * row, row, {"prediction": mean} | given, np.full(len(row), np.nan), spread
+    )
     figures = {"interval/coverage_90", "interval/width_db", "reduced_chi2", "heard_above_db"} | {
         "levels_rmse_db"
     }

@@ -1,4 +1,6 @@
-"""Figures of merit against their definitions and against hard cases; how they are shown and compared."""
+"""Figures of merit against their definitions and against hard cases;
+how they are shown and compared.
+"""
 
 import math
 from typing import get_args
@@ -35,7 +37,9 @@ def spectra(count: int = 3, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 def channels(count: int = 5, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(seed)
     target = torch.randn(count, 4, 6, dtype=torch.complex64, generator=generator)
-    return target + 0.3 * torch.randn(target.shape, dtype=torch.complex64, generator=generator), target
+    return target + 0.3 * torch.randn(
+        target.shape, dtype=torch.complex64, generator=generator
+    ), target
 
 
 def summarise(metric, *arguments):
@@ -47,7 +51,9 @@ def test_spectrum_figures_are_the_libraries():
     prediction, target = spectra()
     figures = summarise(SpectrumMetrics(), prediction, target)
     p, t = prediction.double().numpy(), target.double().numpy()
-    plain = [structural_similarity(a, b, win_size=7, data_range=1.0) for a, b in zip(p, t, strict=True)]
+    plain = [
+        structural_similarity(a, b, win_size=7, data_range=1.0) for a, b in zip(p, t, strict=True)
+    ]
     gauss = [
         structural_similarity(
             a, b, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
@@ -65,7 +71,9 @@ def test_spectrum_figures_are_the_libraries():
 
 @pytest.mark.parametrize("scale", [1e-200, 1e-120, 1e-90, 1e90, 1e120, 1e200])
 def test_ratios_do_not_depend_on_the_unit_of_the_channels(scale):
-    """Fourth powers of the physical channel vanished or overflowed: after one free scalar, NMSE 1 or 0."""
+    """Fourth powers of the physical channel vanished or overflowed: after one free scalar,
+    NMSE 1 or 0.
+    """
     plain, scaled = (summarise(ChannelMetrics(s), *channels()) for s in (1.0, scale))
     for name in ("nmse", "nmse_scalar", "snr_db", "power_mae_db"):
         assert scaled[name] == pytest.approx(plain[name], rel=1e-9), name
@@ -107,7 +115,10 @@ def test_perfect_prediction_is_capped_not_infinite():
 def test_images_below_the_window_have_no_ssim():
     figures = summarise(SpectrumMetrics(), torch.rand(2, 8, 36), torch.rand(2, 8, 36))
     assert figures["ssim"] is not None and figures["ssim_gauss"] is None
-    assert summarise(SpectrumMetrics(), torch.rand(2, 4, 36), torch.rand(2, 4, 36))["ssim_median"] is None
+    assert (
+        summarise(SpectrumMetrics(), torch.rand(2, 4, 36), torch.rand(2, 4, 36))["ssim_median"]
+        is None
+    )
 
 
 def test_unmeasured_pixels_count_nowhere():
@@ -131,18 +142,24 @@ def test_channel_figures_follow_their_definitions():
     error = ((prediction - target).abs() ** 2).sum((1, 2)).double()
     power = (target.abs() ** 2).sum((1, 2)).double()
     assert figures["nmse"] == pytest.approx(float(error.sum() / power.sum()), rel=1e-6)
-    assert figures["snr_db"] == pytest.approx(float((-10 * (error / power).log10()).mean()), rel=1e-6)
+    assert figures["snr_db"] == pytest.approx(
+        float((-10 * (error / power).log10()).mean()), rel=1e-6
+    )
     assert figures["mse"] == pytest.approx(float(error.mean() / 24 * scale**2), rel=1e-6)
 
 
 def test_one_free_scalar_forgives_gain_and_phase_only():
     prediction, target = channels()
     turned = prediction * (2 * torch.exp(1j * torch.arange(5.0)))[:, None, None]
-    plain, free = (summarise(ChannelMetrics(), p, target)["nmse_scalar"] for p in (prediction, turned))
+    plain, free = (
+        summarise(ChannelMetrics(), p, target)["nmse_scalar"] for p in (prediction, turned)
+    )
     assert free == pytest.approx(plain, rel=1e-5)
     assert 0.01 < plain <= summarise(ChannelMetrics(), prediction, target)["nmse"]
     # For a single entry the free scalar is the answer itself.
-    assert summarise(ChannelMetrics(), prediction[:, :1, :1], target[:, :1, :1])["nmse_scalar"] is None
+    assert (
+        summarise(ChannelMetrics(), prediction[:, :1, :1], target[:, :1, :1])["nmse_scalar"] is None
+    )
 
 
 def test_hard_case_silent_channel(caplog):
@@ -227,16 +244,23 @@ def test_the_authors_similarity_is_of_zero_padded_images():
     window = torch.outer(line / line.sum(), line / line.sum())[None, None]
     blur = lambda image: torch.nn.functional.conv2d(image[:, None], window, padding=5)[:, 0]  # noqa: E731
     a, b = blur(prediction), blur(target)
-    aa, bb, ab = blur(prediction**2) - a * a, blur(target**2) - b * b, blur(prediction * target) - a * b
+    aa, bb, ab = (
+        blur(prediction**2) - a * a,
+        blur(target**2) - b * b,
+        blur(prediction * target) - a * b,
+    )
     local = (2 * a * b + 1e-4) * (2 * ab + 9e-4) / ((a * a + b * b + 1e-4) * (aa + bb + 9e-4))
     metric = SpectrumMetrics()
     metric.update(prediction, target)
     expected = local.mean((1, 2)).numpy()
     np.testing.assert_allclose(metric.compute()["ssim_padded"], expected, rtol=1e-6)
-    assert metric.summary(metric.compute())["ssim_padded"] == pytest.approx(expected.mean(), rel=1e-6)
+    assert metric.summary(metric.compute())["ssim_padded"] == pytest.approx(
+        expected.mean(), rel=1e-6
+    )
 
 
-OF_ANOTHER = {"ssim_median", "snr_db_p10", "snr_db_p50", "snr_db_p90"}  # quantiles of a figure with an entry
+# Quantiles of a figure with an entry
+OF_ANOTHER = {"ssim_median", "snr_db_p10", "snr_db_p50", "snr_db_p90"}
 
 
 def figure_names(kind):
@@ -255,7 +279,9 @@ def test_every_figure_has_an_entry(kind):
 
 
 def test_every_figure_knows_which_way_is_better():
-    """The validation error of channels did not: the report called the worst moment of a training its best."""
+    """The validation error of channels did not:
+    the report called the worst moment of a training its best.
+    """
     larger = {"psnr_db", "snr_db", "ssim", "ssim_gauss", "ssim_padded", "skill"} | OF_ANOTHER
     larger |= {"psnr_db_median", "ssim_gauss_median"}
     for name in {"skill", *(name for kind in DECIDING for name in figure_names(kind))}:

@@ -1,4 +1,6 @@
-"""Methods and datasets of other packages: found, trained, stored, compared; a broken one disturbs nobody."""
+"""Methods and datasets of other packages: found, trained, stored, compared;
+a broken one disturbs nobody.
+"""
 
 import importlib
 import tomllib
@@ -38,11 +40,19 @@ def installed(tmp_path, monkeypatch):
 
     def install(project: Path) -> None:
         declared = tomllib.loads((project / "pyproject.toml").read_text())["project"]
-        info = tmp_path / "site" / f"{declared['name'].replace('-', '_')}-{declared['version']}.dist-info"
+        info = (
+            tmp_path
+            / "site"
+            / f"{declared['name'].replace('-', '_')}-{declared['version']}.dist-info"
+        )
         info.mkdir(parents=True)
-        (info / "METADATA").write_text(f"Name: {declared['name']}\nVersion: {declared['version']}\n")
+        (info / "METADATA").write_text(
+            f"Name: {declared['name']}\nVersion: {declared['version']}\n"
+        )
         groups = declared["entry-points"].items()
-        lines = [f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in of.items()) for group, of in groups]
+        lines = [
+            f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in of.items()) for group, of in groups
+        ]
         (info / "entry_points.txt").write_text("\n".join(lines))
         monkeypatch.syspath_prepend(str(project))
         monkeypatch.syspath_prepend(str(info.parent))
@@ -59,15 +69,23 @@ def installed(tmp_path, monkeypatch):
 def test_a_method_and_a_dataset_of_another_package(installed, tmp_path):
     installed(EXAMPLES / "own-method")
     config = compose(
-        "dataset=corridor", "dataset.count=60", "model=nearest_k", "model.k=2", "baselines=[mean]",
+        "dataset=corridor",
+        "dataset.count=60",
+        "model=nearest_k",
+        "model.k=2",
+        "baselines=[mean]",
         "logger=none",
-    )  # fmt: skip
+    )
     facts, objects = train(config, tmp_path)
     assert facts["model/name"] == "nearest_k" and objects.methods[0].k == 2
     assert facts["test/rmse_db"] < facts["baseline/mean/rmse_db"]
-    predictor = gsparc.load(objects.checkpoints[0])  # its class is out of a file, and of a plugin: trusted
+    # Its class is out of a file, and of a plugin: trusted
+    predictor = gsparc.load(objects.checkpoints[0])
     assert predictor.rssi(rx=[30.0, 1.0, 1.5]).shape == (1,)
-    assert datamodule({"_target_": "own_method.Corridor", "count": 9}, trusted=False).name == "corridor"
+    assert (
+        datamodule({"_target_": "own_method.Corridor", "count": 9}, trusted=False).name
+        == "corridor"
+    )
     assert unlisted_contenders()["nearest_k"].overrides(None) == ["model=nearest_k"]
     assert {*unlisted_contenders()} == {"nearest_k", "other_carriers", "direct_beam", "ridge"}
     again, *_ = evaluate_files([objects.checkpoints[0]])
@@ -76,7 +94,9 @@ def test_a_method_and_a_dataset_of_another_package(installed, tmp_path):
 
 @pytest.mark.parametrize("words", [["dataset=corridor"], ["dataset=corridor", "count=40"]])
 def test_a_plugins_dataset_without_a_path_was_left_out_of_a_comparison(installed, words):
-    """`+datasets.corridor.dataset=corridor`, as the page has it: `no dataset has a path` was the answer."""
+    """`+datasets.corridor.dataset=corridor`, as the page has it:
+    `no dataset has a path` was the answer.
+    """
     installed(EXAMPLES / "own-method")
     more = ["splits.random.datasets=[corridor]", "only=['corridor/random/*']"]
     config = compose(*(f"+datasets.corridor.{word}" for word in words), *more, config="compare")
@@ -92,11 +112,15 @@ def test_a_plugin_was_no_nearest_name(installed):
     installed(EXAMPLES / "own-method")
     with pytest.raises(MissingConfigException) as error:
         compose("model=nearest_kk")
-    assert error_in_one_line(error.value) == "model=nearest_kk: no such choice; did you mean 'nearest_k'?"
+    assert error_in_one_line(error.value) == (
+        "model=nearest_kk: no such choice; did you mean 'nearest_k'?"
+    )
 
 
 def test_a_method_that_could_not_answer_once_stored_was_trained(installed):
-    """Its table was shown; then `gsparc.load`, `evaluate` and `compare` failed on its checkpoint."""
+    """Its table was shown; then `gsparc.load`,
+    `evaluate` and `compare` failed on its checkpoint.
+    """
     installed(EXAMPLES / "own-method")
 
     class Tree(method_class("nearest_k")):
@@ -106,7 +130,9 @@ def test_a_method_that_could_not_answer_once_stored_was_trained(installed):
 
     rows = np.arange(12)
     fold = Fold(rows, rows[:0], rows[:0])
-    with pytest.raises(ValueError, match="nearest_k: its checkpoint loses _tree: name it in `stored`"):
+    with pytest.raises(
+        ValueError, match="nearest_k: its checkpoint loses _tree: name it in `stored`"
+    ):
         Tree().fit(invent("rssi", 12), fold, FitContext())
 
 
@@ -134,12 +160,15 @@ def test_a_baseline_by_an_older_name_was_silently_none(installed, tmp_path, capl
     project = tmp_path / "older"
     project.mkdir()
     (project / "older.py").write_text(
-        "from gsparc.models.baselines.mean import Mean\n\n\nclass Older(Mean):\n    plain_place = 45\n"
+        "from gsparc.models.baselines.mean import Mean\n\n\nclass Older(Mean):\n    plain_place "
+        "= 45\n"
     )
     entry = '[project.entry-points."gsparc.models"]\nolder = "older:Older"\n'
     (project / "pyproject.toml").write_text(f'[project]\nname = "older"\nversion = "1"\n{entry}')
     installed(project)
-    assert caplog.messages == ["plugin older: no baseline; plain_place is called baseline_order now"]
+    assert caplog.messages == [
+        "plugin older: no baseline; plain_place is called baseline_order now"
+    ]
 
 
 def test_a_third_party_library_as_a_plugin(installed, tmp_path):
@@ -147,9 +176,13 @@ def test_a_third_party_library_as_a_plugin(installed, tmp_path):
     installed(EXAMPLES / "gpytorch-method")
     file = spectra(tmp_path / "own.npz")
     config = compose(
-        "dataset=own", f"dataset.file={file}", "model=gpytorch", "model.steps=5", "baselines=[mean]",
+        "dataset=own",
+        f"dataset.file={file}",
+        "model=gpytorch",
+        "model.steps=5",
+        "baselines=[mean]",
         "logger=none",
-    )  # fmt: skip
+    )
     facts, objects = train(config, tmp_path)
     assert facts["test/mse"] < facts["baseline/mean/mse"]
     place = objects.data.moving[0] + objects.data.site.origin

@@ -12,7 +12,9 @@ def confidence(seed: int = 0, **more) -> Confidence:
 
 
 def test_the_best_confidence_is_alpha_over_loss():
-    """Of the paper's loss, which hard_cases/test_confidence_overflow.py compares with its formula."""
+    """Of the paper's loss, which hard_cases/test_confidence_overflow.py compares
+    with its formula.
+    """
     g = torch.linspace(-9, 9, 20001)
     for loss in (0.01, 0.05, 0.1):
         best = 1 + g[weighted_loss(torch.tensor(loss), g, 0.3).argmin()].exp()
@@ -44,4 +46,8 @@ def test_far_from_what_was_measured_nothing_is_sure():
     for seed in range(5):
         sure = confidence(seed)
         sure.store_range(near)
-        assert sure.normalised_confidence(far).median() < 1e-6 < sure.normalised_confidence(near).median()
+        assert (
+            sure.normalised_confidence(far).median()
+            < 1e-6
+            < sure.normalised_confidence(near).median()
+        )

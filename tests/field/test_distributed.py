@@ -1,4 +1,6 @@
-"""Several processes train what one does; one that is killed ends all, and the run goes on bit for bit."""
+"""Several processes train what one does; one that is killed ends all,
+and the run goes on bit for bit.
+"""
 
 import shutil
 
@@ -8,12 +10,20 @@ from invented import invent
 from several import Kill, trained
 from states import same
 
-from gsparc.field.distributed import SummedGradients, first_process_value, process_count, sum_gradients
+from gsparc.field.distributed import (
+    SummedGradients,
+    first_process_value,
+    process_count,
+    sum_gradients,
+)
 
 
 def test_strategies_that_share_batches_are_known_by_name():
     assert SummedGradients.from_strategy("ddp")._start_method == "spawn"
-    assert SummedGradients.from_strategy("ddp_fork_find_unused_parameters_true")._start_method == "fork"
+    assert (
+        SummedGradients.from_strategy("ddp_fork_find_unused_parameters_true")._start_method
+        == "fork"
+    )
     assert (
         SummedGradients.from_strategy("auto")
         is SummedGradients.from_strategy("fsdp")
@@ -32,7 +42,8 @@ def test_alone_nothing_is_changed():
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("static_end", "double", "most"), [("rx", True, 1e-12), ("rx", False, 1e-3), ("tx", True, 1e-12)]
+    ("static_end", "double", "most"),
+    [("rx", True, 1e-12), ("rx", False, 1e-3), ("tx", True, 1e-12)],
 )
 def test_two_processes_learn_what_one_does(tmp_path, static_end, double, most):
     """200 steps with densification, pruning and resets; every 10 steps both hold the same bits."""
@@ -50,14 +61,18 @@ def test_a_killed_process_ends_all_and_the_run_goes_on_bit_identically(tmp_path)
     data, cut = invent("spectrum", 40), tmp_path / "cut"
     trained(data, tmp_path / "whole", 2, 63)
     last = cut / "last.ckpt"
-    with pytest.raises(RuntimeError, match=f"process 1 ended by SIGKILL.*ckpt_path={last}") as error:
+    with pytest.raises(
+        RuntimeError, match=f"process 1 ended by SIGKILL.*ckpt_path={last}"
+    ) as error:
         trained(data, cut, 2, 63, more=[Kill(33)])
     assert "\n" not in str(error.value)
     left = torch.load(last, weights_only=True)
     assert left["global_step"] == 28
     shutil.copy(last, tmp_path / "cut.ckpt")
     trained(data, cut, 2, 63, resume=last)
-    whole, resumed = (torch.load(f / "last.ckpt", weights_only=True) for f in (tmp_path / "whole", cut))
+    whole, resumed = (
+        torch.load(f / "last.ckpt", weights_only=True) for f in (tmp_path / "whole", cut)
+    )
     assert whole["global_step"] == 63 and len(whole["state_dict"]["model.gaussians.ids"]) > 20
     for part in ("state_dict", "optimizer_states", "lr_schedulers"):
         assert same(whole[part], resumed[part]), part

@@ -10,11 +10,14 @@ class Root(torch.nn.Module):
 
     def __init__(self, count: int = 6) -> None:
         super().__init__()
-        self.gaussians = GaussianField(torch.arange(3.0 * count).reshape(count, 3), torch.ones(count, 3), 0.5)
+        self.gaussians = GaussianField(
+            torch.arange(3.0 * count).reshape(count, 3), torch.ones(count, 3), 0.5
+        )
         self.head = torch.nn.Module()
         self.head.per_gaussian = True
         self.head.weight = torch.nn.Parameter(torch.randn(count, 2, 3))
-        self.shared = torch.nn.Parameter(torch.randn(count, 3))  # as many rows, but not the Gaussians'
+        # As many rows, but not the Gaussians'
+        self.shared = torch.nn.Parameter(torch.randn(count, 3))
 
 
 def stepped(root: Root) -> torch.optim.Adam:
@@ -63,7 +66,9 @@ def test_resize_makes_room_for_a_state_dict():
     smaller.shared = torch.nn.Parameter(torch.zeros(9, 3))
     resize_gaussians(smaller, smaller.gaussians, 9)
     smaller.load_state_dict(larger.state_dict())
-    assert torch.equal(smaller.gaussians.means, larger.gaussians.means) and len(smaller.gaussians) == 9
+    assert (
+        torch.equal(smaller.gaussians.means, larger.gaussians.means) and len(smaller.gaussians) == 9
+    )
 
 
 def test_what_is_not_learned_is_not_learned_after_an_edit_either():

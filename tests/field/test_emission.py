@@ -46,7 +46,9 @@ def test_activations():
     plain = emission(activation="linear")
     logits = plain.logits(where)
     assert torch.equal(plain(where, apart), logits)
-    assert torch.equal(emission(activation="softplus")(where, apart), torch.nn.functional.softplus(logits))
+    assert torch.equal(
+        emission(activation="softplus")(where, apart), torch.nn.functional.softplus(logits)
+    )
     assert torch.equal(emission(activation="sigmoid")(where, apart), torch.sigmoid(logits))
     shifted = emission(activation="sigmoid", log_distance=True)(where, apart)
     assert torch.allclose(shifted, torch.sigmoid(logits - apart.log()[..., None]))

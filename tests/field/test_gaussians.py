@@ -10,14 +10,20 @@ TURN = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # boresight along x
 
 def test_uniform_fills_the_enlarged_box():
     torch.manual_seed(0)
-    field = create_field(FieldSettings(count=2000, placement="uniform", margin=0.5), BOX, None, None)
+    field = create_field(
+        FieldSettings(count=2000, placement="uniform", margin=0.5), BOX, None, None
+    )
     low, high = field.means.min(0).values, field.means.max(0).values
     assert (low >= BOX[0] - 0.5).all() and (high <= BOX[1] + 0.5).all()
-    assert torch.allclose(low, BOX[0] - 0.5, atol=0.05) and torch.allclose(high, BOX[1] + 0.5, atol=0.05)
+    assert torch.allclose(low, BOX[0] - 0.5, atol=0.05) and torch.allclose(
+        high, BOX[1] + 0.5, atol=0.05
+    )
 
 
 def test_sphere_surrounds_the_receiver_above_its_horizon():
-    field = create_field(FieldSettings(count=500, placement="sphere", near=1, far=6), BOX, RECEIVER, TURN)
+    field = create_field(
+        FieldSettings(count=500, placement="sphere", near=1, far=6), BOX, RECEIVER, TURN
+    )
     local = (field.means - RECEIVER) @ TURN
     distance = local.norm(dim=1)
     assert distance.min() >= 1 and distance.max() <= 6 and (local[:, 2] > 0).all()
@@ -41,11 +47,17 @@ def test_an_unknown_start_is_refused():
 def test_opacity_scale_and_ids_are_as_asked(init, count):
     settings = FieldSettings(count=count, placement=init, opacity=0.2, scale=0.4)
     field = create_field(settings, BOX, RECEIVER, TURN)
-    assert len(field) == count and field.ids.tolist() == list(range(count)) and int(field.next_id) == count
+    assert (
+        len(field) == count
+        and field.ids.tolist() == list(range(count))
+        and int(field.next_id) == count
+    )
     assert torch.allclose(field.opacities, torch.full((count,), 0.2))
     assert torch.allclose(field.scales, torch.full((count, 3), 0.4))
     assert (
-        create_field(FieldSettings(count=count, placement=init), BOX, RECEIVER, TURN).scales.isfinite().all()
+        create_field(FieldSettings(count=count, placement=init), BOX, RECEIVER, TURN)
+        .scales.isfinite()
+        .all()
     )
 
 
@@ -61,5 +73,7 @@ def test_a_grid_fills_the_box_and_says_where_it_is_too_fine():
     field = create_field(FieldSettings(placement="grid", margin=0, spacing=0.3), box, None, None)
     assert len(field) == 46 * 33 * 13 and float(field.scales.max()) == pytest.approx(0.3)
     assert torch.equal(field.means.amin(0), box[0]) and torch.equal(field.means.amax(0), box[1])
-    with pytest.raises(ValueError, match=r"spacing=0.01 m makes 560,000,000 Gaussians .* raise model.field"):
+    with pytest.raises(
+        ValueError, match=r"spacing=0.01 m makes 560,000,000 Gaussians .* raise model.field"
+    ):
         create_field(FieldSettings(placement="grid", margin=0, spacing=0.01), box, None, None)

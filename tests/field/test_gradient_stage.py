@@ -30,7 +30,11 @@ class Interrupt(L.Callback):
 
 def run(tmp_path, *callbacks, steps: int = 20, overrides: tuple[str, ...] = (), **more):
     file, made = spectra(tmp_path / "own.npz"), {"callbacks": lambda: list(callbacks), "every": 5}
-    return trained(file, tmp_path / "run", steps, *overrides, **made, **more)[0].fitted_model().state_dict()
+    return (
+        trained(file, tmp_path / "run", steps, *overrides, **made, **more)[0]
+        .fitted_model()
+        .state_dict()
+    )
 
 
 @pytest.fixture(scope="module")
@@ -56,10 +60,13 @@ def test_an_interrupt_ends_the_step_and_goes_on_bit_identically(whole, tmp_path)
 
 @pytest.mark.slow
 def test_a_run_cut_off_where_a_solved_field_is_edited_could_not_go_on(tmp_path, monkeypatch):
-    """The edit looked for the batch of the step before: so ended every run of rfid that was resumed."""
+    """The edit looked for the batch of the step before:
+    so ended every run of rfid that was resumed.
+    """
     torch.set_num_threads(1)
     asked = {"overrides": ("init=images",)}
-    monkeypatch.setattr("gsparc.callbacks.densify.MOST_CHANGE", 1.0)  # of so small a field any edit is more
+    # Of so small a field any edit is more
+    monkeypatch.setattr("gsparc.callbacks.densify.MOST_CHANGE", 1.0)
     edits = partial(Densify, start=5, stop=15, interval=5, grad_threshold=0.0, max_gaussians=44)
     whole = run(tmp_path, edits(), **asked)
     with pytest.raises(KeyboardInterrupt):
@@ -71,7 +78,9 @@ def test_a_run_cut_off_where_a_solved_field_is_edited_could_not_go_on(tmp_path, 
 
 @pytest.mark.slow
 def test_a_look_that_was_due_where_a_run_was_cut_off_was_left_out(tmp_path):
-    """Of the learning curve, and of what is kept; a checkpoint of step 10 was written before the look."""
+    """Of the learning curve, and of what is kept;
+    a checkpoint of step 10 was written before the look.
+    """
     torch.set_num_threads(1)
     whole, folder = run(tmp_path, CostLedger(), validate_every=5), tmp_path / "run"
     rows = [row | {"seconds": ""} for row in curve.read_curve(folder)]
@@ -102,7 +111,9 @@ def test_six_of_six_steps_were_called_ended_by_their_time(taken, notes):
 
 
 def test_a_checkpoint_with_every_step_done_still_ends_in_a_model(whole, tmp_path):
-    """Killed between the last checkpoint and the model's file: Lightning then skips training and its end."""
+    """Killed between the last checkpoint and the model's file:
+    Lightning then skips training and its end.
+    """
     ledger = CostLedger()
     resumed = run(tmp_path, ledger, resume=whole[1] / "run" / "last.ckpt")
     assert all(torch.equal(value, resumed[key]) for key, value in whole[0].items())

@@ -1,4 +1,6 @@
-"""Steps that do not pay are not taken: the best validation is kept, and training ends when none is better."""
+"""Steps that do not pay are not taken: the best validation is kept,
+and training ends when none is better.
+"""
 
 from functools import partial
 
@@ -21,7 +23,8 @@ COLD = ("init=sphere", "model.keep_best=true", "model.refit=false")
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
-    file = spectra(tmp_path_factory.mktemp("own") / "own.npz", rows=120)  # 10 of them for validation
+    # 10 of them for validation
+    file = spectra(tmp_path_factory.mktemp("own") / "own.npz", rows=120)
     return file, *loaded(file)
 
 
@@ -54,10 +57,13 @@ def test_steps_that_hurt_are_taken_back(measured, tmp_path, caplog):
     wild = ("init=images", "model.optimizer.emission=50.0")
     caplog.set_level("INFO")
     method = fitted(measured, tmp_path / "wild", *wild)
-    start = fitted(measured, tmp_path / "start", "init=images", "model.steps=0", "model.refit=false")
+    start = fitted(
+        measured, tmp_path / "start", "init=images", "model.steps=0", "model.refit=false"
+    )
     assert method.steps == 0 and held_out(method, measured) < 1.1 * held_out(start, measured)
     assert "40 taken, none kept" in caplog.text  # keeping the best ends no training
-    assert "changed the squared error" not in caplog.text  # `0 gradient steps changed ...` was said, too
+    # `0 gradient steps changed ...` was said, too
+    assert "changed the squared error" not in caplog.text
 
 
 def test_steps_that_nobody_asked_for_end_after_looks_without_a_gain(measured, tmp_path, caplog):
@@ -77,8 +83,12 @@ def test_no_steps_of_the_model_took_those_of_the_trainer(measured, tmp_path):
 
 
 @pytest.mark.parametrize("keep_best", [True, False])
-def test_a_second_stage_asked_for_figures_it_has_not_and_took_more_steps(measured, tmp_path, keep_best):
-    """`callbacks=early_stopping` ended in an error; after `trainer.max_time` 391 of 281 steps were kept."""
+def test_a_second_stage_asked_for_figures_it_has_not_and_took_more_steps(
+    measured, tmp_path, keep_best
+):
+    """`callbacks=early_stopping` ended in an error;
+    after `trainer.max_time` 391 of 281 steps were kept.
+    """
     stop = partial(EarlyStopping, "val/error", min_delta=1.0, patience=2)  # the third look ends it
     more = ("init=images", "model.refit=true", f"model.keep_best={keep_best}")
     method = fitted(measured, tmp_path, *more, callbacks=lambda: [stop()])

@@ -14,7 +14,12 @@ def test_ssim_is_scikit_images():
     a, b = images(seed=0), images(seed=1)
     want = [
         structural_similarity(
-            x.numpy(), y.numpy(), gaussian_weights=True, sigma=1.5, use_sample_covariance=False, data_range=1
+            x.numpy(),
+            y.numpy(),
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+            data_range=1,
         )
         for x, y in zip(a, b, strict=True)
     ]
@@ -68,7 +73,9 @@ def test_channel_loss_is_the_mean_squared_error():
 
 
 def test_antennas_that_are_not_modelled_are_refused():
-    """A file of several antennas without their positions was once fitted by one, broadcast to all."""
+    """A file of several antennas without their positions was once fitted by one,
+    broadcast to all.
+    """
     with pytest.raises(ValueError, match=r"\(4, 1, 3\) channels predicted, \(4, 2, 3\) measured"):
         channel_loss(torch.zeros(4, 1, 3), torch.zeros(4, 2, 3))
 
@@ -112,7 +119,9 @@ def test_slopes_of_the_blind_losses(snapshot):
 @pytest.mark.parametrize("snapshot", ["none", "phase", "phase_timing"])
 @pytest.mark.parametrize("masked", [False, True])
 def test_channel_losses_stay_on_the_device_of_the_channels(snapshot, masked):
-    """Offsets of timing took their tones from the CPU; `meta` mixes with those as little as a GPU does."""
+    """Offsets of timing took their tones from the CPU;
+    `meta` mixes with those as little as a GPU does.
+    """
     channels = torch.empty(3, 2, 5, dtype=torch.complex64, device="meta")
     mask = torch.empty(3, 2, 5, dtype=torch.bool, device="meta") if masked else None
     assert channel_loss(channels, channels, mask, snapshot).device.type == "meta"

@@ -32,7 +32,9 @@ def model(data, count: int = 20, **more) -> GaussianModel:
 
 
 @pytest.mark.parametrize("static_end", ["rx", "tx"])
-@pytest.mark.parametrize(("kind", "shape"), [("spectrum", (12, 24)), ("csi", (1, 1)), ("rssi", (1,))])
+@pytest.mark.parametrize(
+    ("kind", "shape"), [("spectrum", (12, 24)), ("csi", (1, 1)), ("rssi", (1,))]
+)
 def test_a_prediction_has_the_shape_of_a_target(campaign, kind, shape, static_end):
     data = campaign(kind, static_end=static_end)
     batch = data.batch(np.arange(5))
@@ -58,13 +60,17 @@ def test_signed_channels_refuse_an_activation_of_powers(campaign):
 def test_attenuation_is_gain_over_distance_and_can_be_off(campaign):
     data = campaign("spectrum")
     batch = data.batch(np.arange(4))
-    on = model(data, attenuation=AttenuationSettings(inverse_distance=True, gain=3.0, d_ref=2.0, d_min=0.1))
+    on = model(
+        data, attenuation=AttenuationSettings(inverse_distance=True, gain=3.0, d_ref=2.0, d_min=0.1)
+    )
     off = model(data, attenuation=AttenuationSettings(inverse_distance=False))
     apart = (batch.tx[:, None] - on.gaussians.means).square().sum(-1).add(0.01).sqrt() / 2.0
     assert torch.allclose(on.relative_distances(batch.tx), apart, atol=1e-6)
     plain = off.emissions(batch.tx, batch.rx)
     assert off.attenuation(apart) is None
-    assert torch.allclose(on.emissions(batch.tx, batch.rx), plain * (3.0 / apart)[..., None], rtol=1e-4)
+    assert torch.allclose(
+        on.emissions(batch.tx, batch.rx), plain * (3.0 / apart)[..., None], rtol=1e-4
+    )
 
 
 def test_the_reference_distance_is_from_the_still_end_to_the_moving_box(campaign):
@@ -82,7 +88,9 @@ def test_only_the_gaussians_that_a_static_receiver_sees_emit(campaign):
     seen = int(want.raster.visible.sum())
     assert 0 < seen < 60 and len(view.visible.gaussians) == seen
     for some in (batch.tx, batch.tx[:1]):
-        assert torch.allclose(view.render(field, some, batch.rx).mean, want.mean[: len(some)], atol=1e-5)
+        assert torch.allclose(
+            view.render(field, some, batch.rx).mean, want.mean[: len(some)], atol=1e-5
+        )
     assert len(field.gaussians) == 60  # the field itself is left as it was
     with torch.no_grad():
         field.gaussians.version += 1
@@ -101,7 +109,9 @@ def test_poses_of_a_batch_are_seen_each_for_itself(campaign):
 
 def mean_of_images(data, shape=(1, 1), **settings) -> GaussianModel:
     torch.manual_seed(0)
-    emission = EmissionSettings(RAW, hidden=3, activation="signed_sigmoid", log_distance=True, init_bias=0.0)
+    emission = EmissionSettings(
+        RAW, hidden=3, activation="signed_sigmoid", log_distance=True, init_bias=0.0
+    )
     field = FieldSettings(count=20, placement="uniform", opacity=0.5)
     whole = ModelSettings(field, emission, INVERSE, response=ResponseSettings(**settings))
     transmitter = torch.from_numpy(data.tx[0]).float()

@@ -38,8 +38,11 @@ def test_every_parameter_learns(campaign, tmp_path):
         data = campaign(kind)
         trained = module(data, tmp_path)
         trained.training_step(data.batch(np.arange(8)), 0).backward()
-        silent = [n for n, p in trained.model.named_parameters() if p.grad is None or not p.grad.any()]
-        # From an isotropic start a turn changes nothing; powers of one pose have no place in the image.
+        silent = [
+            n for n, p in trained.model.named_parameters() if p.grad is None or not p.grad.any()
+        ]
+        # From an isotropic start a turn changes nothing;
+        # powers of one pose have no place in the image.
         assert set(silent) <= {"gaussians.quats"}, kind
 
 

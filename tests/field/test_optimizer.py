@@ -1,7 +1,13 @@
 import pytest
 import torch
 
-from gsparc.field.optimizer import OptimizerSettings, optimizer_for, rate_factor, rate_kind, scheduler_for
+from gsparc.field.optimizer import (
+    OptimizerSettings,
+    optimizer_for,
+    rate_factor,
+    rate_kind,
+    scheduler_for,
+)
 
 SETTINGS = OptimizerSettings(positions=1e-3, positions_final=1e-5, decay=0.1)
 
@@ -34,7 +40,9 @@ def test_every_parameter_has_its_rate():
 
 
 def test_one_tensor_per_group_at_its_own_rate(campaign):
-    model = torch.nn.ModuleDict({"emission": torch.nn.Linear(2, 3), "confidence": torch.nn.Linear(1, 1)})
+    model = torch.nn.ModuleDict(
+        {"emission": torch.nn.Linear(2, 3), "confidence": torch.nn.Linear(1, 1)}
+    )
     model["confidence"].bias.requires_grad_(False)
     optimizer = optimizer_for(model, OptimizerSettings(emission=0.3, confidence=0.7, decay=0.5))
     rates = {group["name"]: group["lr"] for group in optimizer.param_groups}

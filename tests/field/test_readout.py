@@ -21,7 +21,10 @@ def test_clones_after_a_closed_form_keep_the_rendered_image(tmp_path, more):
     model, batch = method.fitted_model(), data.batch(fold.train[:8])
     densify = Densify(grad_threshold=0.5)
     densify.statistics = densify._zero_statistics(model)
-    densify.statistics["gradient"][::20], densify.statistics["seen"] = 1.0, torch.ones(len(model.gaussians))
+    densify.statistics["gradient"][::20], densify.statistics["seen"] = (
+        1.0,
+        torch.ones(len(model.gaussians)),
+    )
     planned = densify.plan(model, torch.Generator().manual_seed(0), in_place=True)
     before = model(batch.tx, batch.rx).mean
     solved = solve_readout(model, planned, batch)
@@ -32,7 +35,10 @@ def test_clones_after_a_closed_form_keep_the_rendered_image(tmp_path, more):
         model.emission.bias2.copy_(solved.bias)
     change = float((model(batch.tx, batch.rx).mean - before).square().mean().sqrt())
     assert len(planned.parents) == 4 and len(model.gaussians) == 42
-    assert change == pytest.approx(float(solved.change) ** 0.5, rel=1e-3) and change < 1e-3 < 3 * unsolved
+    assert (
+        change == pytest.approx(float(solved.change) ** 0.5, rel=1e-3)
+        and change < 1e-3 < 3 * unsolved
+    )
 
 
 def test_emissions_of_networks_are_not_solved_again(tmp_path):

@@ -17,7 +17,9 @@ GRID = SphereGrid.hemisphere(8, 16)
 
 
 # ---- factored channels ----
-@pytest.mark.parametrize("tones", [2.4e9 + 1e6 * np.arange(7), 2.4e9 + 1e6 * np.array([0, 1, 2.5, 5])])
+@pytest.mark.parametrize(
+    "tones", [2.4e9 + 1e6 * np.arange(7), 2.4e9 + 1e6 * np.array([0, 1, 2.5, 5])]
+)
 def test_channels_are_steering_times_gain_times_delay(tones):
     """Even combs and uneven ones are the sum written out."""
     lengths = torch.tensor([0.0, 3.0, 40.0])
@@ -35,9 +37,13 @@ def test_channels_are_steering_times_gain_times_delay(tones):
 
 
 def test_products_of_many_rows_were_stored_for_each_antenna(monkeypatch):
-    """512 rows of 2,000 sources at 64 antennas: 3 s and 1 GB, and .03 to .9 s with the rows last."""
+    """512 rows of 2,000 sources at 64 antennas: 3 s and 1 GB,
+    and .03 to .9 s with the rows last.
+    """
     stored, product = [], torch.einsum
-    monkeypatch.setattr(torch, "einsum", lambda how, *parts: stored.append(parts) or product(how, *parts))
+    monkeypatch.setattr(
+        torch, "einsum", lambda how, *parts: stored.append(parts) or product(how, *parts)
+    )
     for rows in (1, 64):
         ChannelResponse(8, 16, None, torch.ones(3))(torch.randn(rows, 3, dtype=torch.complex64))
         assert stored[-1][2].numel() == max(one.numel() for one in stored[-1])
@@ -72,7 +78,11 @@ def test_slopes_end_to_end_through_composite():
     def loss() -> Tensor:
         return (model(tx, rx).mean - wanted).square().sum()
 
-    for parameter in (model.gaussians.means, model.gaussians.opacity_logits, model.emission.weight2):
+    for parameter in (
+        model.gaussians.means,
+        model.gaussians.opacity_logits,
+        model.emission.weight2,
+    ):
         (slope,) = torch.autograd.grad(loss(), parameter)
         step = 2e-3 * slope / slope.norm()
         with torch.no_grad():
@@ -87,7 +97,9 @@ def test_slopes_end_to_end_through_composite():
 
 def _pose() -> Pose:
     site = array_site(GRID, planar_array(2, 2))
-    return Pose(torch.from_numpy(site.static_position).float(), torch.from_numpy(site.rx_rotation).float())
+    return Pose(
+        torch.from_numpy(site.static_position).float(), torch.from_numpy(site.rx_rotation).float()
+    )
 
 
 def _splatted(hidden: int = 0, count: int = 30):

@@ -1,4 +1,6 @@
-"""Schedules of shares act where they fall in a training of any length, and not at all in a very short one."""
+"""Schedules of shares act where they fall in a training of any length,
+and not at all in a very short one.
+"""
 
 import pytest
 

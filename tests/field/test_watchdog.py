@@ -36,7 +36,9 @@ class Looks:
         self._last[key] = now
         if gap > self.longest[0]:
             stack = traceback.extract_stack(frame or sys._getframe(2), limit=9)
-            where = " < ".join(f"{one.filename.rpartition('/')[2]}:{one.lineno}" for one in stack[::-1])
+            where = " < ".join(
+                f"{one.filename.rpartition('/')[2]}:{one.lineno}" for one in stack[::-1]
+            )
             self.longest = gap, where
 
 
@@ -50,7 +52,9 @@ def watched() -> Iterator[Looks]:
             looks.look()
         ask()
 
-    modules = [m for m in list(sys.modules.values()) if getattr(m, "raise_if_cancelled", None) is ask]
+    modules = [
+        m for m in list(sys.modules.values()) if getattr(m, "raise_if_cancelled", None) is ask
+    ]
     before = signal.signal(signal.SIGALRM, lambda signum, frame: looks.look(frame))
     signal.setitimer(signal.ITIMER_REAL, OFTEN_S, OFTEN_S)
     try:
@@ -73,9 +77,10 @@ KINDS = {  # what is measured, and overrides; as many rows as make the longest p
     "static array": (static_array, ()),
     "moving array": (moving_array, ()),
     "a search": (
-        lambda folder: channels(folder / "own.npz", 300, shape="S"), ("model=image_source_gp",),
+        lambda folder: channels(folder / "own.npz", 300, shape="S"),
+        ("model=image_source_gp",),
     ),
-}  # fmt: skip
+}
 EVERY = [pytest.param(kind, marks=() if kind == "powers" else pytest.mark.slow) for kind in KINDS]
 
 
@@ -93,7 +98,9 @@ def test_an_interrupt_ends_every_phase_within_a_second(kind, tmp_path):
     try:
         with watched() as looks:
             method.fit(
-                data, split_for({"name": "random"}, data).folds[0], fit_context(config, run_dir=tmp_path)
+                data,
+                split_for({"name": "random"}, data).folds[0],
+                fit_context(config, run_dir=tmp_path),
             )
     finally:
         torch.set_num_threads(threads)

@@ -29,8 +29,8 @@ class Outcome:
         seconds: of everything [s].
         fit_s: of the fit [s].
         model: its terms, where its Gaussians come from, and their number.
-        own, best, allowed: our error, that of the plain method `name`, and how much larger ours may be: minus
-            PSNR in dB of spectra, NMSE of channels, rmse in dB of powers.
+        own, best, allowed: our error, that of the plain method `name`, and how much larger ours may
+            be: minus PSNR in dB of spectra, NMSE of channels, rmse in dB of powers.
         errors: of every plain method.
         plain: whether the default came to no more than a plain process.
         refused: what it said instead; then nothing else is known.
@@ -55,7 +55,9 @@ class Outcome:
         return self.own - self.best > self.allowed
 
     def grossly_behind(self, times: float) -> bool:
-        """Whether its error is `times` what is allowed: more than few seconds of training explain."""
+        """Whether its error is `times` what is allowed:
+        more than few seconds of training explain.
+        """
         most = self.best + self.allowed
         return self.own > (most * times if self.best > 0 else most + 10 * math.log10(times))
 
@@ -72,7 +74,13 @@ def run(
     file, started = folder / "own.npz", time.perf_counter()
     np.savez(file, **arrays(world, seed))
     found = Outcome(world.name, seed)
-    said = ["dataset=own", f"dataset.file='{file}'", "model=gsparc", f"split={world.split}", "logger=none"]
+    said = [
+        "dataset=own",
+        f"dataset.file='{file}'",
+        "model=gsparc",
+        f"split={world.split}",
+        "logger=none",
+    ]
     try:
         facts, objects = train(compose(*said, "baselines=[zero]", *more), folder / "run")
     except ValueError as error:
@@ -95,7 +103,9 @@ def run(
     difference = own[told] - plain[found.name][told]
     spread = standard_error(difference, _unit(world, data, split.folds[0].test)[told])
     found.own, found.best = _figure(kind, float(own[told].mean())), _figure(kind, means[found.name])
-    found.allowed = max(_least(world, found.best), _figure(kind, means[found.name] + 2 * spread) - found.best)
+    found.allowed = max(
+        _least(world, found.best), _figure(kind, means[found.name] + 2 * spread) - found.best
+    )
     found.seconds = time.perf_counter() - started
     return found, objects
 
@@ -108,9 +118,15 @@ def repeated(world: World, folder: Path, more: tuple[str, ...] = ()) -> Outcome:
     difference = np.array([o.own - o.errors[best] for o in every])
     spread = 2 * float(difference.std(ddof=1)) / math.sqrt(FRESH)
     return replace(
-        every[0], seed=-1, seconds=sum(o.seconds for o in every), own=float(np.mean([o.own for o in every])),
-        name=best, best=errors[best], errors=errors, allowed=max(spread, _least(world, errors[best])),
-    )  # fmt: skip
+        every[0],
+        seed=-1,
+        seconds=sum(o.seconds for o in every),
+        own=float(np.mean([o.own for o in every])),
+        name=best,
+        best=errors[best],
+        errors=errors,
+        allowed=max(spread, _least(world, errors[best])),
+    )
 
 
 def _least(world: World, best: float) -> float:
@@ -145,7 +161,9 @@ def _unit(world: World, data: Measurements, rows: np.ndarray) -> np.ndarray:
 
 
 def standard_error(difference: np.ndarray, unit: np.ndarray) -> float:
-    """Of the mean of differences (n,), those of a unit not independent; of rows, where there is one unit."""
+    """Of the mean of differences (n,), those of a unit not independent; of rows,
+    where there is one unit.
+    """
     number = np.unique(unit, return_inverse=True)[1].reshape(-1)
     if number.max() == 0:
         number = np.arange(len(unit))

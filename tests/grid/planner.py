@@ -1,4 +1,5 @@
-"""What a planner is told of simulated networks, beside their truth, by seeds; FOLDER keeps their models.
+"""What a planner is told of simulated networks, beside their truth, by seeds;
+FOLDER keeps their models.
 
 python tests/grid/planner.py covered FOLDER 0 1 2 >> docs/results/maps/covered.csv
 python tests/grid/planner.py inside FOLDER 910 911 >> docs/results/maps/inside.csv
@@ -70,9 +71,14 @@ def learned(data: Measurements, file: Path) -> tuple[Predictor, Promise]:
     """A model of all rows with its promise, from its file where it is there."""
     if not file.is_file():
         method, every = wrap_per_station(Gsparc(), data), np.arange(len(data))
-        fold, context = Fold(every, every[:0], every[:0]), FitContext(file.parent, stations="together")
+        fold, context = (
+            Fold(every, every[:0], every[:0]),
+            FitContext(file.parent, stations="together"),
+        )
         method.fit(data, fold, context)
-        promise = gather_promise(Learned(method, Gsparc(), data, fold, context), PromiseSettings(folds=FOLDS))
+        promise = gather_promise(
+            Learned(method, Gsparc(), data, fold, context), PromiseSettings(folds=FOLDS)
+        )
         checkpoint.save(file, method)
         promise.store(file)
     predictor = gsparc.load(file)
@@ -82,48 +88,74 @@ def learned(data: Measurements, file: Path) -> tuple[Predictor, Promise]:
 
 
 def covered(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
-    """Share promised with its interval, at places asked outdoors, true there, true at all, share refused."""
+    """Share promised with its interval, at places asked outdoors, true there, true at all,
+    share refused.
+    """
     one = town(seed, buildings)
     predictor, promise = learned(one.data(LISTED), folder / f"{seed}-{buildings}.ckpt")
-    low, high = np.maximum(one.moment[:, :2].min(0), AREA[:2]), np.minimum(one.moment[:, :2].max(0), AREA[2:])
-    even = ((one.asked[:, :2] > low) & (one.asked[:, :2] < high)).all(1) & (np.arange(len(one.asked)) < EVEN)
+    low, high = (
+        np.maximum(one.moment[:, :2].min(0), AREA[:2]),
+        np.minimum(one.moment[:, :2].max(0), AREA[2:]),
+    )
+    even = ((one.asked[:, :2] > low) & (one.asked[:, :2] < high)).all(1) & (
+        np.arange(len(one.asked)) < EVEN
+    )
     places, best, out = one.asked[even], one.truth[even].max(1), ~one.indoors[even]
     for level in np.quantile(best[out], 1 - np.array(SHARES)).round():
-        field = predict_map(predictor, [*low, *high], step_m=STEP_M, threshold_db=level, promise=promise)
+        field = predict_map(
+            predictor, [*low, *high], step_m=STEP_M, threshold_db=level, promise=promise
+        )
         at = tuple(
-            np.abs(axis - places[:, i, None]).argmin(1) for i, axis in ((1, field.grid.y), (0, field.grid.x))
+            np.abs(axis - places[:, i, None]).argmin(1)
+            for i, axis in ((1, field.grid.y), (0, field.grid.x))
         )
         said, known = 1 - field.outage[at], ~field.refused[at]
         ends = covered_between(field, predictor, promise)
-        shares = said[known & out].mean(), (best >= level)[known & out].mean(), (best >= level)[known].mean()
+        shares = (
+            said[known & out].mean(),
+            (best >= level)[known & out].mean(),
+            (best >= level)[known].mean(),
+        )
         figures = (1 - np.nanmean(field.outage), *ends, *shares, 1 - known.mean())
         yield (seed, int(buildings), level, *(round(float(v), 4) for v in figures))
 
 
 def inside(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
-    """Shares of 90 % intervals of `predict`, outdoors, that hold the strongest cell, all; refused of both."""
+    """Shares of 90 % intervals of `predict`, outdoors, that hold the strongest cell, all;
+    refused of both.
+    """
     one = town(seed, buildings)
     predictor, promise = learned(one.data(LISTED), folder / f"{seed}-{buildings}.ckpt")
     places, cells = one.asked[:EVEN][~one.indoors[:EVEN]], np.arange(len(one.place))
     truth = one.truth[:EVEN][~one.indoors[:EVEN]]
     level, spread, _ = np.moveaxis(joint_levels(predictor, places, cells), 1, 0)
-    asked = np.repeat(to_local(predictor.site, places, None), len(cells), 0), np.tile(cells, len(places))
+    asked = (
+        np.repeat(to_local(predictor.site, places, None), len(cells), 0),
+        np.tile(cells, len(places)),
+    )
     error = promise.expected_errors(*asked, spread.reshape(-1)).reshape(level.shape)
     best = np.arange(len(places)), level.argmax(1)
     figures = []
     for chosen in (best, np.s_[:]):
-        held, known = np.abs(level - truth)[chosen] < half_width(0.9) * error[chosen], error[chosen] > 0
+        held, known = (
+            np.abs(level - truth)[chosen] < half_width(0.9) * error[chosen],
+            error[chosen] > 0,
+        )
         figures += [held[known].mean(), 1 - known.mean()]
     yield (seed, int(buildings), *(round(float(v), 4) for v in figures))
 
 
 def planned(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
-    """After `STOPS` more places in streets, outdoors: errors of the strongest level, of all cells [dB].
+    """After `STOPS` more places in streets, outdoors: errors of the strongest level,
+    of all cells [dB].
 
-    Share misjudged at a level that three quarters have, and error of the share that is predicted to.
+    Share misjudged at a level that three quarters have,
+    and error of the share that is predicted to.
     """
     streets, lines = folder / f"streets{seed}.geojson", np.arange(AREA[0], AREA[2] + 1, BLOCK_M)
-    ways = [[[c, AREA[1]], [c, AREA[3]]] for c in lines] + [[[AREA[0], c], [AREA[2], c]] for c in lines]
+    ways = [[[c, AREA[1]], [c, AREA[3]]] for c in lines] + [
+        [[AREA[0], c], [AREA[2], c]] for c in lines
+    ]
     streets.write_text(json.dumps({"type": "MultiLineString", "coordinates": ways}))
     planning.coarse_grid, planning.CANDIDATES = partial(coarse_grid, count=PLANNED[0]), PLANNED[1]
     grid = planning.coarse_grid(None, AREA, 1.5)
@@ -141,9 +173,15 @@ def planned(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
         far = np.minimum(far, np.linalg.norm(stops - stops[far.argmax()], axis=1))
     for name, threshold in {"strongest": None, "covered": level}.items():
         found = planning.plan_measurements(
-            predictor, most, AREA, height_m=1.5, threshold_db=threshold, promise=promise, route=False,
+            predictor,
+            most,
+            AREA,
+            height_m=1.5,
+            threshold_db=threshold,
+            promise=promise,
+            route=False,
             walkable=streets,
-        )  # fmt: skip
+        )
         apart, ways[name] = cKDTree(stops).query(found.places[:, :2])
         assert apart.max() < 1.0
     heard = one.truth[EVEN:] + rng.normal(0, NOISE_DB, (len(stops), len(every)))
@@ -161,12 +199,18 @@ def planned(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
         share = 1 - outage_probability(mean.T, spread.T, level, alike.T, below).mean()
         errors = mean.max(1) - true.max(1), mean - true
         wrong = ((mean.max(1) >= level) != (true.max(1) >= level)).mean()
-        figures = (*(np.sqrt((e**2).mean()) for e in errors), wrong, share - (true.max(1) >= level).mean())
+        figures = (
+            *(np.sqrt((e**2).mean()) for e in errors),
+            wrong,
+            share - (true.max(1) >= level).mean(),
+        )
         yield (seed, name, count, *(round(float(v), 4) for v in figures))
 
 
 def azimuths(seed: int, buildings: bool, _: Path) -> Iterator[tuple]:
-    """Three azimuths wrong by an angle: lists, named, told to [deg]; others: named, of how many; untested."""
+    """Three azimuths wrong by an angle: lists, named, told to [deg]; others: named, of how many;
+    untested.
+    """
     one = draw_network(seed, 0, 2 * MOMENTS, 20, buildings)
     lists, rng = one.listed(LISTED).sum(0), np.random.default_rng(seed)
     enough = np.flatnonzero(lists >= LEAST_LISTS)
@@ -177,9 +221,13 @@ def azimuths(seed: int, buildings: bool, _: Path) -> Iterator[tuple]:
         azimuth[wrong] += angle * rng.choice([-1, 1], len(wrong))
         data = replace(one, azimuth=azimuth % 360).data(LISTED)
         names, notes = np.array(data.site.stations.name), check_azimuths(data)
-        kinds = ([note for note in notes if head in note] for head in ("contradicted by", "would not show"))
+        kinds = (
+            [note for note in notes if head in note]
+            for head in ("contradicted by", "would not show")
+        )
         named, told = (
-            dict(re.findall(r"([0-9]+-[0-9]+) (?:\(listed )?([0-9]+)", " ".join(kind))) for kind in kinds
+            dict(re.findall(r"([0-9]+-[0-9]+) (?:\(listed )?([0-9]+)", " ".join(kind)))
+            for kind in kinds
         )
         named, untold = np.isin(names, [*named]), np.isin(names, [*told])
         false = np.delete(named, wrong).sum(), len(names) - len(wrong), untold.sum()
@@ -189,7 +237,9 @@ def azimuths(seed: int, buildings: bool, _: Path) -> Iterator[tuple]:
 
 
 def off(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
-    """Cells of a site that was off in a second drive: moments expected, named, chance; others named."""
+    """Cells of a site that was off in a second drive: moments expected, named, chance;
+    others named.
+    """
     one = draw_network(seed, 0, 1000, 10, buildings)
     first, second = (slice(0, 600), slice(600, 1000))
     data = replace(one, moment=one.moment[first], measured=one.measured[first]).data(LISTED)
@@ -221,9 +271,12 @@ PARTS = {"off": off, "covered": covered, "inside": inside, "planned": planned, "
 
 if __name__ == "__main__":
     logging.disable(logging.WARNING)
-    network_learning.list_first = lambda names, _: ", ".join(names)  # all that are untested, not the first
+    # All that are untested, not the first
+    network_learning.list_first = lambda names, _: ", ".join(names)
     part, folder, *seeds = sys.argv[1:]
     kinds = (True,) if os.environ.get("BUILT") or part == "planned" else (False, True)
     for seed, buildings in product(map(int, seeds), kinds):
-        csv.writer(sys.stdout, lineterminator="\n").writerows(PARTS[part](seed, buildings, Path(folder)))
+        csv.writer(sys.stdout, lineterminator="\n").writerows(
+            PARTS[part](seed, buildings, Path(folder))
+        )
         sys.stdout.flush()

@@ -35,7 +35,9 @@ def reloaded(world: World, folder: Path, objects: TrainedRun) -> None:
     scale = float(before.mean.abs().max()) or 1.0
     assert torch.allclose(after.mean, before.mean, atol=1e-4 * scale), "reload: other predictions"
     if before.confidence is not None:
-        assert torch.allclose(after.confidence, before.confidence, atol=1e-3), "reload: other confidence"
+        assert torch.allclose(after.confidence, before.confidence, atol=1e-3), (
+            "reload: other confidence"
+        )
 
 
 def predicted(world: World, folder: Path, objects: TrainedRun) -> None:
@@ -49,13 +51,17 @@ def predicted(world: World, folder: Path, objects: TrainedRun) -> None:
         found = np.asarray(getattr(predictor, data.site.kind)(**places))
         assert np.isfinite(found).all(), "predict: not finite"
     sure = [float(np.median(np.asarray(predictor.confidence(**places)))) for places in (near, far)]
-    assert sure[1] <= max(SURE_FAR, 0.5 * sure[0]) and sure[1] <= sure[0], f"confidence near, far: {sure}"
+    assert sure[1] <= max(SURE_FAR, 0.5 * sure[0]) and sure[1] <= sure[0], (
+        f"confidence near, far: {sure}"
+    )
 
 
 def evaluated(world: World, folder: Path, objects: TrainedRun) -> None:
     """`gsparc evaluate` finds the figure that training did."""
     figure = f"test/{DECIDING[objects.data.site.kind]}"
-    again = evaluate_files([folder / "run" / "model.ckpt"], {"file": str(folder / "own.npz")})[0].facts
+    again = evaluate_files([folder / "run" / "model.ckpt"], {"file": str(folder / "own.npz")})[
+        0
+    ].facts
     before = objects.evaluation.facts[figure]
     assert abs(again[figure] - before) <= 1e-3 * abs(before) + 1e-6, (
         f"evaluate: {again[figure]}, not {before}"
@@ -74,17 +80,26 @@ def drawn(world: World, folder: Path, objects: TrainedRun) -> None:
 
 
 def resumed(world: World, folder: Path, objects: TrainedRun) -> None:
-    """Trained again from the run's last state, where it has one, it ends with about the same figure."""
+    """Trained again from the run's last state, where it has one,
+    it ends with about the same figure.
+    """
     last = folder / "run" / "last.ckpt"
     if not last.exists():
         return
-    said = ["dataset=own", f"dataset.file='{folder / 'own.npz'}'", "model=gsparc", f"split={world.split}"]
+    said = [
+        "dataset=own",
+        f"dataset.file='{folder / 'own.npz'}'",
+        "model=gsparc",
+        f"split={world.split}",
+    ]
     more = [f"ckpt_path='{last}'", "baselines=[zero]", "logger=none"]
     facts, _ = train(compose(*said, *more), folder / "again")
     figure = f"test/{DECIDING[objects.data.site.kind]}"
     before = objects.evaluation.facts[figure]
     # Seconds end searches, so that a resumed one may come to more; it may not come to less by much.
-    assert abs(facts[figure] - before) <= 0.3 * abs(before) + 1e-6, f"resume: {facts[figure]}, not {before}"
+    assert abs(facts[figure] - before) <= 0.3 * abs(before) + 1e-6, (
+        f"resume: {facts[figure]}, not {before}"
+    )
 
 
 PARTS = (checked, reloaded, predicted, evaluated, drawn, resumed)

@@ -1,7 +1,8 @@
-"""`make grid`: every kind of data with defaults, resumable; a line of JSON for each, and a table at the end.
+"""`make grid`: every kind of data with defaults, resumable; a line of JSON for each,
+and a table at the end.
 
-python tests/grid/sweep.py RESULTS.jsonl            # the covering set: every pair of properties meets
-python tests/grid/sweep.py RESULTS.jsonl --seed 7   # 100 combinations drawn by a seed
+python tests/grid/sweep.py RESULTS.jsonl            # the covering set: every pair of properties
+meets python tests/grid/sweep.py RESULTS.jsonl --seed 7   # 100 combinations drawn by a seed
 """
 
 import argparse
@@ -59,7 +60,9 @@ def main() -> int:
     """Exit status 1 where something was refused, behind or did not answer."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("results", type=Path)
-    parser.add_argument("--seed", type=int, help="draw 100 combinations instead of the covering set")
+    parser.add_argument(
+        "--seed", type=int, help="draw 100 combinations instead of the covering set"
+    )
     parser.add_argument("--rows", type=int, nargs="+", default=[30, 300, 3000])
     parser.add_argument("--csv", type=Path, help="write the table, as docs/results/kinds.csv is")
     parser.add_argument("more", nargs="*", help="overrides, such as effort=.3")
@@ -79,7 +82,9 @@ def main() -> int:
         done.append({**json.loads(found.line()), "failures": failures})
         with given.results.open("a") as file:
             file.write(json.dumps(done[-1]) + "\n")
-        console.print(f"{number} of {len(chosen)}: {world.name}, {found.seconds:.0f} s", highlight=False)
+        console.print(
+            f"{number} of {len(chosen)}: {world.name}, {found.seconds:.0f} s", highlight=False
+        )
     console.print(Table("kinds of data", [Column(head, "") for head in HEADS], [*map(cells, done)]))
     if given.csv is not None:
         with given.csv.open("w", encoding="utf-8", newline="") as file:
@@ -87,7 +92,8 @@ def main() -> int:
     bad = [one for one in done if one["refused"] or one["failures"] or outcome_of(one).behind]
     plain = sum(entry["plain"] for entry in done)
     console.print(
-        f"{len(done)} combinations, {len(bad)} with something wrong, {plain} no more than a plain process"
+        f"{len(done)} combinations, {len(bad)} with something wrong, {plain} no more than a "
+        "plain process"
     )
     return int(bool(bad))
 

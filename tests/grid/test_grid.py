@@ -1,7 +1,8 @@
-"""The grid of kinds: `model=gsparc` serves every kind of data, and never loses to a plain method beside it.
+"""The grid of kinds: `model=gsparc` serves every kind of data,
+and never loses to a plain method beside it.
 
-`make grid` runs the whole covering set with defaults; here few seconds are given to each, so that a loss
-counts when it is a gross one, after five fresh seeds.
+`make grid` runs the whole covering set with defaults; here few seconds are given to each, so that a
+loss counts when it is a gross one, after five fresh seeds.
 """
 
 import numpy as np
@@ -21,7 +22,9 @@ GROSS = 1.5  # times the allowed error, in decibels as much more
 
 
 def assert_served(world: World, folder, effort: float, parts=PARTS) -> None:
-    """Train, and fail where the default is behind on fresh seeds as well, or a part does not answer."""
+    """Train, and fail where the default is behind on fresh seeds as well,
+    or a part does not answer.
+    """
     more = (f"effort={effort}", "threads=1")
     found, objects = run(world, 0, folder, more)
     assert not found.refused, found.refused
@@ -49,7 +52,10 @@ def test_every_kind_of_thirty_rows(number, tmp_path):
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize(
     "world",
-    [pytest.param(one, id=one.name, marks=pytest.mark.rare if i > 1 else ()) for i, one in enumerate(SOME)],
+    [
+        pytest.param(one, id=one.name, marks=pytest.mark.rare if i > 1 else ())
+        for i, one in enumerate(SOME)
+    ],
 )
 def test_every_kind_of_three_hundred_rows(world, tmp_path):
     assert_served(world, tmp_path, 0.5)
@@ -63,7 +69,9 @@ def test_a_process_of_one_length_predicted_the_mean_in_a_gap(tmp_path):
         compose("dataset=own", f"dataset.file='{file}'", "model=gp", "split=blocks", "logger=none")
     )
     data, split = begun.module.measurements, begun.split
-    figures = [fit_baseline(name, data, split).scores.figures()["psnr_db"] for name in ("gp", "idw")]
+    figures = [
+        fit_baseline(name, data, split).scores.figures()["psnr_db"] for name in ("gp", "idw")
+    ]
     assert figures[0] > figures[1] + 0.1
 
 

@@ -1,4 +1,5 @@
-"""Small measured worlds of every kind: a shoebox with clutter and noise, as arrays of the documented schema.
+"""Small measured worlds of every kind: a shoebox with clutter and noise,
+as arrays of the documented schema.
 
 Nothing of gsparc is used, so that a mistake of ours is not in both.
 """
@@ -21,10 +22,15 @@ LEVELS_DB = 1.5  # noise of powers [dB]
 SPECKLE = 0.02  # noise of spectra
 
 CHOICES = {
-    "kind": ("array", "moving_array", "image", "tone", "tones", "antennas", "power"), "runs": (1, 5),
-    "stations": (1, 4), "moving": ("rx", "tx", "both"), "frame": ("metres", "utm", "degrees"),
-    "missing": ("none", "silent", "masked"), "split": ("random", "blocks", "runs"), "rows": (30, 300, 3000),
-}  # fmt: skip
+    "kind": ("array", "moving_array", "image", "tone", "tones", "antennas", "power"),
+    "runs": (1, 5),
+    "stations": (1, 4),
+    "moving": ("rx", "tx", "both"),
+    "frame": ("metres", "utm", "degrees"),
+    "missing": ("none", "silent", "masked"),
+    "split": ("random", "blocks", "runs"),
+    "rows": (30, 300, 3000),
+}
 
 
 @dataclass(frozen=True)
@@ -32,13 +38,14 @@ class World:
     """One combination of properties.
 
     Attributes:
-        kind: `array`, spectra of a static array; `moving_array`; `image`, spectra without an array; `tone`,
-            `tones` (30) and `antennas` (4), channels; `power`.
+        kind: `array`, spectra of a static array; `moving_array`; `image`, spectra without an array;
+            `tone`, `tones` (30) and `antennas` (4), channels; `power`.
         runs: how many; channels of each have a phase of their own.
         stations: how many static ends.
         moving: which end moves.
         frame: of places: metres about 0, UTM metres, or degrees.
-        missing: a tenth of the rows is below what is heard (`silent`) or was not measured (`masked`).
+        missing: a tenth of the rows is below what is heard (`silent`) or was not measured
+            (`masked`).
         split: what is held out.
         rows: places.
     """
@@ -60,20 +67,30 @@ class World:
     @property
     def possible(self) -> bool:
         """Whether there can be such measurements."""
-        if (self.split == "runs" and self.runs == 1) or (self.moving == "both" and self.stations > 1):
+        if (self.split == "runs" and self.runs == 1) or (
+            self.moving == "both" and self.stations > 1
+        ):
             return False
         if self.moving == "both" and self.frame == "degrees":  # such files have no degrees
             return False
-        return {"array": self.moving == "tx", "moving_array": self.moving == "rx"}.get(self.kind, True)
+        return {"array": self.moving == "tx", "moving_array": self.moving == "rx"}.get(
+            self.kind, True
+        )
 
 
 def every(rows: tuple[int, ...] = CHOICES["rows"]) -> list[World]:
     """All that are possible, of some numbers of rows."""
-    return [w for c in itertools.product(*CHOICES.values()) if (w := World(*c)).possible and w.rows in rows]
+    return [
+        w
+        for c in itertools.product(*CHOICES.values())
+        if (w := World(*c)).possible and w.rows in rows
+    ]
 
 
 def covering(worlds: list[World], seed: int = 0) -> list[World]:
-    """A small set in which every pair of values of two properties meets that meets in any of `worlds`."""
+    """A small set in which every pair of values of two properties meets that meets
+    in any of `worlds`.
+    """
     order = np.random.default_rng(seed).permutation(len(worlds))
     pairs = [possible_pairs([worlds[i]]) for i in order]
     missing, chosen = set().union(*pairs), []
@@ -86,7 +103,9 @@ def covering(worlds: list[World], seed: int = 0) -> list[World]:
 
 def possible_pairs(worlds: list[World]) -> set[tuple[tuple[int, object], ...]]:
     """Pairs of values of two properties that meet in any of them."""
-    return {pair for world in worlds for pair in itertools.combinations(enumerate(astuple(world)), 2)}
+    return {
+        pair for world in worlds for pair in itertools.combinations(enumerate(astuple(world)), 2)
+    }
 
 
 def drawn(worlds: list[World], count: int, seed: int) -> Iterator[World]:
@@ -118,7 +137,9 @@ def arrays(world: World, seed: int) -> dict[str, np.ndarray]:
 
 
 def _walk(world: World, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Places (S, 3) [m] along lines through a part of the room, at least one for each run, and runs (S,)."""
+    """Places (S, 3) [m] along lines through a part of the room, at least one for each run,
+    and runs (S,).
+    """
     side = {30: 1.0, 300: 1.5, 3000: 3.0}[world.rows]  # dense enough for channels to be related
     lines = max(world.runs, world.rows // 30)
     line = np.arange(world.rows) * lines // world.rows
@@ -143,8 +164,12 @@ class _Room:
             for gain, far, _ in self.paths(place, end)
         )
 
-    def paths(self, place: np.ndarray, end: np.ndarray) -> list[tuple[float, np.ndarray, np.ndarray]]:
-        """Gain, length (S,) [m], and the point (S, 3) that the receiver at `place` sees, of each path."""
+    def paths(
+        self, place: np.ndarray, end: np.ndarray
+    ) -> list[tuple[float, np.ndarray, np.ndarray]]:
+        """Gain, length (S,) [m], and the point (S, 3) that the receiver at `place` sees,
+        of each path.
+        """
         images = [(1.0, end)]
         for axis, wall in itertools.product(range(3), (0, 1)):
             mirrored = end.copy()
@@ -197,10 +222,14 @@ def _elements(world: World) -> np.ndarray:
 def _directions() -> np.ndarray:
     """Unit vectors (D, 3), rows of elevation 0 to 90 degrees first."""
     elevation, azimuth = np.meshgrid(
-        np.arange(SHAPE[0]) * np.pi / 2 / SHAPE[0], np.arange(SHAPE[1]) * 2 * np.pi / SHAPE[1], indexing="ij"
+        np.arange(SHAPE[0]) * np.pi / 2 / SHAPE[0],
+        np.arange(SHAPE[1]) * 2 * np.pi / SHAPE[1],
+        indexing="ij",
     )
     flat = np.cos(elevation)
-    return np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1).reshape(-1, 3)
+    return np.stack(
+        [flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], -1
+    ).reshape(-1, 3)
 
 
 def _image(room: _Room, rx: np.ndarray, tx: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -232,7 +261,9 @@ def _values(world: World, measured: np.ndarray, rng: np.random.Generator) -> dic
         if world.missing == "silent":
             value[gone] = 0
         elif world.missing == "masked":
-            found["mask"] = np.broadcast_to(~gone.reshape(-1, *[1] * (value.ndim - 1)), value.shape).copy()
+            found["mask"] = np.broadcast_to(
+                ~gone.reshape(-1, *[1] * (value.ndim - 1)), value.shape
+            ).copy()
     if world.stations == 1:
         value = value[:, 0]
         if "mask" in found:
@@ -248,12 +279,16 @@ def _values(world: World, measured: np.ndarray, rng: np.random.Generator) -> dic
     return {**found, name: value}
 
 
-def _places(world: World, place: np.ndarray, fixed: np.ndarray, other: np.ndarray) -> dict[str, np.ndarray]:
+def _places(
+    world: World, place: np.ndarray, fixed: np.ndarray, other: np.ndarray
+) -> dict[str, np.ndarray]:
     """Positions in the frame of the world."""
     still = "tx" if world.moving == "rx" else "rx"
     if world.frame == "degrees":
         latitude, longitude = _degrees(place)
-        stations = dict(zip(("station_latitude", "station_longitude"), _degrees(fixed), strict=True))
+        stations = dict(
+            zip(("station_latitude", "station_longitude"), _degrees(fixed), strict=True)
+        )
         heights = {f"{world.moving}_height": place[:, 2], "station_height": fixed[:, 2]}
         return {"latitude": latitude, "longitude": longitude, **stations, **heights}
     origin = UTM if world.frame == "utm" else np.zeros(3)
@@ -266,6 +301,10 @@ def _places(world: World, place: np.ndarray, fixed: np.ndarray, other: np.ndarra
 
 
 def _degrees(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Latitude and longitude of metres east and north of the corner, on a sphere as large as the Earth."""
+    """Latitude and longitude of metres east and north of the corner,
+    on a sphere as large as the Earth.
+    """
     metre = 360 / 40_030_000
-    return DEGREES[0] + place[:, 1] * metre, DEGREES[1] + place[:, 0] * metre / np.cos(np.radians(DEGREES[0]))
+    return DEGREES[0] + place[:, 1] * metre, DEGREES[1] + place[:, 0] * metre / np.cos(
+        np.radians(DEGREES[0])
+    )

@@ -17,7 +17,9 @@ ENGINES = ["reference", "cpu", "cuda shim"] + ([] if cuda_library.missing_device
 
 @pytest.fixture(params=ENGINES)
 def backend(request):
-    """What to call the backend: under the CUDA kernels, which serve CPU tensors here, that is still `cpu`."""
+    """What to call the backend: under the CUDA kernels, which serve CPU tensors here,
+    that is still `cpu`.
+    """
     if request.param in ("reference", "cpu"):
         yield request.param
         return
@@ -41,7 +43,9 @@ def undisturbed(tmp_path_factory):
 
 
 def pytest_addoption(parser):
-    parser.addoption("--table", type=Path, help="write what was measured between the markers of this file")
+    parser.addoption(
+        "--table", type=Path, help="write what was measured between the markers of this file"
+    )
 
 
 def pytest_runtest_setup(item):

@@ -1,8 +1,8 @@
 """At the receiver: r -> 0 divides by zero, and a Gaussian around the receiver has no direction.
 
-Remedy: absent for r <= near, fading in smoothly up to 2 near (csrc/footprint.h, reference.py). Shown: finite
-everywhere, gradients exactly zero when absent, no jump at either end: opacity is C1 in r, so a step of 1e-6
-changes the image by less than 1e-3.
+Remedy: absent for r <= near, fading in smoothly up to 2 near (csrc/footprint.h, reference.py).
+Shown: finite everywhere, gradients exactly zero when absent, no jump at either end: opacity is C1
+in r, so a step of 1e-6 changes the image by less than 1e-3.
 """
 
 from itertools import pairwise
@@ -25,17 +25,22 @@ def at(distance: float):
 @pytest.mark.parametrize("distance", [0.0, 1e-30, 1e-6, 0.01, NEAR * 0.999])
 def test_absent_and_without_gradient(backend, dtype, distance):
     got = render(at(distance).to(dtype), origin(), GRID, backend, near=NEAR)
-    assert not got["visible"].any() and (got["image"] == 0).all() and (got["transmittance"] == 1).all()
+    assert (
+        not got["visible"].any() and (got["image"] == 0).all() and (got["transmittance"] == 1).all()
+    )
     for name in ("d_means", "d_quats", "d_scales", "d_opacities", "d_features", "d_means2d"):
         assert (got[name] == 0).all(), name
 
 
 def test_fades_in_without_a_jump(backend):
     for edge in (NEAR, 2 * NEAR):
-        a, b = (render(at(edge + s), origin(), GRID, backend, near=NEAR)["image"] for s in (-1e-6, 1e-6))
+        a, b = (
+            render(at(edge + s), origin(), GRID, backend, near=NEAR)["image"] for s in (-1e-6, 1e-6)
+        )
         assert (a - b).abs().max() < 1e-3
     images = [
-        render(at(NEAR * k / 10), origin(), GRID, backend, near=NEAR)["image"].max() for k in range(10, 21)
+        render(at(NEAR * k / 10), origin(), GRID, backend, near=NEAR)["image"].max()
+        for k in range(10, 21)
     ]
     assert all(a <= b + 1e-9 for a, b in pairwise(images)) and images[-1] > 0.5
 

@@ -1,7 +1,7 @@
 """At the transmitter: 1 / d and log d blow up where a Gaussian meets it.
 
-Remedy: d = sqrt(|x - mu|^2 + d_min^2) / d_ref. Shown: finite at d = 0, forward and backward, with no pull on
-the Gaussian there; far away the slope of the plain law within (d_min / d)^2.
+Remedy: d = sqrt(|x - mu|^2 + d_min^2) / d_ref. Shown: finite at d = 0, forward and backward, with
+no pull on the Gaussian there; far away the slope of the plain law within (d_min / d)^2.
 """
 
 import pytest
@@ -20,9 +20,12 @@ D_MIN, D_REF = 0.05, 2.0
 def model(campaign, activation: str) -> GaussianModel:
     torch.manual_seed(0)
     emission = EmissionSettings(
-        EncodingSettings("raw"), hidden=2, activation=activation, log_distance=activation == "sigmoid",
+        EncodingSettings("raw"),
+        hidden=2,
+        activation=activation,
+        log_distance=activation == "sigmoid",
         init_bias=0.0,
-    )  # fmt: skip
+    )
     attenuation = AttenuationSettings(inverse_distance=True, d_min=D_MIN, d_ref=D_REF, gain=1.0)
     settings = ModelSettings(FieldSettings(count=1, placement="uniform"), emission, attenuation)
     return GaussianModel(settings, campaign("spectrum").site, RECEIVER)

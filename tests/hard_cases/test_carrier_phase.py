@@ -1,7 +1,7 @@
 """Carrier phase: 2 pi f r / c in float32 is off by radians at hundreds of metres.
 
-Remedy: cycles are reduced in float64 before the cast (gsparc/physics/waves.py). Shown: 10 km at 60 GHz
-within 1e-3 rad of rational arithmetic, forward, and the slope of the unreduced phase, backward.
+Remedy: cycles are reduced in float64 before the cast (gsparc/physics/waves.py). Shown: 10 km at 60
+GHz within 1e-3 rad of rational arithmetic, forward, and the slope of the unreduced phase, backward.
 """
 
 from fractions import Fraction
@@ -57,7 +57,9 @@ def test_every_subcarrier_of_the_factored_band(tones):
 def test_uneven_tones_are_not_factored():
     frequency = torch.tensor([1.0, 1.01, 1.03, 1.07, 1.08, 1.11, 1.2], dtype=torch.float64) * 2.4e9
     distance = torch.tensor([123.456], dtype=torch.float64)
-    torch.testing.assert_close(wave_over_band(distance, frequency), point_wave(distance[:, None], frequency))
+    torch.testing.assert_close(
+        wave_over_band(distance, frequency), point_wave(distance[:, None], frequency)
+    )
 
 
 def test_band_backward_equals_tone_by_tone():

@@ -1,8 +1,9 @@
-"""Confidence overflow: exp(g) is infinite beyond 88; clipping it after gives 0 * inf = NaN in the gradient.
+"""Confidence overflow: exp(g) is infinite beyond 88;
+clipping it after gives 0 * inf = NaN in the gradient.
 
-Remedy: g is clamped first (its gradient beyond the clamp is 0), log C is softplus(g), targets have unit
-power. Shown: g from -1e4 to 1e4, finite loss and gradient, in float32 and with a network in bfloat16.
-Tolerance against float64 inside the clamp: 1e-6 relative to 1 + C.
+Remedy: g is clamped first (its gradient beyond the clamp is 0), log C is softplus(g), targets have
+unit power. Shown: g from -1e4 to 1e4, finite loss and gradient, in float32 and with a network in
+bfloat16. Tolerance against float64 inside the clamp: 1e-6 relative to 1 + C.
 """
 
 import pytest
@@ -40,4 +41,6 @@ def test_right_inside_the_clamp(g):
     loss = torch.tensor([0.0, 0.3, 10.0])
     got = weighted_loss(loss, torch.full((3,), g), 0.3).double()
     c = 1 + torch.full((3,), g, dtype=torch.float64).exp()
-    assert torch.allclose(got, c * loss.double() - 0.3 * c.log(), atol=float(1e-6 * (1 + c[0]) * 10))
+    assert torch.allclose(
+        got, c * loss.double() - 0.3 * c.log(), atol=float(1e-6 * (1 + c[0]) * 10)
+    )

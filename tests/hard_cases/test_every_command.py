@@ -1,8 +1,10 @@
-"""Every command on a full disk, and under Ctrl-C in every stage: one line, and the exit status that says it.
+"""Every command on a full disk, and under Ctrl-C in every stage: one line,
+and the exit status that says it.
 
-Remedy: files appear by renaming (gsparc/base/files.py), errors pass one door (gsparc/commands/shared/cli.py),
-and a thread that computes asks whether to go on (gsparc/processes/worker.py). The disk is a limit on the
-size of files, failing like a full one in the middle of writing.
+Remedy: files appear by renaming (gsparc/base/files.py), errors pass one door
+(gsparc/commands/shared/cli.py), and a thread that computes asks whether to go on
+(gsparc/processes/worker.py). The disk is a limit on the size of files,
+failing like a full one in the middle of writing.
 """
 
 import re
@@ -20,14 +22,22 @@ from gsparc.__main__ import main
 LINES = {
     "a rendered field": "train dataset=rfid model=gsparc model.effects.array=false",
     "an array's field": "train dataset=rfid model=gsparc",
-    "sources": "train dataset=newrf model=gsparc init=sources", "powers": "train dataset=own model=gsparc",
-    "stations": "train dataset=ble model=gp", "study": "study kind=effects dataset=newrf",
-    "compare": "compare datasets.rfid.root=DIR", "evaluate": "evaluate ckpt=FILE",
-    "predict": "predict ckpt=FILE places=FILE", "map": "map ckpt=FILE", "plan": "plan ckpt=FILE",
-    "place": "place ckpt=FILE", "view": "view ckpt=FILE save=page.html", "tradeoff": "tradeoff ckpt=FILE",
+    "sources": "train dataset=newrf model=gsparc init=sources",
+    "powers": "train dataset=own model=gsparc",
+    "stations": "train dataset=ble model=gp",
+    "study": "study kind=effects dataset=newrf",
+    "compare": "compare datasets.rfid.root=DIR",
+    "evaluate": "evaluate ckpt=FILE",
+    "predict": "predict ckpt=FILE places=FILE",
+    "map": "map ckpt=FILE",
+    "plan": "plan ckpt=FILE",
+    "place": "place ckpt=FILE",
+    "view": "view ckpt=FILE save=page.html",
+    "tradeoff": "tradeoff ckpt=FILE",
     "calibrate": "calibrate ckpt=FILE",
-}  # fmt: skip
-ALIKE = ("an array's field", "evaluate", "place", "view")  # stop where another kind does, at the same door
+}
+# Stop where another kind does, at the same door
+ALIKE = ("an array's field", "evaluate", "place", "view")
 STOPPED = [pytest.param(kind, marks=pytest.mark.rare if kind in ALIKE else ()) for kind in LINES]
 SIZES = (0, 300, 6_000, 60_000)  # bytes: nothing, Hydra's notes, tables, pictures and models
 
@@ -77,13 +87,15 @@ def test_ctrl_c_ends_every_stage_in_one_line(kind, tiny, tmp_path, monkeypatch):
     assert knock(main, "gsparc", _said(tiny, kind, tmp_path / "whole")).status == 0
     whole, stopped = time.monotonic() - began, 0
     before = signal.signal(signal.SIGALRM, lambda *unused: signal.raise_signal(signal.SIGINT))
-    ignored = signal.signal(signal.SIGINT, signal.default_int_handler)  # in the background it is ignored
+    # In the background it is ignored
+    ignored = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         for part in range(18):
             if part % 6 == 0 and stopped:
                 break
             words = _said(tiny, kind, tmp_path / f"run{part}")
-            # The first run imports, on a machine that may have been busier: later ones can be over sooner.
+            # The first run imports, on a machine that may have been busier:
+            # later ones can be over sooner.
             signal.setitimer(signal.ITIMER_REAL, whole * (part % 6 + 1) / 7 / 5 ** (part // 6))
             answer = knock(main, "gsparc", words)
             signal.setitimer(signal.ITIMER_REAL, 0)

@@ -1,8 +1,9 @@
 """Everybody there: a Gaussian that covers every strip, and a million of them.
 
 Remedy: entries are counted before they are allocated, and refused with a clear line beyond a bound
-(operators.py). Shown: one giant costs one entry per strip; a million huge ones stay within the stated bytes:
-entries (4 B each) + records, boxes and orders (under 200 B each) + as much again while planning.
+(operators.py). Shown: one giant costs one entry per strip; a million huge ones stay within the
+stated bytes: entries (4 B each) + records, boxes and orders (under 200 B each)
++ as much again while planning.
 """
 
 import resource
@@ -49,7 +50,12 @@ def test_a_million_huge_ones():
     n = 1_000_000
     draw = torch.Generator().manual_seed(0)
     means = torch.randn(n, 3, generator=draw) * 5
-    model = (means, torch.randn(n, 4, generator=draw), torch.full((n, 3), 3.0), torch.full((n,), 0.3))
+    model = (
+        means,
+        torch.randn(n, 4, generator=draw),
+        torch.full((n, 3), 3.0),
+        torch.full((n,), 0.3),
+    )
     features = torch.ones(n, 1)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     plan = make_plan(*model, origin(), GRID)

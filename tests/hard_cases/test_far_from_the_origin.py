@@ -1,8 +1,9 @@
 """Far from the origin: at 1e5 m a float32 coordinate has steps of 8 mm.
 
-Remedy: positions are centred in float64 at load; everything inside is local. Shown: a campaign carried 100 km
-away trains to the same figures and predicts the same at the same places. Positions are multiples of 2^-10 m,
-so that the shift itself does not round; then nothing may differ. Tolerance: none.
+Remedy: positions are centred in float64 at load; everything inside is local. Shown: a campaign
+carried 100 km away trains to the same figures and predicts the same at the same places. Positions
+are multiples of 2^-10 m, so that the shift itself does not round; then nothing may differ.
+Tolerance: none.
 """
 
 import numpy as np
@@ -25,6 +26,8 @@ def test_a_translated_campaign_predicts_the_same(tmp_path, moving):
         predictors.append(gsparc.load(objects.checkpoints[0]))
         figures.append(facts["test/psnr_db"])
     places = np.round(1024 * np.random.default_rng(1).uniform(-0.5, 0.5, (20, 3))) / 1024
-    near, far = (p.spectrum(**{moving: places + o}) for p, o in zip(predictors, (0.0, FAR), strict=True))
+    near, far = (
+        p.spectrum(**{moving: places + o}) for p, o in zip(predictors, (0.0, FAR), strict=True)
+    )
     assert near.std() > 0.01
     assert np.array_equal(near, far) and figures[0] == figures[1]

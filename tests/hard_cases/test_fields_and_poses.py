@@ -1,9 +1,11 @@
-"""Everything at once: fields, poses, grids, precisions nobody thought of, drawn by tests/helpers/fields.py.
+"""Everything at once: fields, poses, grids, precisions nobody thought of,
+drawn by tests/helpers/fields.py.
 
-Remedy: all of them together. Bound of every comparison: FACTOR rounding errors of the input, carried to the
-output as the float64 reference carries them: `fields.condition` measures how far, by nudging every number of
-the input by one unit of float32's rounding. Thousands of examples stayed below 9 such errors. Pixels so near
-a threshold that one such unit crosses it are left out of the comparison and of the gradients; all are finite.
+Remedy: all of them together. Bound of every comparison: FACTOR rounding errors of the input,
+carried to the output as the float64 reference carries them: `fields.condition` measures how far, by
+nudging every number of the input by one unit of float32's rounding. Thousands of examples stayed
+below 9 such errors. Pixels so near a threshold that one such unit crosses it are left out of the
+comparison and of the gradients; all are finite.
 """
 
 import math
@@ -22,12 +24,19 @@ FACTOR = 16
 
 
 def holds(fast: int, many: int, **drawn):
-    """Of `fast` drawn examples in `make test`, a fifth of `many` in `make test-slow`, all in `make rare`."""
+    """Of `fast` drawn examples in `make test`, a fifth of `many` in `make test-slow`,
+    all in `make rare`.
+    """
     slow, rare = pytest.mark.slow, pytest.mark.rare
     few, some = pytest.param(fast, id="few"), pytest.param(many // 5, marks=slow, id="some")
     efforts = [few, some, pytest.param(many, marks=(slow, rare), id="many")]
     quiet = [HealthCheck.too_slow, HealthCheck.filter_too_much, HealthCheck.data_too_large]
-    plain = {"deadline": None, "database": None, "derandomize": True, "suppress_health_check": quiet}
+    plain = {
+        "deadline": None,
+        "database": None,
+        "derandomize": True,
+        "suppress_health_check": quiet,
+    }
 
     def of(check):
         def test(backend, examples):
@@ -44,7 +53,9 @@ def holds(fast: int, many: int, **drawn):
 
 ANYTHING = st.one_of(
     st.floats(width=32, allow_nan=True, allow_infinity=True, allow_subnormal=True),
-    st.sampled_from([math.nan, math.inf, -math.inf, 1e38, -1e38, 1e-45, 1e-38, 1e19, 1e6, 1e5, -0.0]),
+    st.sampled_from(
+        [math.nan, math.inf, -math.inf, 1e38, -1e38, 1e-45, 1e-38, 1e19, 1e6, 1e5, -0.0]
+    ),
 )
 NAMES = st.sampled_from(["means", "quats", "scales", "opacities"])
 
@@ -64,7 +75,9 @@ def test_equals_float64_within_the_condition_of_the_input(backend, drawn: Drawn)
 
 @holds(8, 200, drawn=fields())
 def test_gradient_is_exactly_zero_where_nothing_is_seen(backend, drawn: Drawn):
-    """Behind the stopping rule, below the cut-off, inside the near cut, off the grid: 0, nothing small."""
+    """Behind the stopping rule, below the cut-off, inside the near cut, off the grid: 0,
+    nothing small.
+    """
     steady = condition(drawn, nudges=2).steady
     seen = layers(drawn)
     counts = (seen.strength >= drawn.cutoff.alpha) & (seen.light > 0) & steady.flatten()
@@ -92,7 +105,9 @@ def test_weights_and_frozen_views_say_the_same(backend, drawn: Drawn):
 
 
 @holds(25, 500, drawn=fields(), name=NAMES, row=st.integers(0, 9), value=ANYTHING)
-def test_any_number_is_refused_by_name_or_harmless(backend, drawn: Drawn, name: str, row: int, value: float):
+def test_any_number_is_refused_by_name_or_harmless(
+    backend, drawn: Drawn, name: str, row: int, value: float
+):
     """NaN, infinities, denormals, 1e38 in one place of one Gaussian."""
     assume(len(drawn.scene.means) > 0)
     row = row % len(drawn.scene.means)
@@ -108,7 +123,9 @@ def test_any_number_is_refused_by_name_or_harmless(backend, drawn: Drawn, name: 
 
 
 def test_the_bound_sees_three_lost_digits():
-    """Able to fail: means that are wrong by a thousand roundings give a result far beyond the bound."""
+    """Able to fail: means that are wrong by a thousand roundings give a result far beyond the
+    bound.
+    """
     drawn = Drawn(
         one([0.4, 0.3, 0.6]), origin(), SphereGrid.hemisphere(8, 32), "tangent", 0.3, True, Cutoff()
     )

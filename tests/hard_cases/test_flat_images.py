@@ -1,7 +1,7 @@
 """Flat images: SSIM of constant images leaves [-1, 1] and its gradient becomes NaN.
 
-Remedy: second moments are taken about the target's mean and the variance is floored at 0. Shown: constants
-1e-7 apart in float32, against float64 within 1e-5, gradients finite.
+Remedy: second moments are taken about the target's mean and the variance is floored at 0. Shown:
+constants 1e-7 apart in float32, against float64 within 1e-5, gradients finite.
 """
 
 import pytest

@@ -1,8 +1,8 @@
 """Full disk: a checkpoint or a dataset that no longer fits.
 
-Remedy: written beside and renamed, so that the good one survives; the error is one line that says which
-file (gsparc/models/checkpoint.py, gsparc/tables/raw.py). Shown with a limit on the size of files, which
-fails like a full disk does: in the middle of writing.
+Remedy: written beside and renamed, so that the good one survives; the error is one line that says
+which file (gsparc/models/checkpoint.py, gsparc/tables/raw.py). Shown with a limit on the size of
+files, which fails like a full disk does: in the middle of writing.
 """
 
 from pathlib import Path
@@ -46,7 +46,9 @@ def test_simulation_keeps_its_finished_shards(tmp_path):
     assert run(simulation, str(whole), 20)[0] == 0
     code, _ = run(simulation, str(out), 20, int(0.9 * whole.stat().st_size))
     said = out.with_suffix(".txt").read_text()
-    assert code == 1 and "box.h5: cannot be written (File too large)" in said and "\n" not in said, said
+    assert (
+        code == 1 and ("box.h5: cannot be written (File too large)") in said and "\n" not in said
+    ), said
     assert left(tmp_path) == ["box.h5.parts", "box.txt", "whole.h5"]
     assert len(list((tmp_path / "box.h5.parts").glob("shard_*.npz"))) == 5
     assert run(simulation, str(out), 20)[0] == 0 and out.read_bytes()

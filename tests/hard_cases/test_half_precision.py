@@ -1,9 +1,10 @@
-"""Half precision: 1 - 1e-6 rounds to 1; opacities, transmittances, logarithms and SSIM lose what they say.
+"""Half precision: 1 - 1e-6 rounds to 1; opacities, transmittances,
+logarithms and SSIM lose what they say.
 
 Remedy: features, confidence and the closed-form start compute in float32 whatever autocast says
-(gsparc/field/model.py, confidence.py, gsparc/models/splat/closed_form_start.py); float16 and bfloat16 tensors
-are refused by the rasterizer. Shown: a run under bfloat16 autocast is finite and ends within 1 % of float32's
-error.
+(gsparc/field/model.py, confidence.py, gsparc/models/splat/closed_form_start.py); float16 and
+bfloat16 tensors are refused by the rasterizer. Shown: a run under bfloat16 autocast is finite and
+ends within 1 % of float32's error.
 """
 
 import numpy as np
@@ -28,7 +29,9 @@ def fitted(folder, autocast: bool) -> tuple[torch.Tensor, torch.Tensor]:
         batch = data.batch(np.arange(8))
         mean = method.predict(batch).mean
     assert mean.dtype == torch.float32 and mean.isfinite().all()
-    assert all(p.dtype == torch.float32 and p.isfinite().all() for p in method.fitted_model().parameters())
+    assert all(
+        p.dtype == torch.float32 and p.isfinite().all() for p in method.fitted_model().parameters()
+    )
     return mean, batch.target
 
 

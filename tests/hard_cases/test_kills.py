@@ -1,8 +1,9 @@
 """Kills: SIGKILL at random moments of training and of simulation.
 
-Remedy: every file appears by renaming (gsparc/models/checkpoint.py, gsparc/simulate/shards.py); all that a
-run needs to go on is in its last checkpoint, or in its finished shards. Shown: after any kill what is there
-is whole; going on always works; the end is bit-identical to an uninterrupted run's. Tolerance: none.
+Remedy: every file appears by renaming (gsparc/models/checkpoint.py, gsparc/simulate/shards.py); all
+that a run needs to go on is in its last checkpoint, or in its finished shards. Shown: after any
+kill what is there is whole; going on always works;
+the end is bit-identical to an uninterrupted run's. Tolerance: none.
 """
 
 import json
@@ -36,7 +37,8 @@ def assert_whole(folder: Path) -> None:
 
 
 def sooner(folder: Path):
-    """Folders and shares of the seconds: kills come sooner where a run ended before the first of them.
+    """Folders and shares of the seconds: kills come sooner
+    where a run ended before the first of them.
 
     The machine may have been busy while the run that nobody disturbed was timed.
     """
@@ -46,8 +48,11 @@ def sooner(folder: Path):
         yield here, 0.4**attempt
 
 
-pytestmark = pytest.mark.slow  # at once: tests/commands/test_resumed.py, tests/simulate/test_campaign.py
-CHAINS = pytest.mark.parametrize("chain", [1, *(pytest.param(one, marks=pytest.mark.rare) for one in (0, 2))])
+# At once: tests/commands/test_resumed.py, tests/simulate/test_campaign.py
+pytestmark = pytest.mark.slow
+CHAINS = pytest.mark.parametrize(
+    "chain", [1, *(pytest.param(one, marks=pytest.mark.rare) for one in (0, 2))]
+)
 
 
 @CHAINS
@@ -57,7 +62,9 @@ def test_training_killed_again_and_again(undisturbed, tmp_path, chain):
     for folder, share in sooner(tmp_path):
         kills = 0
         for moment in moments(5 if chain else 3, share * seconds, seed=chain):
-            if not killed(training, str(folder), [*settings, *last_checkpoint(folder)], after_s=moment):
+            if not killed(
+                training, str(folder), [*settings, *last_checkpoint(folder)], after_s=moment
+            ):
                 break
             kills += 1
             assert_whole(folder)
@@ -92,7 +99,8 @@ def test_simulation_killed_again_and_again(simulated, tmp_path, chain):
         if kills:
             break
     assert kills, "every run had ended before it was killed"
-    if out.exists():  # killed when the file was whole: its parts are whole, too, or on their way out
+    # Killed when the file was whole: its parts are whole, too, or on their way out
+    if out.exists():
         left = folder / "box.h5.parts"
         assert not left.exists() or (left / "plan.json").exists()
     else:

@@ -1,8 +1,8 @@
 """Three hundred ways to damage each kind of file: refused in one line, or read exactly as before.
 
 Remedy: checksums of archives (gsparc/models/checkpoint.py), of arrays and of everything together
-(gsparc/tables/raw.py). Tolerance: none. Naive: HDF5 checks no scalar and no attribute, so a changed carrier is
-read like a sound one.
+(gsparc/tables/raw.py). Tolerance: none. Naive: HDF5 checks no scalar and no attribute, so a changed
+carrier is read like a sound one.
 """
 
 import random
@@ -29,7 +29,9 @@ def mutated(content: bytes, seed: int) -> bytes:
     draw, data = random.Random(seed), bytearray(content)
     for _ in range(draw.randint(1, 3)):
         at, length = draw.randrange(len(data)), draw.randint(1, 64)
-        kind = draw.choice(["flip", "flip", "flip", "zero", "repeat", "insert", "drop", "swap", "cut"])
+        kind = draw.choice(
+            ["flip", "flip", "flip", "zero", "repeat", "insert", "drop", "swap", "cut"]
+        )
         if kind == "flip":
             data[at] ^= 1 << draw.randrange(8)
         elif kind == "zero":
@@ -58,7 +60,9 @@ def files(tmp_path_factory) -> dict[str, Path]:
     method = build({"_target_": "gsparc.models.baselines.idw.InverseDistance"})
     method.fit(*loaded(spectra(folder / "spectra.npz")), FitContext(folder))
     checkpoint.save(folder / "idw.ckpt", method, "seed: 3\n", {"train_s": 1.5})
-    return {path.suffix: path for path in (folder / "own.npz", folder / "own.h5", folder / "idw.ckpt")}
+    return {
+        path.suffix: path for path in (folder / "own.npz", folder / "own.h5", folder / "idw.ckpt")
+    }
 
 
 def answer(path: Path) -> list[object]:
@@ -66,7 +70,9 @@ def answer(path: Path) -> list[object]:
     if path.suffix == ".ckpt":
         method, stored = loading.load(path)
         state = method.state()
-        parts = [v.numpy().tobytes() if isinstance(v, torch.Tensor) else repr(v) for v in state.values()]
+        parts = [
+            v.numpy().tobytes() if isinstance(v, torch.Tensor) else repr(v) for v in state.values()
+        ]
         return [stored.method, stored.config, repr(stored.extra), stored.site.sha256, *parts]
     data = load_own(path)
     return [data.site.sha256, data.site.name, data.row_names, repr(data.provenance)]

@@ -1,8 +1,9 @@
 """Needle, pancake: k11 k22 - k12^2 cancels to a negative number in float32.
 
-Remedy: the determinant is a sum of squares of cofactors, |cof(M)^T n|^2 + low-pass terms, and the quadratic
-form is completed to squares (csrc/footprint.h). Shown: aspect ratios up to 1e6 in float32 agree with float64.
-Tolerance 2e-3 on the image: directions rounded to float32 move a needle 0.55 px thin by up to 1e-4 of that.
+Remedy: the determinant is a sum of squares of cofactors, |cof(M)^T n|^2 + low-pass terms, and the
+quadratic form is completed to squares (csrc/footprint.h). Shown: aspect ratios up to 1e6 in float32
+agree with float64. Tolerance 2e-3 on the image:
+directions rounded to float32 move a needle 0.55 px thin by up to 1e-4 of that.
 """
 
 import pytest

@@ -1,7 +1,7 @@
 """Nobody there: no Gaussians, all culled, all transparent.
 
-Remedy: empty plans are plans (csrc/plan.cpp); outputs and gradients are defined: zeros, transmittance 1.
-Exact: nothing is computed that could round.
+Remedy: empty plans are plans (csrc/plan.cpp); outputs and gradients are defined: zeros,
+transmittance 1. Exact: nothing is computed that could round.
 """
 
 from dataclasses import replace
@@ -16,7 +16,9 @@ GRID = SphereGrid.hemisphere(10, 20)
 
 
 def assert_nothing_is_seen(got):
-    assert (got["image"] == 0).all() and (got["transmittance"] == 1).all() and not got["visible"].any()
+    assert (
+        (got["image"] == 0).all() and (got["transmittance"] == 1).all() and not got["visible"].any()
+    )
     assert all((value == 0).all() for name, value in got.items() if name.startswith("d_"))
 
 

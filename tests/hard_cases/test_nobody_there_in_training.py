@@ -1,8 +1,8 @@
 """Nobody there, in training: everything is pruned, or nothing is seen.
 
-Remedy: pruning has a floor and keeps the most opaque; empty plans are plans. Shown: a run that would prune
-every Gaussian ends with the floor; a run whose Gaussians are all behind the horizon, and one that starts
-without any, finish with finite figures.
+Remedy: pruning has a floor and keeps the most opaque; empty plans are plans. Shown: a run that
+would prune every Gaussian ends with the floor; a run whose Gaussians are all behind the horizon,
+and one that starts without any, finish with finite figures.
 """
 
 import lightning.pytorch as L
@@ -15,7 +15,8 @@ from contexts import trained
 from gsparc.commands.train import train
 
 PRUNE = (
-    "init=sphere",  # of emissions that were solved for, no Gaussian goes that changes what is rendered
+    # Of emissions that were solved for, no Gaussian goes that changes what is rendered
+    "init=sphere",
     "callbacks=densify",
     "callbacks.densify.start=4",
     "callbacks.densify.interval=4",

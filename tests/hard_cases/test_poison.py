@@ -1,8 +1,9 @@
 """Poison: a NaN in a target or a parameter during training.
 
-Remedy: the loss is looked at before the step; a run that meets a NaN or an infinity stops, names sample or
-Gaussian, leaves batch and parameters on disk, and keeps the last good checkpoint. Never silently zeroed.
-The rasterizer's door refuses what is not finite or would overflow inside. Exact: refused, or finite.
+Remedy: the loss is looked at before the step; a run that meets a NaN or an infinity stops, names
+sample or Gaussian, leaves batch and parameters on disk, and keeps the last good checkpoint. Never
+silently zeroed. The rasterizer's door refuses what is not finite or would overflow inside. Exact:
+refused, or finite.
 """
 
 import dataclasses
@@ -52,7 +53,12 @@ class Spoil(L.Callback):
     [
         *(
             (Spoil(7, name, 3), f"Gaussian id 3, {name}", "at step 7 .*")
-            for name in ("gaussians.means", "gaussians.opacity_logits", "emission.weight2", "emission.bias2")
+            for name in (
+                "gaussians.means",
+                "gaussians.opacity_logits",
+                "emission.weight2",
+                "emission.bias2",
+            )
         ),
         # A NaN that a step itself makes is met one step later; no checkpoint is written in between.
         (Spoil(10, "log_gain", ..., after=True), "log_gain", ""),
@@ -70,9 +76,13 @@ class Spoil(L.Callback):
 def test_a_spoilt_parameter_stops_the_run_and_is_named(tmp_path, spoil, offender, named):
     with pytest.raises(NonFiniteLoss, match=named + re.escape(offender)):
         trained(
-            spectra(tmp_path / "own.npz"), tmp_path, 20, callbacks=lambda: [spoil], every=5,
+            spectra(tmp_path / "own.npz"),
+            tmp_path,
+            20,
+            callbacks=lambda: [spoil],
+            every=5,
             validate_every=10 if spoil.step == 9 else 500,
-        )  # fmt: skip
+        )
     left = torch.load(tmp_path / "nonfinite.pt", weights_only=True)
     assert left["offender"].startswith(offender) and len(left["target"]) == len(left["index"])
     assert left["step"] >= 7 and (spoil.step != 7 or left["step"] == 7)
@@ -98,7 +108,9 @@ def test_a_spoilt_target_stops_the_run_and_its_sample_is_named(tmp_path):
     assert (tmp_path / "nonfinite.pt").exists()
 
 
-@pytest.mark.parametrize("name,value", [("means", 1e7), ("means", 1e38), ("scales", 2e5), ("scales", 1e38)])
+@pytest.mark.parametrize(
+    "name,value", [("means", 1e7), ("means", 1e38), ("scales", 2e5), ("scales", 1e38)]
+)
 def test_what_overflows_inside_is_refused_at_the_rasterizers_door(backend, name, value):
     scene = random_scene(n=5).to(torch.float32)
     getattr(scene, name)[3] = value

@@ -1,9 +1,9 @@
 """Resume: killed anywhere, also between two densifications or in the refit.
 
-Remedy: everything per Gaussian is in the checkpoint (moments, gathered statistics, ids); data order and the
-draws of densification are pure functions of (seed, step). Tolerance: none; figures and tensors are identical,
-and so are the statistics of the last interval. Seconds, machine and memory differ. Killed again and again:
-test_kills.py.
+Remedy: everything per Gaussian is in the checkpoint (moments, gathered statistics, ids); data order
+and the draws of densification are pure functions of (seed, step). Tolerance: none; figures and
+tensors are identical, and so are the statistics of the last interval. Seconds, machine and memory
+differ. Killed again and again: test_kills.py.
 """
 
 import pytest
@@ -15,7 +15,11 @@ RARE = pytest.mark.rare
 
 @pytest.mark.parametrize(
     "stage,saves",
-    [("", 3), ("refit", 4), *(pytest.param(*case, marks=RARE) for case in (("", 1), ("", 5), ("refit", 1)))],
+    [
+        ("", 3),
+        ("refit", 4),
+        *(pytest.param(*case, marks=RARE) for case in (("", 1), ("", 5), ("refit", 1))),
+    ],
 )
 def test_killed_in_each_stage(undisturbed, tmp_path, stage, saves):
     folder, settings, _ = undisturbed

@@ -1,8 +1,10 @@
-"""The C++ kernels under AddressSanitizer and UndefinedBehaviorSanitizer, over hard cases and random fields.
+"""The C++ kernels under AddressSanitizer and UndefinedBehaviorSanitizer,
+over hard cases and random fields.
 
-Remedy: none needed where nothing is found. The module is built apart (CMake option GSPARC_SANITIZE), and the
-tests of the kernels run on it unchanged: memory beside a tensor or a plan, overflowing integers, casts of
-numbers that the integer cannot hold end the run. Able to fail: a plan whose order leaves the tensors does.
+Remedy: none needed where nothing is found. The module is built apart (CMake option
+GSPARC_SANITIZE), and the tests of the kernels run on it unchanged: memory beside a tensor or a
+plan, overflowing integers, casts of numbers that the integer cannot hold end the run. Able to fail:
+a plan whose order leaves the tensors does.
 """
 
 import hashlib
@@ -18,7 +20,15 @@ from filelock import FileLock
 ROOT = Path(__file__).parents[2]
 SOURCES = sorted([*(ROOT / "ops" / "csrc").glob("*.*"), ROOT / "CMakeLists.txt"])
 CASES = [
-    *("seam", "pole", "horizon", "at_the_receiver", "needle_pancake", "zero_quaternion", "near_opaque"),
+    *(
+        "seam",
+        "pole",
+        "horizon",
+        "at_the_receiver",
+        "needle_pancake",
+        "zero_quaternion",
+        "near_opaque",
+    ),
     *("underflow", "ties", "nobody_there", "everybody_there", "threads", "fields_and_poses"),
 ]
 OVERRUN = """
@@ -33,7 +43,8 @@ def test_a_box_that_leaves_the_image():
 """
 
 
-pytestmark = pytest.mark.timeout(1500)  # the build takes seven processor minutes, beside other tests
+# The build takes seven processor minutes, beside other tests
+pytestmark = pytest.mark.timeout(1500)
 
 
 def build() -> Path:
@@ -41,12 +52,20 @@ def build() -> Path:
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in SOURCES)).hexdigest()[:16]
     folder = ROOT / "build" / f"sanitized-{digest}"
     environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-    given = ["-DGSPARC_SANITIZE=ON", f"-DPython_EXECUTABLE={sys.executable}", "-DCMAKE_BUILD_TYPE=Release"]
+    given = [
+        "-DGSPARC_SANITIZE=ON",
+        f"-DPython_EXECUTABLE={sys.executable}",
+        "-DCMAKE_BUILD_TYPE=Release",
+    ]
     folder.parent.mkdir(exist_ok=True)
     with FileLock(folder.with_suffix(".lock")):  # of processes of tests one builds
         found = list(folder.glob("ops/csrc/_native*.so"))
-        for command in (["-S", ROOT, "-B", folder, *given], ["--build", folder, "-j2"]) if not found else ():
-            subprocess.run(["cmake", *command], check=True, capture_output=True, env=environment, timeout=900)
+        for command in (
+            (["-S", ROOT, "-B", folder, *given], ["--build", folder, "-j2"]) if not found else ()
+        ):
+            subprocess.run(
+                ["cmake", *command], check=True, capture_output=True, env=environment, timeout=900
+            )
     return next(folder.glob("ops/csrc/_native*.so"))
 
 
@@ -57,13 +76,17 @@ def library(name: str) -> str:
 def watched(module: Path, isa: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     """pytest on the sanitized module; leaks are Python's own, so they are not looked for."""
     environment = {
-        **os.environ, "LD_PRELOAD": f"{library('libasan.so')} {library('libstdc++.so')}",
+        **os.environ,
+        "LD_PRELOAD": f"{library('libasan.so')} {library('libstdc++.so')}",
         "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=1:detect_odr_violation=0",
-        "UBSAN_OPTIONS": "print_stacktrace=1:halt_on_error=1", "OMP_NUM_THREADS": "2",
-    }  # fmt: skip
+        "UBSAN_OPTIONS": "print_stacktrace=1:halt_on_error=1",
+        "OMP_NUM_THREADS": "2",
+    }
     given = [str(module), isa, "-q", "-s", "-p", "no:cacheprovider", *arguments]
     command = [sys.executable, "tests/helpers/sanitized.py", *given]
-    return subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900)
+    return subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=900
+    )
 
 
 @pytest.fixture(scope="module")
@@ -78,17 +101,26 @@ def module() -> Path:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "isa,others",  # tests that choose an instruction set themselves run once for it
-    [pytest.param("baseline", ("avx2", "avx512"), marks=pytest.mark.rare), ("avx2", ("avx512",)),
-     ("avx512", ("avx2", "baseline"))],
+    [
+        pytest.param("baseline", ("avx2", "avx512"), marks=pytest.mark.rare),
+        ("avx2", ("avx512",)),
+        ("avx512", ("avx2", "baseline")),
+    ],
     ids=["baseline", "avx2", "avx512"],
-)  # fmt: skip
+)
 def test_nothing_is_found(module, isa, others):
     files = [f"tests/hard_cases/test_{case}.py" for case in CASES]
     ops = ("kernels", "compute_kernels", "queries")
     files += [f"tests/ops/test_{name}.py" for name in ops]
     left = " and ".join(f"not {word}" for word in ("shim", "forked", *others))
     done = watched(
-        module, isa, *files, "-m", "not slow", "-k", f"{left} and (not reference or compute_kernels)"
+        module,
+        isa,
+        *files,
+        "-m",
+        "not slow",
+        "-k",
+        f"{left} and (not reference or compute_kernels)",
     )
     if done.returncode == 99:
         pytest.skip(f"this machine has no {isa}")

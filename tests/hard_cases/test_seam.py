@@ -1,8 +1,8 @@
 """Seam: footprints cut at azimuth +-pi, because a tile rectangle is clamped to the image.
 
-Remedy: boxes wrap modulo the width and pixel offsets take the nearest image (csrc/project.h, csrc/pixels.h).
-Shown: rotating the world about the boresight by k columns rolls image and gradients. Tolerance 1e-10 in
-float64: the rotated positions differ in their last bits.
+Remedy: boxes wrap modulo the width and pixel offsets take the nearest image (csrc/project.h,
+csrc/pixels.h). Shown: rotating the world about the boresight by k columns rolls image and
+gradients. Tolerance 1e-10 in float64: the rotated positions differ in their last bits.
 """
 
 import math
@@ -29,11 +29,16 @@ def test_turning_the_world_rolls_the_image(backend, projection, columns):
     scene, turn = random_scene(n=30, seed=1), turn_about_boresight(columns)
     noise = torch.randn(3, 2, 20, 72, dtype=torch.float64)
     still = Pose(torch.zeros(3, dtype=torch.float64), torch.eye(3, dtype=torch.float64))
-    before = render(scene, still, GRID, backend, upstream=noise, behind=False, projection=projection)
-    # The world turned by `turn` is the receiver turned back: everything of the Gaussians stays the same.
+    before = render(
+        scene, still, GRID, backend, upstream=noise, behind=False, projection=projection
+    )
+    # The world turned by `turn` is the receiver turned back:
+    # everything of the Gaussians stays the same.
     turned = Pose(still.position, turn.mT)
     rolled = noise.roll(columns, -1)
-    after = render(scene, turned, GRID, backend, upstream=rolled, behind=False, projection=projection)
+    after = render(
+        scene, turned, GRID, backend, upstream=rolled, behind=False, projection=projection
+    )
     assert (after["image"] - before["image"].roll(columns, -1)).abs().max() < 1e-10
     for name in ("d_means", "d_quats", "d_scales", "d_opacities", "d_features", "d_means2d"):
         gap = (after[name] - before[name]).abs().max() / (1 + before[name].abs().max())
@@ -43,10 +48,14 @@ def test_turning_the_world_rolls_the_image(backend, projection, columns):
 @PROJECTIONS
 def test_footprint_wider_than_the_circle_counts_each_pixel_once(backend, projection):
     """A single layer is at most its opacity anywhere; counted twice it would exceed it."""
-    scene = replace(one([0.3, 0.1, 0.9], sigma=3.0, opacity=0.5), features=torch.ones(1, 1, 1).double())
+    scene = replace(
+        one([0.3, 0.1, 0.9], sigma=3.0, opacity=0.5), features=torch.ones(1, 1, 1).double()
+    )
     image = render(scene, origin(), GRID, backend, projection=projection, compensate=False)["image"]
     assert image.max() <= 0.5
-    want = render(scene, origin(), GRID, "reference", projection=projection, compensate=False)["image"]
+    want = render(scene, origin(), GRID, "reference", projection=projection, compensate=False)[
+        "image"
+    ]
     assert (image - want).abs().max() < 1e-12
 
 

@@ -1,7 +1,8 @@
 """Surgery: clone, split, prune and reset desynchronise parameters, moments and counters.
 
-Remedy: one place edits them all (gsparc/field/edit.py). Shown: after any sequence shapes agree, moments are
-finite, untouched rows are bit-identical in everything, ids are permanent and unique. Tolerance: none.
+Remedy: one place edits them all (gsparc/field/edit.py). Shown: after any sequence shapes agree,
+moments are finite, untouched rows are bit-identical in everything, ids are permanent and unique.
+Tolerance: none.
 """
 
 import math
@@ -27,7 +28,9 @@ RECEIVER = Pose.identity(torch.tensor([0.0, 0.0, -2.0]))
 
 def fresh(count: int) -> tuple[GaussianModel, SimpleNamespace]:
     torch.manual_seed(0)
-    emission = EmissionSettings(EncodingSettings("raw"), hidden=2, activation="sigmoid", init_bias=0.0)
+    emission = EmissionSettings(
+        EncodingSettings("raw"), hidden=2, activation="sigmoid", init_bias=0.0
+    )
     model = GaussianModel(
         ModelSettings(FieldSettings(count=count, placement="sphere"), emission), SITE, RECEIVER
     )
@@ -41,7 +44,9 @@ def learn(model: GaussianModel, optimizer: torch.optim.Optimizer) -> None:
     optimizer.step()
 
 
-def rows_by_id(model: GaussianModel, optimizer: torch.optim.Optimizer) -> dict[int, list[torch.Tensor]]:
+def rows_by_id(
+    model: GaussianModel, optimizer: torch.optim.Optimizer
+) -> dict[int, list[torch.Tensor]]:
     """Everything that belongs to each Gaussian, by its permanent id."""
     found: dict[int, list[torch.Tensor]] = {int(i): [] for i in model.gaussians.ids}
     for parameter in row_parameters(model, len(model.gaussians)).values():
@@ -64,7 +69,9 @@ EDIT = st.fixed_dictionaries(
 
 
 @settings(max_examples=25, deadline=None)
-@given(count=st.integers(1, 12), edits=st.lists(EDIT, min_size=1, max_size=5), seed=st.integers(0, 99))
+@given(
+    count=st.integers(1, 12), edits=st.lists(EDIT, min_size=1, max_size=5), seed=st.integers(0, 99)
+)
 def test_any_sequence_leaves_one_consistent_state(count, edits, seed):
     model, trainer = fresh(count)
     optimizer = trainer.optimizers[0]
@@ -79,7 +86,14 @@ def test_any_sequence_leaves_one_consistent_state(count, edits, seed):
             model.gaussians.opacity_logits[weak] = -9.0
         before = rows_by_id(model, optimizer)
         densify = Densify(
-            0, 99, 1, 0.5, edit["share"], edit["children"], max_gaussians=edit["most"], min_gaussians=1
+            0,
+            99,
+            1,
+            0.5,
+            edit["share"],
+            edit["children"],
+            max_gaussians=edit["most"],
+            min_gaussians=1,
         )
         wanting = (torch.rand(n, generator=draw) < edit["want"]).float()
         densify.statistics = {"gradient": wanting, "seen": torch.ones(n), "radius": torch.ones(n)}
@@ -119,7 +133,9 @@ NASTY = st.sampled_from([0.0, 1.0, -1.0, 1e-45, 1e38, -1e38, math.inf, -math.inf
 @settings(max_examples=40, deadline=None, derandomize=True, database=None)
 @given(count=st.integers(1, 12), draws=st.data())
 def test_statistics_of_any_kind_leave_a_sound_field(count, draws):
-    """Gradients that overflowed or are NaN decide who is split; what comes out is finite all the same."""
+    """Gradients that overflowed or are NaN decide who is split;
+    what comes out is finite all the same.
+    """
     model, trainer = fresh(count)
     learn(model, trainer.optimizers[0])
     nasty = {

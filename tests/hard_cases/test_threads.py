@@ -1,7 +1,7 @@
 """Threads: sums depend on how the work was divided.
 
-Remedy: strips leave their sums in slots of their own, added per Gaussian in strip order (csrc/backward.h); no
-atomics. Shown: 1 thread = 2 = 5 threads, bit for bit.
+Remedy: strips leave their sums in slots of their own, added per Gaussian in strip order
+(csrc/backward.h); no atomics. Shown: 1 thread = 2 = 5 threads, bit for bit.
 """
 
 import multiprocessing

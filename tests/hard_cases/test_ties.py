@@ -1,7 +1,8 @@
 """Ties: equal distances sort differently per run, order of rows or backend.
 
-Remedy: order by (distance, permanent id), a stable radix sort over rows in order of id (csrc/plan.cpp).
-Shown: permuting Gaussians together with their ids changes nothing, bit for bit; reference and cpu agree.
+Remedy: order by (distance, permanent id), a stable radix sort over rows in order of id
+(csrc/plan.cpp). Shown: permuting Gaussians together with their ids changes nothing, bit for bit;
+reference and cpu agree.
 """
 
 from dataclasses import replace

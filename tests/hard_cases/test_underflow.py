@@ -1,7 +1,7 @@
 """Underflow: in float32 the transmittance reaches 0, or a denormal that is not quite 0.
 
-Remedy: one stopping rule, T before a layer >= cutoff.transmittance, the same in both passes (csrc/forward.h).
-Shown: gradients of everything behind are exactly 0, not small.
+Remedy: one stopping rule, T before a layer >= cutoff.transmittance, the same in both passes
+(csrc/forward.h). Shown: gradients of everything behind are exactly 0, not small.
 """
 
 import pytest
@@ -39,8 +39,13 @@ def test_equals_float64(backend, projection):
 
 @pytest.mark.parametrize("opacity", [1e-44, 1e-38, 1e-31, 1e-20, 1e-3])
 def test_share_of_the_faintest_has_no_slope_that_overflows(backend, opacity):
-    """1 / sum(alpha) is infinite in float32, and 0 times it was NaN: the share keeps its value only."""
-    model = [leaf.requires_grad_() for leaf in one([1.0, 0.0, 0.0], opacity=opacity).to(torch.float32).model]
+    """1 / sum(alpha) is infinite in float32, and 0 times it was NaN:
+    the share keeps its value only.
+    """
+    model = [
+        leaf.requires_grad_()
+        for leaf in one([1.0, 0.0, 0.0], opacity=opacity).to(torch.float32).model
+    ]
     plan = make_plan(*model, origin(), GRID, cutoff=Cutoff(1e-3, relative=True), backend=backend)
     share = mean_weights(plan, *model).share
     share.sum().backward()

@@ -1,7 +1,9 @@
-"""Zero quaternion: normalising divides by zero, and squares of 1e-30 or 1e20 are no float32 numbers.
+"""Zero quaternion: normalising divides by zero,
+and squares of 1e-30 or 1e20 are no float32 numbers.
 
-Remedy: up to 1e-18 it means no rotation and has no gradient; others are divided by their longest component
-first (csrc/footprint.h, reference.py). Tolerance: none for zero; 1e-4 in float32 for 1e-12 to 1e20.
+Remedy: up to 1e-18 it means no rotation and has no gradient; others are divided by their longest
+component first (csrc/footprint.h, reference.py). Tolerance: none for zero;
+1e-4 in float32 for 1e-12 to 1e20.
 """
 
 import pytest

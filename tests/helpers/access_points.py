@@ -31,7 +31,9 @@ def walks(count: int, seed: int) -> Fingerprints:
     """Straight walks of 30 rows through the hall of `invented`."""
     rng, size = np.random.default_rng(seed), np.array([30.0, 20, 0])
     ends = rng.uniform(0.05, 0.95, (count, 2, 3)) * size
-    places = (ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * np.linspace(0, 1, 30)[:, None]).reshape(-1, 3)
+    places = (ends[:, :1] + (ends[:, 1:] - ends[:, :1]) * np.linspace(0, 1, 30)[:, None]).reshape(
+        -1, 3
+    )
     level, _ = invented(1)  # for its access points
     where = np.random.default_rng(9).uniform(0, 1, (level.shape[1], 3)) * [30, 20, 1]
     apart = np.linalg.norm(places[:, None] - where, axis=2)

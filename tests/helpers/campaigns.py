@@ -12,13 +12,16 @@ from shoeboxes import scatter
 from gsparc.ops import SphereGrid
 from gsparc.simulate.shoebox import Room, trace_room
 
-FREQUENCY_HZ = np.array([3.0e8, 3.1e8])  # a metre of wavelength: 100 places then tell something of the rest
+# A metre of wavelength: 100 places then tell something of the rest
+FREQUENCY_HZ = np.array([3.0e8, 3.1e8])
 CONF = Path(__file__).parents[2] / "conf"
 STILL = np.array([1.0, 1.0, 0.5])
 
 
 def spectra(path: Path, rows: int = 40, moving: str = "tx", origin: float = 0.0) -> Path:
-    """Six lobes that come and go over a cube of 1 m, 16 x 32; `moving` end `tx` or `rx`, `origin` [m]."""
+    """Six lobes that come and go over a cube of 1 m, 16 x 32; `moving` end `tx` or `rx`,
+    `origin` [m].
+    """
     rng = np.random.default_rng(0)
     where = np.round(1024 * rng.uniform(-0.5, 0.5, (rows, 3))) / 1024  # exact also after adding 1e5
     centres = rng.normal(size=(6, 3)) * [1, 1, 0.3] + [0, 0, 0.5]
@@ -28,13 +31,18 @@ def spectra(path: Path, rows: int = 40, moving: str = "tx", origin: float = 0.0)
     images = strength @ np.exp(12 * (centres @ directions.T - 1))
     images = (images / images.max()).astype(np.float32)
     still = "rx" if moving == "tx" else "tx"
-    places = {f"{moving}_position": where + origin, f"{still}_position": np.array([4.0, 0, 0]) + origin}
+    places = {
+        f"{moving}_position": where + origin,
+        f"{still}_position": np.array([4.0, 0, 0]) + origin,
+    }
     np.savez(path, spectrum=images.reshape(rows, 16, 32), **places)
     return path
 
 
 def channels(path: Path, rows: int = 80, moving: str = "rx", shape: str = "SAK") -> Path:
-    """Image sources in a 4 x 3 x 2.5 m room; `shape` is S, SK or SAK (2 antennas, 2 subcarriers)."""
+    """Image sources in a 4 x 3 x 2.5 m room; `shape` is S,
+    SK or SAK (2 antennas, 2 subcarriers).
+    """
     room = Room.from_size((4.0, 3.0, 2.5), -0.5)
     array = np.array([[0.0, 0, 0], [0.3, 0, 0]])
     where = scatter(room, rows, seed=0, margin=0.4)
@@ -50,7 +58,12 @@ def powers(path: Path, rows: int = 80) -> Path:
     """Received power in the same room, in dB."""
     with np.load(channels(path, rows, shape="S")) as stored:
         power = 20 * np.log10(np.abs(stored["csi"]))
-        np.savez(path, tx_position=stored["tx_position"], rx_position=stored["rx_position"], rssi_db=power)
+        np.savez(
+            path,
+            tx_position=stored["tx_position"],
+            rx_position=stored["rx_position"],
+            rssi_db=power,
+        )
     return path
 
 
@@ -62,7 +75,9 @@ def compose(*overrides: str, config: str = "train"):
 
     chosen = tuple(word for word in overrides if _chooses(word))
     composed = pickle.loads(_composed(config, *chosen))
-    values = OverridesParser.create().parse_overrides([word for word in overrides if word not in chosen])
+    values = OverridesParser.create().parse_overrides(
+        [word for word in overrides if word not in chosen]
+    )
     for one in values:
         OmegaConf.update(composed, one.key_or_group, one.value())
     if "model" in composed:
@@ -90,7 +105,9 @@ def _chooses(word: str) -> bool:
 
 @cache
 def _composed(config: str, *choices: str) -> bytes:
-    """Files are put together once for all settings of the same choices: nine tenths of composing."""
+    """Files are put together once for all settings of the same choices:
+    nine tenths of composing.
+    """
     from hydra import compose as hydra_compose
     from hydra import initialize_config_module
     from hydra.core.global_hydra import GlobalHydra
@@ -116,7 +133,9 @@ RENDERED = tuple(
 
 
 def brief(file: Path, *more: str) -> list[str]:
-    """Overrides that train the splatted field for a second: few Gaussians, few steps, the mean beside it."""
+    """Overrides that train the splatted field for a second: few Gaussians, few steps,
+    the mean beside it.
+    """
     return [
         "dataset=own",
         f"dataset.file='{file}'",
@@ -144,8 +163,19 @@ def plain(file: Path, model: str, *more: str):
     return compose(*(s for s in brief(file) if not s.startswith("model.")), f"model={model}", *more)
 
 
-FROZEN = [f"model.optimizer.{name}=0" for name in ("positions", "positions_final", "scales", "rotations",
-          "opacities", "emission", "confidence", "gain")]  # no weight moves  # fmt: skip
+FROZEN = [
+    f"model.optimizer.{name}=0"
+    for name in (
+        "positions",
+        "positions_final",
+        "scales",
+        "rotations",
+        "opacities",
+        "emission",
+        "confidence",
+        "gain",
+    )
+]  # no weight moves
 
 
 def weights(path: Path) -> dict:

@@ -1,6 +1,8 @@
-"""Simulated measurements of all kinds and layouts with nothing wrong: `gsparc check` should call them good.
+"""Simulated measurements of all kinds and layouts with nothing wrong:
+`gsparc check` should call them good.
 
-PYTHONPATH=tests/helpers python tests/helpers/clean_tables.py 200    # how many it warns of, and of what
+PYTHONPATH=tests/helpers python tests/helpers/clean_tables.py 200    # how many it warns of,
+and of what
 """
 
 import json
@@ -19,7 +21,9 @@ Files = tuple[str, dict[str, object]]  # what stands in the file by its name, an
 
 
 def _powers(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Places (n, 2), levels (n, 3), rows of one transmitter (n, 3), and columns that say nothing."""
+    """Places (n, 2), levels (n, 3), rows of one transmitter (n, 3),
+    and columns that say nothing.
+    """
     place, level = fields(seed, SITES)
     level = np.round(level + np.random.default_rng(seed).normal(0, 2, level.shape))
     own, one, columns = truths(seed, "")
@@ -36,7 +40,9 @@ def write(seed: int, folder: Path) -> Path:
         {"lat": north.round(7), "lon": east.round(7), **dict(zip(names, level.T, strict=True))}
     )
     long = wide.melt(["lat", "lon"], names, "bssid", "rssi").sort_index(kind="stable")
-    one = pd.DataFrame({"x": alone[:, 0], "y": alone[:, 1], "z": 1.5, "rssi_dbm": alone[:, 2], **columns})
+    one = pd.DataFrame(
+        {"x": alone[:, 0], "y": alone[:, 1], "z": 1.5, "rssi_dbm": alone[:, 2], **columns}
+    )
     path = folder / f"{seed}.csv"
     if kind == 0:  # wide, degrees
         wide.to_csv(path, index=False)
@@ -50,8 +56,9 @@ def write(seed: int, folder: Path) -> Path:
     elif kind == 4:  # lists of the strongest
         best = [
             {"station": names[t], "lat": north[i], "lon": east[i], "rsrp": level[i, t]}
-            for i in range(ROWS) for t in np.argsort(-level[i])[:2]
-        ]  # fmt: skip
+            for i in range(ROWS)
+            for t in np.argsort(-level[i])[:2]
+        ]
         pd.DataFrame(best).to_csv(path, index=False)
     elif kind == 5:  # runs, and a place in one cell
         cells = [f"POINT ({e:.7f} {n:.7f})" for e, n in zip(east, north, strict=True)]
@@ -64,18 +71,24 @@ def write(seed: int, folder: Path) -> Path:
 
 
 def _channels(place: np.ndarray, rng: np.random.Generator, kind: int) -> dict[str, np.ndarray]:
-    """Direct path and four reflections; of one antenna and 16 tones, four and 8, or a single tone."""
+    """Direct path and four reflections; of one antenna and 16 tones, four and 8,
+    or a single tone.
+    """
     antennas, tones = ((1, 16), (4, 8), (4, 1))[kind - 6]
     rx = np.c_[place / 30, rng.uniform(0.5, 2.5, len(place))]
     tx, frequency = np.r_[rng.uniform(0, [20, 13]), 2.2], 2.4e9 + 1e6 * np.arange(tones)
     array = np.c_[np.arange(antennas) * 0.0625, np.zeros((antennas, 2))]
     csi = np.zeros((len(rx), antennas, tones), complex)
     for gain, mirror in zip(
-        (1, 0.4, 0.3, 0.3, 0.2), [[1, 1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1], [-1, -1, 1]], strict=True
+        (1, 0.4, 0.3, 0.3, 0.2),
+        [[1, 1, 1], [-1, 1, 1], [1, -1, 1], [1, 1, -1], [-1, -1, 1]],
+        strict=True,
     ):
         away = np.linalg.norm(rx[:, None] + array - tx * mirror, axis=2)[..., None]
         csi += gain * np.exp(-2j * np.pi * frequency * away / LIGHT) / away
-    noise = 0.03 * np.sqrt((abs(csi) ** 2).mean() / 2) * (rng.normal(size=(*csi.shape, 2)) @ [1, 1j])
+    noise = (
+        0.03 * np.sqrt((abs(csi) ** 2).mean() / 2) * (rng.normal(size=(*csi.shape, 2)) @ [1, 1j])
+    )
     held = {"rx_position": rx, "tx_position": tx, "csi": csi + noise, "frequency_hz": frequency}
     return held | ({"array_position": array} if antennas > 1 else {})
 
@@ -83,8 +96,12 @@ def _channels(place: np.ndarray, rng: np.random.Generator, kind: int) -> dict[st
 def _spectra(place: np.ndarray, rng: np.random.Generator, kind: int) -> dict[str, np.ndarray]:
     """Lobes of a direct path and two reflections, elevations from the horizon, azimuths from x."""
     tx, rx = np.c_[place[:100] / 30, rng.uniform(1, 4, 100)], np.array([10.0, 6.0, 0.0])
-    up, around = np.meshgrid(np.radians(np.arange(0, 90, 5)), np.radians(np.arange(0, 360, 5)), indexing="ij")
-    towards = np.stack([np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1)
+    up, around = np.meshgrid(
+        np.radians(np.arange(0, 90, 5)), np.radians(np.arange(0, 360, 5)), indexing="ij"
+    )
+    towards = np.stack(
+        [np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)], axis=-1
+    )
     image = np.zeros((len(tx), *up.shape))
     for gain, mirror in ((1, [1, 1, 1]), (0.4, [-1, 1, 1]), (0.3, [1, -1, 1])):
         seen = tx * mirror - rx

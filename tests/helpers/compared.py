@@ -12,8 +12,11 @@ def filled(method, value, seed=None, effort=None, split="random", kind="spectrum
     facts = {f"test/{name}": number for name, number in zip(figures, (value, 0.9), strict=True)}
     facts |= {
         "split/sha256": f"{split}{seed if more.get('drawn') else ''}",
-        "dataset/kind": kind, "time/train_s": 1.0, "time/train_cpu_s": 1.0, "machine/load": 0.1,
-    }  # fmt: skip
+        "dataset/kind": kind,
+        "time/train_s": 1.0,
+        "time/train_cpu_s": 1.0,
+        "machine/load": 0.1,
+    }
     cell = {"dataset": "rfid", "split": split, "method": method, "effort": effort, "seed": seed}
     cell |= {"draws": more.pop("drawn", False), "earlier": more.pop("earlier", "")}
     cell |= {"given": more.pop("given", "")}

@@ -1,4 +1,6 @@
-"""The kernel of the similarity with what defines it in PyTorch, and how a kernel is run in every way."""
+"""The kernel of the similarity with what defines it in PyTorch,
+and how a kernel is run in every way.
+"""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -30,7 +32,9 @@ SHAPES = ((1, 11, 11), (3, 90, 360), (2, 23, 37), (1, 40, 12), (2, 12, 70), (0, 
 def evaluated(
     call: Callable[..., Tensor], shape: tuple[int, ...], dtype: torch.dtype = torch.float32
 ) -> list[Tensor]:
-    """The similarity of two images and its gradient by the first, for a slope that rises from -1 to 2."""
+    """The similarity of two images and its gradient by the first,
+    for a slope that rises from -1 to 2.
+    """
     shown, target = (image.to(dtype) for image in images(*shape))
     out = call(shown.requires_grad_(), target)
     slope = torch.linspace(-1, 2, out.numel(), dtype=torch.float64).reshape(out.shape).to(out.dtype)
@@ -39,7 +43,9 @@ def evaluated(
 
 @contextmanager
 def instruction_set(name: str) -> Iterator[None]:
-    """The CPU kernels of one instruction set; skips the test where this machine or build has none."""
+    """The CPU kernels of one instruction set;
+    skips the test where this machine or build has none.
+    """
     fastest = _native.instruction_set()
     if not _native.use_instruction_set(name):
         pytest.skip(f"this machine or build has no {name}")
@@ -58,5 +64,7 @@ def assert_threads_agree(call: Callable[[], list[Tensor]]) -> list[Tensor]:
             results.append(call())
     finally:
         torch.set_num_threads(before)
-    assert all(torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True))
+    assert all(
+        torch.equal(a, b) for other in results[1:] for a, b in zip(results[0], other, strict=True)
+    )
     return results[0]

@@ -44,7 +44,9 @@ def loaded(file: Path) -> tuple[Measurements, Fold]:
 def trained(
     file: Path, folder: Path, steps: int, *overrides: str, **more: Any
 ) -> tuple[Method, Measurements]:
-    """The splatted field of `brief`, after so many steps on a user's file; `more` is for `short`."""
+    """The splatted field of `brief`, after so many steps on a user's file;
+    `more` is for `short`.
+    """
     data, fold = loaded(file)
     method = build(compose(*brief(file, "model.refit=false", *overrides)).model).create_for(data)
     method.fit(data, fold, short(folder, steps, **more))

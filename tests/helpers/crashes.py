@@ -1,6 +1,8 @@
-"""Runs in a process of their own that may be killed: forked from a server that has imported everything once.
+"""Runs in a process of their own that may be killed:
+forked from a server that has imported everything once.
 
-Equivalent to starting the command and killing it, except that 50 kills do not cost 50 imports of torch.
+Equivalent to starting the command and killing it,
+except that 50 kills do not cost 50 imports of torch.
 """
 
 import contextlib
@@ -18,7 +20,13 @@ from states import different
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(
-    ["crashes", "campaigns", "gsparc.commands.train", "gsparc.models.splat.method", "gsparc.callbacks"]
+    [
+        "crashes",
+        "campaigns",
+        "gsparc.commands.train",
+        "gsparc.models.splat.method",
+        "gsparc.callbacks",
+    ]
 )
 
 
@@ -81,19 +89,31 @@ def small_campaign(rows: int):
     from gsparc.simulate.spectrum import SpectrumSettings
 
     scene = SceneSettings(
-        name="box", transmitter_m=(1.0, 1.5, 2.6), area_m=((0.2, 0.2), (5.8, 4.8)), height_m=(1.1, 1.5),
-        num_receivers=rows, carrier_hz=2.4e9, bandwidth_hz=40e6, subcarriers=4,
+        name="box",
+        transmitter_m=(1.0, 1.5, 2.6),
+        area_m=((0.2, 0.2), (5.8, 4.8)),
+        height_m=(1.1, 1.5),
+        num_receivers=rows,
+        carrier_hz=2.4e9,
+        bandwidth_hz=40e6,
+        subcarriers=4,
         room={"size_m": [6, 5, 3], "reflection": -0.6, "boxes_m": [[[2.6, 2.2, 0], [3.0, 2.6, 3]]]},
-    )  # fmt: skip
+    )
     effects = Effects(
-        refraction=False, diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False
+        refraction=False,
+        diffraction=False,
+        edge_diffraction=False,
+        diffuse=False,
+        polarisation=False,
     )
     spectrum = SpectrumSettings(height=18, width=36, rows=4, columns=4)
     return CampaignSettings(scene=scene, effects=effects, spectrum=spectrum, shard=4)
 
 
 class Limited:
-    """No file may grow beyond so many bytes: what a full disk does, without filling one. 0 is no limit."""
+    """No file may grow beyond so many bytes: what a full disk does, without filling one.
+    0 is no limit.
+    """
 
     def __init__(self, most_bytes: int) -> None:
         self.most = most_bytes
@@ -139,7 +159,9 @@ def _kill(child: multiprocessing.Process) -> bool:
 
 
 def killed_at(file: Path, saves: int, target, *arguments, after_s: float = 0.0) -> int:
-    """SIGKILL a run once `file` has been written `saves` times and `after_s` more; the step it holds."""
+    """SIGKILL a run once `file` has been written `saves` times and `after_s` more;
+    the step it holds.
+    """
     from gsparc.models import checkpoint
 
     seen: set[int] = set()
@@ -156,7 +178,9 @@ def killed_at(file: Path, saves: int, target, *arguments, after_s: float = 0.0) 
 
 
 def moments(count: int, longest_s: float, seed: int) -> list[float]:
-    """Random moments of a run of that length [s], early enough that runs which go on are still running."""
+    """Random moments of a run of that length [s],
+    early enough that runs which go on are still running.
+    """
     draw = random.Random(seed)
     return [draw.uniform(0.02, 0.5 * longest_s) for _ in range(count)]
 
@@ -174,7 +198,9 @@ def assert_same(whole: Path, resumed: Path) -> None:
     folders, facts = (whole, resumed), []
     for folder in folders:
         every = json.loads((folder / "summary.json").read_text()).items()
-        facts.append({k: v for k, v in every if not k.startswith(VARYING) and not any(t in k for t in TIMED)})
+        facts.append(
+            {k: v for k, v in every if not k.startswith(VARYING) and not any(t in k for t in TIMED)}
+        )
     assert facts[0] == facts[1]
     assert different(*(checkpoint.read(folder / "model.ckpt").state for folder in folders)) == []
     last = [checkpoint.read(folder / "refit" / "last.ckpt").extra["trainer"] for folder in folders]

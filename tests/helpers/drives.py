@@ -1,4 +1,6 @@
-"""A drive test with GPS as people keep it: a table of rows, one of stations, and places to ask about."""
+"""A drive test with GPS as people keep it: a table of rows, one of stations,
+and places to ask about.
+"""
 
 import csv
 from collections.abc import Iterable
@@ -52,7 +54,9 @@ def city_drive(folder: Path, count: int = 300, held: int = 60) -> Drive:
     asked[rng.choice(count, held, replace=False)] = True
     degrees = np.stack([arrays["latitude"], arrays["longitude"]], axis=1)[rows]
     level = level[rows].round(2)
-    table = np.array([[*map(repr, d), *map(str, p)] for d, p in zip(degrees.tolist(), level, strict=True)])
+    table = np.array(
+        [[*map(repr, d), *map(str, p)] for d, p in zip(degrees.tolist(), level, strict=True)]
+    )
     sites = [
         [station, arrays["station_latitude"][i], arrays["station_longitude"][i], 10.0]
         for station, i in zip(STATIONS, chosen, strict=True)
@@ -62,5 +66,6 @@ def city_drive(folder: Path, count: int = 300, held: int = 60) -> Drive:
         write_table(folder / "drive.csv", heads, table[~asked]),
         write_table(folder / "sites.csv", ["name", "lat", "lon", "height"], sites),
         write_table(folder / "places.csv", heads[:2], table[asked, :2]),
-        level[asked], level[~asked],
-    )  # fmt: skip
+        level[asked],
+        level[~asked],
+    )

@@ -8,12 +8,34 @@ import numpy as np
 from gsparc.apps.export.compiled.blob import CHECKED, HEAD, SECTION, Form, pack_form
 
 SIZES = {
-    1: (0, 1, 2, 7, 8, 9, 10, 11, 12, 13), 2: (0, 1, 2, 7, 8, 9), 3: (0, 1, 2, 3, 4, 5), 4: (0, 1, 2, 3, 4),
-}  # fmt: skip
+    1: (0, 1, 2, 7, 8, 9, 10, 11, 12, 13),
+    2: (0, 1, 2, 7, 8, 9),
+    3: (0, 1, 2, 3, 4, 5),
+    4: (0, 1, 2, 3, 4),
+}
 WHOLE = [
-    0, 1, 2, 3, 4, 6, 7, 8, 15, 16, 17, 31, 64, 255, 1024, 4095, 4096, 46341, 65535, 65536,
+    0,
+    1,
+    2,
+    3,
+    4,
+    6,
+    7,
+    8,
+    15,
+    16,
+    17,
+    31,
+    64,
+    255,
+    1024,
+    4095,
+    4096,
+    46341,
+    65535,
+    65536,
     *2 ** np.arange(17, 27),
-]  # fmt: skip
+]
 ODD = [np.nan, np.inf, -np.inf, -1, 0, 0.5, 1e-300, 1e300, -1e9, 2.0**31, 2.0**53, 2.0**63]
 MOST = 1 << 22  # numbers of an array that is made longer
 
@@ -25,44 +47,73 @@ def needed(kind: int, n: list[int]) -> dict[str, int]:
         parts = 2 * elements + 2
         wide = columns * (2 if waves1 else 1)
         return {
-            "at": anchors * axes, "whitening": anchors * count, "weights": count * parts, "offset": parts,
-            "pairs": 2 * elements**2 * (lags0 + lags1), "table0": lags0 * height * waves0,
-            "wave0": waves0 * columns, "table1": lags1 * height * waves1, "wave1": waves1 * columns,
+            "at": anchors * axes,
+            "whitening": anchors * count,
+            "weights": count * parts,
+            "offset": parts,
+            "pairs": 2 * elements**2 * (lags0 + lags1),
+            "table0": lags0 * height * waves0,
+            "wave0": waves0 * columns,
+            "table1": lags1 * height * waves1,
+            "wave1": waves1 * columns,
             "square": height * wide,
-        }  # fmt: skip
+        }
     if kind == 2:
         axes, anchors, count, seen, height, width = n
         return {
-            "at": anchors * axes, "whitening": anchors * count, "weights": count * seen, "offset": seen,
-            "means": 3 * seen, "starts": -(-height // 4) * -(-width // 4) + 1,
-        }  # fmt: skip
+            "at": anchors * axes,
+            "whitening": anchors * count,
+            "weights": count * seen,
+            "offset": seen,
+            "means": 3 * seen,
+            "starts": -(-height // 4) * -(-width // 4) + 1,
+        }
     if kind == 3:
         count, rows, outputs, antennas, still, combs = n
         padded, axes = -(-rows // 16) * 16, 6 if still > 1 else 3
         return {
-            "moving": antennas * 3, "sources": count * 3, "images": still * count * 3, "combs": combs * 3,
-            "by_angle": count, "by_length": count, "places": axes * padded, "towards": count * 3 * padded,
-            "level": count * 2 * outputs, "weights": count * 2 * outputs * padded,
-            "offsets": still * 3 if still > 1 else 0, "factors": 2 * antennas * still * outputs,
-        }  # fmt: skip
+            "moving": antennas * 3,
+            "sources": count * 3,
+            "images": still * count * 3,
+            "combs": combs * 3,
+            "by_angle": count,
+            "by_length": count,
+            "places": axes * padded,
+            "towards": count * 3 * padded,
+            "level": count * 2 * outputs,
+            "weights": count * 2 * outputs * padded,
+            "offsets": still * 3 if still > 1 else 0,
+            "factors": 2 * antennas * still * outputs,
+        }
     axes, rows, _, sets, terms = n
     return {
-        "places": rows * axes, "columns": axes * (-(-rows // 8) * 8), "extra": rows, "values": rows,
-        "slopes": rows * terms, "weighed": terms, "unsure": terms**2, "root": rows * (rows + 1) // 2,
+        "places": rows * axes,
+        "columns": axes * (-(-rows // 8) * 8),
+        "extra": rows,
+        "values": rows,
+        "slopes": rows * terms,
+        "weighed": terms,
+        "unsure": terms**2,
+        "root": rows * (rows + 1) // 2,
         "sets": 3 * sets,
-    }  # fmt: skip
+    }
 
 
 def an_array() -> Form:
     """A small spectrum of a static array, of any numbers."""
     draw, sizes = np.random.default_rng(0), [3, 5, 4, 3, 6, 5, 3, 2, 2, 2]
-    arrays = {name: draw.normal(size=count).astype(np.float32) for name, count in needed(1, sizes).items()}
+    arrays = {
+        name: draw.normal(size=count).astype(np.float32) for name, count in needed(1, sizes).items()
+    }
     return Form(1, [float(one) for one in [*sizes[:3], 0, 1, 1, 2, *sizes[3:]]], arrays)
 
 
 def mutated(form: Form, draw: np.random.Generator) -> bytes:
     """Sizes, numbers, elements of arrays and the table otherwise; arrays often as long as fits."""
-    numbers, arrays = list(form.numbers), {name: value.ravel().copy() for name, value in form.arrays.items()}
+    numbers, arrays = (
+        list(form.numbers),
+        {name: value.ravel().copy() for name, value in form.arrays.items()},
+    )
     sizes = SIZES[form.kind]
     for at in draw.choice(sizes, draw.integers(0, 5)):
         now = numbers[at]
@@ -79,7 +130,8 @@ def mutated(form: Form, draw: np.random.Generator) -> bytes:
     fits, most = draw.random() < 0.8, MOST if large else MOST >> 9
     if fits and all(0 <= numbers[at] < 2**26 and numbers[at] % 1 == 0 for at in sizes):
         for name, count in needed(form.kind, [int(numbers[at]) for at in sizes]).items():
-            wrapped = count % 2**32 if draw.random() < 0.5 else count  # as an int product would have it
+            # As an int product would have it
+            wrapped = count % 2**32 if draw.random() < 0.5 else count
             if name in arrays and arrays[name].size and wrapped <= most:
                 arrays[name] = np.resize(arrays[name], wrapped)
     if fits and form.kind == 2 and arrays["starts"].size:
@@ -96,13 +148,17 @@ def mutated(form: Form, draw: np.random.Generator) -> bytes:
             )
             with np.errstate(over="ignore"):
                 value[at] = some[draw.integers(len(some))]
-    blob = bytearray(pack_form(Form(form.kind, numbers, arrays), np.zeros(3), float(draw.random() < 0.5)))
+    blob = bytearray(
+        pack_form(Form(form.kind, numbers, arrays), np.zeros(3), float(draw.random() < 0.5))
+    )
     if draw.random() < 0.3:
         _other_table(blob, draw)
     return with_checksum(blob)
 
 
-def _even_sets(numbers: list[float], arrays: dict[str, np.ndarray], draw: np.random.Generator) -> None:
+def _even_sets(
+    numbers: list[float], arrays: dict[str, np.ndarray], draw: np.random.Generator
+) -> None:
     """Trees over all rows, their neighbours as many as are said, boxes of their nodes."""
     many, rows = arrays["sets"].size // 3, int(np.clip(np.nan_to_num(numbers[1]), 0, MOST))
     cut = np.linspace(0, rows, many + 1).astype(np.int64)
@@ -121,12 +177,27 @@ def _other_table(blob: bytearray, draw: np.random.Generator) -> None:
         at = HEAD.size + SECTION.size * int(draw.integers(many))
         name, kind, unused, offset, count = SECTION.unpack(blob[at : at + SECTION.size])
         other = SECTION.unpack_from(blob, HEAD.size + SECTION.size * int(draw.integers(many)))
-        some = [count % 2**40 + 1, 2 * (count % 2**40), 0, 2**62, -1, (len(blob) - offset) // 4, other[4]]
+        some = [
+            count % 2**40 + 1,
+            2 * (count % 2**40),
+            0,
+            2**62,
+            -1,
+            (len(blob) - offset) // 4,
+            other[4],
+        ]
         fields = [
-            (other[0], kind, unused, offset, count), (name, int(draw.integers(6)), unused, offset, count),
-            (name, kind, unused, int(draw.choice([0, 64, len(blob) // 64 * 64, -64, 2**62])), count),
+            (other[0], kind, unused, offset, count),
+            (name, int(draw.integers(6)), unused, offset, count),
+            (
+                name,
+                kind,
+                unused,
+                int(draw.choice([0, 64, len(blob) // 64 * 64, -64, 2**62])),
+                count,
+            ),
             (name, kind, unused, offset, int(some[draw.integers(len(some))])),
-        ]  # fmt: skip
+        ]
         blob[at : at + SECTION.size] = SECTION.pack(*fields[draw.integers(len(fields))])
     if draw.random() < 0.1:
         blob[24:32] = struct.pack("<q", int(draw.choice([0, -1, many + 1, many - 1, 2**40])))

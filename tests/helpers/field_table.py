@@ -22,7 +22,8 @@ OURS = "gsparc"
 WHAT = {  # of data and splits, for the headings
     "rfid/random": "128 and 32 of the 6,123 RFID spectra, our draw",
     "rfid/grouped": "RFID spectra, stretches of the path apart",
-    "room/random": "spectra of the paper's room, simulated", "newrf/random": "channels of a conference room",
+    "room/random": "spectra of the paper's room, simulated",
+    "newrf/random": "channels of a conference room",
     "wideband/places": "spectra at ten carriers, places apart",
     "wideband/carriers": "spectra at ten carriers, each carrier in turn",
     "argos/random": "channels of a simulated stand-in for Argos",
@@ -30,17 +31,22 @@ WHAT = {  # of data and splits, for the headings
     "exp005/blocks_30cm": "channels at 42 antennas, squares of .3 m",
     "plane/drawn": "powers on a plane under 42 antennas",
     "plane/blocks_30cm": "powers on a plane, squares of .3 m",
-    "city/drawn": "powers of a campus", "city/blocks_300m": "powers of a campus, squares of 300 m",
-}  # fmt: skip
+    "city/drawn": "powers of a campus",
+    "city/blocks_300m": "powers of a campus, squares of 300 m",
+}
 
 MEDIANS = {  # over test rows
-    "psnr_db_median": "median PSNR dB", "ssim_gauss_median": "median SSIM", "snr_db_p50": "median SNR dB",
+    "psnr_db_median": "median PSNR dB",
+    "ssim_gauss_median": "median SSIM",
+    "snr_db_p50": "median SNR dB",
     "mae_db_median": "median error dB",
-}  # fmt: skip
+}
 
 
 def collect(files: Iterable[str | Path]) -> pd.DataFrame:
-    """Return rows of tables; of the same fit those of the last file, and the last times of a query."""
+    """Return rows of tables; of the same fit those of the last file,
+    and the last times of a query.
+    """
     rows = pd.concat([read_published(file) for file in files], ignore_index=True)
     times = ["query_ms", "query_p95_ms", "to_copy"]
     rows[times] = rows.groupby(GROUP, dropna=False)[times].ffill()
@@ -57,11 +63,18 @@ def _section(name: str, rows: pd.DataFrame) -> str:
     rows = rows.sort_values("score_db", ascending=False, kind="stable")
     figure, draws = rows.figure.iloc[0], rows.draws.any()
     columns = [
-        Column("method", "", of=_named), Column("extra input", "", of="given"),
+        Column("method", "", of=_named),
+        Column("extra input", "", of="given"),
         Column(score_heading(figure), ".2f", of=_score),
-        *(Column(heading, ".3g", of=name) for name, heading in MEDIANS.items() if rows[name].notna().any()),
-        CPU, P50, Column("Gaussians", ".0f", of=lambda row: row["gaussians"] or None),
-    ]  # fmt: skip
+        *(
+            Column(heading, ".3g", of=name)
+            for name, heading in MEDIANS.items()
+            if rows[name].notna().any()
+        ),
+        CPU,
+        P50,
+        Column("Gaussians", ".0f", of=lambda row: row["gaussians"] or None),
+    ]
     columns = [one for one in columns if one.of != "given" or rows.given.any()]
     several = f"one split; ± deviation over {rows.seeds.max()} seeds, others one seed"
     alone = several if rows.seeds.max() > 1 else "one split, one seed"
@@ -83,7 +96,10 @@ def _score(row: Row) -> Interval:
 
 def _dates(rows: pd.DataFrame) -> str:
     days = sorted({f"{day[:4]}-{day[4:6]}-{day[6:]}" for day in rows.date})
-    return f"{' to '.join(dict.fromkeys([days[0], days[-1]]))}, commits {', '.join(sorted(set(rows.commit)))}"
+    return (
+        f"{' to '.join(dict.fromkeys([days[0], days[-1]]))}, commits "
+        f"{', '.join(sorted(set(rows.commit)))}"
+    )
 
 
 def write(rows: pd.DataFrame, page: Path = PAGE) -> None:

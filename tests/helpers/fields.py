@@ -1,6 +1,7 @@
 """Fields, poses and grids of every hard kind at once, and how ill-conditioned they are.
 
-A field is drawn Gaussian by Gaussian from named kinds, so that a failure shrinks to the kinds that matter.
+A field is drawn Gaussian by Gaussian from named kinds,
+so that a failure shrinks to the kinds that matter.
 """
 
 import hashlib
@@ -30,19 +31,30 @@ GRIDS = st.sampled_from(
     ]
 )
 DIRECTIONS = {
-    "anywhere": None, "seam": (-1.0, 1e-7, 0.3), "zenith": (0.0, 0.0, 1.0), "near zenith": (1e-6, -1e-6, 1.0),
-    "nadir": (0.0, 0.0, -1.0), "horizon": (0.6, 0.8, 0.0), "below": (0.5, -0.5, -0.4),
-}  # fmt: skip
+    "anywhere": None,
+    "seam": (-1.0, 1e-7, 0.3),
+    "zenith": (0.0, 0.0, 1.0),
+    "near zenith": (1e-6, -1e-6, 1.0),
+    "nadir": (0.0, 0.0, -1.0),
+    "horizon": (0.6, 0.8, 0.0),
+    "below": (0.5, -0.5, -0.4),
+}
 QUATERNIONS = {
-    "any": None, "none": (0.0, 0.0, 0.0, 0.0), "long": 1e9, "short": 1e-9, "identity": (1.0, 0, 0, 0),
-}  # fmt: skip
+    "any": None,
+    "none": (0.0, 0.0, 0.0, 0.0),
+    "long": 1e9,
+    "short": 1e-9,
+    "identity": (1.0, 0, 0, 0),
+}
 OPACITIES = (1 - 1e-7, 1.0, 0.99, 0.985, 0.7, 0.1, 0.004, 1e-7, 1e-30, 0.0)
 ASPECTS = (1.0, 1e-1, 1e-2, 1e-4, 1e-6)
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """One example: Gaussians (of values that float32 holds), a receiver, how it looks, in which precision."""
+    """One example: Gaussians (of values that float32 holds), a receiver, how it looks,
+    in which precision.
+    """
 
     scene: Scene
     pose: Pose
@@ -89,28 +101,41 @@ def fields(draw, grids: st.SearchStrategy = GRIDS) -> Drawn:
     features = torch.randn(2, count, 1, generator=noise)
     ids = torch.randperm(1000, generator=noise)[:count]
     scene = (
-        Scene(stack(0, 3), stack(1, 4), stack(2, 3), torch.tensor([r[3] for r in rows]), features, ids)
+        Scene(
+            stack(0, 3), stack(1, 4), stack(2, 3), torch.tensor([r[3] for r in rows]), features, ids
+        )
         .to(torch.float32)
         .to(torch.float64)
     )
     turn = torch.linalg.qr(torch.randn(3, 3, generator=noise, dtype=torch.float64))[0]
     turned = draw(st.booleans())
-    rotation = (turn * torch.linalg.det(turn).sign()).float().double() if turned else torch.eye(3).double()
+    rotation = (
+        (turn * torch.linalg.det(turn).sign()).float().double() if turned else torch.eye(3).double()
+    )
     place = (
-        torch.zeros(3).double() if draw(st.booleans()) else torch.randn(3, generator=noise).double() * 0.02
+        torch.zeros(3).double()
+        if draw(st.booleans())
+        else torch.randn(3, generator=noise).double() * 0.02
     )
     return Drawn(
-        scene, Pose(place.float().double(), rotation), draw(grids),
-        draw(st.sampled_from(["tangent", "equirect"])), draw(st.sampled_from([0.3, 0.3, 0.01, 0.0])),
+        scene,
+        Pose(place.float().double(), rotation),
+        draw(grids),
+        draw(st.sampled_from(["tangent", "equirect"])),
+        draw(st.sampled_from([0.3, 0.3, 0.01, 0.0])),
         draw(st.booleans()),
         draw(st.sampled_from([Cutoff(), Cutoff(1e-3, 1e-4, relative=True), Cutoff(1e-6, 0.0)])),
         draw(st.sampled_from([torch.float32, torch.float64])),
-    )  # fmt: skip
+    )
 
 
 def show(drawn: Drawn, backend: str, **more) -> Outcome:
-    """`render` in the precision drawn; the reference's truth is `show(exact(drawn), "reference")`."""
-    return render(drawn.scene.to(drawn.dtype), drawn.pose, drawn.grid, backend, **drawn.optics, **more)
+    """`render` in the precision drawn; the reference's truth is
+    `show(exact(drawn), "reference")`.
+    """
+    return render(
+        drawn.scene.to(drawn.dtype), drawn.pose, drawn.grid, backend, **drawn.optics, **more
+    )
 
 
 def exact(drawn: Drawn) -> Drawn:
@@ -119,7 +144,9 @@ def exact(drawn: Drawn) -> Drawn:
 
 
 def nudged(drawn: Drawn, seed: int) -> Drawn:
-    """Every input moved by up to one unit of float32's rounding: vectors by that share of their length."""
+    """Every input moved by up to one unit of float32's rounding:
+    vectors by that share of their length.
+    """
     noise = torch.Generator().manual_seed(seed)
 
     def draws(shape: torch.Size) -> Tensor:
@@ -136,7 +163,9 @@ def nudged(drawn: Drawn, seed: int) -> Drawn:
     x, y, z = draws(torch.Size([3])).tolist()
     turn = torch.tensor([[1, -z, y], [z, 1, -x], [-y, x, 1]], dtype=torch.float64)
     place = drawn.pose.position + draws(torch.Size([3])) * drawn.pose.position.norm()
-    return replace(drawn, scene=replace(scene, **moved), pose=Pose(place, drawn.pose.rotation @ turn))
+    return replace(
+        drawn, scene=replace(scene, **moved), pose=Pose(place, drawn.pose.rotation @ turn)
+    )
 
 
 @dataclass(frozen=True)
@@ -172,7 +201,11 @@ def layers(drawn: Drawn) -> Layers:
     light, _ = reference.transmittances(alpha, optics.cutoff.transmittance)
     directions = drawn.grid.directions().flatten(0, 1)
     return Layers(
-        order, shapes if optics.cutoff.relative else most, most, light, seen.direction @ directions.mT
+        order,
+        shapes if optics.cutoff.relative else most,
+        most,
+        light,
+        seen.direction @ directions.mT,
     )
 
 
@@ -184,7 +217,8 @@ class Condition:
         steady: (H, W) bool, no threshold is so near that rounding could cross it.
         moves: largest change of each output over `steady` pixels.
         truth: the outputs themselves.
-        terms: number of terms of order 1 that a gradient sums; over the length of a quaternion for its own.
+        terms: number of terms of order 1 that a gradient sums; over the length of a quaternion for
+            its own.
     """
 
     steady: Tensor
@@ -193,7 +227,9 @@ class Condition:
     terms: dict[str, float]
 
     def allowed(self, name: str, precision: str, factor: float) -> float:
-        """Bound on the error of output `name`: `factor` rounding errors of input, sums and result."""
+        """Bound on the error of output `name`: `factor` rounding errors of input,
+        sums and result.
+        """
         share = EPS[precision] / EPS["float32"]
         largest = float(self.truth[name].abs().max()) if self.truth[name].numel() else 0.0
         own = EPS[precision] * (1 + largest + self.terms.get(name, 0.0))
@@ -218,7 +254,11 @@ def _measure(drawn: Drawn, nudges: int, **more) -> Condition:
     base, others = layers(drawn), [layers(nudged(drawn, seed)) for seed in range(nudges)]
     unsteady = torch.zeros(drawn.grid.height * drawn.grid.width, dtype=torch.bool)
     cut = drawn.cutoff
-    for value, threshold in (("strength", cut.alpha), ("most", ALPHA_MAX), ("light", cut.transmittance)):
+    for value, threshold in (
+        ("strength", cut.alpha),
+        ("most", ALPHA_MAX),
+        ("light", cut.transmittance),
+    ):
         here = getattr(base, value).clamp_min(1e-300).log()
         away = [(getattr(o, value).clamp_min(1e-300).log() - here).abs() for o in others]
         room = 8 * torch.stack([*away, torch.full_like(here, 256 * EPS["float32"])]).amax(0)
@@ -236,9 +276,15 @@ def _measure(drawn: Drawn, nudges: int, **more) -> Condition:
                 gap = gap[..., steady] if name in ("image", "transmittance") else gap
                 moves[name] = max(moves[name], float(gap.max()) if gap.numel() else 0.0)
     lengths = drawn.scene.quats.norm(dim=1)
-    shortest = float(torch.where(lengths > SHORTEST_QUATERNION, lengths, 1.0).amin()) if len(lengths) else 1.0
+    shortest = (
+        float(torch.where(lengths > SHORTEST_QUATERNION, lengths, 1.0).amin())
+        if len(lengths)
+        else 1.0
+    )
     summed = float(steady.sum()) * len(drawn.scene.features)
-    terms = {name: summed for name in truth if name.startswith("d_")} | {"d_quats": summed / shortest}
+    terms = {name: summed for name in truth if name.startswith("d_")} | {
+        "d_quats": summed / shortest
+    }
     return Condition(steady, moves, truth, terms)
 
 

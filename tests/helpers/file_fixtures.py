@@ -11,7 +11,9 @@ from gsparc.base.errors import DataError
 
 @pytest.fixture
 def refused():
-    """`refused(says, read, ...)`: the error of `read(...)`, of which each problem is one short line."""
+    """`refused(says, read, ...)`: the error of `read(...)`,
+    of which each problem is one short line.
+    """
     return partial(refused_as, DataError)
 
 
@@ -38,8 +40,10 @@ def csi_arrays() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     rows = 12
     return {
-        "rx_position": rng.uniform(0, 3, (rows, 3)), "tx_position": np.array([4.0, 1.0, 2.0]),
+        "rx_position": rng.uniform(0, 3, (rows, 3)),
+        "tx_position": np.array([4.0, 1.0, 2.0]),
         "csi": rng.normal(size=(rows, 2, 3)) + 1j * rng.normal(size=(rows, 2, 3)),
         "frequency_hz": np.array([2.40e9, 2.41e9, 2.42e9]),
-        "array_position": np.array([[0.0, 0, 0], [0.06, 0, 0]]), "rx_orientation": np.array([1.0, 0, 0, 0]),
-    }  # fmt: skip
+        "array_position": np.array([[0.0, 0, 0], [0.06, 0, 0]]),
+        "rx_orientation": np.array([1.0, 0, 0, 0]),
+    }

@@ -15,10 +15,14 @@ from gsparc.training.context import FitContext, FitReport
 
 
 def gains(member: GainPosterior, places: torch.Tensor) -> torch.Tensor:
-    """Posterior mean gains (m, K, R) complex64 at places (m, 3) float64 [m], attenuated by clutter."""
+    """Posterior mean gains (m, K, R) complex64 at places (m, 3) float64 [m],
+    attenuated by clutter.
+    """
     both, m = torch.cat([places, member.rows.position]), len(places)
     kernel, scene = member.scene.visibility, member.scene
-    seen = [kernel.correlation(both, source)[:m, m:].to(torch.complex64) for source in scene.sources]
+    seen = [
+        kernel.correlation(both, source)[:m, m:].to(torch.complex64) for source in scene.sources
+    ]
     each = [share @ weights for share, weights in zip(seen, member.dual_weights, strict=True)]
     turn = torch.polar(scene.visible_share(places), scene.phase.expand(1, -1))
     return torch.stack(each, 1) * turn[:, :, None]
@@ -29,7 +33,9 @@ def phased(scene: SourceScene, phase: torch.Tensor, quadrature: float = 0.2) -> 
     return replace(scene, phase=phase, quadrature=quadrature)
 
 
-def fitted(data: Measurements, fold: Fold, folder: Path, **settings: Any) -> tuple[ImageSourceGP, FitReport]:
+def fitted(
+    data: Measurements, fold: Fold, folder: Path, **settings: Any
+) -> tuple[ImageSourceGP, FitReport]:
     """One search over at most 100 rows in a box of 2.5 m, unless said, and its report."""
     method = ImageSourceGP(**{"searches": 1, "search_rows": 100, "margin": 2.5, **settings})
     return method, method.fit(data, fold, FitContext(folder))

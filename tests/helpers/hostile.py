@@ -1,7 +1,8 @@
 """`python hostile.py PORT SECONDS PLACES`: clients of every bad kind against a server, all at once.
 
-Half-sent heads and bodies, a byte now and then, nonsense, malformed bodies, answers of PLACES places that
-nobody reads or whose clients die, and more connections than are allowed. Exit status 0 when the time is over.
+Half-sent heads and bodies, a byte now and then, nonsense, malformed bodies, answers of PLACES
+places that nobody reads or whose clients die, and more connections than are allowed.
+Exit status 0 when the time is over.
 """
 
 import asyncio
@@ -12,10 +13,17 @@ import sys
 
 HEAD = "POST /predict HTTP/1.1\r\nhost: a\r\ncontent-type: {}\r\ncontent-length: {}\r\n\r\n"
 MALFORMED = [
-    b"", b"{", b'{"places": [[1, 2, true]]}', b'{"places": [[1, 2, 1%s]]}' % (b"0" * 400), b"[" * 100_000,
-    b'{"places": [[1, 2, 3]], "more": 1}', b'{"places": [%s]}' % b",".join([b"[1e999, 1, 1]"] * 9000),
-    b"\xff" * 50_000, b'{"places": "here"}', b'{"places": [[0, 0, 1e9]]}',
-]  # fmt: skip
+    b"",
+    b"{",
+    b'{"places": [[1, 2, true]]}',
+    b'{"places": [[1, 2, 1%s]]}' % (b"0" * 400),
+    b"[" * 100_000,
+    b'{"places": [[1, 2, 3]], "more": 1}',
+    b'{"places": [%s]}' % b",".join([b"[1e999, 1, 1]"] * 9000),
+    b"\xff" * 50_000,
+    b'{"places": "here"}',
+    b'{"places": [[0, 0, 1e9]]}',
+]
 
 
 def post(body: bytes, kind: str = "application/json") -> bytes:
@@ -25,7 +33,10 @@ def post(body: bytes, kind: str = "application/json") -> bytes:
 
 async def attack(port: int, seconds: float, places: int) -> None:
     """Keep up every kind of client until the time is over."""
-    draw, large = random.Random(0), post(json.dumps({"places": [[1.25, 2.5, 1.5]] * places}).encode())
+    draw, large = (
+        random.Random(0),
+        post(json.dumps({"places": [[1.25, 2.5, 1.5]] * places}).encode()),
+    )
 
     async def once(sent: bytes, drip: bytes = b"", reads: bool = False, lasts: float = 0.0) -> None:
         reader, writer = await asyncio.open_connection("127.0.0.1", port, limit=1024)
@@ -63,7 +74,9 @@ async def attack(port: int, seconds: float, places: int) -> None:
             counts[name] += 1
             await asyncio.sleep(0.02)
 
-    tasks = [asyncio.create_task(repeat(name)) for name, (many, _) in kinds.items() for _ in range(many)]
+    tasks = [
+        asyncio.create_task(repeat(name)) for name, (many, _) in kinds.items() for _ in range(many)
+    ]
     await asyncio.sleep(seconds)
     for task in tasks:
         task.cancel()

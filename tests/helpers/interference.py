@@ -17,5 +17,6 @@ def plane(count: int, seed: int = 0) -> Measurements:
     field = np.exp(-2j * np.pi * far / WAVELENGTH) / far @ np.exp(2j * np.pi * rng.uniform(size=12))
     decibels = 10 * np.log10(np.abs(field) ** 2 + 1e-3) + 0.5 * rng.standard_normal(count)
     return from_arrays(
-        {"rx_position": places, "rssi_db": decibels, "frequency_hz": LIGHT / WAVELENGTH}, {"name": "plane"}
+        {"rx_position": places, "rssi_db": decibels, "frequency_hz": LIGHT / WAVELENGTH},
+        {"name": "plane"},
     )

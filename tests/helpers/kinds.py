@@ -38,20 +38,33 @@ def static_array(folder: Path) -> Measurements:
 def carriers(folder: Path | None = None) -> Measurements:
     """Places in sight of an array, a mirror at y = 4 and one at z = 3; phases of paths free."""
     rng, grid, elements = np.random.default_rng(0), SphereGrid.hemisphere(24, 48), ELEMENTS
-    place = np.c_[rng.uniform(2, 6, PLACES), rng.uniform(-3, 3, PLACES), rng.uniform(0.8, 1.6, PLACES)]
-    images = [place, place * [1, -1, 1] + [0, 2 * WALL, 0], place * [1, 1, -1] + [0, 0, 2 * CEILING]]
+    place = np.c_[
+        rng.uniform(2, 6, PLACES), rng.uniform(-3, 3, PLACES), rng.uniform(0.8, 1.6, PLACES)
+    ]
+    images = [
+        place,
+        place * [1, -1, 1] + [0, 2 * WALL, 0],
+        place * [1, 1, -1] + [0, 0, 2 * CEILING],
+    ]
     away = np.stack(images, 1) - [0.0, 0.0, 1.0]
     distance = np.linalg.norm(away, axis=2)
     response = np.exp(2j * np.pi * away / distance[..., None] @ elements.T)
-    gains = np.array([1, 0.8, 0.7]) / distance * np.exp(2j * np.pi * rng.random((CARRIERS, PLACES, 3)))
+    gains = (
+        np.array([1, 0.8, 0.7]) / distance * np.exp(2j * np.pi * rng.random((CARRIERS, PLACES, 3)))
+    )
     vectors = np.einsum("cpk,pkm->pcm", gains, response).reshape(-1, 16)
-    spectra = bartlett_spectrum(torch.from_numpy(vectors), steering_matrix(elements, grid, 1.0)).numpy()
+    spectra = bartlett_spectrum(
+        torch.from_numpy(vectors), steering_matrix(elements, grid, 1.0)
+    ).numpy()
     spectra = (spectra / spectra.max(1, keepdims=True)).reshape(-1, 24, 48)
     station = np.tile(np.arange(CARRIERS), PLACES)
     arrays = {
-        "tx_position": np.repeat(place, CARRIERS, axis=0), "rx_position": np.array([0.0, 0.0, 1.0]),
-        "spectrum": spectra, "carrier_hz": HERTZ[station], "array_position": elements * 0.3,
-    }  # fmt: skip
+        "tx_position": np.repeat(place, CARRIERS, axis=0),
+        "rx_position": np.array([0.0, 0.0, 1.0]),
+        "spectrum": spectra,
+        "carrier_hz": HERTZ[station],
+        "array_position": elements * 0.3,
+    }
     data = from_arrays(arrays, {"normalisation": "max"})
     # An array half a wavelength apart at each carrier.
     alike = elements * (299_792_458.0 / HERTZ)[:, None, None]
@@ -95,7 +108,12 @@ def several(folder: Path) -> Measurements:
 
 
 KINDS: dict[str, Callable[[Path], Measurements]] = {
-    "images": images, "static array": static_array, "moving array": moving_array, "channels": gains,
-    "channels of an array": bands, "channels from nowhere known": unplaced, "powers": received,
+    "images": images,
+    "static array": static_array,
+    "moving array": moving_array,
+    "channels": gains,
+    "channels of an array": bands,
+    "channels from nowhere known": unplaced,
+    "powers": received,
     "powers of several stations": several,
-}  # fmt: skip
+}

@@ -20,15 +20,28 @@ TURN = np.array(
 def array_site(grid: SphereGrid, array: np.ndarray, **changes) -> Site:
     box = np.array([[1.0, 1.0, 0.8], [1.6, 2.2, 1.2]])
     site = Site(
-        name="known", kind="spectrum", static_end="rx", grid=grid, array=array, carrier_hz=LIGHT / WAVELENGTH,
-        subcarriers_hz=None, origin=np.zeros(3), box=box, moving_box=box,
-        sha256="known", normalisation="max", static_position=RECEIVER, rx_rotation=TURN,
-    )  # fmt: skip
+        name="known",
+        kind="spectrum",
+        static_end="rx",
+        grid=grid,
+        array=array,
+        carrier_hz=LIGHT / WAVELENGTH,
+        subcarriers_hz=None,
+        origin=np.zeros(3),
+        box=box,
+        moving_box=box,
+        sha256="known",
+        normalisation="max",
+        static_position=RECEIVER,
+        rx_rotation=TURN,
+    )
     return replace(site, **changes)
 
 
 def spectra(site: Site, vectors: torch.Tensor) -> torch.Tensor:
-    """`|A^H h|` (B, H, W) without shortcuts: what `SpectrumRenderer` must equal where nothing is unknown."""
+    """`|A^H h|` (B, H, W) without shortcuts:
+    what `SpectrumRenderer` must equal where nothing is unknown.
+    """
     array, grid, wavelength = site.array_geometry()
     matrix = steering_matrix(array, grid, wavelength).to(vectors.dtype)
     return (vectors @ matrix.conj()).abs().view(-1, grid.height, grid.width)
@@ -42,11 +55,13 @@ def measure(
     image = image / image.max((1, 2), keepdims=True)
     rows = len(tx)
     return Measurements(
-        site=replace(site, sha256=sha256), tx=tx, rx_position=np.tile(RECEIVER, (rows, 1)),
+        site=replace(site, sha256=sha256),
+        tx=tx,
+        rx_position=np.tile(RECEIVER, (rows, 1)),
         rx_rotation=np.tile(TURN, (rows, 1, 1)),
         target=np.round(255 * image).astype(np.uint8) if bits else image.astype(np.float32),
         row_names=[f"row {i}" for i in range(rows)],
-    )  # fmt: skip
+    )
 
 
 def walk(rows: int, seed: int = 0, step: float = 0.012) -> np.ndarray:
@@ -60,5 +75,7 @@ def walk(rows: int, seed: int = 0, step: float = 0.012) -> np.ndarray:
 def room_vectors(tx: np.ndarray, order: int, array: np.ndarray):
     """Array vectors (S, M) of a traced room and the trace."""
     room = Room.from_size((7.0, 5.0, 3.0), -0.6)
-    traced = trace_room(room, tx, RECEIVER, LIGHT / WAVELENGTH, max_order=order, array=array @ TURN.T)
+    traced = trace_room(
+        room, tx, RECEIVER, LIGHT / WAVELENGTH, max_order=order, array=array @ TURN.T
+    )
     return traced.csi[:, :, 0], traced

@@ -8,7 +8,9 @@ from gsparc.models.powers.together.learning import StationPriors
 from gsparc.models.powers.together.terms import SharedTerms
 
 
-def known_field(site: Site, places: np.ndarray, own: StationPriors, terms: SharedTerms) -> JointPowerField:
+def known_field(
+    site: Site, places: np.ndarray, own: StationPriors, terms: SharedTerms
+) -> JointPowerField:
     """Return one whose stations share `terms`."""
     result = JointPowerField()
     result.site, result.places, result.own = site, places, own

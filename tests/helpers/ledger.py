@@ -1,6 +1,7 @@
 """What the tests measured while they ran: errors, seconds and counts, case by case.
 
-`tests/hard_cases/conftest.py` says which test is running and writes the table of docs/hard-cases.md from it.
+`tests/hard_cases/conftest.py` says which test is running and writes the table
+of docs/hard-cases.md from it.
 """
 
 from collections import defaultdict
@@ -24,8 +25,8 @@ class Ledger:
         case: what is being tested.
         engine: who stands in for the CPU's kernels; None: nobody.
         passes: case, engine, precision and seconds of each forward and backward pass.
-        errors: case, engine, precision, part ("forward", "backward"), error relative to one plus the largest
-            value wanted, and its share of what was allowed.
+        errors: case, engine, precision, part ("forward", "backward"), error relative to one plus
+            the largest value wanted, and its share of what was allowed.
         tests: outcomes by case.
     """
 
@@ -39,7 +40,9 @@ class Ledger:
         """One forward and backward pass."""
         self.passes.append((self.case, engine, precision, seconds))
 
-    def compared(self, engine: str, precision: str, part: str, error: float, allowed: float) -> None:
+    def compared(
+        self, engine: str, precision: str, part: str, error: float, allowed: float
+    ) -> None:
         """An error against the float64 reference, and what was allowed."""
         self.errors.append((self.case, engine, precision, part, error, error / allowed))
 

@@ -11,12 +11,16 @@ def fields(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     place = rng.uniform(0, [600, 400], (ROWS, 2))
     root = np.linalg.cholesky(36 * np.exp(-cdist(place, place) / 80) + 1e-6 * np.eye(ROWS))
-    away = [np.hypot(15, cdist(place, rng.uniform(0, [600, 400], (1, 2)))[:, 0]) for _ in range(count)]
+    away = [
+        np.hypot(15, cdist(place, rng.uniform(0, [600, 400], (1, 2)))[:, 0]) for _ in range(count)
+    ]
     return place, np.stack([-30 - 32 * np.log10(d) + root @ rng.normal(size=ROWS) for d in away], 1)
 
 
 def truths(seed: int, kind: str) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-    """Places, levels, and columns: what `kind` names, and some that say nothing, or follow the level."""
+    """Places, levels, and columns: what `kind` names, and some that say nothing,
+    or follow the level.
+    """
     rng = np.random.default_rng(seed + 100)
     place, level = fields(seed, 4 if kind == "node" else 1)
     which = rng.integers(0, 4, ROWS)
@@ -27,13 +31,15 @@ def truths(seed: int, kind: str) -> tuple[np.ndarray, np.ndarray, dict[str, np.n
     level = np.where(which > 2, -70 + rng.normal(0, 2, ROWS), level) if kind == "hop" else level
     level = np.round(level + rng.normal(0, 2, ROWS))
     others = {
-        "day": np.repeat(np.arange(10), ROWS // 10), "street": place[:, 0] // 100, 
+        "day": np.repeat(np.arange(10), ROWS // 10),
+        "street": place[:, 0] // 100,
         "speed": rng.gamma(3, 3, ROWS),
-        "bars": np.clip((level + 120) // 12, 0, 4), "asu": level + 140, 
+        "bars": np.clip((level + 120) // 12, 0, 4),
+        "asu": level + 140,
         "snr": level + 115 + rng.normal(0, 1, ROWS),
-        "rsrq": np.round(-10 + (level + 90) / 8 + rng.normal(0, 1, ROWS)), 
+        "rsrq": np.round(-10 + (level + 90) / 8 + rng.normal(0, 1, ROWS)),
         "channel": rng.integers(0, 8, ROWS),
-    }  # fmt: skip
+    }
     return place, level, others | ({kind: column} if kind else {})
 
 

@@ -1,4 +1,6 @@
-"""Ends of a training at a step: a job killed once among many, an interrupt; named in a configuration."""
+"""Ends of a training at a step: a job killed once among many, an interrupt;
+named in a configuration.
+"""
 
 import os
 import signal

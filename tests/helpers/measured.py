@@ -26,10 +26,13 @@ def techtile_arrays() -> dict[str, np.ndarray]:
     mask = np.ones((12, 3), bool)
     mask[4, 1] = False
     return {
-        "tx_position": places, "rx_antenna_position": ANTENNAS,
-        "csi": np.where(mask, channels_of(places), 0).astype(np.complex64), "mask": mask,
-        "run": np.repeat(RUNS, [8, 4]), "frequency_hz": np.array(920e6),
-    }  # fmt: skip
+        "tx_position": places,
+        "rx_antenna_position": ANTENNAS,
+        "csi": np.where(mask, channels_of(places), 0).astype(np.complex64),
+        "mask": mask,
+        "run": np.repeat(RUNS, [8, 4]),
+        "frequency_hz": np.array(920e6),
+    }
 
 
 def release_variables() -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
@@ -43,15 +46,20 @@ def release_variables() -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
     heard[0, 3, 2], stored[0, 3, 2] = 0, np.nan
     over = ("experiment_id", "cycle_id")
     return {
-        "experiment_id": (over[:1], RUNS), "cycle_id": (over[1:], np.arange(1, CYCLES + 1, dtype=np.int32)),
+        "experiment_id": (over[:1], RUNS),
+        "cycle_id": (over[1:], np.arange(1, CYCLES + 1, dtype=np.int32)),
         "hostname": (("hostname",), HOSTS),
         **{f"rover_{axis}": (over, where[..., i]) for i, axis in enumerate("xyz")},
-        "position_available": (over, placed), "csi_real": ((*over, "hostname"), stored.real.copy()),
-        "csi_imag": ((*over, "hostname"), stored.imag.copy()), "csi_available": ((*over, "hostname"), heard),
-    }  # fmt: skip
+        "position_available": (over, placed),
+        "csi_real": ((*over, "hostname"), stored.real.copy()),
+        "csi_imag": ((*over, "hostname"), stored.imag.copy()),
+        "csi_available": ((*over, "hostname"), heard),
+    }
 
 
-def write_release(folder: Path, kind: str = "netcdf3", variables=None, antennas: bool = True) -> Path:
+def write_release(
+    folder: Path, kind: str = "netcdf3", variables=None, antennas: bool = True
+) -> Path:
     """A NetCDF file of the release, and Techtile's table of antennas beside it."""
     variables = release_variables() if variables is None else variables
     path = folder / "csi.nc"
@@ -94,22 +102,31 @@ DEGREES = np.array([[40.7677, -111.83816], [40.75786, -111.83634], [40.75807, -1
 
 
 def metres_of(degrees: np.ndarray) -> np.ndarray:
-    """East and north (..., 2) [m] of latitudes and longitudes (..., 2) about the campus, as in the npz."""
+    """East and north (..., 2) [m] of latitudes and longitudes (..., 2) about the campus,
+    as in the npz.
+    """
     north, east = np.moveaxis(degrees - CAMPUS, -1, 0)
     return np.stack([84_313.2 * east, 110_574.0 * north], axis=-1)
 
 
 def powder_arrays(walk: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    """A walk (of twenty places) heard by three stations, as in the npz; two links were not heard."""
+    """A walk (of twenty places) heard by three stations, as in the npz;
+    two links were not heard.
+    """
     if walk is None:
         walk = CAMPUS + np.cumsum(np.random.default_rng(0).normal(0, 3e-4, (20, 2)), axis=0)
     distance = np.linalg.norm(metres_of(walk)[:, None] - metres_of(DEGREES), axis=-1)
     rssi = (-20 - 25 * np.log10(distance)).astype(np.float32)
     rssi[[3, 7], [0, 2]] = np.nan
     return {
-        "mobile_position": metres_of(walk), "station_position": metres_of(DEGREES), "station": STATIONS,
-        "rssi_db": rssi, "latitude": walk[:, 0], "longitude": walk[:, 1], "frequency_hz": np.array(462.7e6),
-    }  # fmt: skip
+        "mobile_position": metres_of(walk),
+        "station_position": metres_of(DEGREES),
+        "station": STATIONS,
+        "rssi_db": rssi,
+        "latitude": walk[:, 0],
+        "longitude": walk[:, 1],
+        "frequency_hz": np.array(462.7e6),
+    }
 
 
 TABLE = (
@@ -122,10 +139,17 @@ TABLE = (
 def write_walk(folder: Path, change=lambda text: text, table: str = TABLE) -> Path:
     """The same walk as the release's CSV, with a bus, and the table of stations beside it."""
     arrays = powder_arrays()
-    lines = ["timestamp,bus-6186_rss,bus-6186_x,bus-6186_y," + ",".join(STATIONS) + ",tx_x_coord,tx_y_coord"]
+    lines = [
+        "timestamp,bus-6186_rss,bus-6186_x,bus-6186_y,"
+        + ",".join(STATIONS)
+        + ",tx_x_coord,tx_y_coord"
+    ]
     for i, row in enumerate(np.nan_to_num(arrays["rssi_db"].astype(float), nan=-101)):
         powers = ",".join("-101" if p == -101 else f"{p!r}" for p in row.tolist())
-        time, place = f"2022-11-23 13:24:{i:02d}", f"{arrays['latitude'][i]!s},{arrays['longitude'][i]!s}"
+        time, place = (
+            f"2022-11-23 13:24:{i:02d}",
+            f"{arrays['latitude'][i]!s},{arrays['longitude'][i]!s}",
+        )
         lines.append(f"{time},-101,-1,-1,{powers},{place}")
     (folder / "single_tx.csv").write_text(change("\n".join(lines) + "\n"))
     (folder / "location_coordinates.json").write_text(table)
@@ -139,10 +163,12 @@ def ble_arrays() -> dict[str, np.ndarray]:
     sensors = np.array([[7, 7, 1.2], [7, 0.7, 2.3], [13, 12, 1.2], [18, 12, 2.3]])
     distance = np.linalg.norm(places[:, None] - sensors, axis=-1)
     return {
-        "mobile_position": places, "station_position": sensors,
+        "mobile_position": places,
+        "station_position": sensors,
         "station": np.array(["sensor10", "sensor11", "sensor40", "sensor42"]),
-        "rssi_db": (-50 - 20 * np.log10(distance)).astype(np.float32), "frequency_hz": np.array(2.44e9),
-    }  # fmt: skip
+        "rssi_db": (-50 - 20 * np.log10(distance)).astype(np.float32),
+        "frequency_hz": np.array(2.44e9),
+    }
 
 
 MAKERS = {"techtile": techtile_arrays, "powder": powder_arrays, "ble": ble_arrays}

@@ -31,7 +31,9 @@ def source_of(path: str, content: bytes) -> Source:
 
 
 class Mirror:
-    """Files by the path of their URL; `answers` what is done for one, once for each time it is asked for."""
+    """Files by the path of their URL; `answers` what is done for one,
+    once for each time it is asked for.
+    """
 
     def __init__(self) -> None:
         self.files: dict[str, bytes] = {}
@@ -65,7 +67,9 @@ def mirrored(patch) -> Iterator[Mirror]:
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         server.daemon_threads = True
-        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        threading.Thread(
+            target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True
+        ).start()
         patch.setenv(fetching.MIRROR, f"http://127.0.0.1:{server.server_port}/")
         yield mirror
         mirror.stop.set()
@@ -73,7 +77,9 @@ def mirrored(patch) -> Iterator[Mirror]:
 
 
 def offer(patch, folder: Path, *sources: Source, **facts) -> PublicSet:
-    """Let a set `room` of these sources be the only public one, and the cache a folder of the test."""
+    """Let a set `room` of these sources be the only public one,
+    and the cache a folder of the test.
+    """
     about = {"what": "a room", "licence": "MIT", "cite": "its makers", "strip": "release", **facts}
     one = PublicSet("room", sources=sources, **about)
     patch.setenv("XDG_CACHE_HOME", str(folder))

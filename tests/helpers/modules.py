@@ -17,7 +17,9 @@ RECEIVER = Pose.identity(torch.tensor([4.0, 0.0, 0.0]))
 
 def module(data, run_dir, confidence: bool = True) -> GaussianModule:
     torch.manual_seed(0)
-    emission = EmissionSettings(EncodingSettings("raw"), hidden=3, activation="linear", init_bias=0.0)
+    emission = EmissionSettings(
+        EncodingSettings("raw"), hidden=3, activation="linear", init_bias=0.0
+    )
     settings = ModelSettings(
         field=FieldSettings(count=20, placement="uniform"),
         emission=emission,
@@ -25,7 +27,9 @@ def module(data, run_dir, confidence: bool = True) -> GaussianModule:
         confidence=ConfidenceSettings(enabled=confidence),
     )
     shape = data.target.shape[1:] if data.site.kind == "csi" else None
-    ends = (RECEIVER, None) if data.site.static_end == "rx" else (None, torch.tensor([4.0, 0.0, 0.0]))
+    ends = (
+        (RECEIVER, None) if data.site.static_end == "rx" else (None, torch.tensor([4.0, 0.0, 0.0]))
+    )
     model = GaussianModel(settings, data.site, *ends, shape=shape)
     made = GaussianModule(model, LossSettings(0.0), OptimizerSettings(), 10, run_dir)
     made.log = lambda *a, **k: None  # type: ignore[method-assign]

@@ -11,7 +11,8 @@ from typing import Any
 from pages import ROOT
 
 LISTS = ("console", "figures")
-# Of json: hydra's own settings are explained in conf and in the classes, files and modules by their names.
+# Of json: hydra's own settings are explained in conf and in the classes,
+# files and modules by their names.
 ELSEWHERE = re.compile(r"(?:unread/)?(?:settings|files|program)/.*")
 SUFFIX = re.compile(r"(?:_p\d+|_batch64| low| high| least| largest| error)$")
 
@@ -19,10 +20,16 @@ SUFFIX = re.compile(r"(?:_p\d+|_batch64| low| high| least| largest| error)$")
 @cache
 def explained() -> frozenset[str]:
     """Words of the tables, and first columns of the page of a run."""
-    words = set(re.findall(r"`([\w/]+)`", (ROOT / "docs" / "understand.md").read_text(encoding="utf-8")))
+    words = set(
+        re.findall(r"`([\w/]+)`", (ROOT / "docs" / "understand.md").read_text(encoding="utf-8"))
+    )
     for name in LISTS:
-        with (ROOT / "docs" / "reference" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
-            words |= {word.strip(" `") for row in csv.reader(file) for word in re.split("[,;] ", row[0])}
+        with (ROOT / "docs" / "reference" / f"{name}.csv").open(
+            encoding="utf-8", newline=""
+        ) as file:
+            words |= {
+                word.strip(" `") for row in csv.reader(file) for word in re.split("[,;] ", row[0])
+            }
             file.seek(0)
             words |= {row[0] for row in csv.reader(file)}  # some heads have commas
     return frozenset(words)
@@ -43,7 +50,9 @@ def find_unexplained(folder: Path) -> list[str]:
 
 def _keys(content: dict[str, Any], stem: str = "") -> Iterator[str]:
     for key, value in content.items():
-        yield from _keys(value, f"{stem}{key}/") if isinstance(value, dict) and value else [stem + key]
+        yield from (
+            _keys(value, f"{stem}{key}/") if isinstance(value, dict) and value else [stem + key]
+        )
 
 
 def _is_explained(name: str) -> bool:

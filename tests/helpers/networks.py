@@ -1,4 +1,6 @@
-"""Simulated networks of sectors with a known truth, and what a few lines of numpy make of their drives."""
+"""Simulated networks of sectors with a known truth,
+and what a few lines of numpy make of their drives.
+"""
 
 from dataclasses import dataclass
 from functools import cache
@@ -10,8 +12,10 @@ from gsparc.tables.own import from_arrays
 
 SITES, SECTORS, SIDE_M, STEP_M, BLOCK_M = 10, 3, 2500.0, 18.0, 125.0
 COMMON_DB, OWN_DB, NOISE_DB, LENGTH_M = 5.0, 3.5, 1.5, 70.0  # shadowing of a site, of a cell; noise
-INDOOR_DB, BEHIND_DB, BEHIND_M = 16.0, 20.0, 300.0  # what buildings take off, of places in and behind them
-BUILT, HOUSE_M = 0.4, 85.0  # share of the blocks between streets that a building stands in; its side
+# What buildings take off, of places in and behind them
+INDOOR_DB, BEHIND_DB, BEHIND_M = 16.0, 20.0, 300.0
+# Share of the blocks between streets that a building stands in; its side
+BUILT, HOUSE_M = 0.4, 85.0
 
 
 @dataclass(frozen=True)
@@ -45,10 +49,14 @@ class Network:
         """The drive's lists of `count` cells under the schema's names."""
         moment, cell = np.nonzero(self.listed(count))
         result = {
-            "rx_position": self.moment[moment], "station": cell, "station_position": self.place,
-            "station_name": np.array([f"{i // SECTORS}-{i % SECTORS}" for i in range(len(self.place))]),
+            "rx_position": self.moment[moment],
+            "station": cell,
+            "station_position": self.place,
+            "station_name": np.array(
+                [f"{i // SECTORS}-{i % SECTORS}" for i in range(len(self.place))]
+            ),
             "rssi_db": self.measured[moment, cell],
-        }  # fmt: skip
+        }
         sectors = {"station_azimuth": self.azimuth, "station_tilt": self.tilt}
         return result | (sectors if azimuths else {})
 
@@ -58,10 +66,17 @@ class Network:
 
 
 def pattern(
-    place: np.ndarray, cells: np.ndarray, azimuth: np.ndarray, tilt: np.ndarray,
-    width: np.ndarray | float = 65.0, height: np.ndarray | float = 10.0, floor: np.ndarray | float = 25.0,
-) -> np.ndarray:  # fmt: skip
-    """Gains (n, T) [dB] of 3GPP TR 36.814, table A.2.1.1-2, at places (n, 3) of cells (T, 3) [m]."""
+    place: np.ndarray,
+    cells: np.ndarray,
+    azimuth: np.ndarray,
+    tilt: np.ndarray,
+    width: np.ndarray | float = 65.0,
+    height: np.ndarray | float = 10.0,
+    floor: np.ndarray | float = 25.0,
+) -> np.ndarray:
+    """Gains (n, T) [dB] of 3GPP TR 36.814, table A.2.1.1-2, at places (n, 3) of cells (T, 3)
+    [m].
+    """
     away = place[:, None] - cells
     turn = np.degrees(np.arctan2(away[..., 0], away[..., 1])) - azimuth
     turn = (turn + 180) % 360 - 180
@@ -89,7 +104,9 @@ def _streets(rng: np.random.Generator, count: int) -> np.ndarray:
 def _lost_to_buildings(
     places: np.ndarray, sites: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Losses (n, R) [dB] of places (n, 2) in and behind buildings from sites (R, 2) [m]; which are in."""
+    """Losses (n, R) [dB] of places (n, 2) in and behind buildings from sites (R, 2) [m];
+    which are in.
+    """
     count = int(SIDE_M // BLOCK_M) + 2
     built = rng.uniform(size=(count, count)) < BUILT
 
@@ -139,12 +156,19 @@ def draw_network(
     far = np.maximum(np.linalg.norm(every[:, None] - place, axis=-1), 20)
     level = -25 - 35 * np.log10(far) + rng.normal(0, 2.5, cells) + shadow
     level += pattern(
-        every, place, azimuth + rng.normal(0, 5, cells), tilt + rng.normal(0, 0.7, cells),
-        rng.uniform(58, 75, cells), rng.uniform(8, 12, cells), rng.uniform(22, 30, cells),
-    )  # fmt: skip
+        every,
+        place,
+        azimuth + rng.normal(0, 5, cells),
+        tilt + rng.normal(0, 0.7, cells),
+        rng.uniform(58, 75, cells),
+        rng.uniform(8, 12, cells),
+        rng.uniform(22, 30, cells),
+    )
     indoors = np.zeros(len(every), bool)
     if buildings:
-        lost, indoors = _lost_to_buildings(every[:, :2], place[::SECTORS, :2], np.random.default_rng(seed))
+        lost, indoors = _lost_to_buildings(
+            every[:, :2], place[::SECTORS, :2], np.random.default_rng(seed)
+        )
         level -= np.repeat(lost, SECTORS, 1)
     measured = level[:moments] + rng.normal(0, NOISE_DB, (moments, cells))
     written = azimuth % 360
@@ -154,7 +178,9 @@ def draw_network(
 
 
 def reference(one: Network, count: int, azimuths: bool = True) -> tuple[np.ndarray, np.ndarray]:
-    """Levels and deviations (Q, T): a law and a pattern by least squares, a process per cell on the rest."""
+    """Levels and deviations (Q, T): a law and a pattern by least squares,
+    a process per cell on the rest.
+    """
     moment, cell = np.nonzero(one.listed(count))
     level, cells = one.measured[moment, cell], len(one.place)
 
@@ -180,11 +206,15 @@ def reference(one: Network, count: int, azimuths: bool = True) -> tuple[np.ndarr
                 inverse = np.linalg.inv(_matern(apart / length) + noise * np.eye(len(own)))
                 amplitude = (rest - offset) @ inverse @ (rest - offset) / len(own)
                 score = len(own) * np.log(amplitude + 1e-9) - np.linalg.slogdet(inverse)[1]
-                best = min(best, (score, (length, noise, inverse, amplitude)), key=lambda pair: pair[0])
+                best = min(
+                    best, (score, (length, noise, inverse, amplitude)), key=lambda pair: pair[0]
+                )
         length, noise, inverse, amplitude = best[1]
         near = _matern(new / length)
         mean[:, t] += offset + near @ inverse @ (rest - offset)
-        spread[:, t] = np.sqrt(amplitude * np.maximum(1 + noise - ((near @ inverse) * near).sum(1), 1e-3))
+        spread[:, t] = np.sqrt(
+            amplitude * np.maximum(1 + noise - ((near @ inverse) * near).sum(1), 1e-3)
+        )
     return mean, spread
 
 
@@ -193,15 +223,20 @@ def _matern(scaled: np.ndarray) -> np.ndarray:
 
 
 def judged(one: Network, count: int, mean: np.ndarray, spread: np.ndarray) -> dict[str, float]:
-    """Figures of predictions (Q, T): of cells that a list there would have, of those it would not, of all."""
+    """Figures of predictions (Q, T): of cells that a list there would have, of those it would not,
+    of all.
+    """
     least = one.listed(count).sum(0) >= 20
     rank = np.argsort(np.argsort(-one.truth, 1), 1)
     listed, error = rank < count, mean - one.truth
     hold = np.abs(error) < 1.645 * np.sqrt(spread**2)
     low = ~listed & least
     return {
-        "rmse": float(np.sqrt((error**2).mean())), "bias_unlisted": float(error[low].mean()),
-        "bias_listed": float(error[listed].mean()), "hold": float(hold.mean()),
-        "hold_listed": float(hold[listed].mean()), "hold_unlisted": float(hold[low].mean()),
+        "rmse": float(np.sqrt((error**2).mean())),
+        "bias_unlisted": float(error[low].mean()),
+        "bias_listed": float(error[listed].mean()),
+        "hold": float(hold.mean()),
+        "hold_listed": float(hold[listed].mean()),
+        "hold_unlisted": float(hold[low].mean()),
         "best": float((mean.argmax(1) == one.truth.argmax(1)).mean()),
-    }  # fmt: skip
+    }

@@ -7,4 +7,6 @@ import numpy as np
 
 def say(file: Path, *arrays: np.ndarray) -> None:
     """Write whether each has a file of its own, and what is in it."""
-    file.write_text("\n".join(f"{getattr(one, 'file', None) is not None} {one.tolist()}" for one in arrays))
+    file.write_text(
+        "\n".join(f"{getattr(one, 'file', None) is not None} {one.tolist()}" for one in arrays)
+    )

@@ -1,8 +1,10 @@
-"""What a field looks like, from the definitions alone: NumPy and SciPy in float64, none of the reference.
+"""What a field looks like, from the definitions alone: NumPy and SciPy in float64,
+none of the reference.
 
-A Gaussian of covariance S at distance r and direction n is an angular Gaussian of covariance S / r^2.
-`tangent` measures it on the plane that touches the sphere at n (gnomonic projection), in any orthonormal
-basis; `equirect` in azimuth and elevation, linearised at n. Layers are blended front to back.
+A Gaussian of covariance S at distance r and direction n is an angular Gaussian of covariance S /
+r^2. `tangent` measures it on the plane that touches the sphere at n (gnomonic projection), in any
+orthonormal basis; `equirect` in azimuth and elevation, linearised at n.
+Layers are blended front to back.
 """
 
 from dataclasses import dataclass
@@ -89,7 +91,9 @@ def look(means, quats, scales, opacities, features, ids, pose, grid, optics, uns
 
 
 def _footprint(n, axes, grid, optics, unsure) -> Footprint | None:
-    """Of an angular Gaussian at n with its axes in columns (3, 3) [rad]; None of one without area."""
+    """Of an angular Gaussian at n with its axes in columns (3, 3) [rad];
+    None of one without area.
+    """
     step = grid.elevation_step
     if optics.projection == "tangent":
         basis = null_space(n[None]) / step
@@ -114,9 +118,13 @@ def _footprint(n, axes, grid, optics, unsure) -> Footprint | None:
         facing = np.ones(offsets.shape[:2], bool)
         certain = np.broadcast_to(turn / 2 - np.abs(turned) > unsure * turn, facing.shape)
     bare = basis.T @ axes
-    # Of the covariance A A^T the factor R^T R by Householder reflections of A^T: never the product itself.
+    # Of the covariance A A^T the factor R^T R by Householder reflections of A^T:
+    # never the product itself.
     root = np.linalg.qr(np.hstack([bare, np.sqrt(optics.low_pass) * np.eye(2)]).T, mode="r")
-    area, blurred = abs(np.prod(np.diag(np.linalg.qr(bare.T, mode="r")))), abs(np.prod(np.diag(root)))
+    area, blurred = (
+        abs(np.prod(np.diag(np.linalg.qr(bare.T, mode="r")))),
+        abs(np.prod(np.diag(root))),
+    )
     if blurred**2 <= np.finfo(float).tiny:
         return None
     p, q = offsets[..., 0] / root[0, 0], offsets[..., 1]

@@ -14,16 +14,20 @@ RUNS = 5
 def robot(
     transmitter: int = 0, first: int = 0, layout: str = "los"
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """Places (n, 3) [m], frequencies, the transmitter's place; channels (n, 30), coherent within runs."""
+    """Places (n, 3) [m], frequencies, the transmitter's place; channels (n, 30),
+    coherent within runs.
+    """
     released = np.load(release(f"ofdm/wsr-{layout}-a.npz"))
     channel = released["root_sign"] * np.sqrt(released["h2"])
     good = released["good"] & (released["tx_index"] == transmitter) & (channel != 0).all(1)
     runs = np.unique(released["run"][good])[first : first + RUNS]
     good &= np.isin(released["run"], runs)
     given = {
-        "rx_position": released["rx_position"][good], "tx_position": released["tx_position"][transmitter],
-        "frequency_hz": released["subcarrier_hz"], "run": released["run"][good],
-    }  # fmt: skip
+        "rx_position": released["rx_position"][good],
+        "tx_position": released["tx_position"][transmitter],
+        "frequency_hz": released["subcarrier_hz"],
+        "run": released["run"][good],
+    }
     return given, channel[good]
 
 
@@ -32,7 +36,9 @@ def logged(channel: np.ndarray, tones: np.ndarray, seed: int, gain_db: float = 0
     draw, rows = np.random.default_rng(seed), len(channel)
     phase, delay = draw.uniform(0, 2 * np.pi, rows), draw.uniform(0, 50e-9, rows)
     gain = 10 ** (draw.uniform(-gain_db, gain_db, rows) / 20)
-    return channel * gain[:, None] * np.exp(1j * (phase[:, None] - 2 * np.pi * delay[:, None] * tones))
+    return (
+        channel * gain[:, None] * np.exp(1j * (phase[:, None] - 2 * np.pi * delay[:, None] * tones))
+    )
 
 
 def measurements(given: dict[str, np.ndarray], channel: np.ndarray) -> Measurements:

@@ -26,12 +26,17 @@ ROOT = Path(__file__).parents[2]
 TOP = [ROOT / f"{name}.md" for name in ("README", "ARCHITECTURE", "CONTRIBUTING", "CHANGELOG")]
 FOLDERS = ("docs", "docs/tutorials", "docs/reference")
 PAGES = [*TOP, *(page for folder in FOLDERS for page in sorted((ROOT / folder).glob("*.md")))]
-PRESENT = [page for page in PAGES if page.stem != "CHANGELOG"]  # which also speaks of names that are gone
-COMMAND = re.compile(r"(?:python )?(?:train\.py|(?:python -m )?gsparc (?P<name>[a-z]+))\b(?P<rest>.*)")
+# Which also speaks of names that are gone
+PRESENT = [page for page in PAGES if page.stem != "CHANGELOG"]
+COMMAND = re.compile(
+    r"(?:python )?(?:train\.py|(?:python -m )?gsparc (?P<name>[a-z]+))\b(?P<rest>.*)"
+)
 
 
 def compare_files(command: str, folder: Path) -> tuple[list[str], list[str]]:
-    """What a command left that docs/reference/files.csv does not name, and what it names and was not left."""
+    """What a command left that docs/reference/files.csv does not name,
+    and what it names and was not left.
+    """
     table = pd.read_csv(ROOT / "docs" / "reference" / "files.csv", keep_default_na=False)
     rows = table[[bool({command, "all"} & set(by.split(", "))) for by in table["command"]]]
     patterns = {
@@ -42,17 +47,28 @@ def compare_files(command: str, folder: Path) -> tuple[list[str], list[str]]:
     left = [file.name + "/" * file.is_dir() for file in folder.iterdir()]
     shown = [name for name in left if not name.startswith(".") or name == ".hydra/"]  # but locks
     unnamed = [name for name in shown if not any(fnmatch(name, pattern) for pattern in patterns)]
-    absent = [pattern for pattern, where in patterns.items() if not where and not filter_names(left, pattern)]
+    absent = [
+        pattern
+        for pattern, where in patterns.items()
+        if not where and not filter_names(left, pattern)
+    ]
     return unnamed, absent
 
 
 def said(page: Path) -> list[str]:
-    """Lines of code blocks without a language, and inline code; of a configuration its first comments."""
+    """Lines of code blocks without a language, and inline code;
+    of a configuration its first comments.
+    """
     text = page.read_text(encoding="utf-8")
     if page.suffix == ".yaml":
-        return [line.lstrip("# ").partition(" : ")[0].partition("   (")[0] for line in text.splitlines()[:5]]
+        return [
+            line.lstrip("# ").partition(" : ")[0].partition("   (")[0]
+            for line in text.splitlines()[:5]
+        ]
     blocks = re.findall(r"^ *```\n(.*?)^ *```", text, flags=re.DOTALL | re.MULTILINE)
-    inline = re.findall(r"`([^`]+)`", re.sub(r"^ *```.*?^ *```", "", text, flags=re.DOTALL | re.MULTILINE))
+    inline = re.findall(
+        r"`([^`]+)`", re.sub(r"^ *```.*?^ *```", "", text, flags=re.DOTALL | re.MULTILINE)
+    )
     lines = [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
     return lines + [code.replace("\n", " ") for code in inline]
 
@@ -87,7 +103,11 @@ class Tiny:
         Image.new("L", (1600, 900), 255).save(folder / "floor.png")
         heads = "x,y,z,rssi_dbm,station\n"
         rng = np.random.default_rng(0)
-        rows = [f"{x},{y},1.5,{-60 - x},{s}\n" for x, y in rng.uniform(0, 20, (40, 2)) for s in ("a", "b")]
+        rows = [
+            f"{x},{y},1.5,{-60 - x},{s}\n"
+            for x, y in rng.uniform(0, 20, (40, 2))
+            for s in ("a", "b")
+        ]
         for name in ("drive", "second", "both"):
             (folder / f"{name}.csv").write_text(heads + "".join(rows))
         (folder / "sites.csv").write_text("name,x,y,z\na,0,0,8\nb,20,20,8\n")
@@ -121,18 +141,29 @@ class Tiny:
             tx, rx = own["tx_position"], own["rx_position"]
             walls = [tx, (0.0, 1.5, 1.0), (4.0, 1.5, 1.0)]  # where the last leg of each path begins
             np.savez(
-                path, tx_pos=tx, rx_pos=rx, csi=own["csi"].astype("c8"), frequency_hz=own["frequency_hz"],
-                path_offsets=3 * np.arange(len(rx) + 1), path_last_point=np.tile(walls, (len(rx), 1)),
-                path_gain=np.ones(3 * len(rx), np.complex64), split_train=np.arange(48),
+                path,
+                tx_pos=tx,
+                rx_pos=rx,
+                csi=own["csi"].astype("c8"),
+                frequency_hz=own["frequency_hz"],
+                path_offsets=3 * np.arange(len(rx) + 1),
+                path_last_point=np.tile(walls, (len(rx), 1)),
+                path_gain=np.ones(3 * len(rx), np.complex64),
+                split_train=np.arange(48),
                 split_test=np.arange(48, 60),
-            )  # fmt: skip
+            )
         return path
 
     def _walks(self, path: Path) -> Path:
         rows = walks(6, 0)
         test = np.arange(len(rows.level)) % 3 == 0
         np.savez(
-            path, rss_dbm=rows.level, position=rows.position, walk=rows.walk, time_s=rows.time_s, test=test
+            path,
+            rss_dbm=rows.level,
+            position=rows.position,
+            walk=rows.walk,
+            time_s=rows.time_s,
+            test=test,
         )
         return path
 
@@ -141,7 +172,10 @@ class Tiny:
         command = "tradeoff" if command == "locate" else command
         kind = command if command in ("link", "place", "calibrate", "tradeoff") else "map"
         if f"{kind} model" not in self.made:
-            folder, more = self.folder / f"{kind} model", ("baselines=[]", "logger=none", "threads=1")
+            folder, more = (
+                self.folder / f"{kind} model",
+                ("baselines=[]", "logger=none", "threads=1"),
+            )
             if kind == "link":
                 file = channels(self.folder / "link.npz", 60)
                 config = compose("dataset=own", f"dataset.file={file}", "model=complex_gp", *more)
@@ -150,14 +184,22 @@ class Tiny:
                 config = compose(*brief(file, *more))
             else:
                 stations = ["stations=together"] if kind == "place" else []
-                given = ["dataset=own", f"dataset.file={self.data('city')}", "model=gp", *stations, *more]
+                given = [
+                    "dataset=own",
+                    f"dataset.file={self.data('city')}",
+                    "model=gp",
+                    *stations,
+                    *more,
+                ]
                 config = compose(*given)
             train(config, folder)
             self.made[f"{kind} model"] = str(folder / "model.ckpt")
         return self.made[f"{kind} model"]
 
     def line(self, name: str, overrides: tuple[str, ...], run: Path) -> list[str]:
-        """The words of a command that ends within seconds, on data of its kind, into a folder `run`."""
+        """The words of a command that ends within seconds, on data of its kind,
+        into a folder `run`.
+        """
         given = dict(word.partition("=")[::2] for word in overrides)
         dropped = [word for word in given if word.startswith("~")]
         words = {key: value for key, value in given.items() if key not in dropped}
@@ -174,7 +216,11 @@ class Tiny:
                 words["dataset.file"] = self.data(kind)
             if kind == "argos":
                 words |= {"dataset.positions": "true"} if chosen == "argos_sim" else {}
-        if name in ASKING or "ckpt" in words or (name == "plan" and not {"area", "plan"} & set(words)):
+        if (
+            name in ASKING
+            or "ckpt" in words
+            or (name == "plan" and not {"area", "plan"} & set(words))
+        ):
             splats = words.get("save", "").endswith(".ply")  # of a field
             words["ckpt"] = self.model("tradeoff" if splats else name)
         if "init_from" in words:  # weights of the same data and settings
@@ -191,7 +237,9 @@ class Tiny:
             words |= {"places": "places.csv", "out": f"{run}.csv"}
         if name == "locate" and words.get("dataset") == "fingerprints":
             words.pop("ckpt")  # it learns its own field
-            words |= {"dataset.split": words.get("dataset.split", "random").replace("SPLIT", "random")}
+            words |= {
+                "dataset.split": words.get("dataset.split", "random").replace("SPLIT", "random")
+            }
             words["dataset.side_m"] = "3"
             if "data" in words:
                 words["data"] = words["dataset.file"]
@@ -203,18 +251,29 @@ class Tiny:
             words |= {"dataset.file": self.data("city")} if "dataset.file" in words else {}
         if name == "compare":
             table = words.get("experiment", "results/rfid").removeprefix("results/")
-            sets = {"ceiling": ("exp005", "exp006"), "halls": ("hall_1", "hall_2")}.get(table, (table,))
+            sets = {"ceiling": ("exp005", "exp006"), "halls": ("hall_1", "hall_2")}.get(
+                table, (table,)
+            )
             own = [f"datasets.{one}.{'root' if one == 'rfid' else 'file'}" for one in sets]
             for key in [key for key in words if re.match(r"datasets\..*(root|file)$", key)] or own:
                 words[key] = self.data(ALIKE.get(key.split(".")[1], key.split(".")[1]))
             methods = ("gp",) if words.get("task") == "locate" else ("mean", "nearest")
-            only = [f"{key.split('.')[1]}/*/{method}/*" for key in words if key.startswith("datasets.")
-                    for method in methods]  # fmt: skip
-            words |= {"only": f"[{','.join(only)}]", "cells": str(run.parent / "cells"), "latency": "false"}
+            only = [
+                f"{key.split('.')[1]}/*/{method}/*"
+                for key in words
+                if key.startswith("datasets.")
+                for method in methods
+            ]
+            words |= {
+                "only": f"[{','.join(only)}]",
+                "cells": str(run.parent / "cells"),
+                "latency": "false",
+            }
             if "experiment" in words:  # tiny data have other spectra and stations
                 everything = {"rfid": "listed", "city": "stations"}.get(table)
                 words |= {f"datasets.{table}.{everything}": "null"} if everything else {}
-            words |= {"splits.blocks_300m.choose": "['split=blocks','split.side_m=5']"}  # a small city
+            # A small city
+            words |= {"splits.blocks_300m.choose": "['split=blocks','split.side_m=5']"}
         words |= TINY.get(name, {})
         gsparc = words.get("model", "gsparc") == "gsparc" and words.get("experiment") != "sionna"
         if name in ("train", "study") and gsparc:
@@ -239,19 +298,31 @@ ASKING = (
     "update",
 )
 OF_EXPERIMENT = {  # datasets that an experiment is of, where it is not rfid
-    "sionna": "sionna", "paper/coverage": "argos_sim", "paper/snr_brackets": "argos_sim",
-    "paper/argos": "argos", "paper/sionna_room": "sionna",
-}  # fmt: skip
+    "sionna": "sionna",
+    "paper/coverage": "argos_sim",
+    "paper/snr_brackets": "argos_sim",
+    "paper/argos": "argos",
+    "paper/sionna_room": "sionna",
+}
 ALIKE = {
-    "city": "powder", "exp005": "techtile", "exp006": "techtile", "plane": "own", "hall_1": "ble",
+    "city": "powder",
+    "exp005": "techtile",
+    "exp006": "techtile",
+    "plane": "own",
+    "hall_1": "ble",
     "hall_2": "ble",
-}  # fmt: skip
+}
 SHORT = {"threads": "1"}
 FIELD = {"model.field.count": "20", "trainer.max_steps": "2", "trainer.val_check_interval": "1"}
 TINY = {  # what makes each command short
     "train": {**SHORT, "effort": "0.1", "baselines": "[mean]", "logger": "none"},
     "study": {
-        **SHORT, "effort": "0.1", "baselines": "[]", "query_s": "0.1", "queries": "5", "rounds": "1",
+        **SHORT,
+        "effort": "0.1",
+        "baselines": "[]",
+        "query_s": "0.1",
+        "queries": "5",
+        "rounds": "1",
     },
     "tradeoff": {"threads": "[1]", "rounds": "2", "baselines": "[]"},
     "evaluate": {**SHORT, "baselines": "[mean]"},
@@ -259,4 +330,4 @@ TINY = {  # what makes each command short
     "link": {"pusch.coarse": "8", "pusch.fine": "16"},
     "map": {**SHORT, "step_m": "4"},
     "plan": {**SHORT, "count": "2"},
-}  # fmt: skip
+}

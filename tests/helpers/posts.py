@@ -27,7 +27,11 @@ def free_space(far: np.ndarray) -> np.ndarray:
 
 
 def heard(
-    count: int = 60, posts: np.ndarray = POSTS, rssi_db: Callable = free_space, end: str = "tx", **more: Any
+    count: int = 60,
+    posts: np.ndarray = POSTS,
+    rssi_db: Callable = free_space,
+    end: str = "tx",
+    **more: Any,
 ) -> Measurements:
     """Powers of posts (P, 3) by distances, or what `more` gives: `csi` takes their place."""
     arrays = {f"{end}_position": walked(count), "station_position": posts, **more}

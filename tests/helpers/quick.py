@@ -20,7 +20,9 @@ def look_once(patch) -> None:
 
 
 def time_and_draw_less(patch) -> None:
-    """Pictures and sixty rounds of timed queries beside a copy of 16 MiB were half of a training."""
+    """Pictures and sixty rounds of timed queries beside a copy
+    of 16 MiB were half of a training.
+    """
 
     def dot(method, data, rows, examples, title, path):
         Image.new("L", (1, 1)).save(path)  # what loggers are given

@@ -38,7 +38,12 @@ class Scene:
 
     def to(self, dtype: torch.dtype) -> Scene:
         return replace(
-            self, **{k: v.to(dtype) for k, v in vars(self).items() if v is not None and v.is_floating_point()}
+            self,
+            **{
+                k: v.to(dtype)
+                for k, v in vars(self).items()
+                if v is not None and v.is_floating_point()
+            },
         )
 
     def on(self, device: str) -> Scene:
@@ -52,7 +57,9 @@ class Scene:
 def random_scene(
     n: int = 60, channels: int = 2, samples: int = 3, *, seed: int = 0, size: float = 0.4
 ) -> Scene:
-    """Gaussians all around the origin, a few metres away, float64 values that float32 holds exactly."""
+    """Gaussians all around the origin, a few metres away,
+    float64 values that float32 holds exactly.
+    """
     draw = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> Tensor:
@@ -87,7 +94,9 @@ def one(direction, *, distance: float = 4.0, sigma: float = 0.2, opacity: float 
 
 
 def poses(count: int, seed: int = 1) -> Pose:
-    """`count` random poses near the origin; 0 stands for one shared pose. Rotations are exact in float64."""
+    """`count` random poses near the origin; 0 stands for one shared pose.
+    Rotations are exact in float64.
+    """
     draw = torch.Generator().manual_seed(seed)
     size = max(count, 1)
     turn = torch.linalg.qr(torch.randn(size, 3, 3, generator=draw, dtype=torch.float64))[0]
@@ -118,7 +127,9 @@ def render(
     pixels: Tensor | None = None,
     **optics,
 ) -> Outcome:
-    """Image, transmittance, and the gradients of a fixed random linear function of both over `pixels`."""
+    """Image, transmittance, and the gradients of a fixed random linear function
+    of both over `pixels`.
+    """
     started = time.perf_counter()
     names = ["means", "quats", "scales", "opacities", "features"]
     leaves = {name: getattr(scene, name).clone().requires_grad_() for name in names}
@@ -170,7 +181,9 @@ _truths: dict[bytes, Outcome] = {}
 
 def truth(scene: Scene, pose: Pose, grid: SphereGrid, **optics) -> Outcome:
     """The reference in float64, computed once for all backends and precisions."""
-    tensors = [part for part in (*vars(scene).values(), pose.position, pose.rotation) if part is not None]
+    tensors = [
+        part for part in (*vars(scene).values(), pose.position, pose.rotation) if part is not None
+    ]
     parts = [repr((grid, sorted(optics.items()), [t.shape for t in tensors])).encode()]
     key = hashlib.sha256(b"".join([*parts, *(t.numpy().tobytes() for t in tensors)])).digest()
     if key not in _truths:
@@ -201,7 +214,9 @@ def assert_equals_float64(
     tolerances: dict[torch.dtype, float] = TOLERANCES,
     **optics,
 ) -> Outcome:
-    """The backend in both precisions against the reference in float64, which is returned; all finite."""
+    """The backend in both precisions against the reference in float64, which is returned;
+    all finite.
+    """
     scene = scene.to(torch.float32).to(torch.float64)
     want = truth(scene, pose, grid, **optics)
     for dtype, tolerance in tolerances.items():

@@ -1,5 +1,4 @@
 """A robot that drives before three Wi-Fi transmitters: its channels, and the logs of both ends."""
-# ruff: noqa: E501 (a log is one line)
 
 from pathlib import Path
 
@@ -32,7 +31,12 @@ def true_root(where, transmitter) -> np.ndarray:
 def records(csi, tick, time, number, sender) -> bytes:
     """A log of these channels (n, 30), as the card quantises them."""
     rows = np.zeros(len(csi), RECORD)
-    rows["size"], rows["code"], rows["antennas"], rows["length"] = RECORD.itemsize - 2, 0xBB, (3, 1), 192
+    rows["size"], rows["code"], rows["antennas"], rows["length"] = (
+        RECORD.itemsize - 2,
+        0xBB,
+        (3, 1),
+        192,
+    )
     gain = 40 - 20 * np.log10(np.linalg.norm(csi, axis=1))  # the strongest fills the converter
     rows["order"] = 0b100100
     rows["gain"] = 40
@@ -54,19 +58,31 @@ def records(csi, tick, time, number, sender) -> bytes:
 def drive(
     folder: Path, name: str = "t1", packets: int = 600, lost: slice = slice(0, 0), seed: int = 0
 ) -> np.ndarray:
-    """Logs of a robot that drives .6 m before three transmitters, with oscillators of their own; returns its way."""
+    """Logs of a robot that drives .6 m before three transmitters, with oscillators of their own;
+    returns its way.
+    """
     rng = np.random.default_rng(seed)
     folder.mkdir(parents=True, exist_ok=True)
     start = 1_624_839_918.0
     usual = start + 0.008 * np.arange(packets) + rng.gamma(1.0, 50e-6, packets)
     where = np.stack(
-        [np.linspace(0, 0.6, packets), 0.03 * np.sin(np.arange(packets) / 200), np.full(packets, 0.2)], 1
+        [
+            np.linspace(0, 0.6, packets),
+            0.03 * np.sin(np.arange(packets) / 200),
+            np.full(packets, 0.2),
+        ],
+        1,
     )
-    way = "".join(f"{t:.6f},0,{x:.6f},{y:.6f},{z:.6f},\n" for t, (x, y, z) in zip(usual, where, strict=True))
+    way = "".join(
+        f"{t:.6f},0,{x:.6f},{y:.6f},{z:.6f},\n" for t, (x, y, z) in zip(usual, where, strict=True)
+    )
     (folder / f"rx_trajectory_{name}_.csv").write_text(way)
     robot, kept = [], np.delete(np.arange(packets), lost)
     for i, (tx, place) in enumerate(LOS_SET_A.items()):
-        offset, sender = rng.uniform(-15e3, 15e3), bytes([0, 33, 106, 63, 23, 90 + 10 * (i + seed) % 100])
+        offset, sender = (
+            rng.uniform(-15e3, 15e3),
+            bytes([0, 33, 106, 63, 23, 90 + 10 * (i + seed) % 100]),
+        )
         there = usual + 0.0027 * i
         back = there + 100e-6 + rng.gamma(1.0, 16e-6, packets)  # waits for the channel
         h, logs = channel(where, place), []
@@ -74,7 +90,9 @@ def drive(
             turn = np.exp(2j * np.pi * sign * offset * (time - start) + 1j * sign * 0.7 * i)
             delay = rng.uniform(0, 60e-9, packets)
             heard = h * turn[:, None] * np.exp(-2j * np.pi * SPACING_HZ * TONES * delay[:, None])
-            logs.append(heard + 0.01 * np.abs(h).mean() * (rng.normal(size=(2, *h.shape)).T @ [1, 1j]).T)
+            logs.append(
+                heard + 0.01 * np.abs(h).mean() * (rng.normal(size=(2, *h.shape)).T @ [1, 1j]).T
+            )
         tick = there - start + 7.0, back - start + 900.0 + 3e-6 * i
         robot.append(records(logs[0], tick[0], there, np.arange(packets), sender))
         other = records(logs[1], tick[1], back + 40, np.arange(packets), bytes(6))
@@ -83,5 +101,7 @@ def drive(
             b"".join(other[size * k : size * k + size] for k in kept)
         )
     log = np.frombuffer(b"".join(robot), RECORD)
-    (folder / f"csi_rx_{name}.dat").write_bytes(log[np.argsort(log["tick_us"], kind="stable")].tobytes())
+    (folder / f"csi_rx_{name}.dat").write_bytes(
+        log[np.argsort(log["tick_us"], kind="stable")].tobytes()
+    )
     return where

@@ -26,11 +26,15 @@ def shoebox(
     snr_db: float = 30.0,
     seed: int = 0,
 ) -> tuple[Trace, Measurements, Fold]:
-    """A transmitter near a corner, `count` receivers all over the room; its trace, data and random fold."""
+    """A transmitter near a corner, `count` receivers all over the room; its trace,
+    data and random fold.
+    """
     room = Room.from_size(size, reflection, occluders=PILLAR if pillar else np.zeros((0, 2, 3)))
     tx = np.array(size) * [0.15, 0.27, 0.75]
     rx = scatter(room, count, seed + 1, margin=0.1)
-    told = trace_room(room, tx, rx, frequency_hz, max_order=max_order, array=array, snr_db=snr_db, seed=seed)
+    told = trace_room(
+        room, tx, rx, frequency_hz, max_order=max_order, array=array, snr_db=snr_db, seed=seed
+    )
     data = from_arrays(as_arrays(told))
     return told, data, make_split(data.moving, SplitSettings(seed=seed)).folds[0]
 
@@ -38,7 +42,9 @@ def shoebox(
 def directed(
     count: int, *, pillar: bool = False, tones: int = 1, seed: int = 0
 ) -> tuple[Measurements, Fold, np.ndarray]:
-    """A shoebox whose receivers measured where every visible path comes from, and its sources (7, 3) [m]."""
+    """A shoebox whose receivers measured where every visible path comes from,
+    and its sources (7, 3) [m].
+    """
     comb = 2.4e9 + 1e6 * np.arange(tones)
     trace, data, fold = shoebox(
         count, pillar=pillar, frequency_hz=comb if tones > 1 else 2.4e9, max_order=1, seed=seed

@@ -17,9 +17,15 @@ def draw(count: int, seed: int) -> np.ndarray:
 
 
 def truth(places: np.ndarray, change: float = 0.0, offset: float = 0.0) -> np.ndarray:
-    """Levels (n,) [dB] at places (n, 3): some waves, `change` around the cabinet, `offset` everywhere."""
+    """Levels (n,) [dB] at places (n, 3): some waves, `change` around the cabinet,
+    `offset` everywhere.
+    """
     rng = np.random.default_rng(1)
-    waves, phase, weight = rng.normal(size=(40, 2)) / 2, rng.uniform(0, 2 * np.pi, 40), rng.normal(size=40)
+    waves, phase, weight = (
+        rng.normal(size=(40, 2)) / 2,
+        rng.uniform(0, 2 * np.pi, 40),
+        rng.normal(size=40),
+    )
     level = -60 + 3 * np.cos(places[:, :2] @ waves.T + phase) @ weight / np.sqrt(20)
     return level + offset + change * behind(places)
 
@@ -43,14 +49,18 @@ def room_file(path: Path, count: int, seed: int = 5, **changed: float) -> Path:
     """A file of later rows of the same transmitter."""
     places = draw(count, seed)
     np.savez(
-        path, rx_position=places, tx_position=np.array([9.0, 9.0, 2.6]),
+        path,
+        rx_position=places,
+        tx_position=np.array([9.0, 9.0, 2.6]),
         rssi_db=levels(places, seed, **changed),
-    )  # fmt: skip
+    )
     return path
 
 
 def later_rows(count: int, seed: int, **changed: float) -> LaterRows:
-    """Rows of one station that miss a flat map of -60 dB, whose error has a variance of .5 dB^2, noise 4."""
+    """Rows of one station that miss a flat map of -60 dB, whose error has a variance of .5 dB^2,
+    noise 4.
+    """
     places, rng = draw(count, seed), np.random.default_rng(seed)
     missed = truth(places, **changed) - truth(places) + rng.normal(0, np.sqrt(4.5), count)
     number, flat = torch.arange(count), np.ones(count)

@@ -1,4 +1,5 @@
-"""`python sanitized.py MODULE.so ISA PYTEST_ARGUMENTS...`: tests on a build of the kernels that is watched.
+"""`python sanitized.py MODULE.so ISA PYTEST_ARGUMENTS...`:
+tests on a build of the kernels that is watched.
 
 Exit status 99: this machine has no such instruction set.
 """

@@ -28,7 +28,9 @@ def lobes(path, moving: str = "tx") -> tuple[Measurements, Fold]:
 
 
 def wandering(rows: int = 60) -> tuple[Measurements, Fold]:
-    """One lobe, 35 degrees wide, that follows the transmitter: interpolation of brightness shows two."""
+    """One lobe, 35 degrees wide, that follows the transmitter:
+    interpolation of brightness shows two.
+    """
     rng = np.random.default_rng(0)
     where = rng.uniform(-1, 1, (rows, 3)) * [1, 1, 0] + [0, 0, 1.0]
     directions = SphereGrid.hemisphere(16, 32).directions().numpy()
@@ -41,12 +43,18 @@ def wandering(rows: int = 60) -> tuple[Measurements, Fold]:
 def room(
     rows: int = 120, frequency_hz: float = 3e8, max_order: int = 1, directions: bool = False
 ) -> tuple[Measurements, Fold, np.ndarray]:
-    """Channels in a 4 x 3 x 2.5 m box of mirrors, with its sources (I, 3); a wavelength of 1 m at 300 MHz."""
+    """Channels in a 4 x 3 x 2.5 m box of mirrors, with its sources (I, 3);
+    a wavelength of 1 m at 300 MHz.
+    """
     box = Room.from_size((4.0, 3.0, 2.5), -0.6)
     told = trace_room(
-        box, np.array([0.7, 0.8, 1.9]), scatter(box, rows, seed=1, margin=0.3), frequency_hz,
-        max_order=max_order, snr_db=40,
-    )  # fmt: skip
+        box,
+        np.array([0.7, 0.8, 1.9]),
+        scatter(box, rows, seed=1, margin=0.3),
+        frequency_hz,
+        max_order=max_order,
+        snr_db=40,
+    )
     arrays = as_arrays(told)
     sources = told.images.mirror_points(told.tx[0])
     if directions:
@@ -57,14 +65,20 @@ def room(
     return data, fold_of(data), sources - data.site.origin
 
 
-def shadowed(rows: int = 200, range_m: float = 2.0, noise_db: float = 0.5) -> tuple[Measurements, Fold]:
+def shadowed(
+    rows: int = 200, range_m: float = 2.0, noise_db: float = 0.5
+) -> tuple[Measurements, Fold]:
     """Power with shadowing of 6 dB that is correlated as exp(-distance / range), over 20 x 20 m."""
     rng = np.random.default_rng(0)
     where = np.column_stack([rng.uniform(0, 20, (rows, 2)), np.full(rows, 1.5)])
     apart = np.linalg.norm(where[:, None] - where[None], axis=-1)
-    drawn = np.linalg.cholesky(36 * np.exp(-apart / range_m) + 1e-9 * np.eye(rows)) @ rng.normal(size=rows)
+    drawn = np.linalg.cholesky(36 * np.exp(-apart / range_m) + 1e-9 * np.eye(rows)) @ rng.normal(
+        size=rows
+    )
     power = -60 + drawn + noise_db * rng.normal(size=rows)
-    data = from_arrays({"rssi_db": power, "rx_position": where, "tx_position": np.array([10.0, 10.0, 5.0])})
+    data = from_arrays(
+        {"rssi_db": power, "rx_position": where, "tx_position": np.array([10.0, 10.0, 5.0])}
+    )
     return data, fold_of(data)
 
 

@@ -35,13 +35,17 @@ BATCH = 7  # no multiple of two processes, nor a divisor of the rows
 class Doubles(Loaded):
     """Batches in float64."""
 
-    def transfer_batch_to_device(self, batch: Batch, device: torch.device, dataloader_idx: int) -> Batch:
+    def transfer_batch_to_device(
+        self, batch: Batch, device: torch.device, dataloader_idx: int
+    ) -> Batch:
         rx = Pose(batch.rx.position.double(), batch.rx.rotation.double())
         return replace(batch, tx=batch.tx.double(), target=batch.target.double(), rx=rx).to(device)
 
 
 class Alike(L.Callback):
-    """Compares what all processes hold, every 10 steps: parameters, moments, ids and gathered statistics."""
+    """Compares what all processes hold, every 10 steps: parameters, moments,
+    ids and gathered statistics.
+    """
 
     def on_train_batch_end(self, trainer: L.Trainer, module: Any, *unused: Any) -> None:
         if trainer.global_step % 10 or not distributed.is_initialized():
@@ -81,10 +85,16 @@ def densifying() -> list[L.Callback]:
 
 
 def trained(
-    data: Measurements, folder: Path, devices: int, steps: int = 200, double: bool = True,
-    more: Sequence[L.Callback] = (), resume: Path | None = None,
-) -> GaussianModule:  # fmt: skip
-    """A small field after `steps`, with one device in this process, with more in processes of their own.
+    data: Measurements,
+    folder: Path,
+    devices: int,
+    steps: int = 200,
+    double: bool = True,
+    more: Sequence[L.Callback] = (),
+    resume: Path | None = None,
+) -> GaussianModule:
+    """A small field after `steps`, with one device in this process,
+    with more in processes of their own.
 
     `last.ckpt` is left after every seventh step.
     """
@@ -102,9 +112,13 @@ def trained(
         DEFAULTS, max_steps=steps, devices=devices, strategy="ddp_fork" if devices > 1 else "auto"
     )
     context = FitContext(
-        folder, batch_size=BATCH, datamodule=shown, trainer=options, resume=resume,
+        folder,
+        batch_size=BATCH,
+        datamodule=shown,
+        trainer=options,
+        resume=resume,
         callbacks=lambda: [*densifying(), last, *more],
-    )  # fmt: skip
+    )
     L.seed_everything(0, verbose=False)
     trained = made.double() if double else made
     trainer, batches = make_trainer(trained, data, fold, context, TorchCheckpointIO(), Stopwatch())

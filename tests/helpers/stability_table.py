@@ -14,8 +14,12 @@ BEGIN, END = "<!-- measured: begin -->", "<!-- measured: end -->"
 ENGINES = ["reference", "cpu", "cuda shim", "cuda"]
 KEYS = ["case", "backend", "precision"]
 FORMATS = {
-    "forward": "{:.1e}", "backward": "{:.1e}", "of allowed": "{:.0%}", "ms": "{:.2f}", "x truth": "{:.2f}",
-}  # fmt: skip
+    "forward": "{:.1e}",
+    "backward": "{:.1e}",
+    "of allowed": "{:.0%}",
+    "ms": "{:.2f}",
+    "x truth": "{:.2f}",
+}
 
 
 def write(path: Path, ledger: Ledger, folder: Path) -> None:
@@ -27,9 +31,14 @@ def write(path: Path, ledger: Ledger, folder: Path) -> None:
     before, rest = text.split(BEGIN)
     parts = [_conditions(ledger), _kernels(figures)]
     path.write_text(f"{before}{BEGIN}\n{''.join(parts)}{END}{rest.split(END)[1]}", encoding="utf-8")
-    for name, table in (("cases", _cases(ledger, folder)), ("kernels", _formatted(figures.reset_index()))):
+    for name, table in (
+        ("cases", _cases(ledger, folder)),
+        ("kernels", _formatted(figures.reset_index())),
+    ):
         table = table.assign(case=table["case"].astype(str).str.replace("_", " "))
-        table.to_csv(path.parent / "results" / f"hard-cases-{name}.csv", index=False, lineterminator="\n")
+        table.to_csv(
+            path.parent / "results" / f"hard-cases-{name}.csv", index=False, lineterminator="\n"
+        )
 
 
 def _conditions(ledger: Ledger) -> str:
@@ -68,10 +77,14 @@ def _figures(ledger: Ledger) -> pd.DataFrame:
     found = worst.reindex(columns=["forward", "backward"])
     found.insert(0, "examples", times.size().reindex(found.index).astype("Int64"))
     found["of allowed"], found["ms"] = errors.groupby(KEYS)["share"].max(), 1e3 * median
-    found["x truth"] = found["ms"] / (1e3 * found.index.get_level_values("case").map(truth).astype(float))
+    found["x truth"] = found["ms"] / (
+        1e3 * found.index.get_level_values("case").map(truth).astype(float)
+    )
     found = found[found.index.isin(ENGINES, level="backend")]
     order = {name: number for number, name in enumerate(ENGINES)}
-    return found.sort_index(key=lambda level: level.map(order) if level.name == "backend" else level)
+    return found.sort_index(
+        key=lambda level: level.map(order) if level.name == "backend" else level
+    )
 
 
 def _formatted(table: pd.DataFrame) -> pd.DataFrame:
@@ -85,19 +98,31 @@ def _formatted(table: pd.DataFrame) -> pd.DataFrame:
 
 
 def _markdown(heads: Iterable[str], rule: str, rows: Iterable[Iterable[object]]) -> str:
-    lines = [f"| {' | '.join(heads)} |", rule, *(f"| {' | '.join(map(str, row))} |" for row in rows)]
+    lines = [
+        f"| {' | '.join(heads)} |",
+        rule,
+        *(f"| {' | '.join(map(str, row))} |" for row in rows),
+    ]
     return "".join(f"{line}\n" for line in lines)
 
 
 def _kernels(figures: pd.DataFrame) -> str:
     largest = {name: "max" for name in ("forward", "backward", "of allowed")}
     by = (
-        figures.fillna({"forward": 0.0, "backward": 0.0}).groupby(KEYS[1:]).agg({"examples": "sum"} | largest)
+        figures.fillna({"forward": 0.0, "backward": 0.0})
+        .groupby(KEYS[1:])
+        .agg({"examples": "sum"} | largest)
     )
-    by = by.reindex([(e, kind) for e in ENGINES for kind in ("float32", "float64") if (e, kind) in by.index])
+    by = by.reindex(
+        [(e, kind) for e in ENGINES for kind in ("float32", "float64") if (e, kind) in by.index]
+    )
     heads = ("backend", "precision", "examples", "forward", "backward", "of allowed")
     return (
         "\n### Accuracy of the kernels\n\n"
-        "Worst of all cases: difference to the float64 reference, relative to one plus the largest value,\n"
-        "and share of the tolerance. [Case by case, with times](results/hard-cases-kernels.csv).\n\n"
-    ) + _markdown(heads, "|---|---|---:|---:|---:|---:|", _formatted(by.reset_index()).to_numpy().tolist())
+        "Worst of all cases: difference to the float64 reference, relative to one plus the "
+        "largest value,\n"
+        "and share of the tolerance. [Case by case, with "
+        "times](results/hard-cases-kernels.csv).\n\n"
+    ) + _markdown(
+        heads, "|---|---|---:|---:|---:|---:|", _formatted(by.reset_index()).to_numpy().tolist()
+    )

@@ -27,31 +27,49 @@ def _plane() -> dict[str, np.ndarray]:
     """Powers of three waves, centimetre by centimetre; a few rows are faults."""
     places = np.stack(np.meshgrid(np.arange(80), np.arange(80), [25]), axis=-1).reshape(-1, 3) / 100
     distance = np.linalg.norm(places[:, None] - [[0, 0, 2.4], [1, 2, 2.4], [3, -1, 2.4]], axis=-1)
-    level = 20 * np.log10(np.abs((np.exp(-2j * np.pi * distance / 0.326) / distance).sum(axis=1)) + 0.05) - 20
+    level = (
+        20
+        * np.log10(np.abs((np.exp(-2j * np.pi * distance / 0.326) / distance).sum(axis=1)) + 0.05)
+        - 20
+    )
     level[700:705] = -90
-    return {"rx_position": np.float32(places), "rssi_db": np.float32(level), "frequency_hz": np.array(920e6)}
+    return {
+        "rx_position": np.float32(places),
+        "rssi_db": np.float32(level),
+        "frequency_hz": np.array(920e6),
+    }
 
 
 def _robot_runs() -> dict[str, np.ndarray]:
-    """Squared channels of three transmitters and their roots: five runs of 1 m in each of five patches."""
+    """Squared channels of three transmitters and their roots:
+    five runs of 1 m in each of five patches.
+    """
     rng, posts = np.random.default_rng(0), np.array([*LOS_SET_A.values()])
     starts = rng.uniform(-0.8, 0.8, (5, 1, 1, 2)) + rng.normal(0, 0.004, (5, 5, 1, 2))
     turned = rng.uniform(0, 2 * np.pi, (5, 1, 1)) + rng.normal(0, 0.005, (5, 5, 1))
     along = 0.016 * np.arange(60)[:, None] * np.stack([np.cos(turned), np.sin(turned)], axis=-1)
-    where = np.pad((starts + along).reshape(25, 60, 2), ((0, 0), (0, 0), (0, 1)), constant_values=0.2)
+    where = np.pad(
+        (starts + along).reshape(25, 60, 2), ((0, 0), (0, 0), (0, 1)), constant_values=0.2
+    )
     root = np.concatenate([true_root(where.reshape(-1, 3), post) for post in posts])
     root += 0.1 * np.abs(root).mean() * (rng.normal(size=(2, *root.shape)).T @ [1, 1j]).T
     square = np.complex64(root**2)
     return {
-        "rx_position": np.float32(np.tile(where.reshape(-1, 3), (3, 1))), "tx_position": np.float32(posts),
-        "tx_index": np.repeat(np.arange(3), 1500), "run": np.tile(np.repeat(np.arange(25), 60), 3),
-        "segment": np.repeat(np.arange(75), 60), "h2": square, "good": np.ones(4500, bool),
+        "rx_position": np.float32(np.tile(where.reshape(-1, 3), (3, 1))),
+        "tx_position": np.float32(posts),
+        "tx_index": np.repeat(np.arange(3), 1500),
+        "run": np.tile(np.repeat(np.arange(25), 60), 3),
+        "segment": np.repeat(np.arange(75), 60),
+        "h2": square,
+        "good": np.ones(4500, bool),
         "root_sign": np.where((root * np.sqrt(square).conj()).real < 0, -1, 1),
-        "subcarrier_hz": FREQUENCY, "frequency_hz": np.array(5.54e9),
-    }  # fmt: skip
+        "subcarrier_hz": FREQUENCY,
+        "frequency_hz": np.array(5.54e9),
+    }
 
 
-# What precedes the channel in a packet of a 43455c0: Ethernet, IP, UDP, mark, sender, channel 48, chip.
+# What precedes the channel in a packet of a 43455c0: Ethernet, IP, UDP, mark, sender, channel 48,
+# chip.
 PACKET = (
     "ffffffffffff4e45584d4f4e08004500012e000100000111a4ab0a0a0a0affffffff"
     "157c157c011a000011111111{}c0a5000030d06500"
@@ -60,18 +78,33 @@ SENDERS = "b83a5ab26e70", "b83a5ab26e71"
 
 
 def _corridor(folder: Path) -> None:
-    """Six logs of twelve packets, whose phases and gains are their own and whose guard tones hold junk."""
-    rng, tone, table = np.random.default_rng(0), np.fft.fftfreq(64, 1 / 64), "file,x,y,rssi_dbm,channel\n"
+    """Six logs of twelve packets, whose phases and gains are their own
+    and whose guard tones hold junk.
+    """
+    rng, tone, table = (
+        np.random.default_rng(0),
+        np.fft.fftfreq(64, 1 / 64),
+        "file,x,y,rssi_dbm,channel\n",
+    )
     folder.mkdir()
     for i in range(6):
-        name, head = f"{204 + i // 2}_{1 + i % 2}.pcap", bytes.fromhex(PACKET.format(SENDERS[i % 2]))
+        name, head = (
+            f"{204 + i // 2}_{1 + i % 2}.pcap",
+            bytes.fromhex(PACKET.format(SENDERS[i % 2])),
+        )
         table += f"{name},{9.7 + 0.6 * i},5.6,{-50 + i},48\n"
         content = struct.pack("<IHHIIII", 0xA1B2C3D4, 2, 4, 0, 0, 1 << 18, 1)
         for k in range(12):
             csi = 1 + 0.5 * np.exp(-2j * np.pi * tone * 0.02)
-            csi *= 10 ** rng.uniform(2.2, 3) * np.exp(2j * np.pi * rng.uniform()) * np.where(tone, 1, 9)
+            csi *= (
+                10 ** rng.uniform(2.2, 3)
+                * np.exp(2j * np.pi * rng.uniform())
+                * np.where(tone, 1, 9)
+            )
             parts = np.stack([csi.real, csi.imag], axis=1).astype("<i2").tobytes()
-            content += struct.pack("<IIII", 1_627_494_000 + i, k, *2 * [len(head + parts)]) + head + parts
+            content += (
+                struct.pack("<IIII", 1_627_494_000 + i, k, *2 * [len(head + parts)]) + head + parts
+            )
         (folder / name).write_bytes(content)
     (folder / "places.csv").write_text(table)
 

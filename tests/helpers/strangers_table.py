@@ -1,10 +1,12 @@
-"""The table docs/results/strangers.csv: what `gsparc check` says of files of strangers, what heeding it buys.
+"""The table docs/results/strangers.csv: what `gsparc check` says of files of strangers,
+what heeding it buys.
 
     PYTHONPATH=tests/helpers python tests/helpers/strangers_table.py [FILE ...]
 
-Errors are of cheap methods, on a random fifth of the rows: of powers the root mean square of `gp` [dB]; of
-channels the normalised error [dB] of the direct path alone, a complex factor and the distance; of spectra the
-angle from each image's peak to the transmitter, the median [deg]; `refused` where nothing is read.
+Errors are of cheap methods, on a random fifth of the rows: of powers the root mean square of `gp`
+[dB]; of channels the normalised error [dB] of the direct path alone, a complex factor and the
+distance; of spectra the angle from each image's peak to the transmitter, the median [deg];
+`refused` where nothing is read.
 """
 
 import csv
@@ -28,8 +30,8 @@ GATEWAY = {"stations_file": str(REAL / "strangers/c11_gw.csv")}
 POSTS = {"stations_file": str(REAL / "strangers/silent_sites.csv")}
 TWICE = "the same name on two carriers"
 
-# Of each file: what is unusual, what it is read with at first, what its advice sets, and, where that is not
-# it, what is right.
+# Of each file: what is unusual, what it is read with at first, what its advice sets, and, where
+# that is not it, what is right.
 CASES: dict[str, tuple[str, dict, dict | None, dict | None]] = {
     "c02_wigle.csv": ("a banner above the heads", {}, None, None),
     "c02_half_null.csv": ("half of the fixes at 0, 0", {}, None, None),
@@ -41,7 +43,8 @@ CASES: dict[str, tuple[str, dict, dict | None, dict | None]] = {
     **{
         f"c04_{name}.npz": (what, {}, {setting: True}, None)
         for name, what, setting in (
-            ("conj", "conjugated", "conjugate"), ("fftorder", "tones in the order of an FFT", "fft_order"),
+            ("conj", "conjugated", "conjugate"),
+            ("fftorder", "tones in the order of an FFT", "fft_order"),
             ("normdelay", "delays taken out", "delays_removed"),
         )
     },
@@ -58,36 +61,64 @@ CASES: dict[str, tuple[str, dict, dict | None, dict | None]] = {
     "c07_floors.csv": ("three floors", {}, {"columns": {"z": "FLOOR*3.2"}}, None),
     "c07_floors_st.csv": ("a station for each floor", {}, None, None),
     "c07_utm.csv": ("two zones of a projection", {}, None, None),
-    "c07_uji.csv": ("metres called degrees", {}, {"columns": {"x": "LONGITUDE", "y": "LATITUDE"}}, None),
+    "c07_uji.csv": (
+        "metres called degrees",
+        {},
+        {"columns": {"x": "LONGITUDE", "y": "LATITUDE"}},
+        None,
+    ),
     "c08_gw_null.csv": ("a gateway at 0, 0", {}, None, None),
     "c10_dji.csv": ("heights above the sea", {}, None, None),
     "c10_compound.h5": ("compounds of MATLAB", {}, None, None),
-    "c10_ampphase.csv": ("amplitudes and phases in columns, no transmitter, no tones", {}, None, None),
+    "c10_ampphase.csv": (
+        "amplitudes and phases in columns, no transmitter, no tones",
+        {},
+        None,
+        None,
+    ),
     "c11_us915.csv": ("64 channels within 1.5 %", GATEWAY, None, None),
     "c11_nofreq.csv": ("the same without frequencies", GATEWAY, None, None),
     "c12_ok.npz": ("nothing", {}, None, None),
     "c12_axes.npz": ("axes exchanged", {}, {"exchange_axes": True}, None),
     "c12_array_mm.npz": ("an array in millimetres", {}, {"array_mm": True}, None),
-    **{f"silent_{mark}.csv": (f"{mark} for not heard", POSTS, None, None) for mark in ("100", "200", "NP")},
+    **{
+        f"silent_{mark}.csv": (f"{mark} for not heard", POSTS, None, None)
+        for mark in ("100", "200", "NP")
+    },
     "h01_asu.csv": ("levels as ASU", SITES, {"columns": {"rssi_db": "asu*2-113"}}, None),
     "h01_minus1.csv": ("-1 for no value", SITES, None, None),
     "h03_lfs.csv": ("a Git LFS pointer", {}, None, None),
     "h04_tower.csv": (
-        "neighbours without identity", {}, {"columns": {"rssi_db": "rsrp", "station": "psc+arfcn"}}, None
+        "neighbours without identity",
+        {},
+        {"columns": {"rssi_db": "rsrp", "station": "psc+arfcn"}},
+        None,
     ),
     "h05_netsurvey.csv": (
-        "neighbours without identity", {}, {"columns": {"rssi_db": "rsrp", "station": "pci+earfcn"}}, None
+        "neighbours without identity",
+        {},
+        {"columns": {"rssi_db": "rsrp", "station": "pci+earfcn"}},
+        None,
     ),
     "h11_influx_pivot.csv": ("three tables in one export", {}, None, None),
     "h12_yx.csv": (
-        "heads in another language", {}, {"columns": {"lat": "Breitenmass", "lon": "Laengenmass"}}, None
+        "heads in another language",
+        {},
+        {"columns": {"lat": "Breitenmass", "lon": "Laengenmass"}},
+        None,
     ),
     "h13_two_phones.csv": (
-        "two phones 9 dB apart", SITES, {"columns": {"device": "phone_model"}}, None
+        "two phones 9 dB apart",
+        SITES,
+        {"columns": {"device": "phone_model"}},
+        None,
     ),
     "h15_min_plain.json": ("a record without a place", {}, None, None),
     "h16_llrp.csv": (
-        "hundredths of dB, EPC", {}, {"columns": {"rssi_db": "ImpinjPeakRSSI*0.01", "station": "EPC"}}, None
+        "hundredths of dB, EPC",
+        {},
+        {"columns": {"rssi_db": "ImpinjPeakRSSI*0.01", "station": "EPC"}},
+        None,
     ),
     "h17_radiomap_flat.npz": ("zeros of linear powers", {}, None, None),
     "h22_esp.csv": ("lists in cells", {}, {"columns": {"rssi_db": "rssi"}}, None),
@@ -95,7 +126,7 @@ CASES: dict[str, tuple[str, dict, dict | None, dict | None]] = {
     "h31_ok.npz": ("nothing", {}, None, None),
     "h31_cm.npz": ("centimetres", {}, {"centimetres": True}, None),
     "h31_ampphase.npz": ("amplitudes beside phases", {}, None, None),
-}  # fmt: skip
+}
 
 
 def error(path: Path, settings: dict) -> str:
@@ -108,7 +139,11 @@ def error(path: Path, settings: dict) -> str:
     if data.site.kind == "rssi":
         scores = fit_baseline("gp", data, split).scores
         return f"{float(scores.figures()['rmse_db'] or np.nan):.2f} dB"
-    return _direct_path(data, fold.train, fold.test) if data.site.kind == "csi" else _peaks(data, fold.test)
+    return (
+        _direct_path(data, fold.train, fold.test)
+        if data.site.kind == "csi"
+        else _peaks(data, fold.test)
+    )
 
 
 def _direct_path(data: Measurements, train: np.ndarray, test: np.ndarray) -> str:
@@ -127,7 +162,9 @@ def _direct_path(data: Measurements, train: np.ndarray, test: np.ndarray) -> str
 def _peaks(data: Measurements, test: np.ndarray) -> str:
     grid = data.site.grid
     seen = np.einsum("sij,si->sj", data.rx_rotation, data.tx - data.rx_position)[test]
-    row, column = np.unravel_index(data.target[test].reshape(len(test), -1).argmax(1), data.target.shape[1:])
+    row, column = np.unravel_index(
+        data.target[test].reshape(len(test), -1).argmax(1), data.target.shape[1:]
+    )
     up = grid.first_elevation + row * grid.elevation_step
     round_ = grid.first_azimuth + column * grid.azimuth_step
     peak = np.stack([np.cos(up) * np.cos(round_), np.cos(up) * np.sin(round_), np.sin(up)], axis=1)

@@ -18,7 +18,8 @@ from rooms_later import draw, truth
 
 import gsparc
 
-CLIENTS, BATCH = 8, 5  # each with a station of its own; `gsparc update` tells the last station's rows
+# Each with a station of its own; `gsparc update` tells the last station's rows
+CLIENTS, BATCH = 8, 5
 STATIONS = CLIENTS + 1
 Row = tuple[int, float, float]  # station and place
 
@@ -27,9 +28,13 @@ def save_room(path: Path) -> None:
     """A model of a room with a station for each who tells rows."""
     places = draw(20, 0)
     gsparc.fit(
-        rx=places.repeat(STATIONS, 0), rssi=truth(places).repeat(STATIONS), model="gp", save=path,
-        station=np.tile(range(STATIONS), len(places)), station_position=draw(STATIONS, 1),
-    )  # fmt: skip
+        rx=places.repeat(STATIONS, 0),
+        rssi=truth(places).repeat(STATIONS),
+        model="gp",
+        save=path,
+        station=np.tile(range(STATIONS), len(places)),
+        station_position=draw(STATIONS, 1),
+    )
 
 
 def place(turn: int) -> list[float]:
@@ -67,13 +72,22 @@ class Soak:
 
     def __init__(self, folder: Path, seconds: float, alive_s: float) -> None:
         self.folder, self.path, self.alive_s = folder, folder / "live.ckpt", alive_s
-        self.told, self.doubtful, self.kills, self.refused = Counter[Row](), set[Row](), 0, Counter[int]()
+        self.told, self.doubtful, self.kills, self.refused = (
+            Counter[Row](),
+            set[Row](),
+            0,
+            Counter[int](),
+        )
         save_room(self.path)
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
             self.port = free.getsockname()[1]
         self.end = time.monotonic() + seconds
-        parts = [*((self._send, number) for number in range(CLIENTS)), (self._serve,), (self._update,)]
+        parts = [
+            *((self._send, number) for number in range(CLIENTS)),
+            (self._serve,),
+            (self._update,),
+        ]
         with ThreadPoolExecutor(len(parts)) as pool:
             for work in [pool.submit(*part) for part in parts]:
                 work.result()
@@ -119,8 +133,14 @@ class Soak:
                 "rssi_db": np.full(BATCH, -60.0),
             }
             np.savez(self.folder / "new.npz", **rows, station_position=draw(STATIONS, 1))
-            words = f"ckpt={self.path}", f"data={self.folder / 'new.npz'}", f"hydra.run.dir={self.folder}/run"
-            command = CONTEXT.Process(target=run, args=("update", str(self.folder), *words, "threads=1"))
+            words = (
+                f"ckpt={self.path}",
+                f"data={self.folder / 'new.npz'}",
+                f"hydra.run.dir={self.folder}/run",
+            )
+            command = CONTEXT.Process(
+                target=run, args=("update", str(self.folder), *words, "threads=1")
+            )
             command.start()
             command.join()
             if command.exitcode == 0:
@@ -132,14 +152,20 @@ class Soak:
         """How often the file holds each row."""
         kept = gsparc.load(self.path).measured
         at = kept["place"][:, :2].round(6).tolist()
-        return Counter((int(station), *where) for station, where in zip(kept["station"], at, strict=True))
+        return Counter(
+            (int(station), *where) for station, where in zip(kept["station"], at, strict=True)
+        )
 
     def counts(self) -> dict[str, int]:
         """What happened."""
         held = self.on_disk()
         return {
-            "told": self.told.total(), "by command": sum(row[0] == CLIENTS for row in self.told.elements()),
-            "lost": (self.told - held).total(), "twice": sum(count - 1 for count in held.values()),
-            "broken": len(self.doubtful), "of these on disk": len(held.keys() & self.doubtful),
-            "of nobody": len(held.keys() - self.doubtful - self.told.keys()), "kills": self.kills,
-        } | {f"answered {status}": count for status, count in self.refused.items() if count}  # fmt: skip
+            "told": self.told.total(),
+            "by command": sum(row[0] == CLIENTS for row in self.told.elements()),
+            "lost": (self.told - held).total(),
+            "twice": sum(count - 1 for count in held.values()),
+            "broken": len(self.doubtful),
+            "of these on disk": len(held.keys() & self.doubtful),
+            "of nobody": len(held.keys() - self.doubtful - self.told.keys()),
+            "kills": self.kills,
+        } | {f"answered {status}": count for status, count in self.refused.items() if count}

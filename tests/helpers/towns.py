@@ -28,9 +28,12 @@ def town_file(path: Path, rows: int = 300, seed: int = 0) -> Path:
     loss = 30 * np.log10(cdist(place, MASTS))
     power = -30 - loss + 5 * root @ rng.normal(size=(rows, 2)) + rng.normal(size=(rows, 2))
     np.savez(
-        path, rx_position=place, station_position=MASTS, station_name=np.array(["west", "east"]),
+        path,
+        rx_position=place,
+        station_position=MASTS,
+        station_name=np.array(["west", "east"]),
         rssi_db=power,
-    )  # fmt: skip
+    )
     return path
 
 

@@ -23,14 +23,18 @@ def logged():
     given, channel = packets.robot()
     del given["run"]
     tones = given["frequency_hz"] - given["frequency_hz"].mean()
-    return set_unknown_factor(packets.measurements(given, packets.logged(channel, tones, 0)), "auto")
+    return set_unknown_factor(
+        packets.measurements(given, packets.logged(channel, tones, 0)), "auto"
+    )
 
 
 @pytest.mark.slow
 def test_neighbours_are_alike_after_alignment_and_test_rows_are_not_looked_at(logged):
     fold = packets.shares(logged, 0)
     turned, _ = align_phases(logged, fold)
-    assert turned.site.phase_reference == "neighbours" and turned.site.unknown_factor == "phase+delay"
+    assert (
+        turned.site.phase_reference == "neighbours" and turned.site.unknown_factor == "phase+delay"
+    )
     assert (turned.target[fold.test] == logged.target[fold.test]).all()
     assert np.allclose(np.abs(turned.target), np.abs(logged.target), rtol=1e-4)
     other = np.array(logged.target)
@@ -47,19 +51,31 @@ def test_rows_that_are_coherent_stay_as_they_are():
 
 
 def test_antennas_at_known_places_bring_the_carriers_phase_back():
-    """A phase of each row's own before 12 antennas: phases over places come back but for one of all rows."""
+    """A phase of each row's own before 12 antennas:
+    phases over places come back but for one of all rows.
+    """
     draw, wavelength = np.random.default_rng(0), 0.326
     places = np.c_[draw.uniform(0, 1.0, (150, 2)), np.full(150, 0.8)]
     antennas = np.c_[draw.uniform(-3, 4, (12, 2)), np.full(12, 2.4)]
     sources = np.concatenate([antennas, antennas * [1, 1, -1]])
     path = np.linalg.norm(places[:, None] - sources, axis=2).reshape(150, 2, 12)
-    channel = (np.array([1.0, 0.4])[:, None] * np.exp(-2j * np.pi * path / wavelength) / path).sum(1)
+    channel = (np.array([1.0, 0.4])[:, None] * np.exp(-2j * np.pi * path / wavelength) / path).sum(
+        1
+    )
     phase = np.exp(2j * np.pi * draw.uniform(size=150))
-    site = replace(_site(), carrier_hz=299792458 / wavelength, array=antennas, static_position=np.zeros(3))
+    site = replace(
+        _site(), carrier_hz=299792458 / wavelength, array=antennas, static_position=np.zeros(3)
+    )
     rows = Snapshots(
-        np.arange(150), np.arange(150), np.zeros(150, int), np.zeros(1, int), places,
-        (channel * phase[:, None])[..., None], np.zeros(1), np.zeros(150, int),
-    )  # fmt: skip
+        np.arange(150),
+        np.arange(150),
+        np.zeros(150, int),
+        np.zeros(1, int),
+        places,
+        (channel * phase[:, None])[..., None],
+        np.zeros(1),
+        np.zeros(150, int),
+    )
     found = align_rows(rows, "phase", site)
     left = found.factors[:, 0] * phase
     assert found.phase_reference == "carrier" and abs(left.mean()) > 0.95
@@ -74,7 +90,9 @@ def test_a_free_gain_is_a_unit_row(logged):
     free = replace(logged, site=replace(logged.site, unknown_factor="phase+delay+gain"))
     fold = packets.shares(free, 0)
     target = align_phases(free, fold)[0].target[fold.train]
-    assert np.ptp(np.abs(target).mean((1, 2))) < 0.5 * np.ptp(np.abs(free.target[fold.train]).mean((1, 2)))
+    assert np.ptp(np.abs(target).mean((1, 2))) < 0.5 * np.ptp(
+        np.abs(free.target[fold.train]).mean((1, 2))
+    )
     told = align_factors(target, target * 2, np.zeros(target.shape[2]), "phase+delay+gain")
     assert np.allclose(np.abs(told), 2, rtol=1e-3)
 
@@ -94,9 +112,15 @@ def test_stations_that_are_missing_took_the_places_of_others():
     stations = Stations(np.c_[np.arange(6.0), np.zeros(6), np.full(6, 2.0)], tuple("abcdef"))
     site = replace(_site(), stations=stations, static_position=None)
     rows = Snapshots(
-        np.arange(10), np.repeat([0, 1], 5), np.tile(np.arange(5), 2), np.arange(1, 6), np.ones((2, 3)),
-        np.ones((2, 5, 1), complex), np.zeros(1), np.zeros(2, int),
-    )  # fmt: skip
+        np.arange(10),
+        np.repeat([0, 1], 5),
+        np.tile(np.arange(5), 2),
+        np.arange(1, 6),
+        np.ones((2, 3)),
+        np.ones((2, 5, 1), complex),
+        np.zeros(1),
+        np.zeros(2, int),
+    )
     away = np.linalg.norm(np.ones(3) - stations.position[1:], axis=1)
     expected = np.exp(-2j * np.pi / site.wavelength * away)
     assert np.allclose(aligned_rows._direct_wave(rows, site)[0, :, 0], expected)
@@ -115,7 +139,9 @@ def test_another_file_is_scored_after_the_unknown_factor_of_the_model(logged):
 
 @pytest.mark.slow
 def test_packets_of_one_place_are_averaged(logged):
-    """Twelve packets of each place were rows of one process: `gp` of a corridor had .665, of means .534."""
+    """Twelve packets of each place were rows of one process: `gp` of a corridor had .665,
+    of means .534.
+    """
     draw, tones = np.random.default_rng(0), logged.site.subcarriers_hz
     row = np.repeat(np.arange(len(logged)), 4)
     shape, level = (len(row), 1, len(tones), 2), 0.3 * np.abs(logged.target).mean()
@@ -142,6 +168,8 @@ def test_what_any_packet_of_a_place_measured_is_known_of_their_mean(logged):
     mask = np.ones(several.target.shape, bool)
     mask[0, 0, 3] = mask[2, 0, 5] = False
     noise = np.full(3, 0.2, np.float32)
-    rows, mean = aligned_rows.average_packets(replace(several, mask=mask, noise_variance=noise), np.arange(3))
+    rows, mean = aligned_rows.average_packets(
+        replace(several, mask=mask, noise_variance=noise), np.arange(3)
+    )
     assert rows.tolist() == [0, 2] and mean.mask[0].all() and not mean.mask[2, 0, 5]
     assert mean.noise_variance[rows].tolist() == pytest.approx([0.1, 0.2])

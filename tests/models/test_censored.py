@@ -1,4 +1,6 @@
-"""Rows where nothing was heard: the likelihood of "below the level", and a town half of which is silent."""
+"""Rows where nothing was heard: the likelihood of "below the level",
+and a town half of which is silent.
+"""
 
 from dataclasses import replace
 
@@ -21,7 +23,9 @@ SHADOWING_DB, LENGTH_M, NOISE_DB = 7.0, 80.0, 1.5
 
 
 def town(count: int = 350, seed: int = 0) -> tuple[Measurements, np.ndarray, np.ndarray]:
-    """A kilometre of streets, half of it below the sensitivity; true powers [dB], and which were heard."""
+    """A kilometre of streets, half of it below the sensitivity; true powers [dB],
+    and which were heard.
+    """
     rng = np.random.default_rng(seed)
     places = np.c_[rng.uniform(0, 1000, (count, 2)), np.full(count, 1.5)]
     gap = np.sqrt(3) * cdist(places, places) / LENGTH_M
@@ -32,7 +36,12 @@ def town(count: int = 350, seed: int = 0) -> tuple[Measurements, np.ndarray, np.
     measured = true + NOISE_DB * rng.standard_normal(count)
     silent = measured < level
     shown = np.where(silent, level, measured)
-    arrays = {"rx_position": places, "tx_position": STATION, "rssi_db": shown, "carrier_hz": np.array(9e8)}
+    arrays = {
+        "rx_position": places,
+        "tx_position": STATION,
+        "rssi_db": shown,
+        "carrier_hz": np.array(9e8),
+    }
     data = from_arrays(arrays, {"name": "town"})
     return replace(data, censored=silent, mask=~silent[:, None]), true, silent
 
@@ -51,16 +60,25 @@ def predicted(model: str, data: Measurements, rows: np.ndarray, asked: np.ndarra
     found = method.predict(batch)
     power = found.mean[:, 0].double()
     deviation = found.variance.double().sqrt() / (np.log(10) / 10 * power)
-    return (10 * torch.log10(power * data.site.target_scale)).numpy(), deviation.numpy(), report.notes
+    return (
+        (10 * torch.log10(power * data.site.target_scale)).numpy(),
+        deviation.numpy(),
+        report.notes,
+    )
 
 
-MODELS = ["gsparc.models.baselines.distance_law.DistanceLaw", "gsparc.models.baselines.gp.GaussianProcess"]
+MODELS = [
+    "gsparc.models.baselines.distance_law.DistanceLaw",
+    "gsparc.models.baselines.gp.GaussianProcess",
+]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "margin"), list(zip(MODELS, (0.93, 0.85), strict=True)))
 def test_silent_rows_tell_of_a_half_silent_town(model, margin):
-    """Over all places, learned from and not: the truth is nearer when silence counts as "below the level"."""
+    """Over all places, learned from and not:
+    the truth is nearer when silence counts as "below the level".
+    """
     ratios, inside = [], []
     for seed in range(3):
         data, true, _ = town(seed=seed)
@@ -78,7 +96,9 @@ def test_silent_rows_tell_of_a_half_silent_town(model, margin):
 @pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_noise_was_learned_as_signal(model):
-    """Half of the powers lie below a receiver's noise, which it reports: levels below that were refused."""
+    """Half of the powers lie below a receiver's noise, which it reports:
+    levels below that were refused.
+    """
     ratios, inside = [], []
     for seed in range(2):
         data, true, _ = town(seed=seed)
@@ -99,7 +119,9 @@ def test_noise_was_learned_as_signal(model):
 
 @pytest.mark.parametrize("model", MODELS)
 def test_saturated_rows_were_learned_as_measured(model):
-    """The strongest 8.6 %, as one receiver in flight had them: too weak by 5 dB about the station."""
+    """The strongest 8.6 %, as one receiver in flight had them:
+    too weak by 5 dB about the station.
+    """
     data, true, _ = town()
     level = np.where(data.censored, true, 10 * np.log10(data.target[:, 0] * data.site.target_scale))
     arrays = {"rx_position": data.rx_position + data.site.origin, "tx_position": STATION}
@@ -109,7 +131,9 @@ def test_saturated_rows_were_learned_as_measured(model):
         clipped = from_arrays(arrays | {"rssi_db": np.minimum(level, top)}, {"saturation_db": how})
         found = predicted(model, clipped, fold_of(clipped).train, np.arange(len(clipped)))
         error[how] = (found[0] - true)[level > top]
-    assert any("in saturation are above their level" in note for note in found[2]) == ("gp" in model)
+    assert any("in saturation are above their level" in note for note in found[2]) == (
+        "gp" in model
+    )
     assert np.abs(error["auto"]).mean() < 0.7 * np.abs(error["none"]).mean()
 
 
@@ -124,7 +148,11 @@ def test_baselines_take_saturated_rows_as_measured_and_say_so():
     data, _, silent = town(60)
     rows, above = np.arange(60), replace(data, censored=-silent.astype(np.int8))
     fold = Fold(rows, rows[:0], rows[:5])
-    notes = build({"_target_": "gsparc.models.baselines.mean.Mean"}).fit(above, fold, FitContext()).notes
+    notes = (
+        build({"_target_": "gsparc.models.baselines.mean.Mean"})
+        .fit(above, fold, FitContext())
+        .notes
+    )
     assert notes == (
         f"mean: {silent.sum()} rows in saturation are learned from as if measured at that level",
     )
@@ -139,7 +167,9 @@ def test_what_cannot_use_them_leaves_them_out_and_says_so(model):
     asked = rows[:10]
     found = build({"_target_": model})
     notes = found.fit(data, Fold(rows, rows[:0], asked), FitContext()).notes
-    assert notes == (f"{found.name}: {silent.sum()} rows where nothing was heard are not learned from",)
+    assert notes == (
+        f"{found.name}: {silent.sum()} rows where nothing was heard are not learned from",
+    )
     assert found.count_components() == (~silent).sum()
     again = build({"_target_": model})
     assert not again.fit(data, Fold(heard_rows(data, rows), rows[:0], asked), FitContext()).notes

@@ -1,4 +1,6 @@
-"""Checkpoints: what goes in comes out; what may not come in: tests/hard_cases/doors/test_checkpoints.py."""
+"""Checkpoints: what goes in comes out; what may not come in:
+tests/hard_cases/doors/test_checkpoints.py.
+"""
 
 import collections
 import os
@@ -86,12 +88,22 @@ def test_extra_keeps_its_shape(fitted, tmp_path):
     assert back["optimizer"]["groups"] == [{"lr": 1e-3, "betas": (0.9, 0.99)}]
     assert back["optimizer"]["state"][0]["step"] == 3 and torch.equal(back["rng"], extra["rng"])
     assert back["scalar"] == 0.25 and back["path"] == "a/b" and back["ordered"] == {"x": 1}
-    assert torch.equal(back["numpy"], torch.arange(3)) and back["tuple"] == (1, 2) and back["none"] is None
+    assert (
+        torch.equal(back["numpy"], torch.arange(3))
+        and back["tuple"] == (1, 2)
+        and back["none"] is None
+    )
 
 
 def test_what_cannot_be_stored_is_named(fitted, path):
     before = path.read_bytes()
-    refused(re.escape("extra.a[1] is a object"), checkpoint.save, path, fitted[0], extra={"a": [1, object()]})
+    refused(
+        re.escape("extra.a[1] is a object"),
+        checkpoint.save,
+        path,
+        fitted[0],
+        extra={"a": [1, object()]},
+    )
     assert path.read_bytes() == before
     refused("not been fitted", checkpoint.save, path, GaussianProcess())
 
@@ -152,7 +164,9 @@ def test_numbers_that_are_not_finite_are_refused_by_name(path, part, value):
     content = torch.load(path, weights_only=True)
     del content["sha256"]
     tensors = {
-        k: v for k, v in content[part].items() if isinstance(v, torch.Tensor) and v.is_floating_point()
+        k: v
+        for k, v in content[part].items()
+        if isinstance(v, torch.Tensor) and v.is_floating_point()
     }
     name, tensor = next(iter(tensors.items()))
     tensor.view(-1)[0] = value
@@ -200,7 +214,9 @@ def test_a_writer_that_stays_is_said(path, tmp_path, monkeypatch):
             pool.submit(lambda: checkpoint.rewriting(link, wait_s=0).__enter__()).result()
         with pytest.raises(CheckpointError, match="others have been writing it"):
             pool.submit(checkpoint.save, path, loading.load(path)[0]).result()
-        pool.submit(lambda: checkpoint.rewriting(path, tmp_path / "other.ckpt").__enter__()).result()
+        pool.submit(
+            lambda: checkpoint.rewriting(path, tmp_path / "other.ckpt").__enter__()
+        ).result()
     checkpoint.update_extra(link, {"note": 1})
     assert link.is_symlink() and checkpoint.read(path).extra["note"] == 1
 
@@ -228,9 +244,17 @@ def mutated(value):
         again = value.clone()
         if again.numel() == 0:
             return torch.ones(1)
-        again.view(-1)[-1:] = ~again.view(-1)[-1:] if again.dtype == torch.bool else again.view(-1)[-1:] + 1
+        again.view(-1)[-1:] = (
+            ~again.view(-1)[-1:] if again.dtype == torch.bool else again.view(-1)[-1:] + 1
+        )
         return again
-    return not value if isinstance(value, bool) else value + "x" if isinstance(value, str) else value + 1
+    return (
+        not value
+        if isinstance(value, bool)
+        else value + "x"
+        if isinstance(value, str)
+        else value + 1
+    )
 
 
 def test_a_changed_content_answered_other_numbers(path, tmp_path):
@@ -249,7 +273,9 @@ def test_a_changed_content_answered_other_numbers(path, tmp_path):
 
 
 def test_a_flipped_bit_in_a_name_left_the_sum_and_the_dataset_unasked(path):
-    """A file without a sum passed for an older one; its site lost its hash, as both share the name."""
+    """A file without a sum passed for an older one; its site lost its hash,
+    as both share the name.
+    """
     with zipfile.ZipFile(path) as archive:
         parts = {name: archive.read(name) for name in archive.namelist()}
     with zipfile.ZipFile(path, "w") as archive:

@@ -16,7 +16,11 @@ def test_a_scene_comes_back_with_its_parts():
     stored = to_containers(scene)
     assert stored["sequences"] == [[], [0, 1]] and stored["clutter"]["plane"] == [0]
     again = from_containers(SourceScene, stored)
-    assert again.sequences == scene.sequences and again.visibility == kernel and again.clutter.plane == (0,)
+    assert (
+        again.sequences == scene.sequences
+        and again.visibility == kernel
+        and again.clutter.plane == (0,)
+    )
     assert torch.equal(again.planes, planes) and again.phase is None
 
 

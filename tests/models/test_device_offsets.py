@@ -1,4 +1,6 @@
-"""Offsets of devices are taken off before every method, and added to what is answered of a named one."""
+"""Offsets of devices are taken off before every method,
+and added to what is answered of a named one.
+"""
 
 from dataclasses import replace
 
@@ -41,7 +43,10 @@ def test_offsets_are_estimated_with_all_stations_on_training_rows_alone():
     assert np.array_equal(levels, learned[1].site.device_levels) and learned[0].device is None
     assert data.site.device_names == ("left", "right", "third")
     np.testing.assert_allclose(levels[:3, 0], [-6, 4, 2], atol=0.7)
-    assert levels[3].tolist() == pytest.approx([0, np.var(levels[:3, 0], ddof=1)]) and not levels[:3, 1].any()
+    assert (
+        levels[3].tolist() == pytest.approx([0, np.var(levels[:3, 0], ddof=1)])
+        and not levels[:3, 1].any()
+    )
     plain = 10 * np.log10(learned[0].target[:, 0] * data.site.target_scale)
     assert np.abs(plain - PLAIN).max() < 0.7
     # Once taken off they are not looked for again, as where every station is learned alone.
@@ -70,7 +75,9 @@ def test_baselines_learn_what_the_mean_device_reads_and_answer_as_each(name):
 
 def test_answers_of_a_named_device_and_of_the_mean_one():
     places, truth = PLACES[:20], PLAIN[:20]
-    said = gsparc.fit(model="gp", rx=PLACES, rssi=LEVEL, device=PHONE, station_position=AT, station=STATION)
+    said = gsparc.fit(
+        model="gp", rx=PLACES, rssi=LEVEL, device=PHONE, station_position=AT, station=STATION
+    )
     roof = said.select_station("0")
     near = np.flatnonzero(STATION[:20] == 0)
     mean, left = (one.predict(rx=places[near]) for one in (roof, roof.select_device("left")))
@@ -83,8 +90,12 @@ def test_answers_of_a_named_device_and_of_the_mean_one():
 
 
 def test_a_table_of_places_names_devices(tmp_path):
-    said = gsparc.fit(model="gp", rx=PLACES, rssi=LEVEL, device=PHONE, station_position=AT, station=STATION)
-    table = pd.DataFrame(PLACES[:4], columns=["x", "y", "z"]).assign(device=["left", "", "right", "left"])
+    said = gsparc.fit(
+        model="gp", rx=PLACES, rssi=LEVEL, device=PHONE, station_position=AT, station=STATION
+    )
+    table = pd.DataFrame(PLACES[:4], columns=["x", "y", "z"]).assign(
+        device=["left", "", "right", "left"]
+    )
     answers = {}
     for name in ("device", "phone"):
         path = tmp_path / f"{name}.csv"
@@ -92,7 +103,10 @@ def test_a_table_of_places_names_devices(tmp_path):
         predict_file(said, path, columns={"device": None if name == "device" else "phone"})
         answers[name] = pd.read_csv(path.with_suffix(".predicted.csv"))
     left, mean = answers["phone"].iloc[[0, 6]], answers["phone"].iloc[[2, 3]]
-    assert list(answers["phone"].phone.fillna("")) == ["left"] * 2 + [""] * 2 + ["right"] * 2 + ["left"] * 2
+    assert (
+        list(answers["phone"].phone.fillna(""))
+        == ["left"] * 2 + [""] * 2 + ["right"] * 2 + ["left"] * 2
+    )
     assert mean.rssi_db_std.min() > left.rssi_db_std.max()
     np.testing.assert_allclose(answers["phone"].rssi_db, answers["device"].rssi_db)
     table.assign(device="fourth").to_csv(tmp_path / "other.csv", index=False)
@@ -103,15 +117,24 @@ def test_a_table_of_places_names_devices(tmp_path):
 def test_devices_are_of_powers():
     with pytest.raises(ValueError, match="device: goes with powers, not with csi"):
         from_arrays(
-            {"rx_position": PLACES, "tx_position": AT[0], "csi": np.exp(1j * LEVEL), "frequency_hz": 1e9,
-             "device": PHONE}
-        )  # fmt: skip
+            {
+                "rx_position": PLACES,
+                "tx_position": AT[0],
+                "csi": np.exp(1j * LEVEL),
+                "frequency_hz": 1e9,
+                "device": PHONE,
+            }
+        )
 
 
 def test_variances_of_levels_add():
-    site = take_off_devices(campaign(), Fold(np.arange(240), np.zeros(0, int), np.zeros(0, int))).site
+    site = take_off_devices(
+        campaign(), Fold(np.arange(240), np.zeros(0, int), np.zeros(0, int))
+    ).site
     one = Prediction(torch.tensor([[2.0]]), torch.tensor([0.0]))
     said = one.of_devices(site)
     unit = site.power_unit("dB")
-    assert float(unit.variance(said.mean, said.variance)) == pytest.approx(site.device_levels[3, 1], rel=1e-5)
+    assert float(unit.variance(said.mean, said.variance)) == pytest.approx(
+        site.device_levels[3, 1], rel=1e-5
+    )
     assert one.of_devices(campaign().site) is one

@@ -1,4 +1,6 @@
-"""The Gaussian field of every kind of measurement: what it says, keeps, stores, and what it does not know."""
+"""The Gaussian field of every kind of measurement: what it says, keeps, stores,
+and what it does not know.
+"""
 
 import logging
 import math
@@ -30,9 +32,7 @@ from gsparc.ops import Pose
 from gsparc.training import race
 from gsparc.training.context import FitContext, FitReport
 
-SMALL = (
-    "model.field.count=40", "init.searches=1", "init.search_rows=60", "init.max_sources=9"
-)  # fmt: skip
+SMALL = ("model.field.count=40", "init.searches=1", "init.search_rows=60", "init.max_sources=9")
 BRIEF = 0.1  # effort
 
 AWAY_M = 150.0
@@ -63,9 +63,13 @@ class Kept(logging.Handler):
 
 
 def fit(
-    name: str, *overrides: str, effort: float = BRIEF, steps: int = 12,
-    small: tuple[str, ...] = SMALL, **more: str,
-) -> Fitted:  # fmt: skip
+    name: str,
+    *overrides: str,
+    effort: float = BRIEF,
+    steps: int = 12,
+    small: tuple[str, ...] = SMALL,
+    **more: str,
+) -> Fitted:
     folder, config = Path(mkdtemp()), compose(*small, *overrides)
     data = KINDS[name](folder)
     fold = fold_of(data)
@@ -127,9 +131,13 @@ def test_a_checkpoint_says_the_same(name, tmp_path):
 
 
 NAMED = {
-    "images": "image_process", "static array": "array_process", "moving array": "bearings",
-    "channels": "image_sources", "channels from nowhere known": "channels", "powers": "powers",
-}  # fmt: skip
+    "images": "image_process",
+    "static array": "array_process",
+    "moving array": "bearings",
+    "channels": "image_sources",
+    "channels from nowhere known": "channels",
+    "powers": "powers",
+}
 
 
 @pytest.mark.parametrize("name", NAMED)
@@ -141,7 +149,10 @@ def test_what_is_chosen_is_named(name):
 @pytest.mark.parametrize("name", ["images", "channels from nowhere known", "powers"])
 def test_what_is_chosen_answers_the_same_by_its_own_name(name):
     count = ("model.field.count=40",) if name == "images" else ()
-    both = [fit(name, f"model={model}", *count, small=(), effort=1.0) for model in ("gsparc", NAMED[name])]
+    both = [
+        fit(name, f"model={model}", *count, small=(), effort=1.0)
+        for model in ("gsparc", NAMED[name])
+    ]
     facts = [one.method.facts() | {"model/made": "", "time/init_s": None} for one in both]
     assert facts[0] == facts[1]
     same(both[0].method, both[1].method, asked(both[0]))
@@ -153,7 +164,9 @@ def test_far_from_all_data_nothing_is_known(name):
     batch, site = asked(fitted), fitted.data.site
     far = torch.from_numpy(site.box.mean(0)).float() + AWAY_M * AWAY[: len(batch)]
     there = (
-        replace(batch, tx=far) if site.moving_end == "tx" else replace(batch, rx=Pose(far, batch.rx.rotation))
+        replace(batch, tx=far)
+        if site.moving_end == "tx"
+        else replace(batch, rx=Pose(far, batch.rx.rotation))
     )
     near, away = fitted.method.predict(batch).confidence, fitted.method.predict(there).confidence
     assert ((near >= 0) & (near <= 1)).all() and (away < 0.01).all() and near.mean() > 0.2
@@ -164,9 +177,16 @@ def test_facts_say_where_it_started_and_what_that_cost(name):
     fitted = default(name)
     facts = fitted.method.facts()
     assert {*facts} == {
-        "model/init", "model/steps", "model/variance_explained", "model/num_gaussians", "time/init_s",
-        "model/made", "model/class", "model/choices", "model/steps_taken",
-    }  # fmt: skip
+        "model/init",
+        "model/steps",
+        "model/variance_explained",
+        "model/num_gaussians",
+        "time/init_s",
+        "model/made",
+        "model/class",
+        "model/choices",
+        "model/steps_taken",
+    }
     assert facts["model/init"] and facts["model/init"] != "auto"
     assert facts["model/num_gaussians"] == fitted.method.count_components()
     assert facts["model/steps"] >= 0 and 0 < facts["time/init_s"] <= fitted.report.seconds
@@ -179,14 +199,18 @@ def test_the_log_begins_with_what_is_trained_and_ends_with_what_it_cost(name):
     fitted = default(name)
     first = next(line for line in fitted.lines if line.startswith("training "))
     before = fitted.lines[: fitted.lines.index(first)]
-    assert all(line.startswith(("effects.", "the residual is all there is")) for line in before[:-1])
+    assert all(
+        line.startswith(("effects.", "the residual is all there is")) for line in before[:-1]
+    )
     assert before[-1].startswith("gsparc is model=")
     init = "+".join(part for part in first.partition("init=")[2].split(",")[:1])
     assert ("by rendering" in first) == isinstance(fitted.method, ImageProcess) and init
     assert ("callbacks" in first) == ("by rendering" in first)
     last = fitted.lines[-1]
     assert last.startswith("cost: ")
-    assert f" {fitted.report.seconds:.1f} s in all" in last or " s spent on what is not used" in last
+    assert (
+        f" {fitted.report.seconds:.1f} s in all" in last or (" s spent on what is not used") in last
+    )
 
 
 @pytest.mark.slow
@@ -217,23 +241,34 @@ def test_a_search_that_could_gain_too_little_ends(monkeypatch, caplog):
     monkeypatch.setattr(race, "STALLED", -math.inf)
     fitted = fit("channels", effort=1.0)
     assert "init=sources is left out: " in caplog.text
-    assert fitted.method.facts()["model/init"] == "diffuse" and "sources" in fitted.report.cost.unused
+    assert (
+        fitted.method.facts()["model/init"] == "diffuse" and "sources" in fitted.report.cost.unused
+    )
 
 
 @pytest.mark.parametrize(
     "name,plain",
     [
-        ("images", "gp"), ("static array", "gp"), ("moving array", "gp"),
-        ("powers", None), ("channels", None), ("channels of an array", None),
+        ("images", "gp"),
+        ("static array", "gp"),
+        ("moving array", "gp"),
+        ("powers", None),
+        ("channels", None),
+        ("channels of an array", None),
     ],
-)  # fmt: skip
+)
 def test_without_gaussians_it_is_the_plain_process(name, plain):
     fitted = fit(name, "model.field.count=0", "model.steps=0")
     assert fitted.method.count_components() == 0 and "phase" not in fitted.method.effects
     assert fitted.method.facts()["model/variance_explained"] is None
     if plain is not None:
-        process, known = method_class(plain)(), np.sort(np.concatenate([fitted.fold.train, fitted.fold.val]))
-        process.fit(fitted.data, Fold(known, known[:0], fitted.fold.test), short(Path(mkdtemp()), 1))
+        process, known = (
+            method_class(plain)(),
+            np.sort(np.concatenate([fitted.fold.train, fitted.fold.val])),
+        )
+        process.fit(
+            fitted.data, Fold(known, known[:0], fitted.fold.test), short(Path(mkdtemp()), 1)
+        )
         batch = asked(fitted)
         one, two = fitted.method.predict(batch), process.predict(batch)
         torch.testing.assert_close(one.mean, two.mean, rtol=1e-4, atol=0)

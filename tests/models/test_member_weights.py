@@ -21,24 +21,35 @@ TARGET = torch.from_numpy(np.random.default_rng(0).standard_normal((50, 3)))
 
 
 def noisy(share: float, seed: int) -> torch.Tensor:
-    return TARGET + share * torch.from_numpy(np.random.default_rng(seed).standard_normal(TARGET.shape))
+    return TARGET + share * torch.from_numpy(
+        np.random.default_rng(seed).standard_normal(TARGET.shape)
+    )
 
 
-def weigh(predicted: list[torch.Tensor], target: torch.Tensor, unit: np.ndarray, deviations: float = 1.0):
+def weigh(
+    predicted: list[torch.Tensor], target: torch.Tensor, unit: np.ndarray, deviations: float = 1.0
+):
     """Weights, one a prediction."""
     return tuple(choose_weights(error_products(predicted, target), unit, deviations))
 
 
 def share(*pairs: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
-    """Weight of the second of two predictions of spectra, where its mean with the first costs more."""
-    grams = [error_products([*map(torch.from_numpy, both)], torch.from_numpy(last)) for *both, last in pairs]
+    """Weight of the second of two predictions of spectra,
+    where its mean with the first costs more.
+    """
+    grams = [
+        error_products([*map(torch.from_numpy, both)], torch.from_numpy(last))
+        for *both, last in pairs
+    ]
     gram = relative_to_row(np.concatenate(grams))
     return float(choose_weights(gram, np.arange(len(gram)), SURE, LEAST_GAIN, FEW_ROWS)[1])
 
 
 def test_a_mixture_need_not_be_surely_better_where_that_is_not_asked_for():
     few = weigh([noisy(0.3, 1), noisy(0.33, 2)], TARGET, EACH, math.inf)
-    assert few == (1.0, 0.0) and 0 < weigh([noisy(0.3, 1), noisy(0.33, 2)], TARGET, EACH, 0.0)[1] < 0.6
+    assert (
+        few == (1.0, 0.0) and 0 < weigh([noisy(0.3, 1), noisy(0.33, 2)], TARGET, EACH, 0.0)[1] < 0.6
+    )
 
 
 def test_rows_of_one_unit_do_not_make_a_mixture():
@@ -57,16 +68,22 @@ def test_complex_predictions_are_weighed_as_they_are_summed():
 
 
 def test_silent_targets_still_give_weights():
-    assert sum(weigh([noisy(0.1, 1), noisy(0.2, 2)], torch.zeros_like(TARGET), EACH)) == pytest.approx(1)
+    assert sum(
+        weigh([noisy(0.1, 1), noisy(0.2, 2)], torch.zeros_like(TARGET), EACH)
+    ) == pytest.approx(1)
 
 
 def test_what_is_explained_is_about_the_mean_of_powers_and_about_zero_of_channels():
-    assert explained_variance(torch.zeros_like(TARGET) + TARGET.mean(0), TARGET, True) == pytest.approx(0)
+    assert explained_variance(
+        torch.zeros_like(TARGET) + TARGET.mean(0), TARGET, True
+    ) == pytest.approx(0)
     assert explained_variance(TARGET, TARGET, False) == 1
     assert explained_variance(torch.zeros_like(TARGET), TARGET, False) == 0
 
 
-def rows(own: float, plain: float, count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def rows(
+    own: float, plain: float, count: int, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     draws = np.random.default_rng(seed)
     target = draws.uniform(0, 1, (count, 40))
     noise = draws.standard_normal((2, count, 40))
@@ -111,10 +128,14 @@ def gram_of(errors: np.ndarray) -> np.ndarray:
     return errors[:, :, None] * errors[:, None, :]
 
 
-def drawn(deviations: list[float], rows: int = 400, common: float = 0.0, seed: int = 0) -> np.ndarray:
+def drawn(
+    deviations: list[float], rows: int = 400, common: float = 0.0, seed: int = 0
+) -> np.ndarray:
     """Errors (rows, K), a part of them common to all."""
     rng = np.random.default_rng(seed)
-    return rng.normal(size=(rows, len(deviations))) * deviations + common * rng.normal(size=(rows, 1))
+    return rng.normal(size=(rows, len(deviations))) * deviations + common * rng.normal(
+        size=(rows, 1)
+    )
 
 
 def test_no_weight_is_negative_where_plain_least_squares_has_one():
@@ -126,7 +147,11 @@ def test_weights_are_the_best_of_a_grid():
     errors = drawn([1.0, 1.2, 0.9], common=0.3)
     gram = gram_of(errors).mean(0)
     least = float(best_weights(gram) @ gram @ best_weights(gram))
-    grid = [np.array([a, b, 1 - a - b]) for a in np.linspace(0, 1, 41) for b in np.linspace(0, 1 - a, 41)]
+    grid = [
+        np.array([a, b, 1 - a - b])
+        for a in np.linspace(0, 1, 41)
+        for b in np.linspace(0, 1 - a, 41)
+    ]
     assert least <= min(float(w @ gram @ w) for w in grid) + 1e-9
 
 

@@ -82,15 +82,24 @@ def test_checkpoints_hold_all_copies(town, fold, tmp_path):
     refused("no station 'roof'; there are 0, 1", predictor.select_station, "roof")
 
 
-def test_a_station_never_heard_is_asked_with_both_ends_and_its_constant_may_be_taken_away(town, tmp_path):
+def test_a_station_never_heard_is_asked_with_both_ends_and_its_constant_may_be_taken_away(
+    town, tmp_path
+):
     split = split_for({"name": "stations"}, town)
     contexts = fold_contexts(FitContext(tmp_path), split)
     fits = fit_folds(method_class("mean")(), town, split, contexts)
     found = evaluate(
-        fits.methods, None, town, split, baselines=["zero"], clock=ClockSettings(rounds=1, least=1),
-    ).facts  # fmt: skip
+        fits.methods,
+        None,
+        town,
+        split,
+        baselines=["zero"],
+        clock=ClockSettings(rounds=1, least=1),
+    ).facts
     spread = np.std(10 * np.log10(town.target[:, 0]).reshape(-1, 4), axis=0)
-    assert found["test/rmse_db_after_constant"] == pytest.approx(np.sqrt(np.mean(spread**2)), rel=0.01)
+    assert found["test/rmse_db_after_constant"] == pytest.approx(
+        np.sqrt(np.mean(spread**2)), rel=0.01
+    )
     assert found["test/rmse_db"] > max(10, 2 * found["test/rmse_db_after_constant"])
     gsparc_like = type("OneEnd", (method_class("mean"),), {"both_ends": False})
     with pytest.raises(ValueError, match="cannot predict stations that it never heard"):
@@ -102,8 +111,13 @@ def test_one_model_of_all_stations_where_that_is_said(town, tmp_path):
     fold = Fold(np.arange(0, len(town), 2), np.arange(0), np.arange(1, len(town), 2))
     method = wrap_per_station(method_class("mean")(), town)
     method.fit(town, fold, FitContext(tmp_path, stations="together"))
-    assert len(dict(method)) == 1 and len(torch.unique(method.predict(town.batch(fold.test)).mean)) == 1
-    with pytest.raises(ValueError, match="stations='togehter': one of auto, each, together is needed"):
+    assert (
+        len(dict(method)) == 1
+        and len(torch.unique(method.predict(town.batch(fold.test)).mean)) == 1
+    )
+    with pytest.raises(
+        ValueError, match="stations='togehter': one of auto, each, together is needed"
+    ):
         FitContext(tmp_path, stations="togehter")
 
 
@@ -123,20 +137,28 @@ def test_a_station_that_heard_nothing_ended_the_run():
 
 
 def test_rows_where_nothing_was_heard_did_not_count_for_gsparc():
-    """It learns from them, as the processes do that it is compared with, of which a station had none."""
+    """It learns from them, as the processes do that it is compared with,
+    of which a station had none.
+    """
     data = heard(rssi_db=lambda far: free_space(far) - [40, 40, np.nan, 40], sensitivity_db=-80.0)
     for name in ("gsparc", "powers", "gp"):
         assert stations_of_fold(method_class(name)(), data, fold_of(data)).learnable.all()
     context = FitContext(stations="each", effort=0.1)
-    method, _ = fit_or_resume(wrap_per_station(method_class("gsparc")(), data), data, fold_of(data), context)
+    method, _ = fit_or_resume(
+        wrap_per_station(method_class("gsparc")(), data), data, fold_of(data), context
+    )
     assert method.predict(data.batch(fold_of(data).test)).mean.isfinite().all()
 
 
 def test_sectors_of_one_mast_were_answered_by_the_first():
-    """A position does not say which of two stations there is meant: the first one answered for both."""
+    """A position does not say which of two stations there is meant:
+    the first one answered for both.
+    """
     named = np.array(["sector 1", "sector 2"])
     data = heard(
-        posts=POSTS[[0, 0]], rssi_db=lambda far: walked()[:, :2] * [-1, -1] - [0, 30], station_name=named
+        posts=POSTS[[0, 0]],
+        rssi_db=lambda far: walked()[:, :2] * [-1, -1] - [0, 30],
+        station_name=named,
     )
     fold = fold_of(data)
     method, batch = fitted("idw", data, fold), data.batch(fold.test)
@@ -157,7 +179,9 @@ def test_the_place_of_a_single_station_was_sought():
 
 
 def test_a_baseline_that_cannot_ended_the_run_of_a_station_with_few_rows():
-    """`complex_gp` knows one end that stands still: it is left out where a station taught nothing."""
+    """`complex_gp` knows one end that stands still:
+    it is left out where a station taught nothing.
+    """
     csi = np.exp(-2j * np.pi * distances(60, POSTS[:2]))
     mask = np.ones(csi.shape, bool)
     mask[3:, 1] = False
@@ -171,13 +195,17 @@ def test_a_baseline_that_cannot_ended_the_run_of_a_station_with_few_rows():
 
 
 def test_chunks_of_many_stations_asked_every_model(town, fold, tmp_path, monkeypatch):
-    """A file of 50,000 rows at 12 stations read 12 large matrices for every 64 rows: half an hour."""
+    """A file of 50,000 rows at 12 stations read 12 large matrices for every 64 rows:
+    half an hour.
+    """
     method = fitted("gp", town, fold, tmp_path)
     whole = score_methods([method], town, Split("random", (fold,)))
     asked = []
     monkeypatch.setattr("gsparc.evaluation.scores.CHUNK", 6)
     answer = method.predict
-    monkeypatch.setattr(method, "predict", lambda b: asked.append(len(b.station.unique())) or answer(b))
+    monkeypatch.setattr(
+        method, "predict", lambda b: asked.append(len(b.station.unique())) or answer(b)
+    )
     parts = score_methods([method], town, Split("random", (fold,)))
     assert sum(asked) < len(asked) + len(POSTS)
     np.testing.assert_array_equal(parts.row, whole.row)
@@ -192,7 +220,9 @@ def test_seconds_of_stations_were_said_to_be_unused(town):
 
 
 def test_models_of_stations_left_folders_in_the_current_one(town, fold, tmp_path):
-    """A search keeps what it finds in `run_dir`; without one that of station 0 became ./station0."""
+    """A search keeps what it finds in `run_dir`;
+    without one that of station 0 became ./station0.
+    """
     folders = []
 
     class Writes(method_class("mean")):
@@ -227,5 +257,12 @@ def test_a_station_at_an_unknown_place_answered_for_all(town, fold, tmp_path):
 
 def test_ratios_of_a_method_were_added_over_stations():
     figures = {"model/steps": 3, "time/init_s": 0.5, "model/exponent": 2.0, "model/init": "rays"}
-    combined = {name: per_station._combine_facts([value] * 2, name) for name, value in figures.items()}
-    assert combined == {"model/steps": 6, "time/init_s": 1.0, "model/exponent": 2.0, "model/init": "rays"}
+    combined = {
+        name: per_station._combine_facts([value] * 2, name) for name, value in figures.items()
+    }
+    assert combined == {
+        "model/steps": 6,
+        "time/init_s": 1.0,
+        "model/exponent": 2.0,
+        "model/init": "rays",
+    }

@@ -44,20 +44,31 @@ from gsparc.training.context import FitContext
 
 NAMED = ("array_process", "image_process", "image_sources", "channels", "powers", "bearings")
 VARIANCE = (
-    "kriging", "distance_law", "gp", "complex_gp", "directional_gp", "image_source_gp", "array",
+    "kriging",
+    "distance_law",
+    "gp",
+    "complex_gp",
+    "directional_gp",
+    "image_source_gp",
+    "array",
     "moving_array",
-)  # fmt: skip
+)
 PLAIN = ("mean", "nearest", "idw", "gp", "kriging")
 INVENTED = [(kind, end) for kind in ("spectrum", "csi", "rssi") for end in ("rx", "tx")]
 # Settings of trainings that are over at once.
 SMALL: dict[str, dict[str, Any]] = {
-    **{name: {"count": 40, "max_steps": 3} for name in ("gsrf", "wrfgs", "swiftwrf", "ngrf", "wideband")},
+    **{
+        name: {"count": 40, "max_steps": 3}
+        for name in ("gsrf", "wrfgs", "swiftwrf", "ngrf", "wideband")
+    },
     **{name: {"width": 16, "samples": 8, "max_steps": 3} for name in ("nerf2", "newrf")},
 }
 UPLINK: dict[str, dict[str, Any]] = {
-    "ridge": {}, "ridge, all antennas": {"inputs": "all"}, "fire": {"max_steps": 3},
+    "ridge": {},
+    "ridge, all antennas": {"inputs": "all"},
+    "fire": {"max_steps": 3},
     "uplink": {"search": UplinkSearch(rounds=2, picks=4, final=2), "teachers": 60},
-}  # fmt: skip
+}
 
 
 MAKES = {  # what others than of received powers are fitted to
@@ -107,14 +118,20 @@ def places(method: Method, count: int = 5) -> torch.Tensor:
     assert method.site is not None
     low, high = torch.from_numpy(method.site.box).double()
     draw = torch.Generator().manual_seed(0)
-    return low + (0.2 + 0.6 * torch.rand(count, 3, generator=draw, dtype=torch.float64)) * (high - low)
+    return low + (0.2 + 0.6 * torch.rand(count, 3, generator=draw, dtype=torch.float64)) * (
+        high - low
+    )
 
 
 def ends(method: Method, moving: torch.Tensor) -> Query:
     """Both ends, the moving one at places (B, 3); the static one where it stood."""
     site = method.site
     assert site is not None
-    still = torch.zeros(3) if site.static_position is None else torch.from_numpy(site.static_position).float()
+    still = (
+        torch.zeros(3)
+        if site.static_position is None
+        else torch.from_numpy(site.static_position).float()
+    )
     if site.moving_end == "rx":
         return Query(still.expand(len(moving), 3), Pose.identity(moving))
     turn = np.eye(3) if site.rx_rotation is None else site.rx_rotation
@@ -137,16 +154,20 @@ LAYOUTS = {
     "powers": kinds.received,
     "deaf": lambda _: deaf(city("all")),
     "bands": kinds.bands,
-    "runs": lambda _: from_arrays(arrays(World("tone", 3, 1, "rx", "metres", "none", "random", 30), 0)),
+    "runs": lambda _: from_arrays(
+        arrays(World("tone", 3, 1, "rx", "metres", "none", "random", 30), 0)
+    ),
 }
 FITTED = [name for name in built_in_methods() if name != "calibrated_raytracer"]
 CASES = [
     *((name, "") for name in (*FITTED, "ridge, all antennas")),
     *((name, f"{kind}, {end} stands") for name in (*PLAIN, "zero") for kind, end in INVENTED),
     *((name, "lobes, rx moves") for name in ("gsrf", "wrfgs", "swiftwrf", "nerf2")),
-    ("gsrf", "room"), ("complex_gp", "runs"), ("image_source_gp", "bands"),
+    ("gsrf", "room"),
+    ("complex_gp", "runs"),
+    ("image_source_gp", "bands"),
     *(("splat", layout) for layout in ("spectra, rx moves", "S", "SK, tx moves", "SAK", "powers")),
-]  # fmt: skip
+]
 
 
 def own(file: Path) -> Measurements:
@@ -156,7 +177,9 @@ def own(file: Path) -> Measurements:
 def slow(cases: list[tuple[str, str]]) -> list[Any]:
     """Cases, marked where a fit takes more than a second that is not taken by others."""
     long = (*NAMED, "gsparc", "splat", "fire", "carriers", "ridge, all antennas")
-    return [pytest.param(*case, marks=[pytest.mark.slow] if case[0] in long else []) for case in cases]
+    return [
+        pytest.param(*case, marks=[pytest.mark.slow] if case[0] in long else []) for case in cases
+    ]
 
 
 @pytest.mark.parametrize(("name", "layout"), slow(CASES))
@@ -196,20 +219,26 @@ def test_answers_are_as_targets_in_any_order_and_those_of_the_stored(name, layou
 
 
 REFUSED = [
-    ("distance_law", "csi, rx stands", "distance_law: needs received powers"), ("ridge", "deaf", "has none"),
+    ("distance_law", "csi, rx stands", "distance_law: needs received powers"),
+    ("ridge", "deaf", "has none"),
     ("array", "spectrum, rx stands", "no antenna array"),
     ("swiftwrf", "csi, rx stands", "swiftwrf: predicts .*holds csi"),
     ("gsrf", "powers", "gsrf: predicts .*holds rssi"),
     ("newrf", "csi, tx stands", "newrf: needs directions of arrival"),
     ("ngrf", "spectrum, rx stands", "ngrf: spectra need .* array"),
-    *((name, "powers", f"{name}: the target is rssi") for name in NAMED[:1] + NAMED[2:4] + NAMED[5:]),
-]  # fmt: skip
+    *(
+        (name, "powers", f"{name}: the target is rssi")
+        for name in NAMED[:1] + NAMED[2:4] + NAMED[5:]
+    ),
+]
 
 
 @pytest.mark.parametrize(("name", "layout", "says"), REFUSED)
 def test_what_a_method_cannot_serve_is_refused_in_one_line(name, layout, says, tmp_path):
     data = LAYOUTS[layout](tmp_path)
-    refused(says, lambda: unfitted(name).create_for(data).fit(data, fold_of(data), FitContext(tmp_path)))
+    refused(
+        says, lambda: unfitted(name).create_for(data).fit(data, fold_of(data), FitContext(tmp_path))
+    )
 
 
 UNFITTED = (*VARIANCE, "nearest", "splat", "gsrf", "uplink", "ridge")
@@ -219,7 +248,9 @@ POISONED = (*SMALL, *PLAIN, "complex_gp", "splat", "array", "directional_gp", "u
 @pytest.mark.parametrize("name", UNFITTED)
 def test_a_method_that_is_not_fitted_says_so(name):
     query = Query(torch.zeros(1, 3), Pose.identity(torch.zeros(3)))
-    with pytest.raises(ValueError, match=r"uplink= is needed|fit or restore|not fitted|not been trained"):
+    with pytest.raises(
+        ValueError, match=r"uplink= is needed|fit or restore|not fitted|not been trained"
+    ):
         method_class(name)().predict(query)
 
 
@@ -229,7 +260,9 @@ def test_no_test_row_is_looked_at(name, tmp_path):
     batch, target, rays = data.batch(fold.test), data.target.copy(), data.directions
     target[fold.test] = 0 if target.dtype == np.uint8 else np.nan
     if rays is not None:
-        rays = [np.full_like(one, np.nan) if row in fold.test else one for row, one in enumerate(rays)]
+        rays = [
+            np.full_like(one, np.nan) if row in fold.test else one for row, one in enumerate(rays)
+        ]
     again = unfitted(name).create_for(data)
     again.fit(replace(data, target=target, directions=rays), fold, short(tmp_path, 10))
     assert torch.equal(again.predict(batch).mean, method.predict(batch).mean)
@@ -252,9 +285,13 @@ def test_few_rows_and_rows_of_one_place_are_finite(name, rows, tmp_path):
     method, batch = unfitted(name).create_for(data), data.batch(fold.test)
     method.fit(data, Fold(few, few[:0], fold.test), short(tmp_path, 10))
     found = method.predict(batch)
-    assert all(torch.isfinite(part).all() for part in (found.mean, found.variance) if part is not None)
+    assert all(
+        torch.isfinite(part).all() for part in (found.mean, found.variance) if part is not None
+    )
     assert (
-        rows != "alike" or name == "array" or torch.allclose(found.mean, batch.target, rtol=1e-3, atol=0.02)
+        rows != "alike"
+        or name == "array"
+        or torch.allclose(found.mean, batch.target, rtol=1e-3, atol=0.02)
     )
 
 
@@ -280,7 +317,9 @@ def test_a_reduction_leaves_the_method_as_it_was(name, settings):
         assert (one is None and two is None) or torch.equal(one, two)
 
 
-@pytest.mark.parametrize(("name", "places", "inside"), [("gp", 1, 1), ("gp", 2, 2), ("nerf2", 1, 2)])
+@pytest.mark.parametrize(
+    ("name", "places", "inside"), [("gp", 1, 1), ("gp", 2, 2), ("nerf2", 1, 2)]
+)
 def test_threads_of_a_query(monkeypatch, name, places, inside):
     """Single places are answered by one thread; what is rendered keeps them all."""
     threads = [2]
@@ -310,15 +349,20 @@ def test_what_is_scored_is_what_is_served(name, layout):
     batch = data.batch(rows)
     scored = method.predict(batch).mean
     if name not in UPLINK:
-        return torch.testing.assert_close(served(predictor, data, rows), scored, rtol=1e-4, atol=1e-5)
+        return torch.testing.assert_close(
+            served(predictor, data, rows), scored, rtol=1e-4, atol=1e-5
+        )
     refused("uplink= is needed", method.predict, replace(batch, uplink=None))
     heard = batch.uplink * data.site.target_scale
     said = predictor.csi(uplink=heard) / data.site.target_scale
     scored = method.predict(replace(batch, noise_variance=None)).mean
-    assert (said - scored).norm() < 1e-3 * scored.norm()  # a search among sources of nearly the same use
+    # A search among sources of nearly the same use
+    assert (said - scored).norm() < 1e-3 * scored.norm()
 
 
-@pytest.mark.parametrize(("name", "how"), [("gp", "each"), ("gp", "together"), ("gsparc", "together")])
+@pytest.mark.parametrize(
+    ("name", "how"), [("gp", "each"), ("gp", "together"), ("gsparc", "together")]
+)
 def test_what_is_scored_of_stations_is_what_is_served(tmp_path, name, how):
     data = kinds.several(tmp_path)
     fold = fold_of(data)
@@ -342,6 +386,8 @@ def test_places_are_served_in_the_phase_of_the_largest_run(words):
     factor = method.runs.look_up(batch.run)[:, None, None]
     assert (factor - 1).abs().max() > 0.1
     said = served(Predictor(method, data.site), data, fold.test)
-    torch.testing.assert_close(said * factor.to(said.dtype), method.predict(batch).mean, rtol=1e-4, atol=1e-5)
+    torch.testing.assert_close(
+        said * factor.to(said.dtype), method.predict(batch).mean, rtol=1e-4, atol=1e-5
+    )
     elsewhere = replace(batch, run=torch.full((len(batch),), 99))
     torch.testing.assert_close(said, method.predict(elsewhere).mean, rtol=1e-4, atol=1e-5)

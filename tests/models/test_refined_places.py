@@ -23,7 +23,9 @@ CARRIER = 2.4e9
 
 
 def _told(count=40, std=0.02, seed=0):
-    """Two complex numbers a place, errors of places and noise; what they were and what is seen of them."""
+    """Two complex numbers a place, errors of places and noise;
+    what they were and what is seen of them.
+    """
     rng = np.random.default_rng(seed)
     error = rng.normal(scale=std, size=(count, 3))
     slope = rng.normal(size=(count, 4, 3)) * 30
@@ -51,7 +53,9 @@ def test_a_place_without_error_stays_and_one_far_too_large_gains_nothing():
     std[::2] = 0.0
     found, _ = estimate_place_errors(seen, torch.arange(40), std)
     assert not found[::2].any() and found[1::2].all()
-    exact = replace(seen, residual=0.1 * torch.randn(40, 4, generator=torch.manual_seed(1)).double())
+    exact = replace(
+        seen, residual=0.1 * torch.randn(40, 4, generator=torch.manual_seed(1)).double()
+    )
     assert estimate_place_errors(exact, torch.arange(40), std)[1] < 0
 
 
@@ -61,7 +65,9 @@ def test_what_was_not_measured_says_nothing_and_rows_of_one_place_share():
     hidden = replace(seen, variance=seen.variance.clone())
     hidden.variance[:, 2:] = torch.inf
     fewer = Linearised(seen.residual[:, :2], seen.slope[:, :2], seen.variance[:, :2])
-    of_all, of_fewer = (estimate_place_errors(each, torch.arange(40), std) for each in (hidden, fewer))
+    of_all, of_fewer = (
+        estimate_place_errors(each, torch.arange(40), std) for each in (hidden, fewer)
+    )
     assert torch.allclose(of_all[0], of_fewer[0]) and of_all[1] == pytest.approx(of_fewer[1])
     halves = [torch.cat(part.split(2, 1)) for part in (seen.residual, seen.slope, seen.variance)]
     stations = estimate_place_errors(Linearised(*halves), torch.arange(40).repeat(2), std)
@@ -69,7 +75,9 @@ def test_what_was_not_measured_says_nothing_and_rows_of_one_place_share():
 
 
 def _channels(error_m, rows=130, seed=0):
-    """Waves of 40 directions over a flat patch, heard by four antennas: of exact and of measured places."""
+    """Waves of 40 directions over a flat patch, heard by four antennas:
+    of exact and of measured places.
+    """
     rng = np.random.default_rng(seed)
     place = np.c_[rng.uniform(0, 0.3, (rows, 2)), np.zeros(rows)]
     directions = rng.normal(size=(40, 3))
@@ -97,7 +105,9 @@ def _fitted(data, fold, **settings):
 
 @pytest.mark.slow
 def test_known_errors_of_places_cost_less_than_unknown_ones():
-    """15 mm of 125 mm: the held-out error falls by a quarter and more, .27 to .15 when this was written."""
+    """15 mm of 125 mm: the held-out error falls by a quarter and more,
+    .27 to .15 when this was written.
+    """
     exact, moved, fold = _channels(0.015)
     told = replace(moved, position_std=np.full(len(moved), 0.015))
     (without, _), (known, report) = (_fitted(data, fold) for data in (moved, told))
@@ -125,7 +135,9 @@ def test_exact_places_stay_though_errors_are_claimed():
 def test_every_field_with_rows_left_out_takes_them(kind, tmp_path):
     data = KINDS[kind](tmp_path)
     fold = fold_of(data)
-    _, report = fitting.fit_or_resume(wrap_per_station(Gsparc(position_std=0.05), data), data, fold, BRIEF)
+    _, report = fitting.fit_or_resume(
+        wrap_per_station(Gsparc(position_std=0.05), data), data, fold, BRIEF
+    )
     assert any("with errors of places" in note or "is not used" in note for note in report.notes)
 
 
@@ -138,5 +150,7 @@ def test_rendered_spectra_say_that_positions_count_as_exact(tmp_path, caplog):
 
 @pytest.mark.parametrize("wrong", [-0.1, float("nan"), "1 cm", True])
 def test_a_setting_that_is_no_length_is_refused(wrong):
-    with pytest.raises(ValueError, match=r"position_std=.*a number of at least 0, or null is needed"):
+    with pytest.raises(
+        ValueError, match=r"position_std=.*a number of at least 0, or null is needed"
+    ):
         Gsparc(position_std=wrong)

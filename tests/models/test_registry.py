@@ -31,7 +31,10 @@ def test_a_plain_method_is_its_class_and_its_name(monkeypatch):
     before, every = plain_methods(), registry.all_methods() | paths
     monkeypatch.setattr(registry, "all_methods", lambda: every)
     plain_methods.cache_clear()
-    assert plain_methods() == (*before[:4], "twice", *before[4:]) and before[3:6:2] == ("idw", "direct_beam")
+    assert plain_methods() == (*before[:4], "twice", *before[4:]) and before[3:6:2] == (
+        "idw",
+        "direct_beam",
+    )
     plain_methods.cache_clear()
 
 

@@ -1,4 +1,6 @@
-"""What misses rows left out by more than what is simpler answers nothing; what is right is never refused."""
+"""What misses rows left out by more than what is simpler answers nothing;
+what is right is never refused.
+"""
 
 from dataclasses import replace
 
@@ -26,18 +28,25 @@ from gsparc.training.context import FitContext
 
 
 def lying_still() -> Measurements:
-    """Levels of three stations, 4 dB of noise, about a street and, half of them, where a phone lay still."""
+    """Levels of three stations, 4 dB of noise, about a street and, half of them,
+    where a phone lay still.
+    """
     rng = np.random.default_rng(1)
     walk = np.c_[rng.uniform(0, 200, (40, 2)), np.full(40, 1.5)]
     spot = walk[0] + np.c_[rng.normal(0, 0.02, (40, 2)), rng.normal(0, 15, 40)]
-    place, posts = np.concatenate([walk, spot]), np.array([[0.0, -3e3, 20], [3e3, 0, 20], [90, 4e3, 20]])
+    place, posts = (
+        np.concatenate([walk, spot]),
+        np.array([[0.0, -3e3, 20], [3e3, 0, 20], [90, 4e3, 20]]),
+    )
     far = np.linalg.norm(place[:, None] - posts, axis=-1)
     levels = -30 * np.log10(far) + rng.normal(0, 4, far.shape)
     return from_arrays({"rx_position": place, "station_position": posts, "rssi_db": levels})
 
 
 def walk_into_a_corner(monkeypatch) -> None:
-    """Have all stations alike choose long lengths and no noise, as a slope that was NaN once did."""
+    """Have all stations alike choose long lengths and no noise,
+    as a slope that was NaN once did.
+    """
     right = learning._fit_common_kernel
 
     def wrong(*given):
@@ -49,11 +58,15 @@ def walk_into_a_corner(monkeypatch) -> None:
 
 
 def fitted(folder, data, fold):
-    return fitting.fit_or_resume(PerStation(Powers()), data, fold, FitContext(folder, stations="together"))
+    return fitting.fit_or_resume(
+        PerStation(Powers()), data, fold, FitContext(folder, stations="together")
+    )
 
 
 def test_a_fit_in_a_corner_predicted_47_dbm_where_minus_86_was_heard(monkeypatch, tmp_path):
-    """Nothing asked whether it predicts what it learned from better than the mean of each station does."""
+    """Nothing asked whether it predicts what it learned from better than the mean
+    of each station does.
+    """
     data = lying_still()
     fold = fold_of(data)
     sane, report = fitted(tmp_path, data, fold)
@@ -65,7 +78,9 @@ def test_a_fit_in_a_corner_predicted_47_dbm_where_minus_86_was_heard(monkeypatch
     mean = PerStation(Mean())
     mean.fit(data, fold, FitContext(tmp_path, stations="each"))
     said, plain = (predict_rows(one, data, fold.test).mean for one in (method, mean))
-    assert torch.equal(said, plain) and not torch.equal(said, predict_rows(sane, data, fold.test).mean)
+    assert torch.equal(said, plain) and not torch.equal(
+        said, predict_rows(sane, data, fold.test).mean
+    )
 
     checkpoint.save(
         tmp_path / "model.ckpt", method, extra=fitting.run_extra(report, data, fold, FitContext())
@@ -78,8 +93,12 @@ def test_a_fit_in_a_corner_predicted_47_dbm_where_minus_86_was_heard(monkeypatch
 
 def test_what_is_right_is_not_refused(campaign, folds, tmp_path):
     fold = folds(60).folds[0]
-    method, report = fitting.fit_or_resume(Powers(), campaign("rssi", 60), fold, FitContext(tmp_path))
-    assert not any(isinstance(note, Severe) for note in report.notes) and not isinstance(method, Mean)
+    method, report = fitting.fit_or_resume(
+        Powers(), campaign("rssi", 60), fold, FitContext(tmp_path)
+    )
+    assert not any(isinstance(note, Severe) for note in report.notes) and not isinstance(
+        method, Mean
+    )
 
 
 def test_a_member_that_answers_what_is_no_number_answers_nothing():

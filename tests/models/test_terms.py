@@ -22,7 +22,11 @@ def measured(kind: str):
     """Small data of a kind; what stands before it is left out of the site or added to it."""
     if not kind.endswith("array"):
         data = invent(kind.removeprefix("unplaced "), 20)
-        return replace(data, site=replace(data.site, static_position=None)) if "unplaced" in kind else data
+        return (
+            replace(data, site=replace(data.site, static_position=None))
+            if "unplaced" in kind
+            else data
+        )
     site = array_site(SphereGrid.hemisphere(9, 18), planar_array())
     site = replace(site, static_end="tx") if kind.startswith("moving") else site
     return replace(invent("spectrum", 20), site=site)
@@ -32,9 +36,12 @@ def chosen(kind: str, effects=(), init="auto", hidden=0, count=1, **more):
     """The parts of what is in closed form, and whether an array is seen through."""
     data = measured(kind)
     settings = Gsparc(
-        EffectSettings(**dict(effects)), init=InitSettings(init), emission=EmissionSettings(hidden=hidden),
-        field=FieldSettings(count=count), **more,
-    )  # fmt: skip
+        EffectSettings(**dict(effects)),
+        init=InitSettings(init),
+        emission=EmissionSettings(hidden=hidden),
+        field=FieldSettings(count=count),
+        **more,
+    )
     found = choose(data, settings)
     parts = tuple(found.list_candidates(data)) if isinstance(found, Mixture) else ()
     return parts, not parts and found.settings.response.array
@@ -68,12 +75,16 @@ def test_what_a_site_calls_for(kind, given, parts, caplog):
 
 
 def test_inverse_distance_was_refused_with_advice_that_undid_it(caplog):
-    """With an array that is `auto` the Gaussians emit powers; one that was asked for stays an error."""
+    """With an array that is `auto` the Gaussians emit powers;
+    one that was asked for stays an error.
+    """
     falls = AttenuationSettings(inverse_distance=True)
     caplog.set_level("INFO", "gsparc")
     assert chosen("array", attenuation=falls) == ((), False)
     assert "effects.array -> false: attenuation.inverse_distance=true" in caplog.messages[0]
-    with pytest.raises(ValueError, match=r"array=true is not possible: attenuation\.inverse_distance"):
+    with pytest.raises(
+        ValueError, match=r"array=true is not possible: attenuation\.inverse_distance"
+    ):
         chosen("array", {"array": True}, attenuation=falls)
 
 
@@ -84,11 +95,23 @@ def test_an_array_may_be_switched_off():
 @pytest.mark.parametrize(
     ("kind", "effects", "message"),
     [
-        ("unplaced csi", {"phase": True}, r"effects\.phase=true is not possible: the dataset does not say"),
+        (
+            "unplaced csi",
+            {"phase": True},
+            r"effects\.phase=true is not possible: the dataset does not say",
+        ),
         ("moving array", {"array": True}, "the receiver moves"),
-        ("array", {"moving_array": True}, r"moving_array=true is not possible: the receiver stands still"),
+        (
+            "array",
+            {"moving_array": True},
+            r"moving_array=true is not possible: the receiver stands still",
+        ),
         ("spectrum", {"array": True}, "the dataset declares no array or no carrier"),
-        ("csi", {"power": True}, r"^model\.effects\.power=true is not possible: the target is csi[^\n]*$"),
+        (
+            "csi",
+            {"power": True},
+            r"^model\.effects\.power=true is not possible: the target is csi[^\n]*$",
+        ),
         ("rssi", {"phase": True}, "the target is rssi, which carries no phase"),
         ("spectrum", {"visibility": False}, "visibility=false is not possible: rasterized"),
         ("csi", {"phase": "splat"}, "one of true, false, auto"),

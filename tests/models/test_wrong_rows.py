@@ -1,4 +1,6 @@
-"""One wrong training row, for every method: refused or finite; left out, as if it had never been."""
+"""One wrong training row, for every method: refused or finite; left out,
+as if it had never been.
+"""
 
 from dataclasses import replace
 
@@ -37,7 +39,9 @@ def moving(arrays):
 
 
 def cases():
-    return [(kind, name, wrong) for kind, names in QUICK.items() for name in names for wrong in WRONG]
+    return [
+        (kind, name, wrong) for kind, names in QUICK.items() for name in names for wrong in WRONG
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +70,9 @@ def answers(file, name, tmp_path, leave_out):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind,name,wrong", cases())
-def test_left_out_it_had_never_been_and_kept_it_is_finite_or_refused(files, tmp_path, kind, name, wrong):
+def test_left_out_it_had_never_been_and_kept_it_is_finite_or_refused(
+    files, tmp_path, kind, name, wrong
+):
     spoilt = answers(files[kind, wrong], name, tmp_path, "outliers")
     sound = answers(files[kind, None], name, tmp_path, [7])
     assert torch.isfinite(sound).all()
@@ -80,14 +86,20 @@ def test_left_out_it_had_never_been_and_kept_it_is_finite_or_refused(files, tmp_
 
 
 MAKE = {  # measurements that methods train or search on, and these methods
-    "spectra": (kinds.images, ("gsrf", "wrfgs", "swiftwrf", "nerf2", "splat", "image_process", "gsparc")),
+    "spectra": (
+        kinds.images,
+        ("gsrf", "wrfgs", "swiftwrf", "nerf2", "splat", "image_process", "gsparc"),
+    ),
     "spectra of a known array": (kinds.static_array, ("array", "array_process", "ngrf", "gsparc")),
     "spectra at carriers": (
         kinds.carriers,
         ("carriers", "other_carriers", "direct_beam", "wideband", "gsparc"),
     ),
     "spectra of a moving array": (kinds.moving_array, ("moving_array", "bearings", "gsparc")),
-    "channels": (kinds.bands, ("gsrf", "ngrf", "image_source_gp", "image_sources", "channels", "gsparc")),
+    "channels": (
+        kinds.bands,
+        ("gsrf", "ngrf", "image_source_gp", "image_sources", "channels", "gsparc"),
+    ),
     "channels with directions": (lambda _: directed(60)[0], ("newrf", "directional_gp", "gsparc")),
     "powers": (kinds.received, ("powers", "gsparc")),
     "uplink": (lambda _: city("all"), ("ridge", "fire", "uplink")),
@@ -109,10 +121,16 @@ def spoilt(data, wrong):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", [None, *WRONG])
-@pytest.mark.parametrize("what,name", [(what, name) for what, (_, names) in MAKE.items() for name in names])
+@pytest.mark.parametrize(
+    "what,name", [(what, name) for what, (_, names) in MAKE.items() for name in names]
+)
 def test_trained_methods_stay_finite_or_refuse(tmp_path, what, name, wrong):
     data = MAKE[what][0](tmp_path)
-    fold = uplink_fold() if what == "uplink" else split_for({"name": "random", "seed": 1}, data).folds[0]
+    fold = (
+        uplink_fold()
+        if what == "uplink"
+        else split_for({"name": "random", "seed": 1}, data).folds[0]
+    )
     config = compose(f"model={name}", *(["model.max_steps=20"] if name == "fire" else []))
     method, asked = build(config.model).create_for(data), data.batch(np.setdiff1d(fold.test, [7]))
     try:
@@ -125,5 +143,10 @@ def test_trained_methods_stay_finite_or_refuse(tmp_path, what, name, wrong):
 
 
 def test_no_method_is_forgotten():
-    here = {name for names in (*QUICK.values(), *(names for _, names in MAKE.values())) for name in names}
-    assert here | {"calibrated_raytracer"} == set(built_in_methods())  # it needs a scene: tests/peers
+    here = {
+        name
+        for names in (*QUICK.values(), *(names for _, names in MAKE.values()))
+        for name in names
+    }
+    # It needs a scene: tests/peers
+    assert here | {"calibrated_raytracer"} == set(built_in_methods())

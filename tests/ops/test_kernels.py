@@ -1,4 +1,6 @@
-"""The kernels against the float64 reference, their stages apart and together, and the list of them."""
+"""The kernels against the float64 reference, their stages apart and together,
+and the list of them.
+"""
 
 import csv
 import ctypes
@@ -56,13 +58,20 @@ def test_equals_reference(dtype, projection, grid, count):
     scene, pose = random_scene(seed=count), poses(count)
     got, want = assert_equals_reference(scene, pose, grid, dtype, projection=projection)
     assert not (want["visible"] & ~got["visible"]).any()
-    assert torch.allclose(got["radii"][want["visible"]].double(), want["radii"][want["visible"]], rtol=1e-4)
+    assert torch.allclose(
+        got["radii"][want["visible"]].double(), want["radii"][want["visible"]], rtol=1e-4
+    )
 
 
 @PROJECTIONS
 @pytest.mark.parametrize(
     "optics",
-    [{"compensate": False}, {"low_pass": 0.0}, {"cutoff": Cutoff(0.01, 1e-4, relative=True)}, {"near": 1.5}],
+    [
+        {"compensate": False},
+        {"low_pass": 0.0},
+        {"cutoff": Cutoff(0.01, 1e-4, relative=True)},
+        {"near": 1.5},
+    ],
     ids=["uncompensated", "sharp", "relative", "fading"],
 )
 def test_switches_equal_reference(projection, optics):
@@ -82,7 +91,10 @@ def test_weights_equal_reference(dtype, projection):
         plan = make_plan(*leaves, pose, grid, projection=projection, cutoff=cut, backend=backend)
         seen = mean_weights(plan, *leaves)
         draw = torch.Generator().manual_seed(3)
-        a, b = (torch.randn(seen.mean.shape, generator=draw, dtype=torch.float64).to(kind) for _ in range(2))
+        a, b = (
+            torch.randn(seen.mean.shape, generator=draw, dtype=torch.float64).to(kind)
+            for _ in range(2)
+        )
         (1000 * (seen.mean * a).sum() + (seen.share * b).sum()).backward()
         values = [seen.mean.detach(), seen.share.detach(), *(leaf.grad for leaf in leaves)]
         results[backend] = dict(enumerate(values))
@@ -92,7 +104,9 @@ def test_weights_equal_reference(dtype, projection):
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
 @pytest.mark.parametrize("away", [1e-19, 1e-20, 1e-22, 1e-30])
 def test_a_hair_off_the_axis_the_gradient_was_no_number(backend, away):
-    """Reference, float32, `equirect`: the slopes of the root and of atan2 have the square of `away`."""
+    """Reference, float32, `equirect`: the slopes of the root and
+    of atan2 have the square of `away`.
+    """
     scene = one([away, 0.0, 1.0])
     want = truth(scene, origin(), GRIDS["sphere"], projection="equirect")
     got = render(scene.to(torch.float32), origin(), GRIDS["sphere"], backend, projection="equirect")
@@ -129,7 +143,9 @@ def test_any_number_of_channels_and_samples(channels, samples):
 
 
 def test_kernels_of_another_compiler_were_the_slowest_ones():
-    """The runtime library of zig's clang says of every instruction set that the processor lacks it."""
+    """The runtime library of zig's clang says of every instruction set
+    that the processor lacks it.
+    """
     told = Path("/proc/cpuinfo")
     flags = re.search(r"^flags\s*:(.*)", told.read_text() if told.exists() else "", re.MULTILINE)
     if flags is None:
@@ -143,7 +159,9 @@ def test_kernels_of_another_compiler_were_the_slowest_ones():
     )
     # A process of its own, because another test may have chosen one here.
     command = [sys.executable, "-c", asks, _native.__file__]
-    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == best
+    assert (
+        subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == best
+    )
 
 
 @SETS
@@ -183,7 +201,9 @@ def test_gradcheck(projection, backend, seed):
 
 def test_clamped_layers_pass_gradient_to_features_only():
     scene = one([1.0, 0, 0.5], opacity=1.0, sigma=3.0)
-    grid = SphereGrid(1, 1, float(torch.atan2(torch.tensor(0.5), torch.tensor(1.0))), 0.0, 0.01, 0.01)
+    grid = SphereGrid(
+        1, 1, float(torch.atan2(torch.tensor(0.5), torch.tensor(1.0))), 0.0, 0.01, 0.01
+    )
     for backend in ("cpu", "reference"):
         got = render(scene, origin(), grid, backend, behind=False)
         assert float(got["image"]) == 0.99
@@ -220,7 +240,8 @@ def test_the_widest_grid_is_drawn_to_its_last_column():
     scene, width = random_scene(n=20, samples=1), WIDEST_GRID
     grid = SphereGrid(1, width, 0.2, 0.0, 0.1, 2 * torch.pi / width)
     one, other = (
-        rasterize(*scene.model, scene.features, poses(0), grid, backend=b).image for b in ("cpu", "reference")
+        rasterize(*scene.model, scene.features, poses(0), grid, backend=b).image
+        for b in ("cpu", "reference")
     )
     assert (one - other).abs().max() < 1e-12 and other.abs().max() > 0.01
 
@@ -254,7 +275,9 @@ def test_plans_and_views_of_other_fields_are_refused():
     with pytest.raises(StalePlan, match="version 3, the field is at 4"):
         frozen.render(scene.features, version=4)
     refused("one pose", freeze, make_plan(*scene.model, poses(2), GRID), *scene.model, version=0)
-    refused("plan again", composite, make_plan(*few.model, poses(0), GRID), *scene.model, scene.features)
+    refused(
+        "plan again", composite, make_plan(*few.model, poses(0), GRID), *scene.model, scene.features
+    )
 
 
 ROOT = Path(__file__).parents[2]

@@ -12,11 +12,15 @@ from gsparc.processes.kernel import ExponentialShadowing, Kernel, Shadowing, Whi
 from gsparc.processes.nearest import JITTER, neighbour_weights
 
 
-@pytest.mark.parametrize("grid", [SphereGrid.hemisphere(6, 10), SphereGrid(5, 7, 0.1, 0.3, 0.2, 0.4)])
+@pytest.mark.parametrize(
+    "grid", [SphereGrid.hemisphere(6, 10), SphereGrid(5, 7, 0.1, 0.3, 0.2, 0.4)]
+)
 @pytest.mark.parametrize("height", [0.0, 0.07])
 @pytest.mark.parametrize("name", ["smooth_rough", "matern32"])
 def test_spectra_of_an_array(grid, height, name):
-    """With and without the half-turn shortcut, of one place and of several, at a trained place and afar."""
+    """With and without the half-turn shortcut, of one place and of several,
+    at a trained place and afar.
+    """
     torch.manual_seed(0)
     array = planar_array()
     array[3, 2] = height
@@ -32,18 +36,26 @@ def test_spectra_of_an_array(grid, height, name):
     expected = renderer(torch.view_as_complex(parts)).clamp(max=1)
     for rows in (slice(None), slice(2, 3)):
         image, unknown = array_spectrum(
-            places[rows], (anchors, whitening), (weights, offset), renderer.tables, renderer.square,
+            places[rows],
+            (anchors, whitening),
+            (weights, offset),
+            renderer.tables,
+            renderer.square,
             matern_mixture(0.4, name),
-        )  # fmt: skip
+        )
         torch.testing.assert_close(image, expected[rows], atol=2e-5, rtol=1e-4)
         torch.testing.assert_close(unknown, share[rows], atol=2e-6, rtol=0)
 
 
 @pytest.mark.parametrize("near", [1, 5, 64])
-@pytest.mark.parametrize("kernel", [
-    Kernel.from_length(0.3, 0.1), Kernel.from_lengths((0.05, 2.0), (0.3, 0.7), 0.01),
-    Kernel((Shadowing(0.05, 0.3), ExponentialShadowing(2.0, 0.7), WhiteNoise(0.01))),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "kernel",
+    [
+        Kernel.from_length(0.3, 0.1),
+        Kernel.from_lengths((0.05, 2.0), (0.3, 0.7), 0.01),
+        Kernel((Shadowing(0.05, 0.3), ExponentialShadowing(2.0, 0.7), WhiteNoise(0.01))),
+    ],
+)
 def test_weights_of_the_nearest_rows(near, kernel):
     torch.manual_seed(1)
     places, queries = torch.rand(200, 3, dtype=torch.float64), torch.rand(7, 3, dtype=torch.float64)
@@ -51,7 +63,9 @@ def test_weights_of_the_nearest_rows(near, kernel):
     noise = kernel.noise * (1 + torch.rand(200, dtype=torch.float64))
     rows = torch.cdist(queries, places).topk(near, largest=False).indices
     expected = neighbour_weights(kernel, queries, places[rows], noise[rows])
-    found = nearest_weights(queries, places, noise + JITTER, rows, kernel.compiled_lengths, kernel.shares)
+    found = nearest_weights(
+        queries, places, noise + JITTER, rows, kernel.compiled_lengths, kernel.shares
+    )
     assert found is not None
     for one, other in zip(found, expected, strict=True):
         torch.testing.assert_close(one, other, atol=1e-10, rtol=1e-9)

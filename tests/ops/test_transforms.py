@@ -1,4 +1,6 @@
-"""Forward mode, second derivatives and `torch.func` over the rasterizer: right, or refused in words."""
+"""Forward mode, second derivatives and `torch.func` over the rasterizer: right,
+or refused in words.
+"""
 
 from dataclasses import replace
 
@@ -10,7 +12,16 @@ from torch.autograd import forward_ad
 from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
 
 from gsparc.field.losses import ssim
-from gsparc.ops import Cutoff, Pose, SphereGrid, composite, freeze, make_plan, mean_weights, rasterize
+from gsparc.ops import (
+    Cutoff,
+    Pose,
+    SphereGrid,
+    composite,
+    freeze,
+    make_plan,
+    mean_weights,
+    rasterize,
+)
 
 GRID = SphereGrid.hemisphere(9, 18)
 POSE = Pose.identity(torch.zeros(3, dtype=torch.float64))
@@ -29,7 +40,9 @@ def image(backend):
 
 
 def shares(backend):
-    return lambda *model: mean_weights(make_plan(*model[:4], POSE, GRID, backend=backend), *model[:4]).share
+    return lambda *model: (
+        mean_weights(make_plan(*model[:4], POSE, GRID, backend=backend), *model[:4]).share
+    )
 
 
 def tangents(values):
@@ -46,10 +59,13 @@ def test_forward_mode_was_zero_in_silence(made, backend):
     found = jvp(function, model, directions)[1]
     step = 1e-6
     ahead, behind = (
-        function(*(v + sign * step * d for v, d in zip(model, directions, strict=True))) for sign in (1, -1)
+        function(*(v + sign * step * d for v, d in zip(model, directions, strict=True)))
+        for sign in (1, -1)
     )
     assert found.abs().max() > 1e-3
-    assert torch.allclose(found, (ahead - behind) / (2 * step), atol=1e-5 * float(found.abs().max()))
+    assert torch.allclose(
+        found, (ahead - behind) / (2 * step), atol=1e-5 * float(found.abs().max())
+    )
     with forward_ad.dual_level():
         duals = [forward_ad.make_dual(v, d) for v, d in zip(model, directions, strict=True)]
         assert torch.allclose(forward_ad.unpack_dual(function(*duals)).tangent, found, rtol=1e-12)
@@ -117,7 +133,9 @@ def test_a_batch_of_features_may_be_mapped(backend):
     model = field()
     features = torch.stack([model[4], 2 * model[4]])
     found = vmap(lambda values: image(backend)(*model[:4], values))(features)
-    assert torch.allclose(found[1], 2 * found[0]) and torch.allclose(found[0], image(backend)(*model))
+    assert torch.allclose(found[1], 2 * found[0]) and torch.allclose(
+        found[0], image(backend)(*model)
+    )
 
 
 @BACKENDS
@@ -146,7 +164,9 @@ def test_second_derivatives_by_either_road():
     rows = [torch.autograd.grad(part, leaf, retain_graph=True)[0] for part in slope]
     assert torch.allclose(hessian(power("cpu"))(model[3]), torch.stack(rows), rtol=1e-8, atol=1e-9)
     (slope,) = torch.autograd.grad(power("cpu")(leaf), leaf, create_graph=True)
-    with pytest.raises(RuntimeError, match=r"kernels have no second derivatives: take backend='reference'"):
+    with pytest.raises(
+        RuntimeError, match=r"kernels have no second derivatives: take backend='reference'"
+    ):
         torch.autograd.grad(slope.sum(), leaf)
 
 
@@ -169,11 +189,18 @@ def test_the_hessian_in_means_was_off_by_five_percent(projection):
         leaf = means.clone().requires_grad_()
         return leaf, torch.autograd.grad(power(backend)(leaf), leaf, **kept)[0].flatten()
 
-    step, directions = 1e-5, torch.eye(model[0].numel(), dtype=torch.float64).unflatten(-1, model[0].shape)
+    step, directions = (
+        1e-5,
+        torch.eye(model[0].numel(), dtype=torch.float64).unflatten(-1, model[0].shape),
+    )
     ends = ([slope(model[0] + sign * step * d)[1] for d in directions] for sign in (1, -1))
-    wanted = torch.stack([(ahead - behind) / (2 * step) for ahead, behind in zip(*ends, strict=True)])
+    wanted = torch.stack(
+        [(ahead - behind) / (2 * step) for ahead, behind in zip(*ends, strict=True)]
+    )
     leaf, kept = slope(model[0], "reference", create_graph=True)
-    rows = torch.stack([torch.autograd.grad(part, leaf, retain_graph=True)[0].flatten() for part in kept])
+    rows = torch.stack(
+        [torch.autograd.grad(part, leaf, retain_graph=True)[0].flatten() for part in kept]
+    )
     for found in (rows, hessian(power("cpu"))(model[0]).reshape(wanted.shape)):
         assert (found - wanted).abs().max() < 1e-6 * wanted.abs().max()
 
@@ -236,10 +263,16 @@ def test_a_frozen_view_was_a_constant_to_transforms(backend):
         lambda made, value: jacfwd(made)(value),
     )
     for derivative in asked:
-        with pytest.raises(RuntimeError, match="a frozen view has no derivatives and cannot be mapped"):
+        with pytest.raises(
+            RuntimeError, match="a frozen view has no derivatives and cannot be mapped"
+        ):
             derivative(lambda features: view.render(features, 0), model[4])
-        with pytest.raises(RuntimeError, match="a frozen view has no derivatives: composite the plan"):
-            derivative(lambda opacities: freeze(plan, *model[:3], opacities, version=0).order, model[3])
+        with pytest.raises(
+            RuntimeError, match="a frozen view has no derivatives: composite the plan"
+        ):
+            derivative(
+                lambda opacities: freeze(plan, *model[:3], opacities, version=0).order, model[3]
+            )
     with pytest.raises(RuntimeError, match="cannot be mapped"):
         vmap(lambda features: view.render(features, 0))(torch.stack([model[4], model[4]]))
     with forward_ad.dual_level():
@@ -253,4 +286,6 @@ def test_similarity_has_forward_mode():
     step, direction = 1e-3, torch.ones_like(image)
     found = jvp(lambda image: ssim(image, target), (image,), (direction,))[1]
     ends = [ssim(image + sign * step * direction, target) for sign in (1, -1)]
-    assert found.abs().max() > 0 and torch.allclose(found, (ends[0] - ends[1]) / (2 * step), rtol=2e-2)
+    assert found.abs().max() > 0 and torch.allclose(
+        found, (ends[0] - ends[1]) / (2 * step), rtol=2e-2
+    )

@@ -1,9 +1,10 @@
 """Fit the problems by command lines and ask the fits, in the tree whose interpreter runs this.
 
-    python tests/oracle/fits.py FOLDER [NAME ...]     # the checkpoints, answers.npz and figures.json
+    python tests/oracle/fits.py FOLDER [NAME ...]     # the checkpoints,
+    answers.npz and figures.json
 
-`tests/oracle/stored` is such a folder. Of gsparc only `gsparc train`, its `summary.json`, `gsparc.load` and
-predictors are used, so that trees of other commits can be asked.
+`tests/oracle/stored` is such a folder. Of gsparc only `gsparc train`, its `summary.json`,
+`gsparc.load` and predictors are used, so that trees of other commits can be asked.
 """
 
 import json
@@ -65,7 +66,9 @@ def places(asked: Arrays) -> dict[str, np.ndarray]:
 
 def target(asked: Arrays) -> np.ndarray:
     """What was measured where it is asked, as it is answered."""
-    measured = next(np.asarray(asked[kind]) for kind in ("csi", "rssi", "spectrum") if kind in asked)
+    measured = next(
+        np.asarray(asked[kind]) for kind in ("csi", "rssi", "spectrum") if kind in asked
+    )
     return measured / 255.0 if measured.dtype == np.uint8 else measured
 
 
@@ -75,7 +78,8 @@ def spread(asked: Arrays) -> float:
 
 
 def answers(checkpoint: Path, asked: Arrays) -> dict[str, np.ndarray]:
-    """Mean, variance and confidence at places; also the mean in float64, where it is followed by autograd.
+    """Mean, variance and confidence at places; also the mean in float64,
+    where it is followed by autograd.
 
     Of several stations, of each.
     """
@@ -105,17 +109,25 @@ def answers(checkpoint: Path, asked: Arrays) -> dict[str, np.ndarray]:
 def missed(told: dict[str, np.ndarray], asked: Arrays) -> float:
     """Root mean square error where it is asked, as a share of the targets' deviation."""
     truth = target(asked)
-    means = [value.reshape(len(truth), -1) for part, value in told.items() if part.split()[0] == "mean"]
+    means = [
+        value.reshape(len(truth), -1) for part, value in told.items() if part.split()[0] == "mean"
+    ]
     error = abs(np.concatenate(means, 1) - truth.reshape(len(truth), -1))
     return float(np.sqrt(np.nanmean(error**2))) / spread(asked)
 
 
 def moved(
-    old: dict[str, np.ndarray], new: dict[str, np.ndarray], asked: Arrays, bound: float, double: float
+    old: dict[str, np.ndarray],
+    new: dict[str, np.ndarray],
+    asked: Arrays,
+    bound: float,
+    double: float,
 ) -> list[str]:
     """Answers that differ by more than a share of the targets' deviation, one line each."""
     scale = spread(asked)
-    lines = [f"{part}: {'gone' if part in old else 'new'}" for part in sorted(old.keys() ^ new.keys())]
+    lines = [
+        f"{part}: {'gone' if part in old else 'new'}" for part in sorted(old.keys() ^ new.keys())
+    ]
     for part in sorted(old.keys() & new.keys()):
         kind = part.split()[0]
         unit = {"variance": scale**2, "confidence": 1.0}.get(kind, scale)
@@ -126,7 +138,8 @@ def moved(
         if not np.nanmax(apart) <= (double if kind == "mean64" else bound):
             at = np.unravel_index(np.nanargmax(apart), apart.shape)
             lines.append(
-                f"{part}: {old[part][at]:.9g} -> {new[part][at]:.9g}, {apart[at]:.2g} of the deviation"
+                f"{part}: {old[part][at]:.9g} -> {new[part][at]:.9g}, {apart[at]:.2g} of the "
+                "deviation"
             )
     return lines
 
@@ -157,7 +170,9 @@ def main(folder: Path, names: list[str]) -> None:
         told[name] = answers(checkpoint, parted(PROBLEMS[name].arrays())[1])
     parts = {f"{name}/{part}": values for name, one in told.items() for part, values in one.items()}
     np.savez_compressed(folder / "answers.npz", **parts)
-    lines = (f"{json.dumps(name)}: {json.dumps(facts[name], sort_keys=True)}" for name in sorted(facts))
+    lines = (
+        f"{json.dumps(name)}: {json.dumps(facts[name], sort_keys=True)}" for name in sorted(facts)
+    )
     (folder / "figures.json").write_text("{\n" + ",\n".join(lines) + "\n}\n", encoding="utf-8")
 
 

@@ -12,7 +12,8 @@ SIZE = np.array([4.0, 3.0, 2.5])  # of the room [m]
 STILL = np.array([0.6, 0.8, 1.9])  # the end that does not move [m]
 POSTS = np.array([[0.0, 0.0, 6.0], [40.0, 5.0, 6.0], [15.0, 30.0, 6.0]])
 QUERIES = 12
-LONG, SHORT = 3.0e8, 2.4e9  # carriers [Hz]: a metre of wavelength, of which few rows tell much, and 125 mm
+# Carriers [Hz]: a metre of wavelength, of which few rows tell much, and 125 mm
+LONG, SHORT = 3.0e8, 2.4e9
 
 Arrays = dict[str, Any]
 
@@ -50,8 +51,12 @@ def mirrors(end: np.ndarray) -> list[tuple[float, np.ndarray]]:
     return result
 
 
-def channel(at: np.ndarray, still: np.ndarray, tones: np.ndarray, antennas: np.ndarray) -> np.ndarray:
-    """Channels (rows, antennas, tones) at places (rows, 3), whose antennas are `at` + offsets (A, 3)."""
+def channel(
+    at: np.ndarray, still: np.ndarray, tones: np.ndarray, antennas: np.ndarray
+) -> np.ndarray:
+    """Channels (rows, antennas, tones) at places (rows, 3),
+    whose antennas are `at` + offsets (A, 3).
+    """
     total = np.zeros((len(at), len(antennas), len(tones)), complex)
     for amplitude, image in mirrors(still):
         far = np.linalg.norm(at[:, None] + antennas - image, axis=-1)[..., None]
@@ -67,7 +72,12 @@ def noisy(clean: np.ndarray, db: float, seed: int) -> np.ndarray:
 
 
 def channels(
-    rows: int, carrier: float = LONG, tones: int = 1, antennas: int = 1, moving: str = "rx", **more: Any
+    rows: int,
+    carrier: float = LONG,
+    tones: int = 1,
+    antennas: int = 1,
+    moving: str = "rx",
+    **more: Any,
 ) -> Arrays:
     """Of a room with one end that moves."""
     comb = carrier + 2e6 * np.arange(tones)
@@ -95,31 +105,44 @@ def both_ends() -> Arrays:
     """Channels whose two ends move."""
     at, other = places(80, 1), places(80, 5)
     pairs = zip(at, other, strict=True)
-    csi = np.array([channel(a[None], b, np.array([LONG]), np.zeros((1, 3)))[0, 0, 0] for a, b in pairs])
+    csi = np.array(
+        [channel(a[None], b, np.array([LONG]), np.zeros((1, 3)))[0, 0, 0] for a, b in pairs]
+    )
     return {"rx": at, "tx": other, "csi": noisy(csi, 30, 2), "frequency_hz": LONG}
 
 
 def planar(side: int, spacing: float) -> np.ndarray:
     """Antennas (side^2, 3) [m] across x and y."""
     line = spacing * (np.arange(side) - (side - 1) / 2)
-    return np.column_stack([*(axis.ravel() for axis in np.meshgrid(line, line)), np.zeros(side * side)])
+    return np.column_stack(
+        [*(axis.ravel() for axis in np.meshgrid(line, line)), np.zeros(side * side)]
+    )
 
 
 def spectra(rows: int, declared: bool, moving: str = "tx", side: int = 4) -> Arrays:
-    """Bartlett spectra (rows, 12, 24) of 8 bits that an upright planar array measures in the room."""
+    """Bartlett spectra (rows, 12, 24) of 8 bits that an upright planar array measures in the
+    room.
+    """
     array = planar(side, 0.5 * C / SHORT)
     elevation, azimuth = np.meshgrid(
         np.deg2rad(np.arange(12) * 90 / 12), np.deg2rad(np.arange(24) * 360 / 24), indexing="ij"
     )
     towards = np.stack(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], -1
+        [
+            np.cos(elevation) * np.cos(azimuth),
+            np.cos(elevation) * np.sin(azimuth),
+            np.sin(elevation),
+        ],
+        -1,
     )
     wavelength = C / SHORT
     steering = np.exp(2j * np.pi / wavelength * towards.reshape(-1, 3) @ array.T)
     floor = np.array([2.0, 1.5, 0.2])
     at = places(rows, 3) * [0.3, 0.3, 0.2] + [1.0, 1.0, 1.6]
     ends = (
-        (np.tile(floor, (rows, 1)), at) if moving == "tx" else (at * [1, 1, 0.1], np.tile(STILL, (rows, 1)))
+        (np.tile(floor, (rows, 1)), at)
+        if moving == "tx"
+        else (at * [1, 1, 0.1], np.tile(STILL, (rows, 1)))
     )
     pictures = []
     for receiver, transmitter in zip(*ends, strict=True):
@@ -157,7 +180,10 @@ def powers(rows: int, **more: Any) -> Arrays:
 def silent() -> Arrays:
     """Powers of one station that is not heard below -75 dBm."""
     arrays = powers(110)
-    return arrays | {"rssi": np.where(arrays["rssi"] < -75, np.nan, arrays["rssi"]), "sensitivity_db": -75.0}
+    return arrays | {
+        "rssi": np.where(arrays["rssi"] < -75, np.nan, arrays["rssi"]),
+        "sensitivity_db": -75.0,
+    }
 
 
 def stations() -> Arrays:
@@ -170,7 +196,9 @@ def stations() -> Arrays:
 def moving_powers() -> Arrays:
     """Powers between two ends that move."""
     rng = np.random.default_rng(4)
-    ends = [np.column_stack([rng.uniform(0, [40, 30], (90, 2)), np.full(90, 1.5)]) for _ in range(2)]
+    ends = [
+        np.column_stack([rng.uniform(0, [40, 30], (90, 2)), np.full(90, 1.5)]) for _ in range(2)
+    ]
     level = -30 - 25 * np.log10(np.linalg.norm(ends[0] - ends[1], axis=1) + 1)
     return {"rx": ends[0], "tx": ends[1], "rssi": level + rng.normal(size=90)}
 
@@ -198,7 +226,13 @@ def snapshots() -> Arrays:
     at = places(110, 1)
     seen = [channel(at, antenna, comb, np.zeros((1, 3))) for antenna in array]
     both = noisy(np.concatenate(seen, axis=1), 30, 2).astype(np.complex64)
-    return {"rx": at, "uplink": both[..., :26], "csi": both[:, :1, 26:], "both": both, "array": array}
+    return {
+        "rx": at,
+        "uplink": both[..., :26],
+        "csi": both[:, :1, 26:],
+        "both": both,
+        "array": array,
+    }
 
 
 # Words of `gsparc train` that a tree may not know yet, and what said the same before.
@@ -215,8 +249,12 @@ PROBLEMS: dict[str, Problem] = {
     "one tone": Problem(lambda: channels(80), command=FEW, slow=True),
     "many tones": Problem(lambda: channels(60, tones=6), command=FEW, slow=True),
     "antennas": Problem(lambda: channels(60, tones=2, antennas=3), command=FEW, slow=True),
-    "uplink of an array": Problem(lambda: channels(60, antennas=4, moving="tx"), command=FEW, slow=True),
-    "uplink of snapshots": Problem(snapshots, "uplink", ("dataset=argos", "dataset.positions=true")),
+    "uplink of an array": Problem(
+        lambda: channels(60, antennas=4, moving="tx"), command=FEW, slow=True
+    ),
+    "uplink of snapshots": Problem(
+        snapshots, "uplink", ("dataset=argos", "dataset.positions=true")
+    ),
     "waves alone": Problem(lambda: channels(80, SHORT), "complex_gp"),
     "sources alone": Problem(
         lambda: channels(80),
@@ -254,7 +292,9 @@ def parted(arrays: Arrays) -> tuple[Arrays, Arrays]:
 
 
 def written(arrays: Arrays, folder: Path) -> tuple[str, ...]:
-    """Write measurements, and `room.yaml` of the walls; the words of `gsparc train` that name the file."""
+    """Write measurements, and `room.yaml` of the walls;
+    the words of `gsparc train` that name the file.
+    """
     (folder / "room.yaml").write_text(f"room: {{size_m: {SIZE.tolist()}}}\n", encoding="utf-8")
     if "uplink" in arrays:
         np.save(folder / "csidata.npy", arrays["both"])

@@ -1,7 +1,8 @@
-"""Other processors tried on this one: numeric tests in child processes, one setting changed at a time.
+"""Other processors tried on this one: numeric tests in child processes,
+one setting changed at a time.
 
-Torch's own kernels read `ATEN_CPU_CAPABILITY`, its MKL (matrix products, factors) `MKL_CBWR`, and numpy's and
-scipy's OpenBLAS `OPENBLAS_CORETYPE`; `GSPARC_TEST_KERNELS` is of `tests/conftest.py`.
+Torch's own kernels read `ATEN_CPU_CAPABILITY`, its MKL (matrix products, factors) `MKL_CBWR`, and
+numpy's and scipy's OpenBLAS `OPENBLAS_CORETYPE`; `GSPARC_TEST_KERNELS` is of `tests/conftest.py`.
 """
 
 import os
@@ -24,7 +25,9 @@ SETTINGS = {
     "two threads": {"OMP_NUM_THREADS": "2"},
 }
 HARD = sorted(str(path) for path in (ROOT / "tests" / "hard_cases").glob("test_*.py"))
-ROOMS = [f"tests/{room}" for room in ("ops", "physics", "processes", "models", "field", "prediction")]
+ROOMS = [
+    f"tests/{room}" for room in ("ops", "physics", "processes", "models", "field", "prediction")
+]
 
 
 def assert_all_pass(setting: str, *paths: str) -> None:
@@ -32,8 +35,21 @@ def assert_all_pass(setting: str, *paths: str) -> None:
     own = {name for settings in SETTINGS.values() for name in settings}
     environment = {name: value for name, value in os.environ.items() if name not in own}
     environment |= {"OMP_NUM_THREADS": "1"} | SETTINGS[setting]
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-n", "0", "-m", "not slow"]
-    done = subprocess.run([*command, *paths], cwd=ROOT, env=environment, capture_output=True, text=True)
+    command = [
+        sys.executable,
+        "-m",
+        "pytest",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-n",
+        "0",
+        "-m",
+        "not slow",
+    ]
+    done = subprocess.run(
+        [*command, *paths], cwd=ROOT, env=environment, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-1000:]
 
 
@@ -42,7 +58,8 @@ OFTEN = "OpenBLAS Haswell"  # where the suite failed once; the others are alike,
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "setting", [pytest.param(one, marks=() if one == OFTEN else pytest.mark.rare) for one in SETTINGS]
+    "setting",
+    [pytest.param(one, marks=() if one == OFTEN else pytest.mark.rare) for one in SETTINGS],
 )
 def test_problems_and_hard_cases_pass(setting):
     assert_all_pass(setting, "tests/oracle", *HARD)

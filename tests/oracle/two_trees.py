@@ -1,4 +1,6 @@
-"""`make oracle BASE=COMMIT`: what fits and answers of the problems moved since a commit, on this machine."""
+"""`make oracle BASE=COMMIT`: what fits and answers of the problems moved since a commit,
+on this machine.
+"""
 
 import re
 import subprocess
@@ -12,7 +14,8 @@ from problems import PROBLEMS, parted
 from rich.console import Console
 
 ROOT = Path(__file__).parents[2]
-ANSWERED, DOUBLE = 1e-5, 1e-8  # of the targets' deviation: answers, and those of closed forms in float64
+# Of the targets' deviation: answers, and those of closed forms in float64
+ANSWERED, DOUBLE = 1e-5, 1e-8
 FIGURES = 1e-4
 NUMBER = re.compile(r"-?\d+\.?\d*(?:e[+-]?\d+)?")
 
@@ -21,22 +24,39 @@ def changed(old: Any, new: Any, name: str = "") -> list[str]:
     """Figures and choices that differ by more than is allowed, one line each."""
     if isinstance(old, dict) and isinstance(new, dict):
         keys = sorted(old.keys() | new.keys())
-        return [line for key in keys for line in changed(old.get(key), new.get(key), f"{name} {key}".strip())]
+        return [
+            line
+            for key in keys
+            for line in changed(old.get(key), new.get(key), f"{name} {key}".strip())
+        ]
     texts = [str(each) for each in (old, new)]
     same = NUMBER.sub("#", texts[0]) == NUMBER.sub("#", texts[1])
     pairs = zip(*(NUMBER.findall(text) for text in texts), strict=False)
-    same = same and all(abs(float(a) - float(b)) <= FIGURES * abs(float(a)) + 1e-9 for a, b in pairs)
+    same = same and all(
+        abs(float(a) - float(b)) <= FIGURES * abs(float(a)) + 1e-9 for a, b in pairs
+    )
     return [] if same else [f"{name}: {old} -> {new}"]
 
 
 def built(commit: str) -> Path:
-    """The tree of a commit, checked out beside this one's builds, with an environment of its own."""
+    """The tree of a commit, checked out beside this one's builds,
+    with an environment of its own.
+    """
     whole = subprocess.check_output(
         ["git", "rev-parse", "--verify", f"{commit}^{{commit}}"], cwd=ROOT, text=True
     )
     tree = ROOT / "build" / "oracle" / whole[:12]
     if not tree.exists():
-        added = ["git", "worktree", "add", "--quiet", "--force", "--detach", str(tree), whole.strip()]
+        added = [
+            "git",
+            "worktree",
+            "add",
+            "--quiet",
+            "--force",
+            "--detach",
+            str(tree),
+            whole.strip(),
+        ]
         subprocess.run(added, cwd=ROOT, check=True)
     subprocess.run(["make", "--quiet", "setup"], cwd=tree, check=True)
     return tree
@@ -56,10 +76,14 @@ def main(commit: str, names: list[str]) -> None:
         lines = moved(told[name], told_here[name], asked, ANSWERED, DOUBLE)
         lines += changed(figures[name], figures_here[name])
         errors = (missed(each[name], asked) for each in (told, told_here))
-        console.print(f"{name}: error {' -> '.join(f'{error:.4f}' for error in errors)} of the deviation")
+        console.print(
+            f"{name}: error {' -> '.join(f'{error:.4f}' for error in errors)} of the deviation"
+        )
         for line in lines:
             console.print(f"  {line}", markup=False)
-    console.print(f"{len(names or PROBLEMS)} problems in {(time.monotonic() - started) / 60:.1f} minutes")
+    console.print(
+        f"{len(names or PROBLEMS)} problems in {(time.monotonic() - started) / 60:.1f} minutes"
+    )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""`h = A z`, `|A^H h|`, its lags and the normalisation, against sums written out and the simulator."""
+"""`h = A z`, `|A^H h|`, its lags and the normalisation,
+against sums written out and the simulator.
+"""
 
 import numpy as np
 import pytest
@@ -14,14 +16,21 @@ WAVELENGTH = 0.3259
 
 def _vectors(rows, elements, seed=0):
     rng = np.random.default_rng(seed)
-    return torch.from_numpy(rng.normal(size=(rows, elements)) + 1j * rng.normal(size=(rows, elements)))
+    return torch.from_numpy(
+        rng.normal(size=(rows, elements)) + 1j * rng.normal(size=(rows, elements))
+    )
 
 
-@pytest.mark.parametrize("array", [planar_array(), np.random.default_rng(1).normal(size=(5, 3)) * 0.2])
+@pytest.mark.parametrize(
+    "array", [planar_array(), np.random.default_rng(1).normal(size=(5, 3)) * 0.2]
+)
 def test_squared_spectrum_is_linear_in_the_lags(array):
     grid, h = SphereGrid.hemisphere(7, 12), _vectors(3, len(array))
     lags = array_response.make_co_array(array, WAVELENGTH)
-    direct = array_response.bartlett_spectrum(h, array_response.steering_matrix(array, grid, WAVELENGTH)) ** 2
+    direct = (
+        array_response.bartlett_spectrum(h, array_response.steering_matrix(array, grid, WAVELENGTH))
+        ** 2
+    )
     v = torch.cat([h.real, h.imag], 1)
     numbers = torch.einsum("bi,kij,bj->bk", v, lags.quadratic_forms(), v)
     torch.testing.assert_close(numbers @ lags.spectrum_basis(grid, WAVELENGTH).T, direct)
@@ -31,7 +40,9 @@ def test_array_output_is_the_weighted_sum_over_directions():
     grid, array = SphereGrid.hemisphere(4, 6), planar_array(2, 2)
     z = _vectors(1, 24).view(1, 4, 6)
     pattern = array_response.element_pattern(grid, 1.5)
-    h = array_response.array_output(z, array_response.steering_matrix(array, grid, WAVELENGTH), grid, pattern)
+    h = array_response.array_output(
+        z, array_response.steering_matrix(array, grid, WAVELENGTH), grid, pattern
+    )
     expected = torch.zeros(4, dtype=torch.complex128)
     for i in range(4):
         for j in range(6):
@@ -51,7 +62,10 @@ def test_slopes_through_the_array_and_the_normalisation(how):
         h = array_response.array_output(torch.complex(real, imag), matrix, grid)
         return array_response.normalise_spectrum(array_response.bartlett_spectrum(h, matrix), how)
 
-    parts = [v.clone().requires_grad_() for v in torch.view_as_real(_vectors(2, 12).view(2, 3, 4)).unbind(-1)]
+    parts = [
+        v.clone().requires_grad_()
+        for v in torch.view_as_real(_vectors(2, 12).view(2, 3, 4)).unbind(-1)
+    ]
     assert torch.autograd.gradcheck(splat_then_array, parts)
 
 

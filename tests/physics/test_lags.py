@@ -41,6 +41,8 @@ def test_lags_hold_the_whole_spectrum():
 def test_an_image_no_array_could_measure_is_not_in_the_span():
     space = SpectrumLags(ELEMENTS, GRID, WAVELENGTH)
     noise = torch.rand(1, 18, 72)
-    assert (space.spectrum(space.to_lags(noise)) - noise).square().sum() > 0.05 * noise.square().sum()
+    assert (
+        space.spectrum(space.to_lags(noise)) - noise
+    ).square().sum() > 0.05 * noise.square().sum()
     with pytest.raises(RuntimeError):
         space.to_lags(torch.rand(1, 18, 71))

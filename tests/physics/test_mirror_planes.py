@@ -3,7 +3,11 @@ import itertools
 import pytest
 import torch
 
-from gsparc.models.image_sources.reflection_orders import find_orthogonal_walls, find_walls, reassign_to_walls
+from gsparc.models.image_sources.reflection_orders import (
+    find_orthogonal_walls,
+    find_walls,
+    reassign_to_walls,
+)
 from gsparc.models.image_sources.scene import SourceScene
 from gsparc.physics.mirror_planes import all_sequences, bisector, images, reflect
 
@@ -54,7 +58,9 @@ def test_two_sources_make_no_wall():
 
 
 def test_walls_of_a_box_are_told_from_sources_spelled_badly():
-    walls = torch.tensor([[1.0, 0, 0, 4], [0, 1, 0, 0], [0, 1, 0, 3], [0, 0, 1, 2.5]], dtype=torch.float64)
+    walls = torch.tensor(
+        [[1.0, 0, 0, 4], [0, 1, 0, 0], [0, 1, 0, 3], [0, 0, 1, 2.5]], dtype=torch.float64
+    )
     transmitter = torch.tensor([0.0, 0.8, 1.9], dtype=torch.float64)
     sequences = ((), (0,), (1,), (2,), (3,), (0, 3), (1, 3), (0, 1))
     good = SourceScene(transmitter, walls, sequences, torch.zeros(len(sequences)), 0.0)

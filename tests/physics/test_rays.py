@@ -4,7 +4,11 @@ from gsparc.physics.rays import closest_ranges_and_gap
 
 
 def test_rays_towards_one_point_meet_there_and_others_never():
-    ends, point, aside = np.array([[0.0, 0, 1], [4.0, 0, 1]]), np.array([1.0, 3, 2]), np.array([0.0, 0, 1])
+    ends, point, aside = (
+        np.array([[0.0, 0, 1], [4.0, 0, 1]]),
+        np.array([1.0, 3, 2]),
+        np.array([0.0, 0, 1]),
+    )
     far = np.linalg.norm(point - ends, axis=1)
     one, other = (point - ends) / far[:, None]
     rays = np.array([one, aside]), np.array([other, -other, aside])

@@ -17,7 +17,11 @@ def rows(seed=0, count=20, antennas=3):
 @pytest.mark.parametrize("unknown_factor", ["phase", "phase+delay", "phase+delay+gain"])
 def test_what_was_put_on_rows_is_taken_off(unknown_factor):
     true, draw = rows(), np.random.default_rng(1)
-    phase, delay, gain = draw.uniform(0, 6.28, 20), draw.uniform(-2e-7, 2e-7, 20), draw.uniform(0.5, 2, 20)
+    phase, delay, gain = (
+        draw.uniform(0, 6.28, 20),
+        draw.uniform(-2e-7, 2e-7, 20),
+        draw.uniform(0.5, 2, 20),
+    )
     put_on = np.exp(1j * phase)[:, None] * np.ones(len(TONES))
     if "delay" in unknown_factor:
         put_on = put_on * np.exp(-2j * np.pi * delay[:, None] * TONES)

@@ -1,4 +1,6 @@
-"""The paper's pictures of a confidence say what its samples say, and nothing where none is stated."""
+"""The paper's pictures of a confidence say what its samples say,
+and nothing where none is stated.
+"""
 
 import numpy as np
 import pytest
@@ -13,13 +15,19 @@ ERROR = RNG.uniform(0.01, 1, 100)  # of rows, the surest first in what follows
 def rows(tmp_path, kind: str, sure=1 - ERROR, silent=0):
     own = {
         "spectrum": {"mae": ERROR, "ssim_gauss": 1 - ERROR, "psnr_db": -20 * np.log10(ERROR)},
-        "csi": {"error_power": ERROR, "target_power": ERROR * 0 + 1, "snr_db": -10 * np.log10(ERROR)},
+        "csi": {
+            "error_power": ERROR,
+            "target_power": ERROR * 0 + 1,
+            "snr_db": -10 * np.log10(ERROR),
+        },
         "rssi": {"error_db": ERROR - 0.5},
     }[kind]
     own = {name: np.where(np.arange(100) < silent, np.nan, values) for name, values in own.items()}
     facts = {"dataset/kind": kind, "model/name": "gsparc", "seed": 0, "split/sha256": "s"}
     run = Run(tmp_path, facts)
-    beside = {f"baseline/gp/{name}": values - 1 for name, values in own.items() if name.endswith("_db")}
+    beside = {
+        f"baseline/gp/{name}": values - 1 for name, values in own.items() if name.endswith("_db")
+    }
     run.__dict__["samples"] = {"confidence": sure, "x_m": ERROR, "y_m": ERROR, **own, **beside}
     return frame_of_runs([run])
 
@@ -66,4 +74,7 @@ def test_brackets_hold_all_rows_and_rise(tmp_path):
     boxes, bars = drawn("snr_brackets", tmp_path)
     heights = [bar.get_height() for bar in bars.patches]
     assert (np.diff(heights) > 0).all() and len(boxes.patches) == 2
-    assert sum(int(text.get_text().split("\n")[1].split()[0]) for text in bars.get_xticklabels()) == 100
+    assert (
+        sum(int(text.get_text().split("\n")[1].split()[0]) for text in bars.get_xticklabels())
+        == 100
+    )

@@ -75,13 +75,24 @@ def test_runs_of_the_same_rows_share_a_picture(kept, tmp_path):
     for name, own in (("a", found), ("b", found), ("c", others)):
         (tmp_path / name).mkdir()
         own.write(tmp_path / name / FILE)
-        facts = {"model/name": name, "baseline/nearest/psnr_db": 9.0, "split/sha256": "s", "seed": 0}
+        facts = {
+            "model/name": name,
+            "baseline/nearest/psnr_db": 9.0,
+            "split/sha256": "s",
+            "seed": 0,
+        }
         runs.append(Run(tmp_path / name, facts | {"test/psnr_db": 9.0}))
     joined = join_examples(frame_of_runs(runs))
     assert [*joined.predicted] == ["nearest", "a", "b"]
     figure = draw_spectra(joined, "title")
     grid = np.array(figure.axes[:20]).reshape(4, 5)
-    assert [axis.get_title() for axis in grid[0]] == ["measured", "nearest", "a", "b", "b - measured"]
+    assert [axis.get_title() for axis in grid[0]] == [
+        "measured",
+        "nearest",
+        "a",
+        "b",
+        "b - measured",
+    ]
     assert all("dB, SSIM" in axis.get_xlabel() for axis in grid[:, 1:4].flat)
     scales = {image.get_clim() for axis in grid[:, :4].flat for image in axis.images}
     assert scales == {(0, 1)}, "one colour scale"

@@ -1,4 +1,6 @@
-"""The map of a campaign and of what a field found: what is on it, and that it is drawn for every kind."""
+"""The map of a campaign and of what a field found: what is on it,
+and that it is drawn for every kind.
+"""
 
 import numpy as np
 import pytest
@@ -29,7 +31,9 @@ def figures(monkeypatch):
 def words(figure: Figure) -> str:
     """All text of a figure, a line each."""
     figure.draw_without_rendering()
-    return "\n".join(text.get_text() for text in figure.findobj(lambda part: hasattr(part, "get_text")))
+    return "\n".join(
+        text.get_text() for text in figure.findobj(lambda part: hasattr(part, "get_text"))
+    )
 
 
 def shown(data, figures):
@@ -54,17 +58,31 @@ def test_check_drew_the_mean_of_the_stations_heard():
 
 def test_of_the_sectors_of_a_mast_the_last_alone_was_named(figures):
     mast = scattered(2)[[0, 0, 1]]
-    arrays = {"rx_position": scattered(), "station_position": mast, "rssi_db": np.full((80, 3), -60.0)}
-    assert "A-1, A-2" in shown(from_arrays({**arrays, "station_name": ["A-1", "A-2", "B-1"]}), figures)[1]
+    arrays = {
+        "rx_position": scattered(),
+        "station_position": mast,
+        "rssi_db": np.full((80, 3), -60.0),
+    }
+    assert (
+        "A-1, A-2"
+        in shown(from_arrays({**arrays, "station_name": ["A-1", "A-2", "B-1"]}), figures)[1]
+    )
 
 
 def test_levels_in_dbm_were_drawn_as_db(figures):
     place, level = scattered(), np.linspace(-90, -40, 80)
-    arrays = {"rx_position": place, "station_position": np.array([[3.0, 3, 5]]), "rssi_db": level[:, None]}
+    arrays = {
+        "rx_position": place,
+        "station_position": np.array([[3.0, 3, 5]]),
+        "rssi_db": level[:, None],
+    }
     data = from_arrays(arrays, {"level_unit": "dBm"})
     levels = link_levels(data)
     draw_site(data, "unused.png", levels, [(0, LevelStep(39, 40, -25.0))])
-    assert {axis.get_ylabel() for axis in figures[-1].axes} >= {"level [dBm]", "received power [dBm]"}
+    assert {axis.get_ylabel() for axis in figures[-1].axes} >= {
+        "level [dBm]",
+        "received power [dBm]",
+    }
 
 
 def test_rows_that_are_wrong_are_marked(figures):
@@ -72,11 +90,17 @@ def test_rows_that_are_wrong_are_marked(figures):
     place[17] = [5000, 300, 1]
     level = -20 * np.log10(np.linalg.norm(place - [3, 3, 5], axis=1))
     level[40] = -150
-    data = from_arrays({"rx_position": place, "tx_position": np.array([3.0, 3, 5]), "rssi_db": level})
+    data = from_arrays(
+        {"rx_position": place, "tx_position": np.array([3.0, 3, 5]), "rssi_db": level}
+    )
     found = find_spots(data, link_levels(data))
     assert np.flatnonzero(found.far).tolist() == [17] and found.suspicious[40]
     figure, said = shown(data, figures)
-    assert "row 17 at (5000, 300)" in said and "row 40" in said and "suspicious level (1 place)" in said
+    assert (
+        "row 17 at (5000, 300)" in said
+        and "row 40" in said
+        and ("suspicious level (1 place)") in said
+    )
     assert figure.axes[0].get_xlim()[1] < 40  # the map is of the others
     assert figure.axes[0].get_aspect() == 1
 
@@ -85,7 +109,9 @@ def test_stations_that_jump_have_a_panel(figures):
     rng = np.random.default_rng(0)
     place = rng.uniform(0, 100, (200, 3)) * [1, 1, 0]
     posts = np.array([[0.0, 0, 9], [100, 0, 9], [0, 100, 9]])
-    level = -30 * np.log10(np.linalg.norm(place[:, None] - posts, axis=-1)) + rng.normal(0, 1, (200, 3))
+    level = -30 * np.log10(np.linalg.norm(place[:, None] - posts, axis=-1)) + rng.normal(
+        0, 1, (200, 3)
+    )
     level[120:, 1] += 20
     names = np.array(["a", "b", "c"])
     data = from_arrays(
@@ -100,7 +126,10 @@ def test_stations_that_jump_have_a_panel(figures):
 
 def test_the_origin_of_degrees_is_said(figures):
     rng = np.random.default_rng(0)
-    arrays = {"latitude": -33 - rng.uniform(0, 0.01, 30), "longitude": 151 + rng.uniform(0, 0.01, 30)}
+    arrays = {
+        "latitude": -33 - rng.uniform(0, 0.01, 30),
+        "longitude": 151 + rng.uniform(0, 0.01, 30),
+    }
     data = from_arrays({**arrays, "rx_height": np.array(1.5), "rssi_db": rng.uniform(-90, -60, 30)})
     origin = data.site.georeference
     said = shown(data, figures)[1]
@@ -110,7 +139,11 @@ def test_the_origin_of_degrees_is_said(figures):
 
 def test_other_kinds_are_drawn_too(campaign, figures):
     assert "spectra" in shown(campaign("spectrum"), figures)[1]
-    ends = {"rx_position": scattered(), "tx_position": scattered()[::-1], "frequency_hz": np.array(1e9)}
+    ends = {
+        "rx_position": scattered(),
+        "tx_position": scattered()[::-1],
+        "frequency_hz": np.array(1e9),
+    }
     said = shown(from_arrays({**ends, "csi": np.exp(1j * np.arange(80))}), figures)[1]
     assert "transmitter" in said and "receiver" in said and "mean channel power [dB]" in said
     line = {"rx_position": np.arange(30.0)[:, None] * [1, 0, 0], "rssi_db": np.arange(30.0)}
@@ -119,7 +152,8 @@ def test_other_kinds_are_drawn_too(campaign, figures):
 
 STATION = np.array([101.0, 204.0, 2.0])
 HALF = np.sqrt(0.5)
-PLANES = np.array([[1.0, 0, 0, 5.0], [HALF, HALF, 0, 2.0], [0, 0, 1.0, -1.0]])  # two walls, and a floor
+# Two walls, and a floor
+PLANES = np.array([[1.0, 0, 0, 5.0], [HALF, HALF, 0, 2.0], [0, 0, 1.0, -1.0]])
 BOX = np.array([[[1.0, 1.0, -1.0], [2.0, 3.0, 0.0]]])
 
 
@@ -146,9 +180,13 @@ def test_walls_and_boxes_are_drawn_where_they_are(room, figures):
     np.testing.assert_allclose(lines["known walls"], [[108, 200], [100, 200]])
     np.testing.assert_allclose(lines["ends that stand"], STATION[None, :2])
     assert {text.get_text() for text in figure.legends[0].get_texts()} == {
-        "measured places", "known walls", "known boxes", "mirror planes found", "boxes found (1)",
+        "measured places",
+        "known walls",
+        "known boxes",
+        "mirror planes found",
+        "boxes found (1)",
         "ends that stand",
-    }  # fmt: skip
+    }
     assert f"z = {room.site.origin[2] - 1.0:.2f} m" in figure.get_suptitle()
 
 

@@ -23,12 +23,20 @@ def few(monkeypatch):
 
 @pytest.mark.parametrize("projection", ["tangent", "equirect"])
 def test_kernels_compute_what_their_references_do(projection):
-    for case in [*kernel_cases(30, projection), loss_case(), training_step_case(projection, count=5)]:
+    for case in [
+        *kernel_cases(30, projection),
+        loss_case(),
+        training_step_case(projection, count=5),
+    ]:
         kernel, reference = case.kernel(), case.reference()
         if case.name == "plan":
             assert torch.equal(kernel.visible, reference.visible)
             continue
-        pairs = zip(kernel, reference, strict=True) if isinstance(kernel, tuple) else [(kernel, reference)]
+        pairs = (
+            zip(kernel, reference, strict=True)
+            if isinstance(kernel, tuple)
+            else [(kernel, reference)]
+        )
         # The loss of plain PyTorch is another mean: 16 spectra are summed here, averaged there.
         for ours, theirs in () if case.name == "loss of spectra" else pairs:
             assert torch.allclose(ours, theirs.to(ours.dtype), rtol=1e-3, atol=1e-3), case.name
@@ -42,11 +50,14 @@ def test_the_table_has_a_ratio_where_there_is_a_reference(tmp_path, monkeypatch,
         "training_step_case",
         lambda projection, device: training_step_case(projection, count=5, device=device),
     )
-    bench.task(compose("counts=[20]", "projections=[tangent]", "rounds=2", "rounds_s=0", config="bench"))
+    bench.task(
+        compose("counts=[20]", "projections=[tangent]", "rounds=2", "rounds_s=0", config="bench")
+    )
     facts = json.loads((tmp_path / "summary.json").read_text())
     seconds = {name: value for name, value in facts.items() if name.startswith("bench/")}
     assert len(seconds) == 7 and min(seconds.values()) > 0
-    assert "faster" in capsys.readouterr().out  # "times" is on the line above where numbers are long
+    # "times" is on the line above where numbers are long
+    assert "faster" in capsys.readouterr().out
     assert (tmp_path / "bench.csv").read_text().count("\n") == 8
 
 

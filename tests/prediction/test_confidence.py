@@ -11,7 +11,13 @@ from towns import trained
 import gsparc
 from gsparc.models import checkpoint, loading
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.prediction.confidence import Guarantee, Trusted, as_confidence, calibrated_box, store_trusted
+from gsparc.prediction.confidence import (
+    Guarantee,
+    Trusted,
+    as_confidence,
+    calibrated_box,
+    store_trusted,
+)
 from gsparc.prediction.left_out import gather_evidence
 from gsparc.processes.kernel import WhiteNoise
 from gsparc.runs.open_runs import Unseen
@@ -40,7 +46,9 @@ def test_every_kind_orders_positions_as_the_evidence_does(site) -> None:
         assert answered.dtype == np.float32 and ((answered >= 0) & (answered <= 1)).all()
         assert np.allclose(answered, as_confidence(kind, score), atol=1e-3)
     plain = gsparc.load(file)
-    assert np.allclose(plain.confidence(tx=world), as_confidence("distance", evidence.scores["distance"]))
+    assert np.allclose(
+        plain.confidence(tx=world), as_confidence("distance", evidence.scores["distance"])
+    )
     assert np.array_equal(plain.accepts(tx=world), plain.confidence(tx=world) >= 0.2)
     assert isinstance(plain.accepts(tx=world[0]), bool)
     # It listed every place that was learned from.
@@ -87,14 +95,19 @@ def test_a_place_far_from_all_measurements_is_never_accepted(site, kind) -> None
     kernel = replace(rivals.kernel, terms=(*rivals.kernel.terms[:-1], WhiteNoise(0.5)))
     laxest = as_confidence(kind, np.array(-1.49 if kind == "gp_variance" else -100.0))
     store_trusted(file, Trusted(kind, float(laxest), Guarantee(), rivals.known, kernel))
-    near, far = data.tx[fold.train[:1]] + data.site.origin, data.site.origin + np.array([[9e5, 0, 0]])
+    near, far = (
+        data.tx[fold.train[:1]] + data.site.origin,
+        data.site.origin + np.array([[9e5, 0, 0]]),
+    )
     assert gsparc.load(file).accepts(tx=near).all() and not gsparc.load(file).accepts(tx=far).any()
 
 
 def test_a_place_outside_of_all_measurements_was_accepted(site) -> None:
     """A model that found sources is sure 30 m beyond its room."""
     data, fold, file = site
-    trusted = replace(Trusted.from_fold(data, fold), kind="learned", threshold=0.0, promise=Guarantee())
+    trusted = replace(
+        Trusted.from_fold(data, fold), kind="learned", threshold=0.0, promise=Guarantee()
+    )
     near = data.tx[fold.train[:2]] + data.site.origin
     places = np.concatenate([near, near + np.array([30.0, 0, 0])])
     store_trusted(file, trusted)

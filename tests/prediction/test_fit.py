@@ -66,7 +66,11 @@ def test_places_of_stations_given_as_an_end_were_refused_by_their_shape_alone(co
         gsparc.fit(rx=PLACES, **wrong)
 
 
-UNITS = {"dBm": lambda level: level, "dBW": lambda level: level - 30, "mW": lambda level: 10 ** (level / 10)}
+UNITS = {
+    "dBm": lambda level: level,
+    "dBW": lambda level: level - 30,
+    "mW": lambda level: 10 ** (level / 10),
+}
 UNITS |= {"W": lambda level: 10 ** (level / 10 - 3), "pW": lambda level: 10 ** (level / 10 + 9)}
 
 
@@ -75,19 +79,33 @@ UNITS |= {"W": lambda level: 10 ** (level / 10 - 3), "pW": lambda level: 10 ** (
     ("model", "several"), [("gp", False), ("gp", True), ("gsparc", True), ("kriging", False)]
 )
 def test_powers_in_dbm_were_answered_in_milliwatts(model, several, tmp_path):
-    """An error of 57 dB for who takes units to come back: now one field, answered in each unit to 1e-4 dB."""
+    """An error of 57 dB for who takes units to come back: now one field,
+    answered in each unit to 1e-4 dB.
+    """
     ends = np.array([[0.0, 0, 2], [9, 9, 2]])
     where = {"station_position": ends} if several else {"tx": END}
     level = np.c_[POWERS, np.roll(POWERS, 7)] if several else POWERS
     asked, answers = PLACES[:6] + 0.2, {}
     for unit in UNITS if model == "gp" else ("dBm", "W"):
-        found = gsparc.fit(rx=PLACES, rssi=UNITS[unit](level), unit=unit, model=model,
-                           save=tmp_path / "m.ckpt", **where)  # fmt: skip
+        found = gsparc.fit(
+            rx=PLACES,
+            rssi=UNITS[unit](level),
+            unit=unit,
+            model=model,
+            save=tmp_path / "m.ckpt",
+            **where,
+        )
         again = gsparc.load(tmp_path / "m.ckpt")
-        assert found.unit == again.unit == unit and gsparc.load(tmp_path / "m.ckpt", unit="dBm").unit == "dBm"
+        assert (
+            found.unit == again.unit == unit
+            and gsparc.load(tmp_path / "m.ckpt", unit="dBm").unit == "dBm"
+        )
         assert np.array_equal(found.rssi(rx=asked), again.rssi(rx=asked))
         assert np.array_equal(found.std(rx=asked), again.std(rx=asked))
-        answers[unit] = found.rssi(rx=asked), *(ask(rx=asked, unit="dBm") for ask in (found.rssi, found.std))
+        answers[unit] = (
+            found.rssi(rx=asked),
+            *(ask(rx=asked, unit="dBm") for ask in (found.rssi, found.std)),
+        )
         for other, back in UNITS.items():
             there = found.rssi(rx=asked, unit=other)
             np.testing.assert_allclose(there, back(answers[unit][1].astype(float)), rtol=3e-5)
@@ -113,10 +131,16 @@ def test_decibels_of_no_known_reference_and_linear_powers_come_back():
 def test_noise_goes_with_its_unit():
     noise = np.full(60, 1e-10)
     scales = [
-        gsparc.fit(rx=PLACES, tx=END, rssi=10 ** (POWERS / 10) * by, unit=unit, noise_variance=noise * by**2,
-                   model="gp").rssi(rx=PLACES[0], unit="dBm")
+        gsparc.fit(
+            rx=PLACES,
+            tx=END,
+            rssi=10 ** (POWERS / 10) * by,
+            unit=unit,
+            noise_variance=noise * by**2,
+            model="gp",
+        ).rssi(rx=PLACES[0], unit="dBm")
         for unit, by in (("mW", 1.0), ("W", 1e-3))
-    ]  # fmt: skip
+    ]
     assert abs(scales[0] - scales[1]) < 1e-4
 
 
@@ -133,17 +157,23 @@ def test_methods_without_deviations_say_so():
     refused("nearest states no deviations", found.std, rx=PLACES[0])
 
 
-@pytest.mark.parametrize("wrong, said", [
-    ({"rx": PLACES, "rssi": POWERS, "unit": "dBi"}, "unit=dBi"),
-    ({"rx": PLACES, "rssi": POWERS, "unit": "mW"}, "rssi.*linear power, at least 0"),
-    ({"rx": PLACES, "rssi": POWERS, "unit": None}, "unit=None"),  # were taken for dBW
-    ({"rx": PLACES, "rssi": POWERS.astype(str), "unit": "mW"}, "rssi: expected real numbers"),
-    ({"rx": PLACES[:5], "rssi": POWERS}, "^gsparc.fit, rx_position: [^;]*found .5, 3.$"),
-    ({"rx": PLACES, "rssi": POWERS, "carier_hz": 1e9}, "carier_hz.*carrier_hz"),
-    ({"rx": PLACES, "csi": np.ones((60, 2), complex), "carrier_hz": 1e9}, "or say frequency_hz="),
-    ({"rx": PLACES}, "one of"),
-    ({"rx": PLACES, "rssi": POWERS, "model": "gps"}, "did you mean 'gp'"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "wrong, said",
+    [
+        ({"rx": PLACES, "rssi": POWERS, "unit": "dBi"}, "unit=dBi"),
+        ({"rx": PLACES, "rssi": POWERS, "unit": "mW"}, "rssi.*linear power, at least 0"),
+        ({"rx": PLACES, "rssi": POWERS, "unit": None}, "unit=None"),  # were taken for dBW
+        ({"rx": PLACES, "rssi": POWERS.astype(str), "unit": "mW"}, "rssi: expected real numbers"),
+        ({"rx": PLACES[:5], "rssi": POWERS}, "^gsparc.fit, rx_position: [^;]*found .5, 3.$"),
+        ({"rx": PLACES, "rssi": POWERS, "carier_hz": 1e9}, "carier_hz.*carrier_hz"),
+        (
+            {"rx": PLACES, "csi": np.ones((60, 2), complex), "carrier_hz": 1e9},
+            "or say frequency_hz=",
+        ),
+        ({"rx": PLACES}, "one of"),
+        ({"rx": PLACES, "rssi": POWERS, "model": "gps"}, "did you mean 'gp'"),
+    ],
+)
 def test_mistakes_are_said_with_their_array(wrong, said):
     with pytest.raises((DataError, ValueError), match=said):
         gsparc.fit(tx=END, **wrong)
@@ -175,9 +205,13 @@ def test_the_mask_of_an_array_was_thrown_away():
     ],
 )
 def test_arrays_were_not_asked_what_files_are(rssi, says, caplog):
-    """`gsparc.fit` answered -60 +- 3e-9 dB, and losses as levels, without a word; runs of files say so."""
+    """`gsparc.fit` answered -60 +- 3e-9 dB, and losses as levels, without a word;
+    runs of files say so.
+    """
     places = PLACES / (1e4 if "kilometres" in says else 1)
-    gsparc.fit(rx=places, tx=END / (1e4 if "kilometres" in says else 1), rssi=rssi, model="distance_law")
+    gsparc.fit(
+        rx=places, tx=END / (1e4 if "kilometres" in says else 1), rssi=rssi, model="distance_law"
+    )
     assert says in caplog.text
 
 

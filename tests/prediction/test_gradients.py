@@ -1,4 +1,6 @@
-"""Gradients of predictions by position: right, in both modes, in the caller's precision, or refused."""
+"""Gradients of predictions by position: right, in both modes, in the caller's precision,
+or refused.
+"""
 
 from collections.abc import Callable
 from functools import cache
@@ -58,7 +60,10 @@ def both_ends(kind: str) -> Measurements:
 def antennas() -> Measurements:
     """Channels from a place to three antennas of a room, at a wavelength of 30 cm."""
     rng = np.random.default_rng(0)
-    at, end = rng.uniform([0, 0, 0.7], [1.5, 1.5, 0.9], (80, 3)), rng.uniform([0, 0, 2], [2, 2, 2.4], (3, 3))
+    at, end = (
+        rng.uniform([0, 0, 0.7], [1.5, 1.5, 0.9], (80, 3)),
+        rng.uniform([0, 0, 2], [2, 2, 2.4], (3, 3)),
+    )
     far = np.linalg.norm(at[:, None] - end, axis=-1)
     noise = 0.02 * (rng.standard_normal((80, 3, 2)) @ [1, 1j])
     csi = np.exp(-2j * np.pi * far / 0.3) / far + noise
@@ -92,7 +97,9 @@ class Assembled(Powers):
 
 
 class Case(NamedTuple):
-    """What is fitted to which data; `station` of several, `thin`: how few rows make it take the nearest."""
+    """What is fitted to which data; `station` of several, `thin`:
+    how few rows make it take the nearest.
+    """
 
     make: Callable[[], Method]
     data: Callable[[Path], Measurements]
@@ -104,12 +111,18 @@ SEARCH = BearingSearchSettings(sources=8, rows=30, candidates=1000, steps=20)
 SOURCES = ("init.searches=1", "init.search_rows=60")
 CASES = {
     "gp, spectra": Case(method_class("gp"), kinds.images),
-    "gp, spectra, nearest rows": Case(method_class("gp"), lambda folder: images(folder, 200), thin=True),
-    "gp, spectra of a moving receiver": Case(method_class("gp"), lambda folder: images(folder, 40, "rx")),
+    "gp, spectra, nearest rows": Case(
+        method_class("gp"), lambda folder: images(folder, 200), thin=True
+    ),
+    "gp, spectra of a moving receiver": Case(
+        method_class("gp"), lambda folder: images(folder, 40, "rx")
+    ),
     "array": Case(lambda: method_class("array")(), kinds.static_array),
     "gsparc, rendered": Case(planned(*RENDERED, "model.field.count=40"), kinds.images),
     "gsparc, array": Case(planned("model.field.count=64"), kinds.static_array),
-    "moving_array": Case(lambda: MovingArrayField(search=SEARCH, components=32), kinds.moving_array),
+    "moving_array": Case(
+        lambda: MovingArrayField(search=SEARCH, components=32), kinds.moving_array
+    ),
     "gsparc, moving array": Case(
         lambda: Assembled(MovingArrayField(search=SEARCH, components=32)), kinds.moving_array
     ),
@@ -121,7 +134,9 @@ CASES = {
     "image_source_gp": Case(
         lambda: ImageSourceGP(searches=1, search_rows=60), lambda _: shoebox(60, pillar=True)[1]
     ),
-    "gsparc, a mixture": Case(lambda: Assembled(ImageSourceGP(searches=1, search_rows=60)), kinds.bands),
+    "gsparc, a mixture": Case(
+        lambda: Assembled(ImageSourceGP(searches=1, search_rows=60)), kinds.bands
+    ),
     "gsparc, channels of an array": Case(planned(*SOURCES), kinds.bands),
     "gsparc, channels from nowhere known": Case(planned(), kinds.unplaced),
     "gsparc, channels of stations": Case(planned(), lambda _: antennas(), "0"),
@@ -135,10 +150,19 @@ CASES = {
     "gsparc, powers of stations": Case(planned(), kinds.several, "0"),
 }
 REFUSED = {
-    "nearest": "change in jumps", "idw": "change in jumps", "mean": "same everywhere",
-    "zero": "same everywhere", "kriging": "outside of autograd", "gsparc": "footprints",
-}  # fmt: skip
-QUICK = ("gp, spectra", "complex_gp, both ends", "gp, powers, nearest rows", "gsparc, powers of stations")
+    "nearest": "change in jumps",
+    "idw": "change in jumps",
+    "mean": "same everywhere",
+    "zero": "same everywhere",
+    "kriging": "outside of autograd",
+    "gsparc": "footprints",
+}
+QUICK = (
+    "gp, spectra",
+    "complex_gp, both ends",
+    "gp, powers, nearest rows",
+    "gsparc, powers of stations",
+)
 
 
 @cache
@@ -170,7 +194,9 @@ def places(predictor: Predictor, count: int = 3) -> torch.Tensor:
 
 
 def ends(predictor: Predictor, at):
-    """Where both are: what moves at places (..., 3 or 6), what stands where nobody knows at the origin."""
+    """Where both are: what moves at places (..., 3 or 6),
+    what stands where nobody knows at the origin.
+    """
     site = predictor.site
     if site.static_end is None:
         return {"tx": at[..., :3], "rx": at[..., 3:]}
@@ -193,7 +219,9 @@ def sums(predictor: Predictor, at: torch.Tensor) -> dict[str, torch.Tensor]:
     weights = torch.complex(*torch.from_numpy(draw.standard_normal(shape)))
     parts = {"mean": torch.real(found.mean * weights).flatten(1).sum(1)}
     # Of a distance law the same decibels everywhere: no slope but of rounding.
-    others = ("confidence",) if predictor.method.name == "distance_law" else ("variance", "confidence")
+    others = (
+        ("confidence",) if predictor.method.name == "distance_law" else ("variance", "confidence")
+    )
     parts |= {name: part for name in others if (part := getattr(found, name)) is not None}
     return parts
 
@@ -209,12 +237,16 @@ def slopes(predictor: Predictor, at: torch.Tensor) -> dict[str, torch.Tensor]:
     }
 
 
-def differences(predictor: Predictor, at: torch.Tensor, step: float = STEP) -> dict[str, torch.Tensor]:
+def differences(
+    predictor: Predictor, at: torch.Tensor, step: float = STEP
+) -> dict[str, torch.Tensor]:
     """Central differences of fourth order: (B, D) of each of `sums`."""
     columns: dict[str, list[torch.Tensor]] = {}
     for axis in torch.eye(at.shape[1], dtype=at.dtype):
         with torch.no_grad():
-            near, far = ([sums(predictor, at + h * n * step * axis) for h in (1, -1)] for n in (1, 2))
+            near, far = (
+                [sums(predictor, at + h * n * step * axis) for h in (1, -1)] for n in (1, 2)
+            )
         for name in near[0]:
             first, second = (pair[0][name] - pair[1][name] for pair in (near, far))
             columns.setdefault(name, []).append((8 * first - second) / (12 * step))
@@ -229,7 +261,10 @@ def error(found: torch.Tensor, wanted: torch.Tensor) -> float:
 def equal_differences(predictor, data):
     at = places(predictor)
     # A pixel that reaches 0 within a step has no difference there: by a twentieth it has.
-    found, wanted = slopes(predictor, at), [differences(predictor, at, s) for s in (STEP, STEP / 20)]
+    found, wanted = (
+        slopes(predictor, at),
+        [differences(predictor, at, s) for s in (STEP, STEP / 20)],
+    )
     assert "mean" in found
     for part, slope in found.items():
         assert slope.dtype == torch.float64 and slope.abs().max() > 0, part
@@ -258,7 +293,9 @@ def are_the_same_in_forward_mode_and_transforms(predictor, data):
 
 
 def leave_answers_as_they_are(predictor, data):
-    """In the caller's precision; float32 loses nothing but its last digits near the world's origin."""
+    """In the caller's precision; float32 loses nothing but its last digits near the world's
+    origin.
+    """
     at = places(predictor)
     with_gradients, plain = asked(predictor, at, grad=True), asked(predictor, at)
     assert with_gradients.dtype == (torch.complex128 if plain.is_complex() else torch.float64)
@@ -291,9 +328,11 @@ def are_finite_at_rows_and_at_one_place(predictor, data):
 
 
 PROPERTIES = (
-    equal_differences, are_the_same_in_forward_mode_and_transforms, leave_answers_as_they_are,
+    equal_differences,
+    are_the_same_in_forward_mode_and_transforms,
+    leave_answers_as_they_are,
     are_finite_at_rows_and_at_one_place,
-)  # fmt: skip
+)
 
 
 @pytest.mark.slow
@@ -320,12 +359,18 @@ def test_wrong_questions_get_clear_answers(name):
     at, end = places(predictor), predictor.site.moving_end
     refused("must be a torch tensor, got ndarray", asked, predictor, at.numpy(), grad=True)
     if predictor.site.static_position is not None:
-        still = torch.from_numpy(predictor.site.static_position + predictor.site.origin).requires_grad_()
+        still = torch.from_numpy(
+            predictor.site.static_position + predictor.site.origin
+        ).requires_grad_()
         with pytest.raises(ValueError, match=f"gradients are by the position of {end} alone"):
             predictor.predict(**{end: at, predictor.site.static_end: still}, grad=True)
-    refused("vmap is not followed", torch.func.vmap(lambda one: asked(predictor, one, grad=True)), at)
+    refused(
+        "vmap is not followed", torch.func.vmap(lambda one: asked(predictor, one, grad=True)), at
+    )
     if predictor.site.kind == "csi":
-        refused("measured tones alone", predictor.csi, tx=at[:, :3], rx=at[:, 3:], symbols=14, grad=True)
+        refused(
+            "measured tones alone", predictor.csi, tx=at[:, :3], rx=at[:, 3:], symbols=14, grad=True
+        )
 
 
 def test_what_a_transform_keeps_is_no_transforms():

@@ -67,7 +67,11 @@ def test_silence_tells_nothing_and_is_counted(predictor):
     found = predictor.update(rx=AT, rssi=[-60.0, -np.inf, np.nan])
     assert len(found.rows) == 1 and found.skipped == 1
     refused(
-        "row 2: out of range; expected linear power", predictor.update, rx=AT, rssi=[1, 1, -1], unit="linear"
+        "row 2: out of range; expected linear power",
+        predictor.update,
+        rx=AT,
+        rssi=[1, 1, -1],
+        unit="linear",
     )
 
 
@@ -97,10 +101,19 @@ def test_places_beside_those_of_the_model_and_one_that_stands_still_are_taken(pr
 
 @pytest.mark.parametrize(
     "name, value",
-    [("fade_db", -1), ("fade_db", np.nan), ("false_alarm", 0), ("false_alarm", np.inf), ("window", 1.5),
-     ("window", 0), ("refit", "yes")],
-)  # fmt: skip
-def test_a_setting_that_cannot_be_is_refused_in_python_as_on_the_command_line(predictor, name, value):
+    [
+        ("fade_db", -1),
+        ("fade_db", np.nan),
+        ("false_alarm", 0),
+        ("false_alarm", np.inf),
+        ("window", 1.5),
+        ("window", 0),
+        ("refit", "yes"),
+    ],
+)
+def test_a_setting_that_cannot_be_is_refused_in_python_as_on_the_command_line(
+    predictor, name, value
+):
     refused(f"{name}={value!r}: ", predictor.update, rx=AT, rssi=LEVELS, **{name: value})
 
 
@@ -132,7 +145,9 @@ def test_levels_come_back_as_they_came_whatever_was_said_of_the_station(predicto
 def test_rows_of_a_key_are_taken_once_until_they_are_undone(predictor, tmp_path):
     predictor.update(rx=AT, rssi=LEVELS, key="monday")
     predictor.update(rx=AT, rssi=LEVELS)  # one that stands still repeats
-    refused_as(ToldBefore, "monday was told before", predictor.update, rx=AT, rssi=LEVELS, key="monday")
+    refused_as(
+        ToldBefore, "monday was told before", predictor.update, rx=AT, rssi=LEVELS, key="monday"
+    )
     assert len(predictor.rows) == 6
     predictor.undo(2)
     assert len(predictor.update(rx=AT, rssi=LEVELS, key="monday").rows) == 3
@@ -164,4 +179,6 @@ def test_damaged_later_rows_of_a_checkpoint_are_said(fitted, predictor, damage):
     extra = versions_extra(predictor.versions)
     damage(extra["updates"])
     stored = checkpoint.read(fitted)
-    refused_as(CheckpointError, "later rows", gsparc.load, replace(stored, extra=stored.extra | extra))
+    refused_as(
+        CheckpointError, "later rows", gsparc.load, replace(stored, extra=stored.extra | extra)
+    )

@@ -36,7 +36,11 @@ def test_settings_are_said_in_words():
 
 def test_a_point_that_another_method_beats_is_said():
     others = pd.DataFrame(
-        {"label": ["nearest", "gp", "mean"], "render_ms_p50": [0.5, 2.0, 0.1], "score": [26.0, 29, 15]}
+        {
+            "label": ["nearest", "gp", "mean"],
+            "render_ms_p50": [0.5, 2.0, 0.1],
+            "score": [26.0, 29, 15],
+        }
     )
     point = {"render_ms_p50": 1.0, "score": 20.0}
     assert find_better(point, others) == "nearest" and find_better(point, others[1:]) is None

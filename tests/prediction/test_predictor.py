@@ -1,4 +1,6 @@
-"""gsparc.load: world coordinates in, the same kind of array out; levels with covariances of their errors."""
+"""gsparc.load: world coordinates in, the same kind of array out;
+levels with covariances of their errors.
+"""
 
 import dataclasses
 import re
@@ -58,7 +60,9 @@ def test_static_end_is_known_and_not_moved(spectra):
     world, still = data.tx[:2] + data.site.origin, data.rx_position[0] + data.site.origin
     with_pose = gsparc.Pose(torch.tensor(still), torch.eye(3, dtype=torch.float64))
     for rx in (still, np.tile(still, (2, 1)), with_pose):
-        assert np.array_equal(np.asarray(predictor.spectrum(tx=world, rx=rx)), predictor.spectrum(tx=world))
+        assert np.array_equal(
+            np.asarray(predictor.spectrum(tx=world, rx=rx)), predictor.spectrum(tx=world)
+        )
     refused("rx= differs from where it stood", predictor.spectrum, tx=world, rx=still + 1)
 
 
@@ -69,24 +73,35 @@ def test_channels_in_physical_units_with_a_moving_receiver(campaign, folds, tmp_
     found = predictor.csi(rx=data.rx_position[row] + data.site.origin)
     assert found.shape == (4, 3) and found.dtype == np.complex64
     assert np.allclose(found, data.target[row] * 2, atol=1e-5)  # target_scale
-    pose = gsparc.Pose(torch.tensor(data.rx_position[[row]] + data.site.origin), torch.eye(3).double()[None])
+    pose = gsparc.Pose(
+        torch.tensor(data.rx_position[[row]] + data.site.origin), torch.eye(3).double()[None]
+    )
     assert torch.allclose(predictor.csi(rx=pose), torch.from_numpy(found))
 
 
 HERE = np.array([3.0, 2, 1])
 
 
-@pytest.mark.parametrize("said, ends", [
-    ("tx= is needed", {}),
-    ("NaN or Inf in row 1", {"tx": [HERE, HERE * np.nan]}),
-    ("shape", {"tx": HERE[:2]}),
-    ("shape", {"tx": np.zeros((2, 2, 3))}),
-    ("shape", {"tx": np.zeros((0, 3))}),
-    ("numbers", {"tx": "here"}),
-    ("must be real numbers", {"tx": [1j, 0, 0]}),  # they lost their imaginary part
-    ("expected metres, none beyond 1e", {"tx": [1e300, 0, 0]}),  # beyond float32: answered with NaN
-    ("holds 2 positions, the other end 3", {"tx": np.tile(HERE, (2, 1)), "rx": np.tile(HERE, (3, 1))}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "said, ends",
+    [
+        ("tx= is needed", {}),
+        ("NaN or Inf in row 1", {"tx": [HERE, HERE * np.nan]}),
+        ("shape", {"tx": HERE[:2]}),
+        ("shape", {"tx": np.zeros((2, 2, 3))}),
+        ("shape", {"tx": np.zeros((0, 3))}),
+        ("numbers", {"tx": "here"}),
+        ("must be real numbers", {"tx": [1j, 0, 0]}),  # they lost their imaginary part
+        (
+            "expected metres, none beyond 1e",
+            {"tx": [1e300, 0, 0]},
+        ),  # beyond float32: answered with NaN
+        (
+            "holds 2 positions, the other end 3",
+            {"tx": np.tile(HERE, (2, 1)), "rx": np.tile(HERE, (3, 1))},
+        ),
+    ],
+)
 def test_positions_that_are_none_are_refused(spectra, said, ends):
     refused(said, spectra[1].spectrum, **ends)
 
@@ -104,14 +119,18 @@ def test_names_are_looked_up_on_first_use():
 
 
 def test_other_frequencies_than_the_one_measured_are_refused(campaign, folds, tmp_path):
-    """One tone was repeated at whatever frequency was asked for, with a phase that belongs to another."""
+    """One tone was repeated at whatever frequency was asked for,
+    with a phase that belongs to another.
+    """
     data = campaign("csi", 30, "tx")
     site = dataclasses.replace(data.site, subcarriers_hz=np.array([2.4e9]))
     data = dataclasses.replace(data, site=site, target=data.target[:, :, :1])
     predictor = loaded(data, folds(30).folds[0], tmp_path)
     place = data.rx_position[0] + data.site.origin
     assert np.array_equal(predictor.csi(rx=place, frequency_hz=2.4e9)[0], predictor.csi(rx=place))
-    refused(r"measured at 2400\.000 MHz alone", predictor.csi, rx=place, frequency_hz=[2.4e9, 2.41e9])
+    refused(
+        r"measured at 2400\.000 MHz alone", predictor.csi, rx=place, frequency_hz=[2.4e9, 2.41e9]
+    )
 
 
 @pytest.fixture
@@ -143,7 +162,9 @@ def test_degrees_to_metres_and_back(abroad):
     many = abroad.metres([47.004, 47.005], [11.002, 11.003], height=[1.0, 2.0])
     assert many.shape == (2, 3) and np.array_equal(many[0, :2], place[:2])
     latitude, longitude, height = abroad.degrees(many)
-    assert np.allclose(latitude, [47.004, 47.005], atol=1e-10) and np.allclose(longitude, [11.002, 11.003])
+    assert np.allclose(latitude, [47.004, 47.005], atol=1e-10) and np.allclose(
+        longitude, [11.002, 11.003]
+    )
     assert height.tolist() == [1, 2] and abroad.degrees(place)[2] == 1.5
     assert isinstance(abroad.select_station(0).rssi(rx=place)[0], np.float32)
 
@@ -158,14 +179,21 @@ def test_degrees_that_mean_nothing_are_refused(abroad, spectra):
 
 
 def test_utm_places_in_float32_were_half_a_metre_off(abroad):
-    """The origin is taken away in float64, but steps of 5,000 km in float32 are 0.5 m: phases were lost."""
+    """The origin is taken away in float64, but steps of 5,000 km in float32 are 0.5 m:
+    phases were lost.
+    """
     utm = np.array([691_500.0, 5_334_500, 0])
     site = dataclasses.replace(abroad.site, origin=abroad.site.origin + utm)
-    far, place = gsparc.Predictor(abroad.method, site).select_station(0), abroad.metres(47.004, 11.002)
+    far, place = (
+        gsparc.Predictor(abroad.method, site).select_station(0),
+        abroad.metres(47.004, 11.002),
+    )
     there = place + utm
     assert np.allclose(far.rssi(rx=there), abroad.select_station(0).rssi(rx=place), atol=1e-4)
     for rough in (torch.tensor(there, dtype=torch.float32), there.astype(np.float32)):
-        refused(r"rx= is float32, which moves in steps of 0.5 m there; give float64", far.rssi, rx=rough)
+        refused(
+            r"rx= is float32, which moves in steps of 0.5 m there; give float64", far.rssi, rx=rough
+        )
     abroad.select_station(0).rssi(rx=place.astype(np.float32))
 
 
@@ -210,7 +238,9 @@ def test_stations_at_a_place_and_places_of_a_station_have_one_variance():
     for number, name in enumerate(predictor.site.stations.name):
         own, scatter = predictor.select_station(name).covariance(tx=PLACES)
         assert scatter == pytest.approx(noise[number])
-        np.testing.assert_allclose(own.diagonal() + scatter, covariance[:, number, number], rtol=1e-6)
+        np.testing.assert_allclose(
+            own.diagonal() + scatter, covariance[:, number, number], rtol=1e-6
+        )
         assert own[0, 1] > own[0, 2], "errors of neighbours are alike"
     pairs = np.repeat(PLACES[:, None], len(numbers), 1)
     np.testing.assert_array_equal(predictor.predict_joint(pairs, numbers)[1], covariance)
@@ -223,7 +253,9 @@ def test_who_knows_no_covariance_says_so():
 
 
 def test_a_plan_of_stations_learned_together_was_an_error_of_shapes(tmp_path):
-    """`gsparc plan` of `model=gp stations=together` ended in "size of tensor a (3) must match b (0)"."""
+    """`gsparc plan` of `model=gp stations=together` ended in "size of tensor a (3)
+    must match b (0)".
+    """
     data = load_own(town_file(tmp_path / "town.npz"))
     method, rows = wrap_per_station(method_class("gp")(), data), np.arange(0, len(data), 7)
     method.fit(data, Fold(rows, rows[:0], rows[:1]), FitContext(tmp_path, stations="together"))

@@ -1,7 +1,8 @@
 """The same rows in another order, twice, or beside stations in another order are one answer.
 
 Whatever is drawn, counted or averaged by rows asks for their content, not for their number
-(`gsparc/data/row_order.py`). Tolerance: 1e-3 dB of powers, 1e-6 of the deviation of channels and spectra.
+(`gsparc/data/row_order.py`). Tolerance: 1e-3 dB of powers,
+1e-6 of the deviation of channels and spectra.
 """
 
 import numpy as np
@@ -21,7 +22,9 @@ TURNED = np.array([2, 0, 1])  # stations
 
 def rearranged(kind: str, order: np.ndarray, stations: np.ndarray) -> dict[str, np.ndarray]:
     """Arrays of `rows_of` with rows and stations in another order."""
-    arrays = {n.lstrip("_"): array if n[0] == "_" else array[order] for n, array in rows_of(kind).items()}
+    arrays = {
+        n.lstrip("_"): array if n[0] == "_" else array[order] for n, array in rows_of(kind).items()
+    }
     for name, array in arrays.items():
         if name.startswith("station_") and array.ndim:
             arrays[name] = array[stations]
@@ -36,14 +39,21 @@ def answers(kind: str, order: np.ndarray, stations: np.ndarray = ROWS[:3]) -> np
     """What a model of these rows answers, (T, 9, ...) of T stations in the order of `rows_of`."""
     arrays, first = rearranged(kind, order, stations), rows_of(kind)
     given = {
-        {"rx_position": "rx", "tx_position": "tx", "rssi_db": "rssi"}.get(n, n): a for n, a in arrays.items()
+        {"rx_position": "rx", "tx_position": "tx", "rssi_db": "rssi"}.get(n, n): a
+        for n, a in arrays.items()
     }
     found = gsparc.fit(**given, effort=0.1, align="none" if "csi" in given else "auto")
     if kind == "degrees":
-        asked = {"rx": np.c_[found.metres(first["latitude"][:9], first["longitude"][:9])[:, :2], np.ones(9)]}
+        asked = {
+            "rx": np.c_[
+                found.metres(first["latitude"][:9], first["longitude"][:9])[:, :2], np.ones(9)
+            ]
+        }
     else:
         asked = {
-            end: first[f"{end}_position"][:9] + 0.1 for end in ("rx", "tx") if f"{end}_position" in first
+            end: first[f"{end}_position"][:9] + 0.1
+            for end in ("rx", "tx")
+            if f"{end}_position" in first
         }
     each = [found]
     if found.site.stations is not None:

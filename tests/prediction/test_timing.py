@@ -28,7 +28,12 @@ def test_seconds_stop_rounds_but_not_below_the_least(monkeypatch):
     times = time_interleaved(slow, ClockSettings(rounds=1000, least=4, warmup=0, rounds_s=0.01))
     assert len(times["slow"]) == 4 and (abs(times["slow"] - 20) < 1).all()
     assert (
-        len(time_interleaved(slow, ClockSettings(rounds=1000, least=4, warmup=0, rounds_s=0.5))["slow"]) == 25
+        len(
+            time_interleaved(slow, ClockSettings(rounds=1000, least=4, warmup=0, rounds_s=0.5))[
+                "slow"
+            ]
+        )
+        == 25
     )
 
 

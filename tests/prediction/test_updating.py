@@ -89,7 +89,9 @@ def test_the_window_keeps_the_last_rows_as_they_were_measured(predictor):
     predictor.update(**rows, window=12)
     kept = predictor.measured
     assert kept["number"].tolist() == list(range(18, 30))
-    assert np.allclose(kept["place"], rows["rx"][18:]) and np.allclose(kept["level"], rows["rssi"][18:])
+    assert np.allclose(kept["place"], rows["rx"][18:]) and np.allclose(
+        kept["level"], rows["rssi"][18:]
+    )
 
 
 def test_an_offset_that_is_said_is_added_to_what_rows_said(predictor):
@@ -126,7 +128,9 @@ def test_a_refit_finds_that_a_change_is_small(predictor):
 
 @pytest.fixture(scope="module", params=["gp", "powers"])  # each station apart, and all together
 def stations(request):
-    """A model of three stations and two phones, levels (n, 3) at places, and places of later rows."""
+    """A model of three stations and two phones, levels (n, 3) at places,
+    and places of later rows.
+    """
     rng = np.random.default_rng(0)
     masts, places = np.c_[rng.uniform(0, 40, (3, 2)), np.full(3, 8.0)], draw(40, 4)
 
@@ -147,14 +151,21 @@ VIEWS = {"select_station": ["b"], "ask_station": [1], "select_device": ["q"], "i
 def test_every_view_of_a_predictor_is_looked_at():
     methods = inspect.getmembers(Predictor, inspect.isfunction)
     views = {name for name, one in methods if one.__annotations__.get("return") == "Predictor"}
-    assert views - {"_view", "select_carrier"} == {*VIEWS}  # levels of other carriers: no model has them
+    # Levels of other carriers: no model has them
+    assert views - {"_view", "select_carrier"} == {*VIEWS}
 
 
 @pytest.mark.parametrize("name", VIEWS)
 def test_views_forgot_later_rows_and_what_came_after_was_all_they_knew(stations, name):
-    """Of 30 rows `in_levels` and others kept none; what was told to a station's was another's, or refused."""
+    """Of 30 rows `in_levels` and others kept none; what was told to a station's was another's,
+    or refused.
+    """
     fitted, heard, at = stations
-    model, asked, later = fitted.in_levels(None), at[:5] + np.array([0, 2, 0]), at + np.array([1, 0, 0])
+    model, asked, later = (
+        fitted.in_levels(None),
+        at[:5] + np.array([0, 2, 0]),
+        at + np.array([1, 0, 0]),
+    )
     view_of = lambda one: getattr(one, name)(*VIEWS[name])  # noqa: E731
     alone = "station" in name
     model.update(rx=at, rssi=heard(at) - 6, unit="dBm")
@@ -162,13 +173,16 @@ def test_views_forgot_later_rows_and_what_came_after_was_all_they_knew(stations,
     assert view.rows.tolist() == model.rows.tolist() and view.journal == model.journal
     levels = heard(later) - 6
     view.update(rx=later, rssi=levels[:, 1:2] if alone else levels, unit="dBm")
-    assert np.array_equal(model.rssi(rx=asked), before) and len(model.rows) == 30  # they go on apart
+    # They go on apart
+    assert np.array_equal(model.rssi(rx=asked), before) and len(model.rows) == 30
     levels[:, [0, 2]] = np.nan if alone else levels[:, [0, 2]]
     model.update(rx=later, rssi=levels, unit="dBm")
     assert view.rows.tolist() == model.rows.tolist() and len(view.rows) == (40 if alone else 60)
     for turn in range(2):
         for ask in ("rssi", "std"):
-            assert np.array_equal(getattr(view, ask)(rx=asked), getattr(view_of(model), ask)(rx=asked)), turn
+            assert np.array_equal(
+                getattr(view, ask)(rx=asked), getattr(view_of(model), ask)(rx=asked)
+            ), turn
         view.shift(-3.0)
         model.shift(-3.0, "b" if alone else None)
     view.undo(3)

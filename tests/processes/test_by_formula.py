@@ -15,7 +15,9 @@ def test_variance_of_places_is_what_known_ones_leave():
     rng = np.random.default_rng(0)
     known, places = rng.uniform(0, 9, (30, 3)), rng.uniform(0, 9, (7, 3))
     between = KERNEL.correlations(torch.from_numpy(known), torch.from_numpy(places)).numpy()
-    gram = KERNEL.correlations(torch.from_numpy(known), torch.from_numpy(known)).numpy() + 0.08 * np.eye(30)
+    gram = KERNEL.correlations(
+        torch.from_numpy(known), torch.from_numpy(known)
+    ).numpy() + 0.08 * np.eye(30)
     wanted = 1.08 - np.diag(between.T @ np.linalg.solve(gram, between))
     np.testing.assert_allclose(process_variance(KERNEL, known, places), wanted, rtol=1e-9)
 
@@ -39,12 +41,18 @@ def test_density_of_rows_given_their_neighbours():
     parameters = KERNEL.parameters().requires_grad_()
     nats, found = nearest_density(KERNEL.with_values(parameters), sample)
     assert abs(nats.item() - wanted) < 1e-6 and abs(found.item() / amplitude - 1) < 1e-6
-    assert torch.autograd.gradcheck(lambda at: nearest_density(KERNEL.with_values(at), sample)[0], parameters)
+    assert torch.autograd.gradcheck(
+        lambda at: nearest_density(KERNEL.with_values(at), sample)[0], parameters
+    )
 
 
 def test_variance_of_a_mixture_has_what_its_members_disagree_about():
     rng = np.random.default_rng(2)
-    share, mean, variance = np.array([0.2, 0.5, 0.3]), rng.normal(size=(3, 4)), rng.uniform(1, 2, (3, 4))
+    share, mean, variance = (
+        np.array([0.2, 0.5, 0.3]),
+        rng.normal(size=(3, 4)),
+        rng.uniform(1, 2, (3, 4)),
+    )
     parts = list(zip(share, torch.from_numpy(mean), torch.from_numpy(variance), strict=True))
     found = mixture_moments(parts)
     np.testing.assert_allclose(found[0], share @ mean)

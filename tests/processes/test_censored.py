@@ -8,11 +8,19 @@ from scipy.spatial.distance import cdist
 from scipy.stats import multivariate_normal
 
 from gsparc.processes import censored
-from gsparc.processes.censored import CERTAIN, ConditionalGaussian, fit_by_ep, log_evidence, truncated_moments
+from gsparc.processes.censored import (
+    CERTAIN,
+    ConditionalGaussian,
+    fit_by_ep,
+    log_evidence,
+    truncated_moments,
+)
 
 
 def test_moments_of_a_truncated_normal():
-    z = torch.tensor([-3000.0, -100.0, -31.0, -30.0, -12.0, -1.0, 0.0, 2.0, 4.0], dtype=torch.float64)
+    z = torch.tensor(
+        [-3000.0, -100.0, -31.0, -30.0, -12.0, -1.0, 0.0, 2.0, 4.0], dtype=torch.float64
+    )
     ratio, lost = truncated_moments(z)
     for one, mean, share in zip(z.tolist(), ratio.tolist(), lost.tolist(), strict=True):
         with mpmath.workdps(60):
@@ -21,7 +29,8 @@ def test_moments_of_a_truncated_normal():
         assert mean == pytest.approx(float(exact), rel=1e-7)
         assert 1 - share == pytest.approx(float(kept), rel=1e-5)
     assert all(
-        part.isfinite().all() for part in truncated_moments(torch.tensor([-1e8, 1e8], dtype=torch.float64))
+        part.isfinite().all()
+        for part in truncated_moments(torch.tensor([-1e8, 1e8], dtype=torch.float64))
     )
 
 
@@ -36,14 +45,19 @@ def small_vector(count: int = 8):
 @pytest.mark.parametrize("side", [(1, 1, 1), (1, -1, 1)])
 def test_evidence_and_means_are_those_of_sampling(side):
     gram, values, unknown = small_vector()
-    told, sides = ConditionalGaussian.from_gram(gram, values, unknown), torch.tensor(side, dtype=torch.int8)
+    told, sides = (
+        ConditionalGaussian.from_gram(gram, values, unknown),
+        torch.tensor(side, dtype=torch.int8),
+    )
     sites = fit_by_ep(told, values[unknown], sides)
     normal = multivariate_normal(told.mean, told.covariance, seed=1)
     assert sites.settled
     drawn = normal.rvs(400_000)
     drawn = drawn[(np.array(side) * drawn < np.array(side) * values[unknown].numpy()).all(1)]
     assert sites.log_evidence == pytest.approx(np.log(len(drawn) / 400_000), abs=0.03)
-    weights = torch.linalg.solve(told.covariance + torch.diag(sites.variance), sites.value - told.mean)
+    weights = torch.linalg.solve(
+        told.covariance + torch.diag(sites.variance), sites.value - told.mean
+    )
     assert np.allclose(told.mean + told.covariance @ weights, drawn.mean(0), atol=0.05)
 
 
@@ -53,7 +67,9 @@ def test_stand_ins_of_a_similar_vector_are_a_start(monkeypatch):
     log_evidence(1.1 * gram, values, sides, last)
     found = log_evidence(gram, values, sides, last)
     alone, calls = log_evidence(gram, values, sides), []
-    assert found[0] == pytest.approx(alone[0], abs=1e-3) and torch.allclose(found[1], alone[1], atol=1e-3)
+    assert found[0] == pytest.approx(alone[0], abs=1e-3) and torch.allclose(
+        found[1], alone[1], atol=1e-3
+    )
     sweep = censored._match_sites
     monkeypatch.setattr(censored, "_match_sites", lambda *given: calls.append(1) or sweep(*given))
     log_evidence(gram, values, sides, last)

@@ -51,7 +51,10 @@ def test_a_station_whose_stated_noise_is_too_small_is_not_taken_for_a_local_chan
     rng, quiet = np.random.default_rng(3), {n: later_rows(20, n) for n in range(9)}
     rows = later_rows(20, 9)
     loud = replace(
-        rows, missed=torch.from_numpy(rng.normal(0, 4, 20)), noise=0 * rows.noise, doubt=0 * rows.doubt
+        rows,
+        missed=torch.from_numpy(rng.normal(0, 4, 20)),
+        noise=0 * rows.noise,
+        doubt=0 * rows.doubt,
     )
     belief = learn({**quiet, 9: loud}, EXTENT)
     weight, added = belief.of(9)
@@ -60,7 +63,9 @@ def test_a_station_whose_stated_noise_is_too_small_is_not_taken_for_a_local_chan
 
 
 def test_a_common_offset_is_not_believed_where_places_differ():
-    """A phone that was held otherwise at each of five places misses all stations of a place alike."""
+    """A phone that was held otherwise at each of five places misses all stations
+    of a place alike.
+    """
     places, at = draw(5, 1), np.array([4.0, -4.0, -5.0, -3.0, -4.5])
     rows = [replace(later_rows(5, n), places=torch.from_numpy(places)) for n in range(20)]
     turned = [replace(one, missed=one.missed + torch.from_numpy(at)) for one in rows]
@@ -123,6 +128,8 @@ def test_a_walk_elsewhere_is_no_reason_to_forget_a_change():
     rows, walk = later_rows(60, 2, change=-12.0), later_rows(80, 30)
     far = replace(walk, places=walk.places / 2 + torch.tensor([10.0, 10.0, 0.75]))
     there = np.array([[5.0, 5.0, 1.5], [4.0, 6.0, 1.5]])
-    before, after = (asked(learn({0: one}, EXTENT), one, there).mean for one in (rows, rows.join(far)))
+    before, after = (
+        asked(learn({0: one}, EXTENT), one, there).mean for one in (rows, rows.join(far))
+    )
     assert (before < -65).all() and after == pytest.approx(before, abs=1)
     assert len(rows.join(far).spread(EXTENT, 40)) == 40

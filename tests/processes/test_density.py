@@ -9,7 +9,10 @@ from gsparc.processes.factor import NotDefiniteError
 from gsparc.processes.fit_kernel import KernelRows, minimise
 from gsparc.processes.kernel import Kernel
 
-KERNELS = (Kernel.from_lengths((0.3,), (1.0,), 0.1), Kernel.from_lengths((0.1, 0.5), (0.3, 0.7), 0.1))
+KERNELS = (
+    Kernel.from_lengths((0.3,), (1.0,), 0.1),
+    Kernel.from_lengths((0.1, 0.5), (0.3, 0.7), 0.1),
+)
 
 
 def rows(count: int, outputs: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -72,16 +75,22 @@ def stations(*more: torch.Tensor) -> list[KernelRows]:
     """Six processes of 20 rows, and of `more` values at places next to each other."""
     rng, result = np.random.default_rng(4), []
     for values in (*torch.from_numpy(rng.normal(size=(6, 20, 1))), *more):
-        places = torch.from_numpy(rng.uniform(size=(len(values), 3)) * (1.0 if len(values) > 2 else 1e-3))
+        places = torch.from_numpy(
+            rng.uniform(size=(len(values), 3)) * (1.0 if len(values) > 2 else 1e-3)
+        )
         signal = torch.sin(4 * places[:, :1]) if len(values) > 2 else 0.0
         result.append(
-            KernelRows(torch.cdist(places, places), torch.ones(len(values), 1).double(), signal + values)
+            KernelRows(
+                torch.cdist(places, places), torch.ones(len(values), 1).double(), signal + values
+            )
         )
     return result
 
 
 def test_the_median_station_of_one_row_had_a_residual_of_0_and_a_slope_that_was_nan():
-    """Its best amplitude is 0, whose inverse overflows; the walk of the common kernel ended in a corner."""
+    """Its best amplitude is 0, whose inverse overflows;
+    the walk of the common kernel ended in a corner.
+    """
     one, two = torch.zeros(1, 1).double(), torch.zeros(2, 1).double()
     for views in ([KernelRows(one, None, one)], stations(one, two), stations(one + 1e-170)):
         for alike in (0.0, 10.0):

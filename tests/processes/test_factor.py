@@ -1,4 +1,6 @@
-"""Factors against torch's own functions: single and batched, real and complex, with and without gradients."""
+"""Factors against torch's own functions: single and batched, real and complex,
+with and without gradients.
+"""
 
 import pytest
 import torch
@@ -72,7 +74,9 @@ def test_rows_left_out_are_predictions_of_the_rest(kind, grouped):
     missed, spread = left_out_signal(inverse, inverse @ values, noise, groups)
     for one in number.unique():
         own, rest = number == one, number != one
-        solved = torch.linalg.solve(given[rest][:, rest], torch.cat([values[rest], given[rest][:, own]], 1))
+        solved = torch.linalg.solve(
+            given[rest][:, rest], torch.cat([values[rest], given[rest][:, own]], 1)
+        )
         weights, known = solved[:, :3], given[own][:, rest] @ solved[:, 3:]
         torch.testing.assert_close(residual[own], values[own] - given[own][:, rest] @ weights)
         torch.testing.assert_close(variance[own], (given[own][:, own] - known).diagonal().real)
@@ -92,9 +96,13 @@ def test_a_factor_of_nothing_says_nothing(capfd):
 @pytest.mark.parametrize("rows", [20, 200])
 @pytest.mark.parametrize("columns", [1, 3])
 def test_values_of_another_precision_are_taken_as_the_factors(rows, columns):
-    """Few rows go to torch, which refuses what LAPACK converted; L may take the covariance's place."""
+    """Few rows go to torch, which refuses what LAPACK converted;
+    L may take the covariance's place.
+    """
     gram = covariance(torch.float64, rows)
-    assert torch.equal(Factor.from_gram(gram.clone(), overwrite=True).lower, Factor.from_gram(gram).lower)
+    assert torch.equal(
+        Factor.from_gram(gram.clone(), overwrite=True).lower, Factor.from_gram(gram).lower
+    )
     values = torch.randn(rows, columns)
     found = Factor.from_gram(gram).solve(values)
     torch.testing.assert_close(gram @ found, values.double())

@@ -18,7 +18,9 @@ def rows(count: int, seed: int = 0, extent: float = 1.0) -> torch.Tensor:
 
 def posterior(known: torch.Tensor, values: torch.Tensor, asked: torch.Tensor):
     """Mean and variance, written out."""
-    gram = correlation(known, known, LENGTH, NAME) + NOISE * torch.eye(len(known), dtype=known.dtype)
+    gram = correlation(known, known, LENGTH, NAME) + NOISE * torch.eye(
+        len(known), dtype=known.dtype
+    )
     cross = correlation(asked, known, LENGTH, NAME)
     weights = torch.linalg.solve(gram, cross.T).T
     return weights @ values, 1 - (weights * cross).sum(1)
@@ -32,7 +34,9 @@ def told(features, values: torch.Tensor, asked: torch.Tensor):
 def test_the_correlation_is_a_mixture_of_two_matern_functions():
     a, b = rows(7), rows(9, 1)
     long, short = (Matern(length, nu=nu)(a, b) for length, nu in ((LENGTH, 2.5), (LENGTH / 3, 1.5)))
-    np.testing.assert_allclose(correlation(a, b, LENGTH, NAME), 0.85 * long + 0.15 * short, atol=1e-12)
+    np.testing.assert_allclose(
+        correlation(a, b, LENGTH, NAME), 0.85 * long + 0.15 * short, atol=1e-12
+    )
 
 
 def test_a_correlation_that_there_is_not_is_refused():
@@ -46,7 +50,9 @@ def test_features_of_all_rows_are_the_posterior():
         whitened_features(known, LENGTH, NOISE, NAME, 60),
         place_features(known, known, LENGTH, NOISE, NAME),
     ):
-        for found, wanted in zip(told(features, values, asked), posterior(known, values, asked), strict=True):
+        for found, wanted in zip(
+            told(features, values, asked), posterior(known, values, asked), strict=True
+        ):
             torch.testing.assert_close(found, wanted, atol=1e-5, rtol=1e-5)
 
 
@@ -66,14 +72,17 @@ def test_there_are_never_more_places_than_allowed_and_never_twins():
     known = rows(50).repeat(3, 1)
     chosen = pivoted_rows(known, LENGTH, 0.0, NAME, 40)
     assert len(set(chosen.tolist())) == 40
-    assert len(pivoted_rows(known, LENGTH, 0.0, NAME, 150)) <= 50  # the others are the same places again
+    # The others are the same places again
+    assert len(pivoted_rows(known, LENGTH, 0.0, NAME, 150)) <= 50
     assert torch.isfinite(whitened_features(known, LENGTH, NOISE, NAME, 40).whitening).all()
 
 
 def test_the_unknown_share_is_1_far_away_and_small_at_data():
     features = whitened_features(rows(60), LENGTH, NOISE, NAME, 60)
     prior = Smoothness(features.places.float(), LENGTH, NOISE, NAME, features.whitening.float())
-    encode = PositionEncoding(EncodingSettings("kernel"), torch.tensor([[0.0] * 3, [1.0] * 3]), prior)
+    encode = PositionEncoding(
+        EncodingSettings("kernel"), torch.tensor([[0.0] * 3, [1.0] * 3]), prior
+    )
     assert encode.tells_share and encode.width == 60
     far = torch.tensor([[40.0, 0.0, 0.0], [1e4, -1e4, 3.0], [0.0, 0.0, -30.0]])
     assert (unknown_share(encode(far)) == 1).all()
@@ -82,12 +91,16 @@ def test_the_unknown_share_is_1_far_away_and_small_at_data():
 
 @pytest.mark.parametrize("extent,wavelength", [(10.0, 0.0107), (100.0, 0.125), (100.0, 0.005)])
 def test_features_far_from_the_middle_are_as_good_as_float64(extent, wavelength):
-    """Positions of thousands of wavelengths: differences come before squares, and as positions are stored."""
+    """Positions of thousands of wavelengths: differences come before squares,
+    and as positions are stored.
+    """
     known = (rows(40, extent=extent) - extent / 2).float()
     known = torch.cat([known, known + 0.3 * wavelength])
     features = whitened_features(known.double(), wavelength / 2, 1e-3, NAME, 80)
     prior = Smoothness(known, wavelength / 2, 1e-3, NAME, features.whitening.float())
-    encode = PositionEncoding(EncodingSettings("kernel"), torch.tensor([[0.0] * 3, [1.0] * 3]), prior)
+    encode = PositionEncoding(
+        EncodingSettings("kernel"), torch.tensor([[0.0] * 3, [1.0] * 3]), prior
+    )
     asked = known + 0.1 * wavelength * torch.randn(80, 3)
     wanted = correlation(asked.double(), features.places, wavelength / 2, NAME) @ features.whitening
     assert wanted.abs().max() > 0.5 and (encode(asked) - wanted).abs().max() < 1e-4

@@ -7,9 +7,13 @@ from gsparc.processes.powers import PowerRows
 
 
 def test_drawn_rows_keep_half_of_what_was_heard():
-    every = PowerRows(np.zeros((1000, 3)), np.arange(1000.0), (np.arange(1000) >= 100).astype(np.int8))
+    every = PowerRows(
+        np.zeros((1000, 3)), np.arange(1000.0), (np.arange(1000) >= 100).astype(np.int8)
+    )
     rows = every.draw_subset(150, 0)
-    assert len(rows.side) == 150 and (~rows.silent).sum() == 75 and (np.diff(rows.decibels) > 0).all()
+    assert (
+        len(rows.side) == 150 and (~rows.silent).sum() == 75 and (np.diff(rows.decibels) > 0).all()
+    )
     assert (~every.draw_subset(300, 0).silent).sum() == 100
     assert np.array_equal(every.draw_subset(1000, 0).decibels, np.arange(1000))
 

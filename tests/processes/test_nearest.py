@@ -1,4 +1,6 @@
-"""Powers of very many rows, each place told by the nearest: where that is exact, and what it says."""
+"""Powers of very many rows, each place told by the nearest: where that is exact,
+and what it says.
+"""
 
 import numpy as np
 import pytest
@@ -22,7 +24,9 @@ KERNEL = Kernel.from_lengths((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
 
 def rows_of(data, count: int) -> PowerRows:
     return PowerRows(
-        data.moving[:count], 10 * np.log10(data.target[:count, 0]).astype(float), np.zeros(count, bool)
+        data.moving[:count],
+        10 * np.log10(data.target[:count, 0]).astype(float),
+        np.zeros(count, bool),
     )
 
 
@@ -30,7 +34,9 @@ def given(rows: PowerRows, most: int = NEIGHBOURS) -> PowerProcess:
     """The same process by nearest rows."""
     values = PlaceValues.from_rows(rows.places, torch.from_numpy(rows.decibels)[:, None])
     heard = float(np.average((rows.decibels - rows.decibels.mean()) ** 2)) / KERNEL.amplitude
-    return PowerProcess(given_places(Prior(KERNEL, Trend(-100.0)), values, 0, neighbours=most), heard)
+    return PowerProcess(
+        given_places(Prior(KERNEL, Trend(-100.0)), values, 0, neighbours=most), heard
+    )
 
 
 @pytest.fixture
@@ -67,7 +73,9 @@ def test_rows_of_one_place_are_its_mean_and_lose_nothing():
     near = given(rows, 1000)
     assert len(near.places) == 40
     for one, other in zip(
-        near.answer(torch.from_numpy(data.moving)), whole.answer(torch.from_numpy(data.moving)), strict=True
+        near.answer(torch.from_numpy(data.moving)),
+        whole.answer(torch.from_numpy(data.moving)),
+        strict=True,
     ):
         assert np.allclose(one, other, rtol=1e-4)
 
@@ -92,7 +100,9 @@ def test_silent_rows_stay_known_and_are_counted(many):
         data.moving, 10 * np.log10(np.where(silent, level, data.target[:, 0])).astype(float), silent
     )
     process, notes = condition_on_powers(rows, Prior(KERNEL, Trend(-100.0)), 0)
-    assert any("of 90 censored rows 30, drawn evenly, are looked at" in note for note in notes), notes
+    assert any("of 90 censored rows 30, drawn evenly, are looked at" in note for note in notes), (
+        notes
+    )
     loud = rows.subset(np.flatnonzero(~silent))
     deaf = given(loud)
     truth = 10 * np.log10(data.target[silent, 0])
@@ -120,7 +130,11 @@ def test_covariances_are_those_of_rows_that_cover_the_site(many):
     rows = rows_of(data, 300)
     process, _ = condition_on_powers(rows, Prior(KERNEL, Trend(-100.0)), 0)
     few = process.with_exact_posterior()
-    assert len(few.places) == 100 and few.with_exact_posterior() == few and isinstance(few.posterior, Exact)
+    assert (
+        len(few.places) == 100
+        and few.with_exact_posterior() == few
+        and isinstance(few.posterior, Exact)
+    )
     queries = torch.from_numpy(data.moving[300:])
     wide, narrow = few.answer(queries)[1], process.answer(queries)[1]
     assert isinstance(process.posterior, Nearest) and (wide >= narrow * 0.99).float().mean() > 0.95
@@ -137,7 +151,8 @@ def test_whole_targets_of_many_rows_are_told_by_the_nearest(campaign, monkeypatc
     said, exactly = near.predict(batch), whole.predict(batch)
     target = batch.target
     errors = [float((found.mean - target).abs().square().mean()) for found in (said, exactly)]
-    assert errors[0] < 2 * errors[1] < 0.1 * float(target.abs().square().mean()), errors  # very smooth
+    # Very smooth
+    assert errors[0] < 2 * errors[1] < 0.1 * float(target.abs().square().mean()), errors
     assert 0.3 < float(said.variance.mean() / exactly.variance.mean()) < 3
     torch.save(near.state(), tmp_path / "state.pt")
     again = GaussianProcess()
@@ -153,7 +168,9 @@ def test_a_kernel_of_other_correlations_was_answered_as_a_sum_of_matern():
     places, values = rng.uniform(0, 1, (40, 3)), torch.from_numpy(rng.normal(size=(40, 1)))
     prior = Prior(Kernel.from_length(0.5, 0.1, term=SmoothRough))
     queries = torch.from_numpy(rng.uniform(0, 1, (5, 3)))
-    near = given_places(prior, PlaceValues.from_rows(places, values), 0, neighbours=40).answer(queries)
+    near = given_places(prior, PlaceValues.from_rows(places, values), 0, neighbours=40).answer(
+        queries
+    )
     exact = Exact.from_values(prior, torch.from_numpy(places), values).answer(queries)
     assert torch.allclose(near.mean, exact.mean, atol=1e-6)
     assert torch.allclose(near.variance, exact.variance, atol=1e-6)

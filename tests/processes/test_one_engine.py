@@ -1,4 +1,6 @@
-"""Covariances are factored and solved in gsparc/processes alone; each operation has one definition there."""
+"""Covariances are factored and solved in gsparc/processes alone;
+each operation has one definition there.
+"""
 
 import ast
 import re
@@ -7,9 +9,24 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
 FACTORING = {
-    "cholesky", "cholesky_ex", "cho_factor", "potrf", "dpotrf", "zpotrf", "cho_solve", "cholesky_solve",
-    "cholesky_inverse", "solve_triangular", "trsm", "trtri", "dtrtri", "trtrs", "potri", "dpotri", "potrs",
-}  # fmt: skip
+    "cholesky",
+    "cholesky_ex",
+    "cho_factor",
+    "potrf",
+    "dpotrf",
+    "zpotrf",
+    "cho_solve",
+    "cholesky_solve",
+    "cholesky_inverse",
+    "solve_triangular",
+    "trsm",
+    "trtri",
+    "dtrtri",
+    "trtrs",
+    "potri",
+    "dpotri",
+    "potrs",
+}
 DEFINED = ("left_out_around", "fit_by_ep")
 
 

@@ -1,4 +1,6 @@
-"""Posteriors against an independent library, and complex ones against twice as many real numbers."""
+"""Posteriors against an independent library,
+and complex ones against twice as many real numbers.
+"""
 
 import math
 
@@ -10,7 +12,13 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Matern
 
 from gsparc.processes import posterior
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.kernel import ExponentialShadowing, IsotropicWaves, Kernel, Shadowing, WhiteNoise
+from gsparc.processes.kernel import (
+    ExponentialShadowing,
+    IsotropicWaves,
+    Kernel,
+    Shadowing,
+    WhiteNoise,
+)
 from gsparc.processes.nearest import Nearest, PlaceValues, condition_on_nearest
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
@@ -26,8 +34,12 @@ def test_random_problems_are_scikit_learns(seed, term):
     lengths, noise, level = rng.uniform(0.1, 3, 2), 10 ** rng.uniform(-3, 0), rng.normal()
     places, queries = rng.uniform(0, 4, (count, 3)), rng.uniform(-1, 5, (7, 3))
     values, amplitude = rng.normal(size=(count, outputs)), rng.uniform(0.1, 3)
-    kernel = Kernel((Shadowing(lengths[0], share), term(lengths[1], 1 - share), WhiteNoise(noise)), amplitude)
-    ours = Exact.from_values(Prior(kernel, Trend(level)), torch.from_numpy(places), torch.from_numpy(values))
+    kernel = Kernel(
+        (Shadowing(lengths[0], share), term(lengths[1], 1 - share), WhiteNoise(noise)), amplitude
+    )
+    ours = Exact.from_values(
+        Prior(kernel, Trend(level)), torch.from_numpy(places), torch.from_numpy(values)
+    )
     found = ours.answer(torch.from_numpy(queries))
     shape = ConstantKernel(share) * Matern(lengths[0], nu=1.5) + ConstantKernel(1.0)
     shape += ConstantKernel(1 - share) * Matern(lengths[1], nu=1.5 if term is Shadowing else 0.5)
@@ -36,7 +48,9 @@ def test_random_problems_are_scikit_learns(seed, term):
     mean, covariance = library.fit(places, values - level).predict(queries, return_cov=True)
     covariance = covariance[..., 0] if covariance.ndim == 3 else covariance  # alike for all outputs
     np.testing.assert_allclose(found.mean, mean.reshape(7, -1) + level, atol=1e-8)
-    np.testing.assert_allclose(amplitude * (found.variance - noise), covariance.diagonal(), atol=1e-8)
+    np.testing.assert_allclose(
+        amplitude * (found.variance - noise), covariance.diagonal(), atol=1e-8
+    )
     np.testing.assert_allclose(ours.covariance(torch.from_numpy(queries)), covariance, atol=1e-8)
     np.testing.assert_allclose(ours.given_values(), values, atol=1e-8)
     given = torch.from_numpy(values - level) / amplitude**0.5
@@ -68,7 +82,10 @@ def test_circular_values_are_real_and_imaginary_parts_of_one_covariance(seed):
 def test_density_and_slope_of_circular_values():
     generator = torch.Generator().manual_seed(0)
     root = torch.randn(12, 24, generator=generator, dtype=torch.complex128)
-    covariance, values = root @ root.mH / 12, torch.randn(12, 3, generator=generator, dtype=torch.complex128)
+    covariance, values = (
+        root @ root.mH / 12,
+        torch.randn(12, 3, generator=generator, dtype=torch.complex128),
+    )
     change = torch.randn(12, 12, generator=generator, dtype=torch.complex128)
     change = 1e-6 * (change + change.mH)
     ends = [Conditioned.from_gram(covariance + step * change, values).nll for step in (-0.5, 0.5)]
@@ -76,12 +93,15 @@ def test_density_and_slope_of_circular_values():
     expected = float((told.nll_gradient @ change).diagonal().sum().real)
     assert ends[1] - ends[0] == pytest.approx(expected, rel=1e-5)
     density = (
-        3 * torch.logdet(covariance).real + (values.mH @ torch.linalg.solve(covariance, values)).trace().real
+        3 * torch.logdet(covariance).real
+        + (values.mH @ torch.linalg.solve(covariance, values)).trace().real
     )
     assert told.nll == pytest.approx(float(density))
 
 
-@pytest.mark.parametrize("trend", [Trend(-70.0), Trend(0.0, Law(-40.0, 3.0, 0.1, 5.0, (0.5, 0.5, 3.0)))])
+@pytest.mark.parametrize(
+    "trend", [Trend(-70.0), Trend(0.0, Law(-40.0, 3.0, 0.1, 5.0, (0.5, 0.5, 3.0)))]
+)
 def test_variance_of_many_rows_is_of_the_nearest(trend, monkeypatch):
     """Within 2 % at places among the rows and far from all; means are the exact ones."""
     rng = np.random.default_rng(0)

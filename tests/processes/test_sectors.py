@@ -5,7 +5,14 @@ import torch
 from networks import pattern
 from scipy.spatial.distance import cdist
 
-from gsparc.processes.sectors import BEARING, LEVEL_DB, OWN_SPREAD, SHARED_SPREAD, Sectors, SectorShadowing
+from gsparc.processes.sectors import (
+    BEARING,
+    LEVEL_DB,
+    OWN_SPREAD,
+    SHARED_SPREAD,
+    Sectors,
+    SectorShadowing,
+)
 from gsparc.processes.trend import Law
 
 
@@ -28,10 +35,18 @@ def test_levels_follow_law_and_pattern_and_terms_are_their_slopes():
     table = np.array([[90.0, 5, 65, 10, 2], [210.0, 3, 70, 9, 0]])
     shared, bend = [3.2, 1.5, 0.1, -0.05, 25.0, 0.5], 1.5
     trend = Sectors(
-        0.0, Law(0.0, 0.0, 1.0, 1.0, None), 2.0, 1.0, table=torch.from_numpy(table),
-        site=torch.zeros(2).long(), band=torch.arange(2), shared=torch.tensor(shared).double(),
-        doubt=torch.eye(8).double(), levels=torch.tensor([-50.0, -44]).double(), unit=2.0,
-    )  # fmt: skip
+        0.0,
+        Law(0.0, 0.0, 1.0, 1.0, None),
+        2.0,
+        1.0,
+        table=torch.from_numpy(table),
+        site=torch.zeros(2).long(),
+        band=torch.arange(2),
+        shared=torch.tensor(shared).double(),
+        doubt=torch.eye(8).double(),
+        levels=torch.tensor([-50.0, -44]).double(),
+        unit=2.0,
+    )
     at = np.c_[rng.uniform(-400, 400, (40, 2)), np.full(40, 1.5)]
     number = np.arange(40) % 2
     places = torch.from_numpy(np.c_[at, np.tile(here, (40, 1)), number])
@@ -40,10 +55,13 @@ def test_levels_follow_law_and_pattern_and_terms_are_their_slopes():
         """With some of an exponent, an azimuth, a tilt or a floor more."""
         decades = trend.law.decades(places).numpy() - 2
         loss = pattern(
-            at, np.tile(here, (2, 1)), table[:, 0] + change.get("azimuth", 0),
-            table[:, 1] + 0.5 + change.get("tilt", 0), *(table[:, 2:4] * np.exp([0.1, -0.05])).T,
+            at,
+            np.tile(here, (2, 1)),
+            table[:, 0] + change.get("azimuth", 0),
+            table[:, 1] + 0.5 + change.get("tilt", 0),
+            *(table[:, 2:4] * np.exp([0.1, -0.05])).T,
             25.0 + change.get("floor", 0),
-        )[np.arange(40), number]  # fmt: skip
+        )[np.arange(40), number]
         own = np.array([-50.0, -44])[number] + table[number, 4]
         return own - 10 * (3.2 + change.get("exponent", 0)) * decades - bend * decades**2 + loss
 

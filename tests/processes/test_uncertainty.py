@@ -36,7 +36,11 @@ def test_what_others_compute_is_the_same():
         known = binomtest(wrong, count).proportion_ci(0.9)
         assert binomial_interval(wrong, count, 0.9) == pytest.approx((known.low, known.high))
     assert binomial_interval(0, 0) == (0.0, 1.0)
-    count, share, risk = rng.integers(0, 500, 300), rng.uniform(0.01, 0.6, 300), rng.uniform(0.01, 0.5, 300)
+    count, share, risk = (
+        rng.integers(0, 500, 300),
+        rng.uniform(0.01, 0.6, 300),
+        rng.uniform(0.01, 0.5, 300),
+    )
     for case in zip(count, share, risk, strict=True):
         most, of = int(most_failures(*case)), case[:2]
         assert most == -1 or binom.cdf(most, *of) <= case[2]
@@ -68,7 +72,9 @@ def test_neighbours_that_err_together_are_as_few():
     bad = rng.random(200) < rng.random(12)[group]
     counts, wrong, share = np.bincount(group), np.bincount(group, bad), bad.mean()
     between = 12 / 11 * ((wrong - share * counts) ** 2).sum() / 200 / (share * (1 - share))
-    assert design_effect(bad, group) == pytest.approx(between * 11 / chi2.ppf(1 - SURE_OF_EFFECT, 11))
+    assert design_effect(bad, group) == pytest.approx(
+        between * 11 / chi2.ppf(1 - SURE_OF_EFFECT, 11)
+    )
     assert design_effect(bad, 0 * group) == design_effect(bad | True, group) == 1.0
 
 
@@ -118,7 +124,9 @@ def test_too_few_to_test_promise_nothing():
 
 
 def accepting(share, aside, risks, least=-np.inf, sets=300):
-    """Of sets of rows that are bad with `share` (n,), surest first, how many accept scores below `least`."""
+    """Of sets of rows that are bad with `share` (n,), surest first,
+    how many accept scores below `least`.
+    """
     rng = np.random.default_rng(0)
     found = 0
     for _ in range(sets):
@@ -132,7 +140,9 @@ def accepting(share, aside, risks, least=-np.inf, sets=300):
 
 @pytest.mark.parametrize("share", [0.08, 0.22])
 def test_one_bad_row_of_the_surest_ended_the_search(share):
-    """Of 60 rows the first test was one of five: sets that promised something were .67 and .24 of all."""
+    """Of 60 rows the first test was one of five:
+    sets that promised something were .67 and .24 of all.
+    """
     assert accepting(np.full(60, share), 12, LAX, sets=200) > (0.95 if share == 0.08 else 0.42)
 
 

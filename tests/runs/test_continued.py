@@ -9,29 +9,51 @@ from gsparc.runs.continued import add_settings_of_run
 def test_a_launcher_s_lost_job_is_said_with_what_to_do():
     lost = type("UncompletedJobError", (RuntimeError,), {"__module__": "submitit.core.utils"})
     said = _message_of(lost("Job 386 (task: 0) with path FILE\nhas not produced any output"))
-    assert "\n" not in said and "Job 386" in said and said.endswith("the same command goes on with the rest")
+    assert (
+        "\n" not in said
+        and "Job 386" in said
+        and said.endswith("the same command goes on with the rest")
+    )
     assert _message_of(ValueError("seed=x: no")) == "seed=x: no"
 
 
 HYDRA = "hydra: {runtime: {cwd: WHERE}}"
 
 
-@pytest.mark.parametrize(("words", "kept"), [
-    ([], ["dataset=own", "dataset.file='DATA'", "model.steps=5", "+trainer.x=1", "hydra.mode=RUN"]),
-    (["model.steps=7"], ["dataset=own", "dataset.file='DATA'", "+trainer.x=1", "hydra.mode=RUN"]),
-    (["model=gp"], ["dataset=own", "dataset.file='DATA'", "+trainer.x=1", "hydra.mode=RUN"]),
-    (["dataset=rfid", "-m"], ["model.steps=5", "+trainer.x=1"]),
-    (["~trainer.x"], ["dataset=own", "dataset.file='DATA'", "model.steps=5", "hydra.mode=RUN"]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("words", "kept"),
+    [
+        (
+            [],
+            [
+                "dataset=own",
+                "dataset.file='DATA'",
+                "model.steps=5",
+                "+trainer.x=1",
+                "hydra.mode=RUN",
+            ],
+        ),
+        (
+            ["model.steps=7"],
+            ["dataset=own", "dataset.file='DATA'", "+trainer.x=1", "hydra.mode=RUN"],
+        ),
+        (["model=gp"], ["dataset=own", "dataset.file='DATA'", "+trainer.x=1", "hydra.mode=RUN"]),
+        (["dataset=rfid", "-m"], ["model.steps=5", "+trainer.x=1"]),
+        (["~trainer.x"], ["dataset=own", "dataset.file='DATA'", "model.steps=5", "hydra.mode=RUN"]),
+    ],
+)
 @pytest.mark.parametrize("of", ["run", "run/last.ckpt", "run/fold0/refit/last.ckpt"])
 def test_a_run_to_go_on_from_brings_its_settings(tmp_path, of, words, kept):
-    """`ckpt_path=RUN` loaded the default data and model, and was refused for not being those of the run."""
+    """`ckpt_path=RUN` loaded the default data and model,
+    and was refused for not being those of the run.
+    """
     notes, data = tmp_path / "run" / ".hydra", tmp_path / "site.npz"
     notes.mkdir(parents=True)
     data.touch()
     told = "[dataset=own, dataset.file=site.npz, model.steps=5, +trainer.x=1, ckpt_path=before]"
     (notes / "overrides.yaml").write_text(told)
-    (notes / "hydra.yaml").write_text(HYDRA.replace("WHERE", str(tmp_path)))  # where the run was started
+    # Where the run was started
+    (notes / "hydra.yaml").write_text(HYDRA.replace("WHERE", str(tmp_path)))
     line = [f"ckpt_path={tmp_path / of}", *words]
     kept = [one.replace("DATA", str(data)) for one in kept]
     here = [f"hydra.run.dir='{tmp_path / 'run'}'", "hydra.output_subdir=null"] * ("-m" not in words)
@@ -51,5 +73,9 @@ def test_no_run_to_go_on_from_was_one_called_null(tmp_path, monkeypatch):
 
 
 def test_a_command_line_without_a_run_to_go_on_from_stays(tmp_path):
-    for line in (["model=gp"], ["ckpt_path=null"], [f"ckpt_path={tmp_path / 'gone.ckpt'}", "seed=1"]):
+    for line in (
+        ["model=gp"],
+        ["ckpt_path=null"],
+        [f"ckpt_path={tmp_path / 'gone.ckpt'}", "seed=1"],
+    ):
         assert add_settings_of_run(line) == line

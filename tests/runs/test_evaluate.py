@@ -22,7 +22,10 @@ QUICK = ClockSettings(rounds=3, least=2, warmup=1)
 
 def fit_all(make, data, split):
     methods = [make() for _ in split.folds]
-    fits = [method.fit(data, fold, FitContext()) for method, fold in zip(methods, split.folds, strict=True)]
+    fits = [
+        method.fit(data, fold, FitContext())
+        for method, fold in zip(methods, split.folds, strict=True)
+    ]
     return methods, [fit.seconds for fit in fits]
 
 
@@ -45,19 +48,36 @@ def test_everything_the_contract_lists(campaign, folds, tmp_path, kind):
         assert f"test/{figure}" in facts
         assert all(f"baseline/{name}/{figure}" in facts for name in plain)
     for name in plain:
-        assert facts[f"baseline/{name}/train_s"] >= 0 and facts[f"baseline/{name}/render_ms_p50"] > 0
+        assert (
+            facts[f"baseline/{name}/train_s"] >= 0 and facts[f"baseline/{name}/render_ms_p50"] > 0
+        )
     for key in (
-        "time/train_s", "time/render_ms_p50", "time/render_ms_p95",
-        "time/render_ms_batch64", "time/ratio_to_copy", "time/includes", "machine/threads", "machine/load",
-        "machine/cpu", "model/num_gaussians", "model/effects", "memory/peak_mb", "dataset/name",
+        "time/train_s",
+        "time/render_ms_p50",
+        "time/render_ms_p95",
+        "time/render_ms_batch64",
+        "time/ratio_to_copy",
+        "time/includes",
+        "machine/threads",
+        "machine/load",
+        "machine/cpu",
+        "model/num_gaussians",
+        "model/effects",
+        "memory/peak_mb",
+        "dataset/name",
         "dataset/sha256",
-        "dataset/stand_in", "dataset/convergence_error", "split/name", "split/sha256",
-    ):  # fmt: skip
+        "dataset/stand_in",
+        "dataset/convergence_error",
+        "split/name",
+        "split/sha256",
+    ):
         assert key in facts, key
     assert facts["time/render_ms_p95"] >= facts["time/render_ms_p50"] > 0
     write_summary(tmp_path / "summary.json", facts)
     write_samples(tmp_path / "per_sample.csv", found.columns)
-    assert len((tmp_path / "per_sample.csv").read_text().splitlines()) == 1 + len(split.folds[0].test)
+    assert len((tmp_path / "per_sample.csv").read_text().splitlines()) == 1 + len(
+        split.folds[0].test
+    )
     if kind == "rssi":
         errors = found.columns["predicted_db"] - found.columns["measured_db"]
         assert np.allclose(errors, found.columns["error_db"])
@@ -76,7 +96,9 @@ def test_the_evaluated_baseline_equals_its_own_row(campaign, folds, tmp_path):
     for figure in ("ssim", "ssim_gauss", "psnr_db", "skill"):
         assert facts[f"test/{figure}"] == facts[f"baseline/idw/{figure}"]
     assert facts["baseline/nearest/skill"] == 0
-    assert facts["test/skill"] == pytest.approx(1 - facts["test/mse"] / facts["baseline/nearest/mse"])
+    assert facts["test/skill"] == pytest.approx(
+        1 - facts["test/mse"] / facts["baseline/nearest/mse"]
+    )
 
 
 def test_a_method_that_is_a_baseline_too_was_fitted_twice(campaign, folds, monkeypatch):
@@ -85,7 +107,9 @@ def test_a_method_that_is_a_baseline_too_was_fitted_twice(campaign, folds, monke
     methods, seconds = fit_all(InverseDistance, data, split)
     monkeypatch.setattr(InverseDistance, "fit", lambda *unused: pytest.fail("fitted again"))
     names = ["mean", "idw"]
-    facts = evaluate(methods, seconds, data, split, clock=QUICK, baselines=names, shared="idw").facts
+    facts = evaluate(
+        methods, seconds, data, split, clock=QUICK, baselines=names, shared="idw"
+    ).facts
     assert facts["baseline/idw/rmse_db"] == facts["test/rmse_db"]
     assert facts["baseline/idw/train_s"] == facts["time/train_s"]
     assert [row[0] for row in results_table(facts, "idw").rows] == ["mean", "idw"]
@@ -94,7 +118,9 @@ def test_a_method_that_is_a_baseline_too_was_fitted_twice(campaign, folds, monke
 
 
 def test_one_strong_row_made_most_of_the_figures_of_powers(campaign, folds):
-    """`nmse`, `skill` and a warning were of linear powers: the strongest row, measured right, was all."""
+    """`nmse`, `skill` and a warning were of linear powers: the strongest row, measured right,
+    was all.
+    """
     data, split = campaign("rssi", 60), folds(60)
     target = data.target.copy()
     target[int(split.folds[0].test[2])] *= 1e6
@@ -125,7 +151,9 @@ def test_folds_are_pooled(campaign, folds, monkeypatch):
 def test_the_prefix_names_the_subset(campaign, folds, tmp_path):
     data, split = campaign("spectrum", 40), folds(40)
     methods, _ = fit_all(Mean, data, split)
-    facts = evaluate(methods, None, data, split, eval_on="train", baselines=("nearest",), clock=QUICK).facts
+    facts = evaluate(
+        methods, None, data, split, eval_on="train", baselines=("nearest",), clock=QUICK
+    ).facts
     assert facts["train/samples"] == len(split.folds[0].train) and "test/ssim" not in facts
     # The nearest training row is the row itself: its error is no bar.
     assert facts["train/skill"] is None and facts["time/train_s"] is None
@@ -144,8 +172,12 @@ def test_baselines_have_not_seen_the_rows_they_are_scored_on(campaign, folds, na
 def test_wrong_counts_are_refused(campaign, folds, tmp_path):
     data, split = campaign("spectrum", 40), folds(40, 2)
     methods, seconds = fit_all(Mean, data, split)
-    refused("1 methods for the 2 folds", evaluate, methods[0], seconds[:1], data, split, clock=QUICK)
-    refused("1 training times for 2 methods", evaluate, methods, seconds[0], data, split, clock=QUICK)
+    refused(
+        "1 methods for the 2 folds", evaluate, methods[0], seconds[:1], data, split, clock=QUICK
+    )
+    refused(
+        "1 training times for 2 methods", evaluate, methods, seconds[0], data, split, clock=QUICK
+    )
 
 
 def test_a_poisoned_prediction_is_not_scored(campaign, folds, tmp_path):
@@ -174,7 +206,9 @@ def test_a_row_that_decides_sums_is_named_beside_a_median(campaign, folds, tmp_p
     facts = evaluate(methods, seconds, loud, split, baselines=(), clock=QUICK).facts
     assert facts["test/decided_by/row"] == row and facts["test/decided_by/share"] > 0.999
     assert 0 < facts["test/decided_by/nmse_median"] < 3
-    assert decided_by_a_row(facts)[0].startswith(f"row {row} alone makes 100.0% of the error or power")
+    assert decided_by_a_row(facts)[0].startswith(
+        f"row {row} alone makes 100.0% of the error or power"
+    )
     write_summary(tmp_path / "summary.json", facts)
 
 
@@ -182,7 +216,13 @@ def test_rows_of_links_whose_both_ends_moved_name_both_places(folds, tmp_path):
     """Training ended with an error after it: six coordinates of a link were taken for three."""
     ends = np.random.default_rng(0).uniform(0, 10, (2, 40, 3))
     power = -40 - 20 * np.log10(np.linalg.norm(ends[0] - ends[1], axis=1))
-    data = from_arrays({"tx_position": ends[0], "rx_position": ends[1], "rssi_db": power, "carrier_hz": 1e9})
+    data = from_arrays(
+        {"tx_position": ends[0], "rx_position": ends[1], "rssi_db": power, "carrier_hz": 1e9}
+    )
     found = evaluated(InverseDistance, data, folds(40), baselines=()).columns
-    for end, names in zip(ends, (("tx_x_m", "tx_y_m", "tx_z_m"), ("x_m", "y_m", "z_m")), strict=True):
-        np.testing.assert_allclose(np.column_stack([found[n] for n in names]), end[found["row"]], atol=1e-6)
+    for end, names in zip(
+        ends, (("tx_x_m", "tx_y_m", "tx_z_m"), ("x_m", "y_m", "z_m")), strict=True
+    ):
+        np.testing.assert_allclose(
+            np.column_stack([found[n] for n in names]), end[found["row"]], atol=1e-6
+        )

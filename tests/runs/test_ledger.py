@@ -1,4 +1,6 @@
-"""A cell is done once for the same settings, files, data, split and program; one cut short goes on."""
+"""A cell is done once for the same settings, files, data, split and program;
+one cut short goes on.
+"""
 
 import importlib
 import os
@@ -29,7 +31,9 @@ from gsparc.runs.ledger import (
 
 
 def state(**changes) -> FitInputs:
-    return FitInputs(**({"settings": {"seed": 0}, "files": {}, "data": "d", "split": "s"} | changes))
+    return FitInputs(
+        **({"settings": {"seed": 0}, "files": {}, "data": "d", "split": "s"} | changes)
+    )
 
 
 def ends(folder, value=1.0, seen=None):
@@ -52,14 +56,19 @@ def cut_short(folder, name="last.ckpt"):
     return work
 
 
-@pytest.mark.parametrize("other", [
-    {"settings": {"seed": 1}},
-    {"files": {"init.file": "0"}},
-    {"data": "e"},
-    {"split": "t"},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"settings": {"seed": 1}},
+        {"files": {"init.file": "0"}},
+        {"data": "e"},
+        {"split": "t"},
+    ],
+)
 def test_a_cell_is_done_once_in_one_state(tmp_path, other):
-    assert run_once(tmp_path, state(), ends(tmp_path, 1)) == run_once(tmp_path, state(), ends(tmp_path, 2))
+    assert run_once(tmp_path, state(), ends(tmp_path, 1)) == run_once(
+        tmp_path, state(), ends(tmp_path, 2)
+    )
     assert read_finished(tmp_path, state(**other)) is None
     assert run_once(tmp_path, state(**other), ends(tmp_path, 3)) == {"value": 3}
     assert read_finished(tmp_path, state()) is None
@@ -70,18 +79,27 @@ def test_a_cell_is_done_once_in_one_state(tmp_path, other):
 
 @pytest.mark.parametrize(
     ("name", "resumed"),
-    [("last.ckpt",) * 2, ("refit/last.ckpt",) * 2, ("fold1/last.ckpt", ""), ("station0/model.ckpt", "")],
+    [
+        ("last.ckpt",) * 2,
+        ("refit/last.ckpt",) * 2,
+        ("fold1/last.ckpt", ""),
+        ("station0/model.ckpt", ""),
+    ],
 )
 @pytest.mark.parametrize("again", [False, True])
 def test_an_interrupted_job_goes_on_and_then_counts_as_done(tmp_path, name, resumed, again):
-    """The same run said again began anew without a word; one that has ended is done again by itself alone."""
+    """The same run said again began anew without a word;
+    one that has ended is done again by itself alone.
+    """
     with pytest.raises(KeyboardInterrupt):
         run_once(tmp_path, state(), cut_short(tmp_path, name), again=again)
     (tmp_path / FAILURE).write_text("of the first try")
     seen = []
     for _ in range(2):
         run_once(tmp_path, state(), ends(tmp_path, 1, seen), again=again)
-    assert seen == [str(tmp_path / resumed), *([None] * again)] and not (tmp_path / FAILURE).exists()
+    assert (
+        seen == [str(tmp_path / resumed), *([None] * again)] and not (tmp_path / FAILURE).exists()
+    )
 
 
 def test_a_checkpoint_of_another_state_is_not_gone_on_from(tmp_path):
@@ -108,7 +126,9 @@ def of(file, *words) -> FitInputs:
 
 
 def test_a_finished_job_answered_for_a_split_file_of_before(tmp_path):
-    """A sweep said again after `split.json` had changed: 3.94 dB of 60 rows where 5.40 of 64 are right."""
+    """A sweep said again after `split.json` had changed:
+    3.94 dB of 60 rows where 5.40 of 64 are right.
+    """
     file, split = spectra(tmp_path / "own.npz"), tmp_path / "split.json"
     words = "split=file", f"split.path='{split}'"
     states = []
@@ -125,7 +145,9 @@ def test_a_finished_job_answered_for_data_of_equal_size_and_time(tmp_path):
         spectra(file)
         arrays = dict(np.load(file))
         if factor == 2:
-            name = next(key for key, value in arrays.items() if value.dtype.kind == "f" and value.ndim > 1)
+            name = next(
+                key for key, value in arrays.items() if value.dtype.kind == "f" and value.ndim > 1
+            )
             arrays[name] = arrays[name][::-1]
         np.savez(file, **arrays)
         os.utime(file, (1e9, 1e9))
@@ -140,10 +162,14 @@ def test_a_finished_job_answered_for_data_of_equal_size_and_time(tmp_path):
 def test_a_job_found_done_read_its_data_first(tmp_path):
     """Seconds for each job of a sweep said again; files of the same bytes say the same."""
     file = spectra(tmp_path / "own.npz")
-    configs = [compose("dataset=own", f"dataset.file='{file}'", "model=mean", f"seed={n}") for n in (0, 1)]
+    configs = [
+        compose("dataset=own", f"dataset.file='{file}'", "model=mean", f"seed={n}") for n in (0, 1)
+    ]
     unread, other = map(FitInputs.from_config, configs)
     run_once(tmp_path, replace(unread, data="d", split="s"), ends(tmp_path))
-    assert read_finished(tmp_path, unread) == {"value": 1} and read_finished(tmp_path, other) is None
+    assert (
+        read_finished(tmp_path, unread) == {"value": 1} and read_finished(tmp_path, other) is None
+    )
     with file.open("ab") as stream:
         stream.write(b" ")
     assert read_finished(tmp_path, FitInputs.from_config(configs[0])) is None
@@ -152,7 +178,9 @@ def test_a_job_found_done_read_its_data_first(tmp_path):
     before = FitInputs.from_config(release)
     (tmp_path / "more.txt").touch()
     assert before.tells_data and before != FitInputs.from_config(release)
-    assert not FitInputs.from_config(compose("dataset=rfid", "dataset.root=null", "model=mean")).tells_data
+    assert not FitInputs.from_config(
+        compose("dataset=rfid", "dataset.root=null", "model=mean")
+    ).tells_data
 
 
 @pytest.fixture
@@ -222,14 +250,20 @@ def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):
     for text in ("[]", "[1]"):
         walls.write_text(text)
         states.append(
-            FitInputs.from_config(OmegaConf.create({"init": {"file": str(walls)}, "workers": len(text)}))
+            FitInputs.from_config(
+                OmegaConf.create({"init": {"file": str(walls)}, "workers": len(text)})
+            )
         )
     assert states[0].files != states[1].files and states[0].settings == states[1].settings
 
 
 @pytest.mark.parametrize("how", ["folder", "list", "link", "inner link", "nested"])
-def test_files_that_a_setting_names_in_a_list_a_folder_or_behind_a_link_count_by_content(tmp_path, how):
-    """A sweep answered of the maps of before: `model.prior=FOLDER`, `[a.tif,b.tif]`, a linked `spectrum/`."""
+def test_files_that_a_setting_names_in_a_list_a_folder_or_behind_a_link_count_by_content(
+    tmp_path, how
+):
+    """A sweep answered of the maps of before: `model.prior=FOLDER`, `[a.tif,b.tif]`,
+    a linked `spectrum/`.
+    """
     (folder := tmp_path / "maps").mkdir()
     for name in ("a.tif", "b.tif"):
         (folder / name).write_text(name)
@@ -238,11 +272,15 @@ def test_files_that_a_setting_names_in_a_list_a_folder_or_behind_a_link_count_by
     (folder / "loop").symlink_to(tmp_path / "in")
     (tmp_path / "link").symlink_to(folder)
     value = {
-        "folder": str(folder), "list": [str(folder / "a.tif"), str(folder / "b.tif")],
-        "link": str(tmp_path / "link"), "inner link": str(tmp_path / "in"),
+        "folder": str(folder),
+        "list": [str(folder / "a.tif"), str(folder / "b.tif")],
+        "link": str(tmp_path / "link"),
+        "inner link": str(tmp_path / "in"),
         "nested": [{"of": [str(folder / "b.tif")]}],
-    }[how]  # fmt: skip
-    of = lambda: FitInputs.from_config(OmegaConf.create({"model": {"prior": value, "name": str(folder)}}))  # noqa: E731
+    }[how]
+    of = lambda: FitInputs.from_config(
+        OmegaConf.create({"model": {"prior": value, "name": str(folder)}})
+    )
     before = of()
     assert before == of() and [*before.files] == ["model.prior"]
     run_once(tmp_path / "in" / "fit", before, ends(tmp_path / "in" / "fit"))
@@ -266,7 +304,9 @@ def test_a_job_that_begins_anew_says_why(tmp_path, caplog):
     run_once(tmp_path, state(), ends(tmp_path, 1))
     assert not caplog.messages
     run_once(tmp_path, state(settings={"seed": 0, "effort": 2}), ends(tmp_path, 1))
-    assert caplog.messages == [f"{tmp_path}: runs again, as these changed since it ran: settings.effort"]
+    assert caplog.messages == [
+        f"{tmp_path}: runs again, as these changed since it ran: settings.effort"
+    ]
 
 
 def test_a_run_that_went_on_said_that_it_began_anew(tmp_path, caplog):

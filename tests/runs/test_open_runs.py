@@ -38,10 +38,14 @@ def town(chosen=(0, 1, 2), **changes):
 
 @pytest.mark.parametrize("chosen", [(2, 0, 1), (1, 2), (2,)])
 def test_stations_in_another_order_were_answered_by_each_other(chosen):
-    """One file lists the stations of a model in another order, or some of them: 31 dB off without a word."""
+    """One file lists the stations of a model in another order, or some of them:
+    31 dB off without a word.
+    """
     data, other = town(), town(chosen)
     method = wrap_per_station(method_class("idw")(), data)
-    method.fit(data, make_split(data.moving, SplitSettings(), place=data.place).folds[0], FitContext())
+    method.fit(
+        data, make_split(data.moving, SplitSettings(), place=data.place).folds[0], FitContext()
+    )
     same = align_to_site(other, data.site)
     assert [NAMES[t] for t in same.station[: len(chosen)]] == [NAMES[t] for t in chosen]
     split = make_split(same.moving, SplitSettings(), place=same.place)
@@ -57,7 +61,11 @@ def test_watts_were_asked_of_a_model_of_milliwatts(tmp_path, model, unit, power)
         for (x, y, z), level in zip(WALK, LEVELS[:, 0], strict=True)
     )
     (tmp_path / "drive.csv").write_text(heads + "".join(rows))
-    given = {"rx_position": WALK, "tx_position": POSTS[0], "rssi_db": LEVELS[:, 0] - 30 * (model == "dBW")}
+    given = {
+        "rx_position": WALK,
+        "tx_position": POSTS[0],
+        "rssi_db": LEVELS[:, 0] - 30 * (model == "dBW"),
+    }
     data = from_arrays(given, {"level_unit": model})
     table = parse_table(tmp_path / "drive.csv")
     other = from_arrays({**table.arrays, "tx_position": POSTS[0]}, table.attributes)
@@ -91,16 +99,24 @@ def test_a_drive_that_names_cells_otherwise_was_to_leave_them_out():
     second = {"station_name": pci[[2, 0, 1]], "station_label": NAMES[[2, 0, 1]]}
     same = align_to_site(town((2, 0, 1), **mast, **second), site)
     assert same.site.stations.name == site.stations.name and same.station[:3].tolist() == [2, 0, 1]
-    listed = town(**mast, station_name=pci, station_label=NAMES).site  # the model's drive was the one by PCI
+    # The model's drive was the one by PCI
+    listed = town(**mast, station_name=pci, station_label=NAMES).site
     assert align_to_site(town((1, 0, 2), **mast), listed).station[:3].tolist() == [1, 0, 2]
-    said = "stations 211, 212, 213 of arrays are none of the model's, north, east, roof: no name in common"
-    with pytest.raises(ValueError, match=said + ".*dataset.columns.station=COLUMN.*stations_file=FILE"):
+    said = (
+        "stations 211, 212, 213 of arrays are none of the model's, north, east, roof: no name "
+        "in common"
+    )
+    with pytest.raises(
+        ValueError, match=said + ".*dataset.columns.station=COLUMN.*stations_file=FILE"
+    ):
         align_to_site(town(**mast, station_name=pci), site)
 
 
 @pytest.mark.parametrize("lost", ["file", "model"])
 def test_stations_of_equal_names_were_unknown_where_one_had_no_places(lost):
-    """A list of cells beside the second drive alone, or beside the first, made all its cells strangers."""
+    """A list of cells beside the second drive alone, or beside the first,
+    made all its cells strangers.
+    """
     nowhere = {"station_position": np.full((3, 3), np.nan)}
     file, model = (town((2, 0, 1), **(nowhere if lost == one else {})) for one in ("file", "model"))
     same = align_to_site(file, model.site)
@@ -160,7 +176,9 @@ def test_test_rows_of_a_drive_counted_unlisted_cells_as_lines(tmp_path, monkeypa
     """`5400 test rows` of a file of 1,800 lines."""
     level = np.linspace(-90, -50, 80)
     level[:30] = -np.inf
-    said = opened_beside_all(tmp_path, monkeypatch, rssi_db=level, sensitivity_db=np.array(-95.0)).foreign
+    said = opened_beside_all(
+        tmp_path, monkeypatch, rssi_db=level, sensitivity_db=np.array(-95.0)
+    ).foreign
     assert "80 of these 80 test rows (50 listed, 30 unlisted) are at places" in said
 
 
@@ -172,7 +190,9 @@ def test_rows_that_none_was_trained_on_read_as_an_alarm(tmp_path, monkeypatch):
 
 
 def test_baselines_of_a_file_are_not_those_of_its_renumbered_stations():
-    """A cache told data apart by their content, not by the numbers that a model has for their stations."""
+    """A cache told data apart by their content,
+    not by the numbers that a model has for their stations.
+    """
     other = town((2, 0, 1))
     split = make_split(other.moving, SplitSettings(), place=other.place)
     for data in (other, align_to_site(other, town().site)):
@@ -204,12 +224,16 @@ def test_data_of_another_place_or_kind_are_refused(room, name, change, message):
 
 
 def test_what_is_in_target_units_is_converted_with_the_target(room):
-    """An uplink kept its own unit: whoever hears it and predicts a downlink was wrong by the ratio."""
+    """An uplink kept its own unit: whoever hears it
+    and predicts a downlink was wrong by the ratio.
+    """
     heard = np.full((len(room), 2, 3), 1 + 1j, np.complex64)
     noise = np.full(len(room), 0.5, np.float32)
     louder = replace(room.site, target_scale=room.site.target_scale * 4)
     back = align_to_site(
-        replace(room, site=louder, target=room.target / 4, uplink=heard / 4, noise_variance=noise / 16),
+        replace(
+            room, site=louder, target=room.target / 4, uplink=heard / 4, noise_variance=noise / 16
+        ),
         room.site,
     )
     assert np.allclose(back.target, room.target)
@@ -242,7 +266,8 @@ def test_a_second_survey_had_no_table_where_a_station_was_rarely_heard_before(pl
     chosen = answerable(Split("whole", (Fold(none, none, every),)), second, (first, learned))
     assert set(second.station[chosen.folds[0].test]) == {0, 1}
     assert (
-        "test rows are left out, of stations with under 4 training rows; heard now: roof (in 8" in caplog.text
+        "test rows are left out, of stations with under 4 training rows; heard now: roof (in 8"
+        in caplog.text
     )
     for name in ("zero", "kriging"):
         fit_baseline(name, second, chosen, learned=(first, learned))

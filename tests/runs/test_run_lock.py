@@ -27,7 +27,9 @@ HOLDS += "hold_folder(Path(sys.argv[1])); print('held', flush=True); time.sleep(
 @pytest.fixture
 def other(tmp_path):
     """Another process that holds the folder."""
-    run = subprocess.Popen([sys.executable, "-c", HOLDS, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    run = subprocess.Popen(
+        [sys.executable, "-c", HOLDS, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
     assert run.stdout is not None and run.stdout.readline() == "held\n"
     yield run
     run.kill()
@@ -50,7 +52,11 @@ def test_training_from_python_took_no_lock(other, tmp_path):
     refused(f"another run writes here .process {other.pid}", train, OmegaConf.create({}), tmp_path)
     other.kill()
     other.wait()
-    with locked(tmp_path), pytest.raises(ValueError, match="another run writes here"), locked(tmp_path):
+    with (
+        locked(tmp_path),
+        pytest.raises(ValueError, match="another run writes here"),
+        locked(tmp_path),
+    ):
         pass
     hold_folder(tmp_path)  # as a command does before it trains
     with locked(tmp_path):
@@ -58,14 +64,22 @@ def test_training_from_python_took_no_lock(other, tmp_path):
     release_folders()
 
 
-@pytest.mark.parametrize("words", [
-    ["hydra.run.dir={0}/0_seed-0"], ["-m", "eval_on=val,test", "hydra.sweep.dir={0}"],
-    ["-m", "eval_on=val", "hydra.sweep.dir={1}", "hydra.sweep.subdir={2}"],
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["hydra.run.dir={0}/0_seed-0"],
+        ["-m", "eval_on=val,test", "hydra.sweep.dir={0}"],
+        ["-m", "eval_on=val", "hydra.sweep.dir={1}", "hydra.sweep.subdir={2}"],
+    ],
+)
 def test_folders_of_a_multirun_and_of_its_jobs_are_held(words, other, tmp_path):
     """A run into one of them passed, and a multirun wrote into the folder of a run that held it."""
-    given = [word.format(tmp_path, tmp_path.parent, tmp_path.name) for word in (*words, "ckpt=none.ckpt")]
-    assert_refused(knock(COMMANDS["evaluate"].run, "evaluate", given), f"{tmp_path}: another run writes here")
+    given = [
+        word.format(tmp_path, tmp_path.parent, tmp_path.name) for word in (*words, "ckpt=none.ckpt")
+    ]
+    assert_refused(
+        knock(COMMANDS["evaluate"].run, "evaluate", given), f"{tmp_path}: another run writes here"
+    )
     assert not (tmp_path / ".hydra").exists()
 
 
@@ -79,7 +93,8 @@ def test_a_folder_that_cannot_be_locked_is_not_written_to(taken, tmp_path, recwa
         (folder / taken).mkdir(parents=True)
     given = ["ckpt=none.ckpt", f"hydra.run.dir={folder}"]
     assert_refused(
-        knock(COMMANDS["evaluate"].run, "evaluate", given), r"run: cannot be locked \(.*give another"
+        knock(COMMANDS["evaluate"].run, "evaluate", given),
+        r"run: cannot be locked \(.*give another",
     )
     assert not [w for w in recwarn if "RunLock" in str(w.message)]
     assert not (folder / ".hydra").exists()
@@ -90,16 +105,27 @@ def test_a_folder_that_cannot_be_locked_is_not_written_to(taken, tmp_path, recwa
 
 
 def test_a_failed_run_left_its_split_beside_the_summary_of_the_one_before(tmp_path, monkeypatch):
-    """Split and settings were of the new run, summary and model of the old one, and all readers took them."""
+    """Split and settings were of the new run, summary and model of the old one,
+    and all readers took them.
+    """
     file = powers(tmp_path / "own.npz")
-    given = "dataset=own", f"dataset.file={file}", "model=idw", "baselines=[]", "logger=none", "threads=1"
+    given = (
+        "dataset=own",
+        f"dataset.file={file}",
+        "model=idw",
+        "baselines=[]",
+        "logger=none",
+        "threads=1",
+    )
     train(compose(*given), tmp_path / "run")
     first = json.loads((tmp_path / "run" / "summary.json").read_text())["run_id"]
     assert json.loads((tmp_path / "run" / "split.json").read_text())["run_id"] == first
     assert checkpoint.read(tmp_path / "run" / "model.ckpt").extra["run_id"] == first
     assert read_run(tmp_path / "run").facts["run_id"] == first
     with monkeypatch.context() as broken, pytest.raises(RuntimeError):
-        broken.setattr("gsparc.commands.train.evaluate", lambda *a, **b: (_ for _ in ()).throw(RuntimeError))
+        broken.setattr(
+            "gsparc.commands.train.evaluate", lambda *a, **b: (_ for _ in ()).throw(RuntimeError)
+        )
         train(compose(*given, "split.seed=5", "model=gp"), tmp_path / "run")
     left = {path.name for path in (tmp_path / "run").iterdir()}
     assert not {"summary.json", "per_sample.csv", "test.png"} & left
@@ -140,14 +166,19 @@ def test_what_a_run_goes_on_from_is_not_set_aside(tmp_path):
         (tmp_path / name).write_text("{}")
     with pytest.raises(ValueError):
         train(compose(f"ckpt_path={tmp_path / 'model.ckpt'}"), tmp_path)
-    assert {path.name for path in tmp_path.glob("*.json*")} == {"summary.json.earlier", "split.json"}
+    assert {path.name for path in tmp_path.glob("*.json*")} == {
+        "summary.json.earlier",
+        "split.json",
+    }
 
 
 def test_a_split_alone_was_called_results(tmp_path, caplog):
     caplog.set_level("INFO")
     (tmp_path / "split.json").write_text("{}")
     set_earlier_aside(tmp_path)
-    assert caplog.messages == [f"{tmp_path}: files of an earlier run there were renamed to NAME.earlier"]
+    assert caplog.messages == [
+        f"{tmp_path}: files of an earlier run there were renamed to NAME.earlier"
+    ]
 
 
 def test_half_written_files_of_killed_runs_stayed_for_ever(tmp_path):

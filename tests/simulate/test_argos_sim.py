@@ -3,14 +3,27 @@
 import numpy as np
 
 from gsparc.data.schema import LIGHT
-from gsparc.simulate.argos_sim import CARRIER_HZ, SPACING_HZ, TONES, Offsets, draw_snapshots, draw_world
+from gsparc.simulate.argos_sim import (
+    CARRIER_HZ,
+    SPACING_HZ,
+    TONES,
+    Offsets,
+    draw_snapshots,
+    draw_world,
+)
 from gsparc.simulate.streets import Streets, trace_streets
 
 
 def _street(buildings: list, **more) -> Streets:
-    none = {"scatterers": np.zeros((0, 3)), "cross_section": np.zeros(0), "scatterer_phase": np.zeros(0)}
+    none = {
+        "scatterers": np.zeros((0, 3)),
+        "cross_section": np.zeros(0),
+        "scatterer_phase": np.zeros(0),
+    }
     boxes = np.array(buildings, dtype=float).reshape(-1, 2, 2)
-    return Streets(boxes, np.full(len(boxes), -0.7), base=np.array([0.0, 0.0, 5.0]), **{**none, **more})
+    return Streets(
+        boxes, np.full(len(boxes), -0.7), base=np.array([0.0, 0.0, 5.0]), **{**none, **more}
+    )
 
 
 def test_free_space_is_friis() -> None:
@@ -22,7 +35,9 @@ def test_free_space_is_friis() -> None:
 
 def test_wall_makes_an_image() -> None:
     """A wall at y = 10 to 20: the user at (20, 0) hears the mirrored base at (0, 20) through it."""
-    rays = trace_streets(_street([[[-50, 10], [50, 20]]], ground=0.0), np.array([[20.0, 0.0, 5.0]]), 0.125)
+    rays = trace_streets(
+        _street([[[-50, 10], [50, 20]]], ground=0.0), np.array([[20.0, 0.0, 5.0]]), 0.125
+    )
     strength = np.sort(np.abs(rays.gain[0]))[::-1]
     assert np.isclose(strength[0], 0.125 / (4 * np.pi * 20))
     assert np.isclose(strength[1], 0.7 * 0.125 / (4 * np.pi * np.hypot(20, 20)))
@@ -31,7 +46,11 @@ def test_wall_makes_an_image() -> None:
 
 def test_building_blocks_and_its_corner_diffracts() -> None:
     """By Keller's coefficient of a half-plane, from the corner at (8, 2)."""
-    streets, user, corner = _street([[[8, -10], [12, 2]]], ground=0.0), np.array([16, 2.5]), np.array([8, 2])
+    streets, user, corner = (
+        _street([[[8, -10], [12, 2]]], ground=0.0),
+        np.array([16, 2.5]),
+        np.array([8, 2]),
+    )
     behind = trace_streets(streets, np.array([[*user, 5.0]]), 0.125)
     assert streets.are_blocked(np.zeros((1, 2)), user[None])[0]
     near, far = np.linalg.norm(corner), np.linalg.norm(user - corner)

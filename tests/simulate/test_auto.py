@@ -18,8 +18,14 @@ from gsparc.simulate.spectrum import SpectrumSettings
 from gsparc.simulate.survey import TracingEngine
 
 FULL = Effects(depth=2, polarisation=False)
-RECORD = [(0, 0, 1.0), (SPECULAR, 1, 0.5), (REFRACTION, 1, 0.6), (DIFFRACTION, 1, 0.01),
-          (SPECULAR | DIFFUSE, 2, 0.02), (SPECULAR, 2, 0.05)]  # fmt: skip
+RECORD = [
+    (0, 0, 1.0),
+    (SPECULAR, 1, 0.5),
+    (REFRACTION, 1, 0.6),
+    (DIFFRACTION, 1, 0.01),
+    (SPECULAR | DIFFUSE, 2, 0.02),
+    (SPECULAR, 2, 0.05),
+]
 
 
 class Invented(TracingEngine):
@@ -36,12 +42,13 @@ class Invented(TracingEngine):
         power = np.tile([p for _, _, p in self.record], count)
         direction = np.abs(rng.normal(size=(count * each, 3)))
         whole = TracedPaths(
-            np.arange(count + 1) * each, np.sqrt(power)[:, None].astype(np.complex64),
+            np.arange(count + 1) * each,
+            np.sqrt(power)[:, None].astype(np.complex64),
             rng.uniform(0, 1e-7, count * each),
             (direction / np.linalg.norm(direction, axis=1, keepdims=True)).astype(np.float32),
             np.tile([m for m, _, _ in self.record], count).astype(np.uint8),
             np.tile([o for _, o, _ in self.record], count).astype(np.uint8),
-        )  # fmt: skip
+        )
         return whole.keep_effects(effects)
 
 
@@ -69,18 +76,33 @@ def decided(deliverable, record=RECORD):
     return auto.verify_choice(choice, settings, probe.errors(choice.effects, settings.required))
 
 
-@pytest.mark.parametrize("text, kind, tolerance", [
-    ("coverage +-1 dB", "coverage", 1.0), ("coverage ±2.5 dB", "coverage", 2.5), ("csi -20 dB", "csi", -20.0),
-    ("csi 30 dB", "csi", -30.0), ("spectrum skill", "spectrum", 0.1), ("spectrum skill 0.8", "spectrum", 0.2),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "text, kind, tolerance",
+    [
+        ("coverage +-1 dB", "coverage", 1.0),
+        ("coverage ±2.5 dB", "coverage", 2.5),
+        ("csi -20 dB", "csi", -20.0),
+        ("csi 30 dB", "csi", -30.0),
+        ("spectrum skill", "spectrum", 0.1),
+        ("spectrum skill 0.8", "spectrum", 0.2),
+    ],
+)
 def test_words_become_a_deliverable(text, kind, tolerance):
     assert Deliverable.parse(text) == Deliverable(kind, pytest.approx(tolerance))
 
 
-@pytest.mark.parametrize("wrong", [
-    {"deliverable": "coverge 1 dB"}, {"deliverable": "spectrum skill 1.5"},
-    {"deliverable": "csi -20 dB please"}, {"rays": 0}, {"rays": 2}, {"confidence": 1.0}, {"probes": 3},
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"deliverable": "coverge 1 dB"},
+        {"deliverable": "spectrum skill 1.5"},
+        {"deliverable": "csi -20 dB please"},
+        {"rays": 0},
+        {"rays": 2},
+        {"confidence": 1.0},
+        {"probes": 3},
+    ],
+)
 def test_bad_settings_are_refused(wrong):
     refused(next(iter(wrong)), AutoSettings, **wrong)
 
@@ -115,9 +137,15 @@ def test_one_odd_receiver_does_not_keep_everything():
     assert not choice.effects.diffuse and choice.effects.specular
 
 
-@pytest.mark.parametrize("probes, quantile, confidence, most", [
-    (128, 0.95, 0.85, 3), (64, 0.95, 0.85, 0), (96, 0.95, 0.9, 1), (16, 0.95, 0.9, 0),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "probes, quantile, confidence, most",
+    [
+        (128, 0.95, 0.85, 3),
+        (64, 0.95, 0.85, 0),
+        (96, 0.95, 0.9, 1),
+        (16, 0.95, 0.9, 0),
+    ],
+)
 def test_few_failures_prove_the_quantile(probes, quantile, confidence, most):
     """Drawn: a violated requirement passes no more often than promised."""
     settings = AutoSettings(quantile=quantile, confidence=confidence)
@@ -150,7 +178,9 @@ def test_fewer_rays_are_taken_where_probes_stay_within_tolerance():
 def test_violated_requirement_is_reported():
     other = probe_of(heard(30, [(0, 0, 1.0), (DIFFRACTION, 1, 3.0)]))
     choice, settings = decided("coverage +-1 dB"), AutoSettings()
-    verdict = auto.verify_choice(choice, settings, other.errors(choice.effects, settings.required)).verdict
+    verdict = auto.verify_choice(
+        choice, settings, other.errors(choice.effects, settings.required)
+    ).verdict
     assert verdict is not None and not verdict.kept and verdict.met == 0.0
 
 
@@ -165,12 +195,19 @@ def test_spectra_are_judged_against_the_nearest_receiver():
 
 
 def test_channel_error_of_a_dropped_path_is_its_share_of_energy():
-    paths = TracedPaths(np.array([0, 2]), np.array([[1.0], [0.1]], np.complex64), np.array([0.0, 1e-8]),
-                  np.array([[0, 0, 1], [0, 0, 1]], np.float32), np.array([0, SPECULAR], np.uint8),
-                  np.array([0, 1], np.uint8))  # fmt: skip
+    paths = TracedPaths(
+        np.array([0, 2]),
+        np.array([[1.0], [0.1]], np.complex64),
+        np.array([0.0, 1e-8]),
+        np.array([[0, 0, 1], [0, 0, 1]], np.float32),
+        np.array([0, SPECULAR], np.uint8),
+        np.array([0, 1], np.uint8),
+    )
     probe, h = probe_of(paths), 1 + 0.1 * np.exp(-2j * np.pi * 24)
     assert probe.nmse(FULL.switch_off("specular"))[0] == pytest.approx(0.01 / abs(h) ** 2, rel=1e-4)
-    assert probe.lost_power_shares(FULL.switch_off("specular"))[0] == pytest.approx(0.01 / 1.01, rel=1e-4)
+    assert probe.lost_power_shares(FULL.switch_off("specular"))[0] == pytest.approx(
+        0.01 / 1.01, rel=1e-4
+    )
     assert probe.nmse(FULL)[0] == 0.0
 
 

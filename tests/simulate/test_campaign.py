@@ -50,7 +50,9 @@ def arrays(path):
 
 
 def read(path, target=None):
-    return load({"name": "sionna", "file": str(path), **({} if target is None else {"target": target})})
+    return load(
+        {"name": "sionna", "file": str(path), **({} if target is None else {"target": target})}
+    )
 
 
 def assert_same(one, two):
@@ -89,8 +91,12 @@ def after(calls):
 def test_file_equals_the_exact_room_and_its_paths_make_the_channel(tmp_path):
     outcome = simulate(plan(), tmp_path / "box.h5")
     stored, about = arrays(tmp_path / "box.h5")
-    room = Room(np.zeros(3), np.array([6.0, 5, 3]), np.full(6, -0.6), np.array(SCENE.room["boxes_m"]))
-    exact = trace_room(room, SCENE.transmitter_m, stored["rx_position"], SCENE.frequency_hz, max_order=3).csi
+    room = Room(
+        np.zeros(3), np.array([6.0, 5, 3]), np.full(6, -0.6), np.array(SCENE.room["boxes_m"])
+    )
+    exact = trace_room(
+        room, SCENE.transmitter_m, stored["rx_position"], SCENE.frequency_hz, max_order=3
+    ).csi
     # the amplitude of a path is the carrier's on all tones: 20 of 2,400 MHz
     np.testing.assert_allclose(stored["csi"], exact, rtol=0.02, atol=1e-4 * np.abs(exact).max())
     assert room.contains(stored["rx_position"]).all()
@@ -102,7 +108,9 @@ def test_file_equals_the_exact_room_and_its_paths_make_the_channel(tmp_path):
     assert outcome.convergence is None and outcome.facts["paths_per_receiver"] > 5
     assert 0 < about["simulate_s"] <= sum(outcome.seconds.values())
     paths = stored["path_offsets"]
-    assert len(paths) == 61 and paths[-1] == len(stored["path_delay"]) == len(stored["path_direction"])
+    assert len(paths) == 61 and paths[-1] == len(stored["path_delay"]) == len(
+        stored["path_direction"]
+    )
     some = slice(*paths[7:9])
     tones = np.exp(-2j * np.pi * np.outer(stored["path_delay"][some], stored["frequency_hz"]))
     np.testing.assert_allclose(stored["path_gain"][some] @ tones, stored["csi"][7, 0], rtol=1e-4)
@@ -138,7 +146,9 @@ def test_file_is_read_as_powers(tmp_path):
 
 
 def test_outlier_does_not_set_the_sensitivity():
-    """In a town one path was 66 dB below the next: 43 places without any counted as weaker still."""
+    """In a town one path was 66 dB below the next:
+    43 places without any counted as weaker still.
+    """
     rng = np.random.default_rng(0)
     power = 10 ** (rng.uniform(-140, -80, 400) / 10)
     weakest = np.sort(power)[1]
@@ -147,7 +157,8 @@ def test_outlier_does_not_set_the_sensitivity():
     found = _in_decibels(power)
     np.testing.assert_allclose(found["sensitivity_db"], 10 * np.log10(weakest))
     assert np.isnan(found["rssi_db"]).sum() == 3
-    assert "sensitivity_db" not in _in_decibels(power[power > 0])  # nothing missing: every power is one
+    # Nothing missing: every power is one
+    assert "sensitivity_db" not in _in_decibels(power[power > 0])
 
 
 def test_noise_has_the_stated_power_and_is_the_same_put_together_on_disk(tmp_path, monkeypatch):
@@ -166,12 +177,18 @@ def test_noise_has_the_stated_power_and_is_the_same_put_together_on_disk(tmp_pat
 
 
 def test_interrupted_run_is_resumed(tmp_path):
-    """Finished shards are not touched, every receiver is there once, the file is the uninterrupted one's."""
+    """Finished shards are not touched, every receiver is there once,
+    the file is the uninterrupted one's.
+    """
     simulate(plan(), tmp_path / "whole.h5")
     interrupted(ShoeboxEngine, "trace", plan(), tmp_path / "cut.h5", after(2))
     assert not (tmp_path / "cut.h5").exists()
     shards = sorted((tmp_path / "cut.h5.parts").glob("shard_*.npz"))
-    before, seen, real = [(s.stat().st_mtime_ns, s.read_bytes()) for s in shards], [], ShoeboxEngine.trace
+    before, seen, real = (
+        [(s.stat().st_mtime_ns, s.read_bytes()) for s in shards],
+        [],
+        ShoeboxEngine.trace,
+    )
     assert len(shards) == 2
 
     def watches(self, *arguments, **named):
@@ -261,7 +278,10 @@ def test_auto_decides_verifies_and_is_drawn(tmp_path):
     outcome = simulate(plan(effects=FEW_PROBES), tmp_path / "box.h5")
     choice = outcome.decision.choice
     assert choice is not None and choice.verdict is not None and choice.verdict.kept
-    assert set(outcome.effects.enabled) == {"line_of_sight", "specular"} and 1 <= outcome.effects.depth < 4
+    assert (
+        set(outcome.effects.enabled) == {"line_of_sight", "specular"}
+        and 1 <= outcome.effects.depth < 4
+    )
     stored = json.loads(arrays(tmp_path / "box.h5")[1]["auto"])
     assert [row["effect"] for row in stored["table"]] == [row.effect for row in choice.table]
     facts = summary_facts(outcome)
@@ -313,7 +333,9 @@ def with_rays(monkeypatch, off: float) -> AutoSettings:
 
 
 def test_fewer_rays_are_simulated_where_verified(tmp_path, monkeypatch):
-    """The file says with how many; what was decided on has all of them, and is not in the solver's error."""
+    """The file says with how many; what was decided on has all of them,
+    and is not in the solver's error.
+    """
     asked, many = with_rays(monkeypatch, 1.05), replace(SCENE, num_receivers=200)
     whole = simulate(plan(scene=many, effects=replace(asked, rays=1.0)), tmp_path / "whole.h5")
     outcome = simulate(plan(scene=many, effects=asked), tmp_path / "fewer.h5")
@@ -321,14 +343,19 @@ def test_fewer_rays_are_simulated_where_verified(tmp_path, monkeypatch):
     assert whole.decision.choice.samples is None and choice.samples == 90_000
     assert choice.verdict.kept and choice.verdict.error == pytest.approx(0.42, abs=0.01)
     (all_, _), (fewer, about) = (arrays(tmp_path / f"{name}.h5") for name in ("whole", "fewer"))
-    assert json.loads(about["sampling"])["samples"] == json.loads(about["auto"])["samples"] == 90_000
+    assert (
+        json.loads(about["sampling"])["samples"] == json.loads(about["auto"])["samples"] == 90_000
+    )
     ratio = fewer["received_power"] / all_["received_power"]
     decided_on = np.isclose(ratio, 1.0, rtol=1e-5)
     assert 128 <= decided_on.sum() < 200
     np.testing.assert_allclose(ratio[~decided_on], 1.05**2, rtol=1e-4)
     assert outcome.convergence.nmse == pytest.approx(1e-4, rel=0.01)
     assert outcome.convergence.power_db == pytest.approx(20 * np.log10(1.01), rel=0.01)
-    assert "90,000 rays" in describe_choice(choice) and summary_facts(outcome)["auto/samples"] == 90_000
+    assert (
+        "90,000 rays" in describe_choice(choice)
+        and summary_facts(outcome)["auto/samples"] == 90_000
+    )
 
 
 def test_fewer_rays_are_refused_where_they_miss(tmp_path, monkeypatch):
@@ -351,7 +378,9 @@ def test_refuted_choice_is_not_simulated(tmp_path, monkeypatch):
     settings = replace(FEW_PROBES, full=full)
     outcome = simulate(plan(effects=settings), tmp_path / "box.h5")
     assert outcome.effects == outcome.decision.choice.effects == full
-    assert "NOT MET by less (line of sight, specular, depth" in describe_choice(outcome.decision.choice)
+    assert "NOT MET by less (line of sight, specular, depth" in describe_choice(
+        outcome.decision.choice
+    )
 
 
 def test_everything_is_simulated_where_few_rows_are_left(tmp_path, monkeypatch):
@@ -360,12 +389,16 @@ def test_everything_is_simulated_where_few_rows_are_left(tmp_path, monkeypatch):
     monkeypatch.setattr(deciding, "COMPILING", 10)
     few = simulate(plan(effects=FEW_PROBES), tmp_path / "few.h5")
     assert few.effects.depth == 4 and few.decision.choice.effects.depth < 4
-    many = simulate(plan(effects=FEW_PROBES, scene=replace(SCENE, num_receivers=120)), tmp_path / "many.h5")
+    many = simulate(
+        plan(effects=FEW_PROBES, scene=replace(SCENE, num_receivers=120)), tmp_path / "many.h5"
+    )
     assert many.effects == many.decision.choice.effects
 
 
 def test_kill_between_first_shard_and_decision_mixes_no_effects(tmp_path):
-    """The shard of a decision nobody had noted stayed, beside rows of the decision taken instead of it."""
+    """The shard of a decision nobody had noted stayed,
+    beside rows of the decision taken instead of it.
+    """
     probed = plan(effects=FEW_PROBES)
     interrupted(Shards, "write_note", probed, tmp_path / "cut.h5")
     stale = tmp_path / "cut.h5.parts" / "shard_0000.npz"
@@ -377,12 +410,19 @@ def test_kill_between_first_shard_and_decision_mixes_no_effects(tmp_path):
 
 
 def put_together(out: Path, receivers: int) -> int:
-    """Write a file from shards whose rows are those of 20 traced places, again and again; peak memory [B]."""
+    """Write a file from shards whose rows are those of 20 traced places, again and again;
+    peak memory [B].
+    """
     asked = plan(
-        scene=replace(SCENE, num_receivers=receivers), effects=replace(MIRROR, noise_snr_db=20.0),
-        spectrum=replace(SMALL, height=45, width=90), csi=ArraySettings(rows=4, columns=4),
-    )  # fmt: skip
-    survey, shards = build_survey(asked.scene, asked.sampling), Shards(out, {"receivers": receivers})
+        scene=replace(SCENE, num_receivers=receivers),
+        effects=replace(MIRROR, noise_snr_db=20.0),
+        spectrum=replace(SMALL, height=45, width=90),
+        csi=ArraySettings(rows=4, columns=4),
+    )
+    survey, shards = (
+        build_survey(asked.scene, asked.sampling),
+        Shards(out, {"receivers": receivers}),
+    )
     wavelength = survey.engine.wavelength
     made = shard_arrays(survey.trace(np.arange(20), MIRROR), asked, wavelength)
     turned = np.random.default_rng(0).permutation(receivers).reshape(-1, 20)
@@ -411,27 +451,39 @@ def test_memory_does_not_grow_with_spectra_and_channels(tmp_path, monkeypatch):
     assert row > 4000 and many - few < 0.25 * 900 * row and len(stored["path_offsets"]) == 1001
 
 
-@pytest.mark.parametrize("room, words", [
-    ({"reflection": -0.5}, r"scene\.room\.size_m=None: a list of three lengths"),
-    ({"size_m": [4, 3, 2], "hight": 3}, r"scene\.room\.hight: no such setting"),
-    ({"size_m": [4, 3, 2], "boxes_m": [[[1, 1, 1], [0, 2, 2]]]}, r"scene\.room\.boxes_m=.*lower corner"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "room, words",
+    [
+        ({"reflection": -0.5}, r"scene\.room\.size_m=None: a list of three lengths"),
+        ({"size_m": [4, 3, 2], "hight": 3}, r"scene\.room\.hight: no such setting"),
+        (
+            {"size_m": [4, 3, 2], "boxes_m": [[[1, 1, 1], [0, 2, 2]]]},
+            r"scene\.room\.boxes_m=.*lower corner",
+        ),
+    ],
+)
 def test_a_room_without_its_size_ended_in_a_key_error(tmp_path, room, words):
     refused(words, simulate, plan(scene=replace(SCENE, room=room)), tmp_path / "box.h5")
 
 
-@pytest.mark.parametrize("changes, words", [
-    ({"builder": "conference_room"}, "exactly one of"),
-    ({"num_receivers": 3}, "at least 20"),
-    ({"area_m": ((2.65, 2.25), (2.95, 2.55))}, "0 of 60 receivers"),
-    ({"transmitter_m": (9.0, 1.0, 1.0)}, "outside the room"),
-    ({"transmitter_m": (9.0, 1.0)}, "three finite numbers"),
-    ({"transmitters": [{"position_m": [1, 1, 1]}]}, "not both"),
-    ({"transmitter_m": None, "transmitters": []}, "one transmitter or more"),
-    ({"transmitter_m": None, "transmitters": [{"position_m": [1, 1, 1], "sectors": 3}]}, "isotropic"),
-    ({"over": "sea"}, "over='sea': one of zero"),
-    ({"receivers": {"knd": "grid"}}, "no such setting"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "changes, words",
+    [
+        ({"builder": "conference_room"}, "exactly one of"),
+        ({"num_receivers": 3}, "at least 20"),
+        ({"area_m": ((2.65, 2.25), (2.95, 2.55))}, "0 of 60 receivers"),
+        ({"transmitter_m": (9.0, 1.0, 1.0)}, "outside the room"),
+        ({"transmitter_m": (9.0, 1.0)}, "three finite numbers"),
+        ({"transmitters": [{"position_m": [1, 1, 1]}]}, "not both"),
+        ({"transmitter_m": None, "transmitters": []}, "one transmitter or more"),
+        (
+            {"transmitter_m": None, "transmitters": [{"position_m": [1, 1, 1], "sectors": 3}]},
+            "isotropic",
+        ),
+        ({"over": "sea"}, "over='sea': one of zero"),
+        ({"receivers": {"knd": "grid"}}, "no such setting"),
+    ],
+)
 def test_bad_scenes_are_refused(tmp_path, changes, words):
     scene = {**vars(SCENE), **changes}
     refused(words, lambda: simulate(plan(scene=SceneSettings(**scene)), tmp_path / "box.h5"))

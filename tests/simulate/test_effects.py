@@ -13,9 +13,13 @@ def paths_of(mechanisms, order, owner=None, ports=1):
     owner = np.zeros(count, int) if owner is None else np.array(owner)
     direction = np.tile(np.array([[1.0, 0, 0]], np.float32), (count, 1))
     return TracedPaths(
-        np.concatenate([[0], np.cumsum(np.bincount(owner))]), np.ones((count, ports), np.complex64),
-        np.arange(count) * 1e-9, direction, np.array(mechanisms, np.uint8), np.array(order, np.uint8),
-    )  # fmt: skip
+        np.concatenate([[0], np.cumsum(np.bincount(owner))]),
+        np.ones((count, ports), np.complex64),
+        np.arange(count) * 1e-9,
+        direction,
+        np.array(mechanisms, np.uint8),
+        np.array(order, np.uint8),
+    )
 
 
 def test_path_needs_all_its_mechanisms_and_depth():
@@ -33,14 +37,29 @@ def test_path_needs_all_its_mechanisms_and_depth():
     assert left(Effects(depth=0)) == [True, False, False, False, False]
 
 
-@pytest.mark.parametrize("config, words", [
-    ({"specular": False}, "diffuse needs"),
-    ({"diffraction": False}, "edge_diffraction needs"),
-    ({"depth": 9}, "at most 8"),
-    ({"speculr": True}, "speculr: no such effect"),
-    (dict.fromkeys(("line_of_sight", "specular", "refraction", "diffraction", "edge_diffraction", "diffuse"),
-                   False), "every mechanism is off"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "config, words",
+    [
+        ({"specular": False}, "diffuse needs"),
+        ({"diffraction": False}, "edge_diffraction needs"),
+        ({"depth": 9}, "at most 8"),
+        ({"speculr": True}, "speculr: no such effect"),
+        (
+            dict.fromkeys(
+                (
+                    "line_of_sight",
+                    "specular",
+                    "refraction",
+                    "diffraction",
+                    "edge_diffraction",
+                    "diffuse",
+                ),
+                False,
+            ),
+            "every mechanism is off",
+        ),
+    ],
+)
 def test_contradictions_are_refused(config, words):
     with pytest.raises(ValueError, match=words):
         from_config(config)

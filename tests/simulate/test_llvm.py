@@ -29,7 +29,9 @@ def test_library_that_kills_its_process_is_reported(monkeypatch, tmp_path):
     library = tmp_path / "libLLVM-15.so"
     library.touch()
     monkeypatch.setattr(
-        llvm, "TINY_SOLVE", "import os, sys; print('LLVM ERROR: fmaximum', file=sys.stderr); os.abort()"
+        llvm,
+        "TINY_SOLVE",
+        "import os, sys; print('LLVM ERROR: fmaximum', file=sys.stderr); os.abort()",
     )
     wrong = llvm.library_fault(library)
     assert wrong is not None and "signal 6" in wrong and "fmaximum" in wrong
@@ -57,7 +59,8 @@ def test_missing_sionna_names_the_remedy(monkeypatch):
 def test_imports_leave_the_ray_tracer_alone():
     """Only `gsparc.simulate` may, and even there not before it is asked to trace."""
     code = (
-        "import sys, gsparc, gsparc.commands.train, gsparc.commands.evaluate, gsparc.datasets.load\n"
+        "import sys, gsparc, gsparc.commands.train, gsparc.commands.evaluate, "
+        "gsparc.datasets.load\n"
         "import gsparc.simulate\n"
         "bad = [m for m in ('mitsuba', 'drjit', 'sionna.rt') if m in sys.modules]\n"
         "assert not bad, bad"

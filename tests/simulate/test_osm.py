@@ -26,7 +26,10 @@ def extract(corners=SQUARE, ids=None, tags=(("building", "yes"),)):
     nodes = "".join(f'<node id="{i}" lat="{a}" lon="{b}"/>' for i, (a, b) in enumerate(corners, 1))
     ids = [*range(1, len(corners) + 1), 1] if ids is None else ids
     refs = "".join(f'<nd ref="{i}"/>' for i in ids)
-    return f'{HEAD}{nodes}<way id="9">{refs}{"".join(f"<tag k={k!r} v={v!r}/>" for k, v in tags)}</way></osm>'
+    return (
+        f"{HEAD}{nodes}<way "
+        f'id="9">{refs}{"".join(f"<tag k={k!r} v={v!r}/>" for k, v in tags)}</way></osm>'
+    )
 
 
 def test_town_is_extruded_in_metres():
@@ -38,7 +41,8 @@ def test_town_is_extruded_in_metres():
     }
     assert by_name["ground"].material == "medium_dry_ground"
     assert read_town(TOWN, 28e9).solids[0].material == "concrete"  # the soil's model ends at 10 GHz
-    assert by_name["buildings_glass"].vertices[:, 2].max() == pytest.approx(27)  # 8 levels and 1 of the roof
+    # 8 levels and 1 of the roof
+    assert by_name["buildings_glass"].vertices[:, 2].max() == pytest.approx(27)
     assert by_name["buildings_brick"].vertices[:, 2].max() == pytest.approx(18)
     heights = np.unique(by_name["buildings_metal"].vertices[:, 2])
     np.testing.assert_allclose(heights, [0, 4, 5, 25])  # a canopy from 4 to 5 m
@@ -58,24 +62,43 @@ def test_town_is_extruded_in_metres():
 
 
 def test_lengths_are_read_as_osm_writes_them():
-    read = {text: osm._metres(text) for text in ("12", "12.5 m", "12,5", "40 ft", "40'", "tall", "", None)}
+    read = {
+        text: osm._metres(text)
+        for text in ("12", "12.5 m", "12,5", "40 ft", "40'", "tall", "", None)
+    }
     assert read == {
-        "12": 12, "12.5 m": 12.5, "12,5": 12.5, "40 ft": pytest.approx(12.192), "40'": pytest.approx(12.192),
-        "tall": None, "": None, None: None,
-    }  # fmt: skip
+        "12": 12,
+        "12.5 m": 12.5,
+        "12,5": 12.5,
+        "40 ft": pytest.approx(12.192),
+        "40'": pytest.approx(12.192),
+        "tall": None,
+        "": None,
+        None: None,
+    }
 
 
 FAR = [(40.0, -30.0), (40.0, -29.0), (41.0, -29.0), (41.0, -30.0)]
 SPOILT = {
-    "empty": "", "words": "a town", "html": "<html><body>503</body></html>", "cut": extract()[:-40],
-    "binary": "\x00\x01\x02\x03OSMHeader", "nothing": f"{HEAD}</osm>",
-    "no building": extract(tags=(("landuse", "grass"),)), "building=no": extract(tags=(("building", "no"),)),
+    "empty": "",
+    "words": "a town",
+    "html": "<html><body>503</body></html>",
+    "cut": extract()[:-40],
+    "binary": "\x00\x01\x02\x03OSMHeader",
+    "nothing": f"{HEAD}</osm>",
+    "no building": extract(tags=(("landuse", "grass"),)),
+    "building=no": extract(tags=(("building", "no"),)),
     "a point": extract(SQUARE[:1], [1, 1]),
-    "a line": extract([(40.0, -30.0), (40.0, -29.999), (40.0, -29.998)]), "open": extract(ids=[1, 2, 3, 4]),
-    "missing nodes": extract(ids=[1, 2, 77, 78, 1]), "no latitude": extract().replace("lat=", "latt="),
-    "beyond the pole": extract([(95.0, -30.0), (95.0, -29.999), (95.001, -29.999), (95.001, -30.0)]),
-    "not numbers": extract().replace('"40.0"', '"north"'), "too wide": extract(FAR),
-}  # fmt: skip
+    "a line": extract([(40.0, -30.0), (40.0, -29.999), (40.0, -29.998)]),
+    "open": extract(ids=[1, 2, 3, 4]),
+    "missing nodes": extract(ids=[1, 2, 77, 78, 1]),
+    "no latitude": extract().replace("lat=", "latt="),
+    "beyond the pole": extract(
+        [(95.0, -30.0), (95.0, -29.999), (95.001, -29.999), (95.001, -30.0)]
+    ),
+    "not numbers": extract().replace('"40.0"', '"north"'),
+    "too wide": extract(FAR),
+}
 
 
 @pytest.mark.parametrize("kind", SPOILT)

@@ -34,5 +34,7 @@ def test_tags_sit_on_bright_pixels_like_the_real_ones(tmp_path):
     data = load_rfid(RFIDStandIn(60, 0, tmp_path).folder())
     elevation, azimuth = boresight_degrees(data)
     assert elevation.min() > 75 and elevation.max() < 81
-    pixel = data.target[np.arange(60), np.round(elevation).astype(int), np.round(azimuth).astype(int) % 360]
+    pixel = data.target[
+        np.arange(60), np.round(elevation).astype(int), np.round(azimuth).astype(int) % 360
+    ]
     assert pixel.mean() / 255 > 0.6 and 0.3 < data.target.mean() / 255 < 0.5

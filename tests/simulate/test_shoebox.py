@@ -22,8 +22,11 @@ def mirror(point, axis, wall):
 def test_images_are_mirrors_in_the_walls():
     mirrored, point = mirror_images(ROOM, 2), np.array([0.2, 1.1, 0.9])
     walls = [(0, -1.0), (0, 4.0), (1, 0.5), (1, 3.5), (2, 0.0), (2, 2.5)]
-    wanted = [(mirror(point, *wall), gain) for wall, gain in zip(walls, ROOM.reflection, strict=True)]
-    wanted += [(mirror(mirror(point, 0, 4.0), 0, -1.0), 0.9 * 0.8)]  # in the high wall, then in the low one
+    wanted = [
+        (mirror(point, *wall), gain) for wall, gain in zip(walls, ROOM.reflection, strict=True)
+    ]
+    # In the high wall, then in the low one
+    wanted += [(mirror(mirror(point, 0, 4.0), 0, -1.0), 0.9 * 0.8)]
     for place, gain in wanted:
         nearest = np.linalg.norm(mirrored.mirror_points(point) - place, axis=1).argmin()
         np.testing.assert_allclose(mirrored.mirror_points(point)[nearest], place)
@@ -35,11 +38,15 @@ def test_reciprocity(occluders):
     room = Room(ROOM.lower, ROOM.upper, ROOM.reflection, occluders)
     tx, rx = scatter(room, 40, seed=0), scatter(room, 40, seed=1)
     there = trace_room(room, tx, rx, 2.4e9, max_order=3).csi
-    np.testing.assert_allclose(trace_room(room, rx, tx, 2.4e9, max_order=3).csi, there, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(
+        trace_room(room, rx, tx, 2.4e9, max_order=3).csi, there, rtol=1e-9, atol=1e-15
+    )
 
 
 def _bounce_by_bounce(room, tx, rx, cell):
-    """The folded path walked wall by wall: is any of its legs inside an occluder? Dense sampling."""
+    """The folded path walked wall by wall: is any
+    of its legs inside an occluder? Dense sampling.
+    """
     mirrored = mirror_images(room, int(np.abs(cell).sum()))
     i = int(np.flatnonzero((mirrored.cell == cell).all(axis=1))[0])
     signs, offsets = mirrored.signs[i], mirrored.offsets[i]
@@ -56,9 +63,14 @@ def test_visibility_equals_walking_the_folded_path():
     mirrored = mirror_images(room, 3)
     tx, rx = scatter(room, 4, seed=2), scatter(room, 4, seed=3)
     seen = visible_images(room, mirrored, tx, rx)
-    walked = np.array([[_bounce_by_bounce(room, t, r, c) for c in mirrored.cell]
-                       for t, r in zip(tx, rx, strict=True)])  # fmt: skip
-    # Dense sampling may miss a grazing path by a fraction of a millimetre, never the other way round.
+    walked = np.array(
+        [
+            [_bounce_by_bounce(room, t, r, c) for c in mirrored.cell]
+            for t, r in zip(tx, rx, strict=True)
+        ]
+    )
+    # Dense sampling may miss a grazing path by a fraction of a millimetre,
+    # never the other way round.
     assert (seen != walked).sum() <= 2 and 0.1 < seen.mean() < 0.9
 
 
@@ -68,7 +80,12 @@ def test_line_of_sight_amplitude_phase_and_delay():
         ROOM, np.array([0.0, 1, 1]), np.array([[3.0, 1, 1], [2.0, 1, 1]]), frequency, max_order=0
     ).csi
     distance = np.array([3.0, 2.0])[:, None]
-    expected = LIGHT / frequency / (4 * np.pi * distance) * np.exp(-2j * np.pi * frequency * distance / LIGHT)
+    expected = (
+        LIGHT
+        / frequency
+        / (4 * np.pi * distance)
+        * np.exp(-2j * np.pi * frequency * distance / LIGHT)
+    )
     np.testing.assert_allclose(csi[:, 0], expected, rtol=1e-9)
 
 
@@ -82,7 +99,10 @@ def test_moving_transmitter_sees_a_mirrored_array():
     distance = np.linalg.norm(tx[:, None, None] - mirrored, axis=-1)
     k = 2 * np.pi * 2.4e9 / LIGHT
     expected = (
-        (traced.images.gain * np.exp(-1j * k * distance) / distance).sum(-1) * LIGHT / 2.4e9 / (4 * np.pi)
+        (traced.images.gain * np.exp(-1j * k * distance) / distance).sum(-1)
+        * LIGHT
+        / 2.4e9
+        / (4 * np.pi)
     )
     np.testing.assert_allclose(traced.csi[:, :, 0], expected, rtol=1e-9)
 
@@ -100,5 +120,12 @@ def test_positions_outside_are_refused():
     with pytest.raises(ValueError, match="rx, row 1"):
         trace_room(ROOM, np.array([0.0, 1, 1]), np.array([[0.0, 1, 1.5], [9.0, 1, 1]]), 2.4e9)
     room = Room(ROOM.lower, ROOM.upper, ROOM.reflection, PILLAR)
-    refused("inside an occluder", trace_room, room, np.array([1.2, 1.8, 1]), np.array([0.0, 1, 1.5]), 2.4e9)
+    refused(
+        "inside an occluder",
+        trace_room,
+        room,
+        np.array([1.2, 1.8, 1]),
+        np.array([0.0, 1, 1.5]),
+        2.4e9,
+    )
     refused("upper", Room, ROOM.upper, ROOM.lower, ROOM.reflection)

@@ -1,4 +1,6 @@
-"""The ray tracer for real; slow; skipped with its remedy where Sionna is not installed (`make sionna`)."""
+"""The ray tracer for real; slow; skipped with its remedy
+where Sionna is not installed (`make sionna`).
+"""
 
 import json
 from dataclasses import replace
@@ -29,12 +31,20 @@ pytestmark = pytest.mark.slow
 TOWN = Path(__file__).parents[2] / "examples" / "town.osm"
 TRANSMITTER = np.array([3.1, 6.2, 3.7])
 QUICK = Sampling(samples=20_000, batch=100)
-PLAIN = Effects(diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2)
+PLAIN = Effects(
+    diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2
+)
 CONFERENCE = SceneSettings(
-    name="conference_room", builder="conference_room", transmitter_m=tuple(TRANSMITTER),
-    area_m=((0.3, 0.3), (13.7, 9.7)), height_m=(1.1, 1.5), num_receivers=40,
-    carrier_hz=2.44e9, bandwidth_hz=80e6, subcarriers=8,
-)  # fmt: skip
+    name="conference_room",
+    builder="conference_room",
+    transmitter_m=tuple(TRANSMITTER),
+    area_m=((0.3, 0.3), (13.7, 9.7)),
+    height_m=(1.1, 1.5),
+    num_receivers=40,
+    carrier_hz=2.44e9,
+    bandwidth_hz=80e6,
+    subcarriers=8,
+)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -53,21 +63,33 @@ def room():
 @pytest.fixture(scope="module")
 def places():
     return draw_places(
-        60, np.array(CONFERENCE.area_m), CONFERENCE.height_m, stands_clear_of(conference_room()), seed=0
+        60,
+        np.array(CONFERENCE.area_m),
+        CONFERENCE.height_m,
+        stands_clear_of(conference_room()),
+        seed=0,
     )
 
 
 def test_one_thread_is_deterministic():
-    """Of several threads the faster one's candidate stays: a hundredth of receivers differed by rounding."""
+    """Of several threads the faster one's candidate stays:
+    a hundredth of receivers differed by rounding.
+    """
     where = draw_places(
-        800, np.array(CONFERENCE.area_m), CONFERENCE.height_m, stands_clear_of(conference_room()), seed=0
+        800,
+        np.array(CONFERENCE.area_m),
+        CONFERENCE.height_m,
+        stands_clear_of(conference_room()),
+        seed=0,
     )
     before = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
         few = Sampling(samples=1_000, batch=400)
         one, two = (
-            RayTracer(conference_room(), TRANSMITTER, 2.44e9, few).trace(where, replace(PLAIN, depth=3))
+            RayTracer(conference_room(), TRANSMITTER, 2.44e9, few).trace(
+                where, replace(PLAIN, depth=3)
+            )
             for _ in range(2)
         )
     finally:
@@ -77,11 +99,15 @@ def test_one_thread_is_deterministic():
 
 
 def test_line_of_sight_is_friis(room, places):
-    paths = room.trace(places, Effects(**{**vars(PLAIN), "specular": False, "refraction": False, "depth": 0}))
+    paths = room.trace(
+        places, Effects(**{**vars(PLAIN), "specular": False, "refraction": False, "depth": 0})
+    )
     seen = np.diff(paths.offsets)
     assert set(seen) == {0, 1} and seen.mean() > 0.5
     distance = np.linalg.norm(places - TRANSMITTER, axis=1)[seen == 1]
-    np.testing.assert_allclose(np.sqrt(paths.power), room.wavelength / (4 * np.pi * distance), rtol=1e-3)
+    np.testing.assert_allclose(
+        np.sqrt(paths.power), room.wavelength / (4 * np.pi * distance), rtol=1e-3
+    )
     np.testing.assert_allclose(paths.delay, distance / 299_792_458.0, rtol=1e-5)
     towards = (TRANSMITTER - places)[seen == 1] / distance[:, None]
     np.testing.assert_allclose(paths.direction, towards, atol=1e-4)
@@ -106,21 +132,31 @@ def test_channels_are_the_solver_s(room, places):
     import sionna.rt as rt
 
     found = rt.PathSolver()(
-        room.scene, max_depth=2, samples_per_src=QUICK.samples, max_num_paths_per_src=120_000,
-        diffuse_reflection=False, seed=QUICK.seed,
-    )  # fmt: skip
+        room.scene,
+        max_depth=2,
+        samples_per_src=QUICK.samples,
+        max_num_paths_per_src=120_000,
+        diffuse_reflection=False,
+        seed=QUICK.seed,
+    )
     real, imaginary = found.cfr(frequencies=mi.Float(tones - tones.mean()), normalize_delays=False)
-    theirs = (real.numpy() + 1j * imaginary.numpy()).reshape(-1, len(tones))[:6]  # the call was filled up
+    # The call was filled up
+    theirs = (real.numpy() + 1j * imaginary.numpy()).reshape(-1, len(tones))[:6]
     # float32 phases of the solver
     np.testing.assert_allclose(ours, theirs, atol=2e-2 * np.abs(theirs).max())
 
 
 def test_attribution_equals_a_run_without(room, places):
-    """What remains of a full run under fewer effects is what a run with fewer effects finds, in power."""
+    """What remains of a full run under fewer effects is what a run with fewer effects finds,
+    in power.
+    """
     full = replace(PLAIN, depth=3)
     whole = room.trace(places, full)
     for less in (replace(full, depth=1), full.switch_off("refraction")):
-        kept, alone = whole.keep_effects(less).received_power(), room.trace(places, less).received_power()
+        kept, alone = (
+            whole.keep_effects(less).received_power(),
+            room.trace(places, less).received_power(),
+        )
         strong = alone > 0.01 * alone.max()
         assert np.median(np.abs(10 * np.log10(kept[strong] / alone[strong]))) < 0.1
     assert set(np.unique(whole.mechanisms)) <= {0, BITS["specular"], BITS["refraction"], 5}
@@ -141,8 +177,9 @@ def test_cut_off_paths_are_traced_again(places, monkeypatch):
 
 
 def test_chains_share_no_hash(places):
-    """All chains of a call share a hash table: with edges on, a tenth of the paths was lost, and single
-    reflections, which every seed finds, differed by 2e-3 for 60 receivers and 3e-2 for 100."""
+    """All chains of a call share a hash table: with edges on, a tenth of the paths was lost, and
+    single reflections, which every seed finds, differed by 2e-3 for 60 receivers and 3e-2 for 100.
+    """
     room = RayTracer(conference_room(), TRANSMITTER, 2.44e9, Sampling(samples=100_000, batch=100))
     full = Effects(diffuse=False, polarisation=False, depth=3)
     first, second = (
@@ -162,8 +199,8 @@ def test_calls_have_one_of_few_sizes():
 
 
 def test_other_places_compile_nothing(places):
-    """Each receiver's coordinates were constants of a kernel of its own, a fifth of the time of tracing, and
-    so were the number of receivers of a call and that of rays."""
+    """Each receiver's coordinates were constants of a kernel of its own, a fifth of the time of
+    tracing, and so were the number of receivers of a call and that of rays."""
     import drjit as dr
 
     room = RayTracer(conference_room(), TRANSMITTER, 2.44e9, QUICK)
@@ -175,7 +212,8 @@ def test_other_places_compile_nothing(places):
         room.with_samples(1777).trace(places[:50], PLAIN)
         anew = [kernel for kernel in dr.kernel_history() if not kernel.get("cache_hit", True)]
     assert len(compiled) < 10  # of what follows the number of paths
-    assert all(kernel["operation_count"] < 1000 for kernel in anew if kernel["size"] == 1777)  # of rays
+    # Of rays
+    assert all(kernel["operation_count"] < 1000 for kernel in anew if kernel["size"] == 1777)
 
 
 def test_polarisation_edges_and_scattering_are_recorded(room, places):
@@ -193,7 +231,11 @@ def test_shipped_scene_needs_only_its_name():
     engine, places = survey.engine, survey.places
     assert all(m["scattering"] > 0 for m in engine.materials().values())
     height, ground = engine.highest_surface(places[:, :2])
-    assert ground.all() and (places[:, 2] - height < 1.81).all() and (places[:, 2] - height > 1.19).all()
+    assert (
+        ground.all()
+        and (places[:, 2] - height < 1.81).all()
+        and (places[:, 2] - height > 1.19).all()
+    )
     assert np.ptp(places[:, :2], axis=0).max() <= 400 and survey.transmitters[0, 2] >= 10
     above = build_survey(replace(city, over="roofs"), QUICK)
     assert not above.engine.highest_surface(above.places[:, :2])[1].all()
@@ -207,15 +249,24 @@ def test_town_with_sectors_in_degrees(tmp_path):
     pytest.importorskip("osmnx", reason="osmnx is not installed: make sionna")
     masts = [{"name": "m", "position_m": [0, 11], "height_m": 20, "sectors": 3, "downtilt_deg": 10}]
     town = SceneSettings(
-        name="town", file=str(TOWN), transmitters=masts, over="ground", open_sky=True, num_receivers=0,
-        receivers={"kind": "streets", "spacing_m": 12}, carrier_hz=3.5e9, bandwidth_hz=100e6, subcarriers=2,
-    )  # fmt: skip
+        name="town",
+        file=str(TOWN),
+        transmitters=masts,
+        over="ground",
+        open_sky=True,
+        num_receivers=0,
+        receivers={"kind": "streets", "spacing_m": 12},
+        carrier_hz=3.5e9,
+        bandwidth_hz=100e6,
+        subcarriers=2,
+    )
     plan = CampaignSettings(
         town, PLAIN, sampling=QUICK, check=0, spectrum=SpectrumSettings(height=18, width=36)
     )
     outcome = simulate(plan, tmp_path / "town.h5")
     power, places = outcome.rows.arrays["received_power"].reshape(3, -1), outcome.survey.places
-    east = (places[:, 0] > 30) & (np.abs(places[:, 1] - 11) < 5)  # on High Street, where the first looks
+    # On High Street, where the first looks
+    east = (places[:, 0] > 30) & (np.abs(places[:, 1] - 11) < 5)
     assert east.sum() >= 3 and (power[0, east] > 3 * power[1:, east].max(0)).all()
     read = load({"name": "sionna", "file": str(tmp_path / "town.h5"), "target": "csi"})
     assert read.site.stations.name == ("m-1", "m-2", "m-3") and len(read) == 3 * len(places)
@@ -227,8 +278,14 @@ def test_town_with_sectors_in_degrees(tmp_path):
 def test_scene_file_of_the_user(tmp_path):
     import sionna.rt as rt
 
-    own = replace(CONFERENCE, builder=None, xml=str(rt.scene.floor_wall), area_m=((-3, -3), (3, 3)),
-                  transmitter_m=(-2.0, 0.0, 3.0), num_receivers=20)  # fmt: skip
+    own = replace(
+        CONFERENCE,
+        builder=None,
+        xml=str(rt.scene.floor_wall),
+        area_m=((-3, -3), (3, 3)),
+        transmitter_m=(-2.0, 0.0, 3.0),
+        num_receivers=20,
+    )
     survey = build_survey(own, QUICK)
     engine, receivers = survey.engine, survey.places
     assert engine.trace(receivers, PLAIN).received_power().min() > 0
@@ -246,7 +303,12 @@ def test_auto_in_the_conference_room(tmp_path):
     assert outcome.convergence is not None and 0 < outcome.convergence.nmse < 0.5
     with h5py.File(tmp_path / "room.h5") as file:
         table = json.loads(file.attrs["auto"])["table"]
-        assert {row["effect"] for row in table} >= {"diffuse", "refraction", "depth > 1", "polarisation"}
+        assert {row["effect"] for row in table} >= {
+            "diffuse",
+            "refraction",
+            "depth > 1",
+            "polarisation",
+        }
         assert all(row["failures"] >= 0 for row in table)
         assert "itu-glass" in json.loads(file.attrs["materials"])
     spectra = load({"name": "sionna", "file": str(tmp_path / "room.h5")})

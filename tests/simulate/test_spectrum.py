@@ -15,8 +15,14 @@ def arriving(directions, powers, delays=None):
     unit = np.array(directions, float)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     delays = np.arange(count) * 1e-8 if delays is None else np.array(delays)
-    return TracedPaths(np.array([0, count]), np.sqrt(np.array(powers))[:, None].astype(np.complex64), delays,
-                 unit.astype(np.float32), np.zeros(count, np.uint8), np.zeros(count, np.uint8))  # fmt: skip
+    return TracedPaths(
+        np.array([0, count]),
+        np.sqrt(np.array(powers))[:, None].astype(np.complex64),
+        delays,
+        unit.astype(np.float32),
+        np.zeros(count, np.uint8),
+        np.zeros(count, np.uint8),
+    )
 
 
 def random_waves(count=9, seed=0):
@@ -63,8 +69,14 @@ def test_silence_is_black():
 
 def test_both_polarisations_add_their_powers():
     waves = random_waves(seed=2)
-    doubled = TracedPaths(waves.offsets, np.repeat(waves.gain, 2, axis=1), waves.delay, waves.direction,
-                    waves.mechanisms, waves.order)  # fmt: skip
+    doubled = TracedPaths(
+        waves.offsets,
+        np.repeat(waves.gain, 2, axis=1),
+        waves.delay,
+        waves.direction,
+        waves.mechanisms,
+        waves.order,
+    )
     (one, low), (two, high) = (
         render_spectra(w, SpectrumSettings(), TONES, WAVELENGTH) for w in (waves, doubled)
     )
@@ -72,7 +84,9 @@ def test_both_polarisations_add_their_powers():
     assert high[0] == pytest.approx(2**0.5 * low[0], rel=1e-5)
 
 
-@pytest.mark.parametrize("settings, words", [({"rows": 0}, "at least 1"), ({"spacing": 0}, "above 0")])
+@pytest.mark.parametrize(
+    "settings, words", [({"rows": 0}, "at least 1"), ({"spacing": 0}, "above 0")]
+)
 def test_bad_settings_are_refused(settings, words):
     with pytest.raises(ValueError, match=words):
         SpectrumSettings(**settings)

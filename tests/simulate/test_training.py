@@ -1,4 +1,6 @@
-"""`dataset=sionna` through the same door as every other: training, baselines, evaluation, a stored model."""
+"""`dataset=sionna` through the same door as every other: training, baselines, evaluation,
+a stored model.
+"""
 
 import json
 from dataclasses import replace
@@ -16,7 +18,9 @@ from gsparc.datasets.sionna import with_true_targets
 from gsparc.simulate.campaign import simulate
 
 BOX = small_campaign(70)
-SEARCH = [f"model.search.{setting}" for setting in ("sources=9", "rows=30", "candidates=1000", "steps=5")]
+SEARCH = [
+    f"model.search.{setting}" for setting in ("sources=9", "rows=30", "candidates=1000", "steps=5")
+]
 ROAD = {"spectrum": ["experiment=sionna", *SEARCH], "csi": ["dataset=sionna", "model=complex_gp"]}
 
 
@@ -31,7 +35,8 @@ def box(tmp_path_factory):
 def test_fewer_effects_are_tested_on_the_full_simulation(kind, box, tmp_path):
     simulate(replace(BOX, effects=replace(BOX.effects, depth=0)), tmp_path / "los.h5")
     alone, whole = (
-        load({"name": "sionna", "file": str(path), "target": kind}) for path in (tmp_path / "los.h5", box)
+        load({"name": "sionna", "file": str(path), "target": kind})
+        for path in (tmp_path / "los.h5", box)
     )
     config = {"name": "sionna", "file": str(tmp_path / "los.h5"), "target": kind, "truth": str(box)}
     data = load(config)
@@ -65,7 +70,13 @@ def test_outages_are_the_truth_s(box):
 
 @pytest.mark.parametrize("kind", ROAD)
 def test_simulated_dataset_is_trained_like_any_other(kind, box, tmp_path):
-    settings = [*ROAD[kind], f"dataset.file={box}", f"dataset.target={kind}", "threads=1", "logger=none"]
+    settings = [
+        *ROAD[kind],
+        f"dataset.file={box}",
+        f"dataset.target={kind}",
+        "threads=1",
+        "logger=none",
+    ]
     facts, objects = train(compose(*settings), tmp_path / "run")
     stored = json.loads((tmp_path / "run" / "summary.json").read_text())
     for name in ("zero", "mean", "nearest", "idw", "gp"):

@@ -1,4 +1,6 @@
-"""Every setting that a message of `gsparc check` proposes is one, and does what the message says it does."""
+"""Every setting that a message of `gsparc check` proposes is one,
+and does what the message says it does.
+"""
 
 import re
 import shlex
@@ -21,7 +23,9 @@ GIVEN = [*REAL.glob("strangers/*.*"), *REAL.glob("strangers2/*.*")]
 
 
 def proposals(found: str) -> list[tuple[str, list[list[str]]]]:
-    """Messages that propose settings, and the settings: alternatives, each of one or several words."""
+    """Messages that propose settings, and the settings: alternatives,
+    each of one or several words.
+    """
     result = []
     for line in found.splitlines():
         words = [shlex.split(one)[0] for one in SETTING.findall(line)]
@@ -29,7 +33,8 @@ def proposals(found: str) -> list[tuple[str, list[list[str]]]]:
         together = bool(re.search(r"dataset\.\S+ '?dataset\.", line))
         ways = [closed] if together else [[word] for word in closed]
         keys = {word.partition("=")[0] for word in words}
-        assert all(read_settings([f"{key}=null"]) for key in keys), line  # raises where there is no such one
+        # Raises where there is no such one
+        assert all(read_settings([f"{key}=null"]) for key in keys), line
         result += [(line, [way for way in ways if way])] if words else []
     return result
 
@@ -41,7 +46,9 @@ def assert_advice_works(path, settings: dict) -> int:
         for way in ways:
             own = {k: v for k, v in read_settings(way).items() if k not in UNUSED and v is not None}
             own["columns"] = {**own["columns"], **settings.get("columns", {})}
-            own["columns"] = {name: head for name, head in own["columns"].items() if head is not None}
+            own["columns"] = {
+                name: head for name, head in own["columns"].items() if head is not None
+            }
             after = said(path, **{**settings, **own})
             assert "no such" not in after and line not in after, (way, line, after)
             refused = "refuses them" in line or "refused, " in before
@@ -60,7 +67,9 @@ def test_advice_to_a_stranger_works(write, name):
 def effect(name: str) -> pd.DataFrame:
     place, level, columns = truths(1, name)
     head = {"power": "tx_power"}.get(name, name)
-    return pd.DataFrame({"x": place[:, 0], "y": place[:, 1], "rssi_dbm": level, head: columns[name]})
+    return pd.DataFrame(
+        {"x": place[:, 0], "y": place[:, 1], "rssi_dbm": level, head: columns[name]}
+    )
 
 
 def filled() -> pd.DataFrame:

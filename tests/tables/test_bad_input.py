@@ -1,5 +1,4 @@
 """Everything a disk can hand us: refused in one clear line that names file, row and expectation."""
-# ruff: noqa: E501 (a case is a row of a table)
 
 import io
 import json
@@ -37,7 +36,9 @@ def test_all_problems_of_a_folder_are_listed_at_once(rfid_folder):
 def test_a_header_with_an_open_bracket_ended_in_a_traceback(tmp_path, refused):
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (3,".ljust(117) + b"\n"
     with zipfile.ZipFile(tmp_path / "own.npz", "w") as archive:
-        archive.writestr("rssi_db.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+        archive.writestr(
+            "rssi_db.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+        )
     refused("own.npz, rssi_db: damaged or not an npz file", load_own, tmp_path / "own.npz")
 
 
@@ -74,40 +75,83 @@ def _together(*spoils):
 
 
 CSI = {
-    "no measurement": (_without("csi"), "expected exactly one of spectrum, csi, rssi, rssi_db; found none"),
+    "no measurement": (
+        _without("csi"),
+        "expected exactly one of spectrum, csi, rssi, rssi_db; found none",
+    ),
     "two measurements": (_set("rssi", np.ones(12)), "found csi and rssi"),
     "no transmitter": (_without("tx_position"), r"tx_position: missing"),
-    "no frequency": (_without("frequency_hz"), "frequency_hz: missing; csi needs the 3 frequencies"),
+    "no frequency": (
+        _without("frequency_hz"),
+        "frequency_hz: missing; csi needs the 3 frequencies",
+    ),
     "misspelt": (_without("tx_position", "tx_positon"), "unknown name; did you mean 'tx_position'"),
-    "real csi": (_set("csi", -np.ones((12, 5, 3))), "csi: expected complex numbers, found dtype float64"),
+    "real csi": (
+        _set("csi", -np.ones((12, 5, 3))),
+        "csi: expected complex numbers, found dtype float64",
+    ),
     "csi nan": (_entry("csi", (5, 1, 1), np.nan), "csi, row 5: not finite"),
     "csi silent": (_set("csi", np.zeros((12, 2, 3), complex)), "every measured value is zero"),
-    "one sample": (_together(_set("csi", np.ones((1, 2, 3), complex)),
-                             _set("rx_position", np.ones((1, 3)))), "two rows or more"),
+    "one sample": (
+        _together(_set("csi", np.ones((1, 2, 3), complex)), _set("rx_position", np.ones((1, 3)))),
+        "two rows or more",
+    ),
     "transposed": (_set("rx_position", np.ones((3, 12))), r"found \(3, 12\); transposed"),
-    "quaternions transposed": (_set("rx_orientation", np.ones((4, 12))), r"found \(4, 12\); transposed"),
-    "two coordinates": (_set("rx_position", np.ones((12, 2))), "rx_position: two coordinates.* rx_height"),
-    "positions nan": (_entry("rx_position", slice(3, 6), np.nan), "rx_position, row 5 = .*three finite coord"),
+    "quaternions transposed": (
+        _set("rx_orientation", np.ones((4, 12))),
+        r"found \(4, 12\); transposed",
+    ),
+    "two coordinates": (
+        _set("rx_position", np.ones((12, 2))),
+        "rx_position: two coordinates.* rx_height",
+    ),
+    "positions nan": (
+        _entry("rx_position", slice(3, 6), np.nan),
+        "rx_position, row 5 = .*three finite coord",
+    ),
     "nothing moves": (_set("rx_position", np.ones(3)), "neither end moves"),
     "GHz": (_set("frequency_hz", np.array([2.40, 2.41, 2.42])), r"expected Hz \(not MHz or GHz\)"),
-    "frequency twice": (_set("frequency_hz", np.array([2.4e9, 2.4e9, 2.42e9])), "same frequency twice"),
-    "one frequency for three": (_set("frequency_hz", np.array(2.4e9)), "one frequency, but csi has 3 columns"),
-    "antenna nan": (_entry("array_position", (0, 0), np.nan), "antenna 0 = .*three finite coordinates"),
+    "frequency twice": (
+        _set("frequency_hz", np.array([2.4e9, 2.4e9, 2.42e9])),
+        "same frequency twice",
+    ),
+    "one frequency for three": (
+        _set("frequency_hz", np.array(2.4e9)),
+        "one frequency, but csi has 3 columns",
+    ),
+    "antenna nan": (
+        _entry("array_position", (0, 0), np.nan),
+        "antenna 0 = .*three finite coordinates",
+    ),
     "two orientations": (_set("rx_rotation", np.eye(3)), "both given; expected one"),
-    "a mirror": (_together(_without("rx_orientation"), _set("rx_rotation", np.diag([1.0, 1, -1]))),
-                 "determinant [+]1"),
+    "a mirror": (
+        _together(_without("rx_orientation"), _set("rx_rotation", np.diag([1.0, 1, -1]))),
+        "determinant [+]1",
+    ),
     "mask of numbers": (_set("mask", np.full((12, 2, 3), 2)), "mask: expected True and False"),
-    "position error nan": (_set("position_std", np.array([0.1] * 11 + [np.nan])), "position_std, row 11: expected a"),
-    "paths without offsets": (_set("path_gain", np.ones(4, complex)), "path_offsets: missing, but path_gain"),
+    "position error nan": (
+        _set("position_std", np.array([0.1] * 11 + [np.nan])),
+        "position_std, row 11: expected a",
+    ),
+    "paths without offsets": (
+        _set("path_gain", np.ones(4, complex)),
+        "path_offsets: missing, but path_gain",
+    ),
     "offsets fall": (_set("path_offsets", np.array([0, 2, 1] + [4] * 10)), "never decrease"),
-    "offsets too short": (_together(_set("path_offsets", np.arange(13)), _set("path_direction", np.ones((11, 3)))),
-                          "expected 12 paths as path_offsets says, found"),
-    "zero direction": (_together(_set("path_offsets", np.arange(13)), _set("path_direction", np.zeros((12, 3)))),
-                       "path 0: expected a direction that is not zero"),
+    "offsets too short": (
+        _together(_set("path_offsets", np.arange(13)), _set("path_direction", np.ones((11, 3)))),
+        "expected 12 paths as path_offsets says, found",
+    ),
+    "zero direction": (
+        _together(_set("path_offsets", np.arange(13)), _set("path_direction", np.zeros((12, 3)))),
+        "path 0: expected a direction that is not zero",
+    ),
     "split alone": (_set("split_train", np.arange(4)), "split_train is given alone"),
-    "split twice": (_together(_set("split_train", np.array([1, 1])), _set("split_test", np.array([3]))),
-                    "split_train, row 1: named twice"),
-}  # fmt: skip
+    "split twice": (
+        _together(_set("split_train", np.array([1, 1])), _set("split_test", np.array([3]))),
+        "split_train, row 1: named twice",
+    ),
+}
 
 
 @pytest.mark.parametrize("case", CSI)
@@ -117,10 +161,19 @@ def test_own_csi(csi_arrays, refused, case):
 
 
 SPECTRUM = {
-    "negative power": (_entry("spectrum", (3, 0, 0), -0.1), r"spectrum, row 3: out of range.*is it in dB"),
-    "16 bit": (_set("spectrum", np.ones((10, 9, 36), np.uint16)), "expected uint8 or floating point"),
+    "negative power": (
+        _entry("spectrum", (3, 0, 0), -0.1),
+        r"spectrum, row 3: out of range.*is it in dB",
+    ),
+    "16 bit": (
+        _set("spectrum", np.ones((10, 9, 36), np.uint16)),
+        "expected uint8 or floating point",
+    ),
     "flat": (_set("spectrum", np.ones((10, 324))), "spectrum: expected shape"),
-    "grid past the zenith": (_set("grid_deg", np.array([20.0, 0, 10, 10])), "elevations run from 20 to 100"),
+    "grid past the zenith": (
+        _set("grid_deg", np.array([20.0, 0, 10, 10])),
+        "elevations run from 20 to 100",
+    ),
     "grid past the circle": (_set("grid_deg", np.array([0.0, 0, 10, 11])), "exceed the circle"),
     "grid backwards": (_set("grid_deg", np.array([0.0, 0, -10, 10])), "steps positive"),
     "grid of two": (_set("grid_deg", np.array([0.0, 0])), "grid_deg: expected shape"),
@@ -137,21 +190,30 @@ def test_own_spectrum(spectrum_arrays, refused, case):
     refused(says, from_arrays, spoil(spectrum_arrays))
 
 
-@pytest.mark.parametrize(("attributes", "says"), [
-    ({"normalisation": "maximum"}, "expected one of max, minmax"),
-    ({"convergence_error": -1.0}, "at least 0"),
-    ({"convergence_error": "low"}, "finite number"),
-    ({"measurement": "spectra"}, "'spectra' names no measurement of this file, which holds spectrum"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("attributes", "says"),
+    [
+        ({"normalisation": "maximum"}, "expected one of max, minmax"),
+        ({"convergence_error": -1.0}, "at least 0"),
+        ({"convergence_error": "low"}, "finite number"),
+        (
+            {"measurement": "spectra"},
+            "'spectra' names no measurement of this file, which holds spectrum",
+        ),
+    ],
+)
 def test_attributes(spectrum_arrays, refused, attributes, says):
     refused(says, from_arrays, spectrum_arrays, attributes)
 
 
-@pytest.mark.parametrize(("powers", "says"), [
-    ({"rssi_db": [-50, -60, 4000, -70.0]}, "row 2: out of range; expected dB"),
-    ({"rssi": [-50, -60, -70, -70.0]}, "linear power"),
-    ({"rssi_db": [-50, -60, -40, -70.0], "noise_variance": 1.0}, "cannot go with rssi_db"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("powers", "says"),
+    [
+        ({"rssi_db": [-50, -60, 4000, -70.0]}, "row 2: out of range; expected dB"),
+        ({"rssi": [-50, -60, -70, -70.0]}, "linear power"),
+        ({"rssi_db": [-50, -60, -40, -70.0], "noise_variance": 1.0}, "cannot go with rssi_db"),
+    ],
+)
 def test_powers_beyond_reason(refused, powers, says):
     rows = {"rx_position": np.arange(12.0).reshape(4, 3), "tx_position": np.zeros(3)}
     refused(says, from_arrays, rows | {name: np.array(value) for name, value in powers.items()})
@@ -199,7 +261,12 @@ def test_files_that_are_no_files(tmp_path, csi_arrays, refused, name):
 
 
 def test_a_name_that_cannot_be_written_is_said_with_those_that_can(tmp_path, csi_arrays, refused):
-    refused(r"cannot be written as '\.mat'; name it \*\.npz, ", write_own, tmp_path / "mine.mat", csi_arrays)
+    refused(
+        r"cannot be written as '\.mat'; name it \*\.npz, ",
+        write_own,
+        tmp_path / "mine.mat",
+        csi_arrays,
+    )
 
 
 def test_a_file_that_cannot_be_opened_is_a_line(tmp_path, csi_arrays, refused, monkeypatch):
@@ -224,8 +291,12 @@ def test_hdf5_name_that_is_no_text_is_refused_or_ignored(tmp_path, csi_arrays):
 
 @pytest.mark.parametrize("name", ["tx_pos", "rx_pos", "csi", "frequency_hz"])
 def test_newrf_without(tmp_path, csi_arrays, refused, name):
-    arrays = {"tx_pos": np.zeros(3), "rx_pos": csi_arrays["rx_position"], "csi": csi_arrays["csi"][:, 0, 0],
-              "frequency_hz": np.array(2.4e9)}  # fmt: skip
+    arrays = {
+        "tx_pos": np.zeros(3),
+        "rx_pos": csi_arrays["rx_position"],
+        "csi": csi_arrays["csi"][:, 0, 0],
+        "frequency_hz": np.array(2.4e9),
+    }
     (tmp_path / "room.npz").write_bytes(_archive(arrays))
     assert len(load({"name": "newrf", "file": str(tmp_path / "room.npz")})) == 12
     del arrays[name]
@@ -233,18 +304,21 @@ def test_newrf_without(tmp_path, csi_arrays, refused, name):
     refused(rf"room\.npz, {name}: missing", read_newrf, tmp_path / "room.npz")
 
 
-@pytest.mark.parametrize("text,says", [
-    ("[" * 50_000, "brackets within brackets, too many"),
-    ('{"name": ' + "[" * 50_000, "brackets within brackets, too many"),
-    ('{"a": ' + "1" * 5000 + "}", r"Exceeds the limit .* value has 5000 digits\)$"),
-    ("[1]", "expected a JSON table as text .found a list"),
-    ("{", "expected a JSON table"),
-    ('{"units": {"frequency_hz": "GHz"}}', "frequency_hz: units are 'GHz'; expected 'Hz'"),
-    ('{"units": [1]}', "units is no table"),
-    ('{"name": [1]}', "name: a list; expected text"),
-    ('{"stand_in": 5}', "stand_in: a int; expected text"),
-    ('{"convergence_error": true}', "convergence_error: True; expected a finite number"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "text,says",
+    [
+        ("[" * 50_000, "brackets within brackets, too many"),
+        ('{"name": ' + "[" * 50_000, "brackets within brackets, too many"),
+        ('{"a": ' + "1" * 5000 + "}", r"Exceeds the limit .* value has 5000 digits\)$"),
+        ("[1]", "expected a JSON table as text .found a list"),
+        ("{", "expected a JSON table"),
+        ('{"units": {"frequency_hz": "GHz"}}', "frequency_hz: units are 'GHz'; expected 'Hz'"),
+        ('{"units": [1]}', "units is no table"),
+        ('{"name": [1]}', "name: a list; expected text"),
+        ('{"stand_in": 5}', "stand_in: a int; expected text"),
+        ('{"convergence_error": true}', "convergence_error: True; expected a finite number"),
+    ],
+)
 def test_attributes_that_are_none(tmp_path, csi_arrays, refused, text, says):
     """Brackets ended `gsparc check` in a traceback; lists and truth values passed."""
     np.savez(tmp_path / "own.npz", attributes=np.array(text), **csi_arrays)
@@ -259,7 +333,9 @@ def test_attributes_that_are_none(tmp_path, csi_arrays, refused, text, says):
     + [(np.complex64, unit) for unit in (1e-42, 1e-38, 1e38)],
 )
 def test_channels_in_units_at_the_edge_of_numbers(csi_arrays, dtype, unit):
-    """Units of 1e-310 were refused row by row; dividing in complex64 by 1e-42 gave NaN or a digit or two."""
+    """Units of 1e-310 were refused row by row;
+    dividing in complex64 by 1e-42 gave NaN or a digit or two.
+    """
     plain = from_arrays(csi_arrays)
     tiny = from_arrays({**csi_arrays, "csi": (csi_arrays["csi"] * unit).astype(dtype)})
     tolerance = 2e-3 if unit == 1e-42 else 1e-5
@@ -274,19 +350,28 @@ def test_a_channel_beyond_float32_is_refused_without_a_warning_before(csi_arrays
     assert np.isfinite(from_arrays({**csi_arrays, "csi": channels}).target).all()
     channels = csi_arrays["csi"].astype(np.complex128)
     channels[3, 0, 0] = value * (1 + 1j)
-    refused(r"csi, row 3: (beyond float32|not finite)", from_arrays, {**csi_arrays, "csi": channels})
+    refused(
+        r"csi, row 3: (beyond float32|not finite)", from_arrays, {**csi_arrays, "csi": channels}
+    )
 
 
 HOLLOW = {
-    "a.json": "[" + "{}," * 10**6 + "{}]", "b.json": "[{" + "[" * 2**21, "c.json": "{}\n" * 10**6,
-    "d.json": "<a>" * 10**6, "e.csv": "\n" * 2**21, "f.csv": "#\r\n" * 10**6, "g.csv": ",,\n" * 10**6,
+    "a.json": "[" + "{}," * 10**6 + "{}]",
+    "b.json": "[{" + "[" * 2**21,
+    "c.json": "{}\n" * 10**6,
+    "d.json": "<a>" * 10**6,
+    "e.csv": "\n" * 2**21,
+    "f.csv": "#\r\n" * 10**6,
+    "g.csv": ",,\n" * 10**6,
     "h.json": '{"a": [1, 2], "b": [' + "1," * 10**6 + "1]}",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", HOLLOW)
 def test_files_of_nothing_but_brackets_or_lines_took_minutes(tmp_path, name):
-    """60 MB of brackets took 27 s, blank lines of a gz file did not end: by a character's count now."""
+    """60 MB of brackets took 27 s, blank lines of a gz file did not end:
+    by a character's count now.
+    """
     (tmp_path / name).write_text(HOLLOW[name])
     began = time.process_time()
     with pytest.raises(DataError, match=r"nearly nothing but|more than 10,000 values") as refused:
@@ -295,7 +380,9 @@ def test_files_of_nothing_but_brackets_or_lines_took_minutes(tmp_path, name):
 
 
 def test_rows_of_records_keep_their_numbers_and_keys_stand_once(tmp_path, refused):
-    """A null between records moved all numbers by one; of two keys of one name the second counted."""
+    """A null between records moved all numbers by one;
+    of two keys of one name the second counted.
+    """
     rows = [{"x": i, "y": i % 7, "rssi": -50 - i} for i in range(30)]
     file = tmp_path / "a.json"
     file.write_text(json.dumps([*rows[:3], None, *rows[3:]]))

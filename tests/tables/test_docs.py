@@ -1,4 +1,6 @@
-"""docs/own-data.md is what a new user reads: its example runs; docs/reference/schema.md is the schema."""
+"""docs/own-data.md is what a new user reads: its example runs;
+docs/reference/schema.md is the schema.
+"""
 
 import re
 import runpy

@@ -15,10 +15,15 @@ def test_round_trip(tmp_path, csi_arrays, suffix):
     mask[3, 0] = False
     csi_arrays["csi"][3, 0] = np.nan
     arrays = {
-        **csi_arrays, "mask": mask, "noise_variance": np.float64(0.02),
-        "position_std": np.linspace(0, 0.1, 12), "row_name": np.array(["ä"] * 12),
-    }  # fmt: skip
-    written = write_own(path, arrays, {"name": "garage", "operator": "me", "convergence_error": 0.01})
+        **csi_arrays,
+        "mask": mask,
+        "noise_variance": np.float64(0.02),
+        "position_std": np.linspace(0, 0.1, 12),
+        "row_name": np.array(["ä"] * 12),
+    }
+    written = write_own(
+        path, arrays, {"name": "garage", "operator": "me", "convergence_error": 0.01}
+    )
     read = load_own(path)
     assert read.site.sha256 == written.site.sha256 and read.site.name == "garage"
     assert read.site.static_end == "tx" and read.target.shape == (12, 2, 3)
@@ -44,7 +49,9 @@ def test_a_subset_of_rows_without_names_was_an_index_error(csi_arrays):
 
 
 def test_the_same_content_has_the_same_hash_in_both_formats(tmp_path, spectrum_arrays):
-    hashes = {write_own(tmp_path / f"a{s}", spectrum_arrays).site.sha256 for s in (".npz", ".h5", ".hdf5")}
+    hashes = {
+        write_own(tmp_path / f"a{s}", spectrum_arrays).site.sha256 for s in (".npz", ".h5", ".hdf5")
+    }
     hashes |= {load_own(tmp_path / f"a{s}").site.sha256 for s in (".npz", ".h5", ".hdf5")}
     assert len(hashes) == 1
     spectrum_arrays["spectrum"][0, 0, 0] += 1e-3
@@ -54,8 +61,13 @@ def test_the_same_content_has_the_same_hash_in_both_formats(tmp_path, spectrum_a
 def test_spectra_are_brought_to_unit_scale(spectrum_arrays):
     assert from_arrays(spectrum_arrays).site.target_scale == 1
     tiny = from_arrays({**spectrum_arrays, "spectrum": spectrum_arrays["spectrum"] * 1e-9})
-    assert tiny.target.max() == 1 and tiny.site.target_scale == spectrum_arrays["spectrum"].max() * 1e-9
-    grey = from_arrays({**spectrum_arrays, "spectrum": (spectrum_arrays["spectrum"] * 255).astype(np.uint8)})
+    assert (
+        tiny.target.max() == 1
+        and tiny.site.target_scale == spectrum_arrays["spectrum"].max() * 1e-9
+    )
+    grey = from_arrays(
+        {**spectrum_arrays, "spectrum": (spectrum_arrays["spectrum"] * 255).astype(np.uint8)}
+    )
     assert grey.target.dtype == np.uint8 and grey.site.grid.width == 36 and grey.site.grid.periodic
 
 
@@ -78,14 +90,18 @@ def test_directions_from_last_points(csi_arrays):
     points = np.repeat(csi_arrays["rx_position"], 2, axis=0) + np.array([0.0, 0, 5.0])
     data = from_arrays({**csi_arrays, "path_offsets": offsets, "path_last_point": points})
     assert len(data.directions) == 12 and data.directions[0].shape == (2, 3)
-    np.testing.assert_allclose(np.concatenate(data.directions), np.tile([0, 0, 1], (24, 1)), atol=1e-6)
+    np.testing.assert_allclose(
+        np.concatenate(data.directions), np.tile([0, 0, 1], (24, 1)), atol=1e-6
+    )
     # Rolled by 90 degrees about x, the receiver's y axis is the world's z: up is along its y.
     rolled = {
         **csi_arrays,
         "rx_orientation": Rotation.from_euler("x", 90, degrees=True).as_quat(scalar_first=True),
     }
     data = from_arrays({**rolled, "path_offsets": offsets, "path_last_point": points})
-    np.testing.assert_allclose(np.concatenate(data.directions), np.tile([0, 1, 0], (24, 1)), atol=1e-6)
+    np.testing.assert_allclose(
+        np.concatenate(data.directions), np.tile([0, 1, 0], (24, 1)), atol=1e-6
+    )
 
 
 def test_a_refused_file_is_not_written(tmp_path, csi_arrays, refused):

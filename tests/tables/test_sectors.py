@@ -27,12 +27,38 @@ def drive_of(folder, count=4, moments=120):
         for m, c in zip(*np.nonzero(listed), strict=True)
     ]
     sites = [
-        [f"S{c // 3}", f"S{c // 3}_{c % 3}", c % 15, 1300 if c < 15 else 6300, *place.round(1), azimuth, 2,
-         tilt - 2, 65, 43, "N"]
-        for c, (place, azimuth, tilt) in enumerate(zip(one.place, one.azimuth, one.tilt, strict=True))
-    ]  # fmt: skip
-    heads = ["Site", "Cell Name", "PCI", "DL EARFCN", "x", "y", "Antenna Height [m]", "Azimuth", "M-Tilt",
-             "E-Tilt", "HBW", "Tx Power [dBm]", "Vendor"]  # fmt: skip
+        [
+            f"S{c // 3}",
+            f"S{c // 3}_{c % 3}",
+            c % 15,
+            1300 if c < 15 else 6300,
+            *place.round(1),
+            azimuth,
+            2,
+            tilt - 2,
+            65,
+            43,
+            "N",
+        ]
+        for c, (place, azimuth, tilt) in enumerate(
+            zip(one.place, one.azimuth, one.tilt, strict=True)
+        )
+    ]
+    heads = [
+        "Site",
+        "Cell Name",
+        "PCI",
+        "DL EARFCN",
+        "x",
+        "y",
+        "Antenna Height [m]",
+        "Azimuth",
+        "M-Tilt",
+        "E-Tilt",
+        "HBW",
+        "Tx Power [dBm]",
+        "Vendor",
+    ]
     drive = write(folder / "drive.csv", ["x", "y", "PCI", "EARFCN", "RSRP [dBm]"], rows)
     return one, drive, heads, sites
 
@@ -43,11 +69,14 @@ def test_a_list_of_sites_is_read_whole(tmp_path):
     reading = read_any(drive, stations_file=write(tmp_path / "sites.csv", heads, sites))
     stations = reading.data.site.stations
     number = [
-        int(pci) + 15 * (channel == "6300") for pci, channel in (name.split() for name in stations.name)
+        int(pci) + 15 * (channel == "6300")
+        for pci, channel in (name.split() for name in stations.name)
     ]
     np.testing.assert_allclose(stations.sector[:, 0], one.azimuth[number])
     np.testing.assert_allclose(stations.sector[:, 1], one.tilt[number])
-    np.testing.assert_allclose(stations.position + reading.data.site.origin, one.place[number], atol=0.06)
+    np.testing.assert_allclose(
+        stations.position + reading.data.site.origin, one.place[number], atol=0.06
+    )
     assert set(stations.carrier_hz) == {1815e6, 806e6} and set(stations.sector[:, 4]) == {43}
     assert stations.sector[:, 5].tolist() == [i // 3 for i in number]
     assert list(stations.label) == [f"S{i // 3}_{i % 3}" for i in number]
@@ -65,7 +94,12 @@ def test_a_cell_number_that_two_listed_stations_share_is_named(tmp_path, refused
     rows = [[*rng.uniform(0, 90, 2).round(1), 7 + i % 2, -70 - i % 9] for i in range(40)]
     drive = write(tmp_path / "drive.csv", ["x", "y", "PCI", "RSRP [dBm]"], rows)
     listed = write(tmp_path / "sites.csv", ["name", "PCI", "x", "y"], cells)
-    refused(r"PCI 7 names A, C of the list of stations; leave only", read_any, drive, stations_file=listed)
+    refused(
+        r"PCI 7 names A, C of the list of stations; leave only",
+        read_any,
+        drive,
+        stations_file=listed,
+    )
 
 
 def test_cells_that_a_list_lacks_are_counted(tmp_path):
@@ -75,7 +109,9 @@ def test_cells_that_a_list_lacks_are_counted(tmp_path):
     reading = read_any(
         drive, stations_file=write(tmp_path / "sites.csv", heads, sites[:lost] + sites[lost + 1 :])
     )
-    assert any(note.startswith("1 of ") and "not in the list, with" in note for note in reading.notes)
+    assert any(
+        note.startswith("1 of ") and "not in the list, with" in note for note in reading.notes
+    )
     assert np.isnan(reading.data.site.stations.position).any(axis=1).sum() == 1
 
 
@@ -83,8 +119,11 @@ def test_channels_and_bands():
     found = earfcn_hz(np.array([100.0, 1300, 6300, 38000, np.nan]))
     np.testing.assert_allclose(found[:4], [2120e6, 1815e6, 806e6, 2595e6])
     assert np.isnan(found[4])
-    np.testing.assert_allclose(band_hz(np.array([3.0, 20, 1800, 3500])), [1805e6, 791e6, 1800e6, 3500e6])
-    assert np.isnan(band_hz(np.array([3000.0, 20e3, 0.003]))).all()  # bands by the thousand were believed
+    np.testing.assert_allclose(
+        band_hz(np.array([3.0, 20, 1800, 3500])), [1805e6, 791e6, 1800e6, 3500e6]
+    )
+    # Bands by the thousand were believed
+    assert np.isnan(band_hz(np.array([3000.0, 20e3, 0.003]))).all()
 
 
 def test_channels_by_the_thousand_were_carriers_of_13_ghz():
@@ -98,8 +137,15 @@ def test_slots_of_neighbours_become_rows(tmp_path):
     one = network(0)
     order = np.argsort(-one.measured, 1)[:100, :3]
     heads = [
-        "x", "y", "Serving PCI", "Serving RSRP [dBm]", "N1 PCI", "N1 RSRP [dBm]", "N2 PCI", "N2 RSRP [dBm]",
-    ]  # fmt: skip
+        "x",
+        "y",
+        "Serving PCI",
+        "Serving RSRP [dBm]",
+        "N1 PCI",
+        "N1 RSRP [dBm]",
+        "N2 PCI",
+        "N2 RSRP [dBm]",
+    ]
     rows = [
         [*place[:2].round(2), *(v for c in cells for v in (c + 10, level[c].round(1)))]
         for place, cells, level in zip(one.moment, order, one.measured, strict=False)
@@ -108,7 +154,9 @@ def test_slots_of_neighbours_become_rows(tmp_path):
     reading = read_any(write(tmp_path / "drive.csv", heads, rows))
     data = reading.data
     assert set(data.site.stations.name) == {str(c + 10) for c in np.unique(order)} | set()
-    assert (data.censored == 0).sum() == 299 and "299 rows of 100 moments" in " ".join(reading.notes)
+    assert (data.censored == 0).sum() == 299 and ("299 rows of 100 moments") in " ".join(
+        reading.notes
+    )
 
 
 @pytest.mark.parametrize("form", ["{}", "PCI {}", "{}_RSRP", "RSRP {} [dBm]"])
@@ -117,21 +165,31 @@ def test_heads_that_hold_a_number_of_the_list_name_its_cells(tmp_path, form):
     one, _, heads, sites = drive_of(tmp_path)
     count, moments = 15, slice(60)
     rows = np.hstack([one.moment[moments, :2].round(2), one.measured[moments, :count].round(1)])
-    drive = write(tmp_path / "wide.csv", ["x", "y", *(form.format(100 + c) for c in range(count))], rows)
+    drive = write(
+        tmp_path / "wide.csv", ["x", "y", *(form.format(100 + c) for c in range(count))], rows
+    )
     listed = write(tmp_path / "s.csv", heads, [[*s[:2], 100 + s[2], *s[3:]] for s in sites[:count]])
     stations = read_any(drive, stations_file=listed).data.site.stations
-    assert stations.name == tuple(str(100 + c) for c in range(count)) and stations.label[4] == "S1_1"
+    assert (
+        stations.name == tuple(str(100 + c) for c in range(count)) and stations.label[4] == "S1_1"
+    )
     wrong = write(tmp_path / "w.csv", ["x", "y", *(f"AP{c}" for c in range(count))], rows)
     with pytest.raises(DataError) as refused:
         read_any(wrong, stations_file=listed)
-    assert len(refused.value.problems) == 1 and "'AP4' and 10 more are no listed" in str(refused.value)
+    assert len(refused.value.problems) == 1 and ("'AP4' and 10 more are no listed") in str(
+        refused.value
+    )
 
 
 def test_levels_without_the_suffix_of_the_others_are_named(tmp_path):
     """Of a release the fixed stations, without _rss, were `and 27 more` of what is not used."""
     one = network(0)
-    rows = np.hstack([one.moment[:60, :2].round(2), one.measured[:60, :5].round(1), np.full((60, 1), -1)])
-    drive = write(tmp_path / "a.csv", ["x", "y", "a_rss", "b_rss", "c", "d", "noise", "z_rate"], rows)
+    rows = np.hstack(
+        [one.moment[:60, :2].round(2), one.measured[:60, :5].round(1), np.full((60, 1), -1)]
+    )
+    drive = write(
+        tmp_path / "a.csv", ["x", "y", "a_rss", "b_rss", "c", "d", "noise", "z_rate"], rows
+    )
     notes = [note for note in read_any(drive).notes if isinstance(note, Caution)]
     said = "columns 'c' and 'd' hold values like these levels and are not used: of stations, too?"
     assert any(note.startswith(said) for note in notes), notes
@@ -181,17 +239,21 @@ def read_list(folder, **columns):
     _, drive, heads, sites = drive_of(folder)
     names = [*heads[:6], *columns]
     rows = [
-        [*row[:6], *(values[i % len(values)] for values in columns.values())] for i, row in enumerate(sites)
+        [*row[:6], *(values[i % len(values)] for values in columns.values())]
+        for i, row in enumerate(sites)
     ]
     reading = read_any(drive, stations_file=write(folder / "sites.csv", names, rows))
     return reading.data.site, " ".join(reading.notes)
 
 
-@pytest.mark.parametrize(("head", "values", "says"), [
-    ("Power", [20000], r"name its unit, as in 'Power \[W\]', where W or mW"),
-    ("EIRP", [2000], r"name its unit, as in 'EIRP \[W\]'"),
-    ("Azimuth", [0, 0.9, 0.6], r"'Azimuth \[rad\]'"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("head", "values", "says"),
+    [
+        ("Power", [20000], r"name its unit, as in 'Power \[W\]', where W or mW"),
+        ("EIRP", [2000], r"name its unit, as in 'EIRP \[W\]'"),
+        ("Azimuth", [0, 0.9, 0.6], r"'Azimuth \[rad\]'"),
+    ],
+)
 def test_the_unit_that_fits_is_named(tmp_path, head, values, says, refused):
     refused(says, read_list, tmp_path, **{head: values})
 
@@ -213,7 +275,9 @@ def test_frequencies_in_kilohertz_and_channels_of_nr(tmp_path):
 
 
 def change(folder, head, values, every=True):
-    """All cautions of a list in which the cells of a column are values, or only the fourth is one."""
+    """All cautions of a list in which the cells of a column are values,
+    or only the fourth is one.
+    """
     _, drive, heads, sites = drive_of(folder, moments=30)
     column = [name.partition(" [")[0] for name in heads].index(head.partition(" [")[0])
     heads[column] = head
@@ -226,15 +290,22 @@ def change(folder, head, values, every=True):
     return [note for note in notes if isinstance(note, Caution) and "'Vendor'" not in note]
 
 
-@pytest.mark.parametrize(("head", "values", "says"), [
-    ("Tx Power [dBm]", lambda v: 20, r"holds 20 in line 5; .* 43 of most; in W\? then write so, as '20 W'"),
-    ("Tx Power", lambda v: 43000, r"holds 43000 in line 5; .* as '43000 mW'"),
-    ("HBW", lambda v: 1.1345, r"holds 1.1345 in line 5; .* as '1.1345 rad'"),
-    ("HBW [deg]", lambda v: 0.065, r"holds 0.065 in line 5"),
-    ("M-Tilt", lambda v: -v, r"holds -2 in line 5; .* of 0 to 30"),
-    ("E-Tilt", lambda v: 10 * v + 40, r"holds \d+ in line 5; .* of 0 to 30"),
-    ("Antenna Height [m]", lambda v: -25, r"holds -25 in line 5; "),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("head", "values", "says"),
+    [
+        (
+            "Tx Power [dBm]",
+            lambda v: 20,
+            r"holds 20 in line 5; .* 43 of most; in W\? then write so, as '20 W'",
+        ),
+        ("Tx Power", lambda v: 43000, r"holds 43000 in line 5; .* as '43000 mW'"),
+        ("HBW", lambda v: 1.1345, r"holds 1.1345 in line 5; .* as '1.1345 rad'"),
+        ("HBW [deg]", lambda v: 0.065, r"holds 0.065 in line 5"),
+        ("M-Tilt", lambda v: -v, r"holds -2 in line 5; .* of 0 to 30"),
+        ("E-Tilt", lambda v: 10 * v + 40, r"holds \d+ in line 5; .* of 0 to 30"),
+        ("Antenna Height [m]", lambda v: -25, r"holds -25 in line 5; "),
+    ],
+)
 def test_a_single_value_in_another_unit_was_believed(tmp_path, head, values, says):
     said, *_ = change(tmp_path, head, values, every=False)
     assert re.search(says, said), said
@@ -249,12 +320,15 @@ def test_the_unit_of_a_cell_that_a_warning_advises_is_read(tmp_path):
     assert "'20 parsecs' in line 5: no station_power_db; unknown" in said
 
 
-@pytest.mark.parametrize(("head", "values", "says"), [
-    ("Azimuth", np.radians, r"as in 'Azimuth \[rad\]'"),
-    ("HBW", np.radians, r"as in 'HBW \[rad\]'"),
-    ("Tx Power", lambda v: 20, r"as in 'Tx Power \[W\]', where W or mW or dBm would fit"),
-    ("Antenna Height", lambda v: -25, r"holds -25 in line 2"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("head", "values", "says"),
+    [
+        ("Azimuth", np.radians, r"as in 'Azimuth \[rad\]'"),
+        ("HBW", np.radians, r"as in 'HBW \[rad\]'"),
+        ("Tx Power", lambda v: 20, r"as in 'Tx Power \[W\]', where W or mW or dBm would fit"),
+        ("Antenna Height", lambda v: -25, r"holds -25 in line 2"),
+    ],
+)
 def test_a_column_in_another_unit_was_believed(tmp_path, head, values, says):
     said, *_ = change(tmp_path, head, values)
     assert re.search(says, said), said

@@ -79,7 +79,9 @@ def test_what_is_silent_is_learned_as_such_and_what_is_not_is_not(write):
 
 def test_saturated_levels_were_learned_and_scored_as_measured(write):
     path = write(long("t", range(ROWS), level=np.minimum(LEVELS[:, 0], -76)))
-    found, plain, given = (read_any(path, saturation_db=one).data for one in ("auto", "none", -79.5))
+    found, plain, given = (
+        read_any(path, saturation_db=one).data for one in ("auto", "none", -79.5)
+    )
     level = 10 * np.log10(found.target[:, 0] * found.site.target_scale)
     assert plain.censored is None and plain.mask is None
     for data, least in ((found, -76), (given, -79.5)):
@@ -92,7 +94,9 @@ def test_the_log_of_a_run_left_out_what_check_warns_of(write, caplog):
     path = write(long("Storey", FLOOR, level=ALONG, places=STUCK))
     Own(path).load()
     warned = [
-        line.removeprefix("warning").strip() for line in said(path).splitlines() if line.startswith("warning")
+        line.removeprefix("warning").strip()
+        for line in said(path).splitlines()
+        if line.startswith("warning")
     ]
     logged = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
     assert len(warned) > 1 and all(any(text in line for line in logged) for text in warned), warned
@@ -109,8 +113,12 @@ def test_absent_links_are_silent_only_where_somebody_says_so(write):
 def channels() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     csi = rng.normal(size=(30, 4)) + 1j * rng.normal(size=(30, 4))
-    return {"rx_position": rng.uniform(0, 9, (30, 3)), "tx_position": np.array([4.0, 2, 2]), "csi": csi,
-            "frequency_hz": 2.4e9 + np.arange(4) * 1e6}  # fmt: skip
+    return {
+        "rx_position": rng.uniform(0, 9, (30, 3)),
+        "tx_position": np.array([4.0, 2, 2]),
+        "csi": csi,
+        "frequency_hz": 2.4e9 + np.arange(4) * 1e6,
+    }
 
 
 @pytest.mark.parametrize("names", [("real", "imag"), ("r", "i")])
@@ -158,8 +166,13 @@ def test_places_and_tones_that_a_file_lacks_can_be_said(write, capsys):
     rng, rx = np.random.default_rng(0), PLACES / 10
     heads = ",".join(f"csi_amp_{k},csi_phase_{k}" for k in range(4))
     path = write(table(f"x,y,z,{heads}", *rx.T, [1.5] * ROWS, *rng.uniform(0, 1, (8, ROWS))))
-    assert "tx_position: missing; expected (3,), (S, 3), (2,) or (S, 2) [m]; or say dataset.tx" in said(path)
-    given = ["dataset.tx_position=[5,3,1.5]", "dataset.frequency_hz=[2.4e9,2.401e9,2.402e9,2.403e9]"]
+    assert (
+        "tx_position: missing; expected (3,), (S, 3), (2,) or (S, 2) [m]; or say dataset.tx"
+    ) in said(path)
+    given = [
+        "dataset.tx_position=[5,3,1.5]",
+        "dataset.frequency_hz=[2.4e9,2.401e9,2.402e9,2.403e9]",
+    ]
     assert main([str(path), *given, "--no-draw"]) == 0
     assert "1 antenna x 4 subcarriers" in capsys.readouterr().out
 
@@ -170,7 +183,9 @@ def test_groups_of_places_were_said_twice(write, caplog):
 
 
 def test_a_mark_beside_strong_levels_was_a_saturation_or_not_heard(write):
-    """Android's -1 and a computer's largest number are no value; beside weak levels alone not heard."""
+    """Android's -1 and a computer's largest number are no value;
+    beside weak levels alone not heard.
+    """
     some = RNG.random(LEVELS.shape) < 0.1
     for mark in (-1, 2147483647, -32768):
         cells = np.where(some, mark, LEVELS.astype(int)).astype(str)
@@ -183,9 +198,9 @@ def test_a_mark_beside_strong_levels_was_a_saturation_or_not_heard(write):
 def test_cells_without_their_name_were_refused_without_the_columns_that_name_them(write):
     eci = np.where(BAND == 0, "", (500 + FLOOR).astype(str))
     path = write(long("cell_id,psc,arfcn", eci, 101 + FLOOR, 1300 + 0 * FLOOR))
-    assert "no station; expected its name, or dataset.columns.station=psc+arfcn, which no row lacks" in said(
-        path
-    )
+    assert (
+        "no station; expected its name, or dataset.columns.station=psc+arfcn, which no row lacks"
+    ) in said(path)
 
 
 def test_levels_in_hundredths_of_a_decibel_were_refused_row_by_row(write):

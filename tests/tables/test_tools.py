@@ -1,4 +1,6 @@
-"""Files in the forms that other tools write, of a place that is simulated: what is read is the truth."""
+"""Files in the forms that other tools write, of a place that is simulated:
+what is read is the truth.
+"""
 
 import gzip
 import json
@@ -16,11 +18,15 @@ from gsparc.tables.read import parse_table
 
 COUNT, LIGHT = 60, 299792458.0
 RNG = np.random.default_rng(7)
-ROOM = np.round(np.c_[RNG.uniform(0, 5, COUNT), RNG.uniform(0, 4, COUNT), RNG.uniform(1, 2, COUNT)], 4)
+ROOM = np.round(
+    np.c_[RNG.uniform(0, 5, COUNT), RNG.uniform(0, 4, COUNT), RNG.uniform(1, 2, COUNT)], 4
+)
 AT, TONES = np.array([4.0, 2.5, 2.2]), 3.5e9 + 4e6 * np.arange(8)
 CHANNELS = sum(
     gain * np.exp(-2j * np.pi * TONES * away[:, None] / LIGHT) / away[:, None]
-    for gain, away in ((g, np.linalg.norm(ROOM - AT * m, axis=1)) for g, m in ((1, 1), (0.5, [-1, 1, 1])))
+    for gain, away in (
+        (g, np.linalg.norm(ROOM - AT * m, axis=1)) for g, m in ((1, 1), (0.5, [-1, 1, 1]))
+    )
 )
 LATITUDE, LONGITUDE = 48.2 + ROOM[:, 1] / 1e3, 16.37 + ROOM[:, 0] / 1e3
 LEVEL = np.round(-60 - 8 * ROOM[:, :2])
@@ -29,7 +35,9 @@ CELLS = ("101", "205")
 
 def text(*heads_and_columns):
     heads, *columns = heads_and_columns
-    return "\n".join([heads, *(",".join(map(str, row)) for row in zip(*columns, strict=True))]) + "\n"
+    return (
+        "\n".join([heads, *(",".join(map(str, row)) for row in zip(*columns, strict=True))]) + "\n"
+    )
 
 
 def levels(reading):
@@ -56,7 +64,11 @@ RECORDS = [
 ]
 HEARD = [
     [
-        {"gateway_ids": {"gateway_id": n}, "rssi": v, "location": {"latitude": at, "longitude": 16.4}}
+        {
+            "gateway_ids": {"gateway_id": n},
+            "rssi": v,
+            "location": {"latitude": at, "longitude": 16.4},
+        }
         for n, v, at in zip(CELLS, row, (48.1, 48.3), strict=True)
     ]
     for row in LEVEL
@@ -76,15 +88,27 @@ POINTS = {
         for one in RECORDS
     ],
 }
-TRACK = '<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>' + "".join(
-    f'<trkpt lat="{one["lat"]}" lon="{one["lon"]}"><ele>180</ele><extensions><rsrp>{one["rsrp"]}</rsrp>'
-    f"<pci>{one['pci']}</pci></extensions></trkpt>" for one in RECORDS
-) + "</trkseg></trk></gpx>"  # fmt: skip
-MARKS = "<kml><Document>" + "".join(
-    f'<Placemark><ExtendedData><Data name="RSRP"><value>{one["rsrp"]}</value></Data><Data name="PCI"><value>'
-    f"{one['pci']}</value></Data></ExtendedData><Point><coordinates>{one['lon']},{one['lat']},0</coordinates>"
-    "</Point></Placemark>" for one in RECORDS
-) + "</Document></kml>"  # fmt: skip
+TRACK = (
+    '<gpx xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>'
+    + "".join(
+        f'<trkpt lat="{one["lat"]}" '
+        f'lon="{one["lon"]}"><ele>180</ele><extensions><rsrp>{one["rsrp"]}</rsrp>'
+        f"<pci>{one['pci']}</pci></extensions></trkpt>"
+        for one in RECORDS
+    )
+    + "</trkseg></trk></gpx>"
+)
+MARKS = (
+    "<kml><Document>"
+    + "".join(
+        f'<Placemark><ExtendedData><Data name="RSRP"><value>{one["rsrp"]}</value></Data><Data '
+        'name="PCI"><value>'
+        f"{one['pci']}</value></Data></ExtendedData><Point><coordinates>{one['lon']},{one['lat']},0</coordinates>"
+        "</Point></Placemark>"
+        for one in RECORDS
+    )
+    + "</Document></kml>"
+)
 FILES = {
     "log.jsonl": "\n".join(map(json.dumps, RECORDS)),
     "log.json": json.dumps(RECORDS),
@@ -92,7 +116,10 @@ FILES = {
     "ttn.jsonl": "\n".join(map(json.dumps, UPLINKS)),
     "track.gpx": TRACK,
     "marks.kml": MARKS,
-    **{f"{way}.json": pd.DataFrame(RECORDS).to_json(orient=way) for way in ("columns", "index", "split")},
+    **{
+        f"{way}.json": pd.DataFrame(RECORDS).to_json(orient=way)
+        for way in ("columns", "index", "split")
+    },
     "drive.log": pd.DataFrame(RECORDS).to_csv(index=False),
 }
 
@@ -122,16 +149,25 @@ WITHOUT = {
 def test_a_record_without_its_place_or_level_was_a_traceback(tmp_path, name):
     (tmp_path / name).write_text(WITHOUT[name], encoding="utf-8")
     found = said(tmp_path / name)
-    assert "no place; these 1 of" in found or ("1 of" in found and "values are missing" in found), found
+    assert "no place; these 1 of" in found or ("1 of" in found and "values are missing" in found), (
+        found
+    )
 
 
 BROKEN = {
     "a.geojson": ('{"features": []}', "no column of levels"),
     "b.json": ("{}", "no rows"),
     "c.jsonl": ("\n".join(map(json.dumps, RECORDS))[:-9], f"line {len(RECORDS)}, column"),
-    "d.json": (json.dumps([{k: v for k, v in one.items() if k != "pci"} | ({"pci": "7"} if i else {})
-        for i, one in enumerate(RECORDS)]), "row 0: no station"),
-}  # fmt: skip
+    "d.json": (
+        json.dumps(
+            [
+                {k: v for k, v in one.items() if k != "pci"} | ({"pci": "7"} if i else {})
+                for i, one in enumerate(RECORDS)
+            ]
+        ),
+        "row 0: no station",
+    ),
+}
 
 
 @pytest.mark.parametrize("name", BROKEN)
@@ -149,7 +185,9 @@ def test_columns_of_json_as_pandas_writes_them_were_one_record(tmp_path):
 def test_gateways_of_an_uplink_stand_where_it_says(tmp_path):
     (tmp_path / "ttn.jsonl").write_text(FILES["ttn.jsonl"])
     site = read_any(tmp_path / "ttn.jsonl").data.site
-    assert site.static_end == "rx" and np.ptp(site.stations.position[:, 1]) == pytest.approx(22240, rel=1e-3)
+    assert site.static_end == "rx" and np.ptp(site.stations.position[:, 1]) == pytest.approx(
+        22240, rel=1e-3
+    )
 
 
 def test_feather_and_gzip_were_unknown_endings(tmp_path, refused):
@@ -163,10 +201,15 @@ def test_feather_and_gzip_were_unknown_endings(tmp_path, refused):
     refused("damaged or not compressed by gzip", read_any, tmp_path / "bad.csv.gz")
 
 
-@pytest.mark.parametrize("start, way", [
-    (b"\x93NUMPY", "savez it beside rx_position"), (b"! VNA\n# Hz S MA R 50\n", r"Touchstone"),
-    (b"\x80\x05", "a pickle; write Parquet"), (b"PK\x03\x04", "save it as CSV"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "start, way",
+    [
+        (b"\x93NUMPY", "savez it beside rx_position"),
+        (b"! VNA\n# Hz S MA R 50\n", r"Touchstone"),
+        (b"\x80\x05", "a pickle; write Parquet"),
+        (b"PK\x03\x04", "save it as CSV"),
+    ],
+)
 def test_files_that_no_reader_takes_show_the_way_out(tmp_path, start, way, refused):
     (tmp_path / "mine.dat").write_bytes(start + b"1 2 3")
     refused(way, parse_table, tmp_path / "mine.dat")
@@ -174,7 +217,9 @@ def test_files_that_no_reader_takes_show_the_way_out(tmp_path, start, way, refus
 
 @pytest.mark.parametrize("name", ["a.npz", "a.h5", "a.mat", "a.parquet", "a.csv"])
 def test_a_pointer_of_git_was_a_damaged_file(tmp_path, name, refused):
-    (tmp_path / name).write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n")
+    (tmp_path / name).write_text(
+        "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n"
+    )
     refused("not the file but a Git LFS pointer to it; git lfs pull", read_any, tmp_path / name)
 
 
@@ -202,7 +247,8 @@ def test_heads_of_other_tools_were_refused(tmp_path, kind):
 
 def test_slots_of_tems_were_no_slots(tmp_path):
     heads = (
-        "All-Latitude,All-Longitude,Serving Cell Identity,Serving Physical Cell ID,Serving Cell RSRP (dBm)"
+        "All-Latitude,All-Longitude,Serving Cell Identity,Serving Physical Cell ID,Serving Cell "
+        "RSRP (dBm)"
     )
     heads += ",Neighbor Cell Physical Cell ID[1],Neighbor Cell RSRP (dBm)[1]"
     path = tmp_path / "tems.csv"
@@ -216,7 +262,9 @@ def test_slots_of_tems_were_no_slots(tmp_path):
 
 def test_networks_with_names_of_their_own_were_no_levels(tmp_path):
     path = tmp_path / "survey.csv"
-    path.write_text(text("X,Y,Office WiFi,printer,noise floor", *ROOM.T[:2], *LEVEL.T, [-96] * COUNT))
+    path.write_text(
+        text("X,Y,Office WiFi,printer,noise floor", *ROOM.T[:2], *LEVEL.T, [-96] * COUNT)
+    )
     reading = read_any(path)
     assert_levels(reading, ("Office WiFi", "printer"))
     assert any("by their values: no head says so" in note for note in reading.notes)
@@ -227,7 +275,9 @@ def test_rows_between_two_fixes_were_refused_one_by_one(tmp_path):
     places = [np.where(empty, "", np.char.mod("%.6f", v)) for v in (LATITUDE, LONGITUDE)]
     path = tmp_path / "qxdm.csv"
     path.write_text(text("GPS Lat,GPS Lon,RSRP", *places, LEVEL[:, 0]))
-    assert len(read_any(path).data) == 20 and "no place; these 40 of 60 rows are left out" in said(path)
+    assert len(read_any(path).data) == 20 and (
+        "no place; these 40 of 60 rows are left out"
+    ) in said(path)
 
 
 def test_half_a_place_hid_all_other_faults_of_a_file(tmp_path):
@@ -249,7 +299,9 @@ SETTINGS = {"tx_position": AT.tolist()}
 def test_lists_and_complex_numbers_in_cells_were_no_channels(tmp_path):
     complexes = tmp_path / "matlab.csv"
     cells = [[f"{v.real:.9g}{v.imag:+.9g}i" for v in tone] for tone in CHANNELS.T]
-    complexes.write_text(text("pos_1,pos_2,pos_3," + ",".join(f"h_{k}" for k in range(8)), *ROOM.T, *cells))
+    complexes.write_text(
+        text("pos_1,pos_2,pos_3," + ",".join(f"h_{k}" for k in range(8)), *ROOM.T, *cells)
+    )
     lists = tmp_path / "picoscenes.csv"
     parts = abs(CHANNELS), np.angle(CHANNELS)
     inside = [[f"[{' '.join(f'{v:.7f}' for v in row)}]" for row in part] for part in parts]
@@ -277,11 +329,14 @@ def test_an_esp32_was_read_as_its_rssi_alone(tmp_path, refused):
 
 
 def test_a_row_for_each_tone_was_a_place_for_each(tmp_path):
-    """As network analysers and notebooks write them: rows of a place were measurements of one tone."""
+    """As network analysers and notebooks write them:
+    rows of a place were measurements of one tone.
+    """
     rows = [
         (*place, f"{tone:.0f}", 20 * np.log10(abs(v)), np.degrees(np.angle(v)))
-        for place, row in zip(ROOM, CHANNELS, strict=True) for tone, v in zip(TONES, row, strict=True)
-    ]  # fmt: skip
+        for place, row in zip(ROOM, CHANNELS, strict=True)
+        for tone, v in zip(TONES, row, strict=True)
+    ]
     path = tmp_path / "vna.csv"
     path.write_text(text("x,y,z,freq_hz,s21_mag_db,s21_phase_deg", *zip(*rows, strict=True)))
     reading = read_any(path, **SETTINGS)
@@ -290,7 +345,9 @@ def test_a_row_for_each_tone_was_a_place_for_each(tmp_path):
 
 
 def test_tones_named_by_their_frequencies_were_no_tones(tmp_path):
-    heads = "x_mm,y_mm,z_mm," + ",".join(f"S21_{p}_{f / 1e9:.3f}GHz" for f in TONES for p in ("re", "im"))
+    heads = "x_mm,y_mm,z_mm," + ",".join(
+        f"S21_{p}_{f / 1e9:.3f}GHz" for f in TONES for p in ("re", "im")
+    )
     path = tmp_path / "wide.csv"
     columns = [part for tone in CHANNELS.T for part in (tone.real, tone.imag)]
     path.write_text(text(heads, *(1e3 * ROOM.T), *columns))
@@ -301,12 +358,21 @@ def test_tones_named_by_their_frequencies_were_no_tones(tmp_path):
 
 KNOWN = {"rx_position": ROOM, "tx_position": AT, "frequency_hz": TONES}
 SHAPES = {
-    "Sionna": {"rx_positions": ROOM, "tx_positions": AT[None], "frequencies": TONES,
-               "h_freq": CHANNELS[:, None, None, None, None]},
-    "DeepMIMO": {"location": ROOM, "tx_loc": AT, "channel": CHANNELS[:, None, None], "freqs": TONES},
+    "Sionna": {
+        "rx_positions": ROOM,
+        "tx_positions": AT[None],
+        "frequencies": TONES,
+        "h_freq": CHANNELS[:, None, None, None, None],
+    },
+    "DeepMIMO": {
+        "location": ROOM,
+        "tx_loc": AT,
+        "channel": CHANNELS[:, None, None],
+        "freqs": TONES,
+    },
     "real and imaginary parts": {**KNOWN, "csi": np.stack([CHANNELS.real, CHANNELS.imag], 2)},
     "of networks": {**KNOWN, "H": np.stack([CHANNELS.real, CHANNELS.imag], 1)},
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("kind", SHAPES)
@@ -317,11 +383,18 @@ def test_arrays_under_the_names_of_other_tools_were_unknown(kind):
 def test_one_tone_of_stations_in_degrees_lost_its_axis():
     """Channels (S, T, A, 1) became (S, T, A) where stations stand in degrees."""
     north, east = 59 + ROOM[:, 1] * 9e-6, 18 + ROOM[:, 0] * 1.7e-5
-    places = {"latitude": north, "longitude": east, "rx_height": ROOM[:, 2], "station_height": [3.0, 3.0]}
+    places = {
+        "latitude": north,
+        "longitude": east,
+        "rx_height": ROOM[:, 2],
+        "station_height": [3.0, 3.0],
+    }
     stations = {"station_latitude": [59.0, 59.0], "station_longitude": [18.0, 18.1]}
     array = {"array_position": np.eye(3)[:2] * 0.05, "frequency_hz": [3e9]}
     csi = np.broadcast_to(CHANNELS[:, :1, None, None], (len(CHANNELS), 2, 2, 1))
-    arrays = {key: np.asarray(one) for key, one in {**places, **stations, **array, "csi": csi}.items()}
+    arrays = {
+        key: np.asarray(one) for key, one in {**places, **stations, **array, "csi": csi}.items()
+    }
     assert interpret(Raw(arrays), "file").data.target.shape[1:] == (2, 1)
 
 
@@ -330,10 +403,14 @@ def test_a_file_without_a_known_array_was_refused_without_its_names(refused):
     refused(r"found none of them among tau \(9, 3\)", interpret, raw, "file")
 
 
-@pytest.mark.parametrize("setting, changes", [
-    ("feet", {"rx_position": ROOM / 0.3048, "tx_position": AT / 0.3048}),
-    ("exchange_xy", {"rx_position": ROOM[:, [1, 0, 2]]}), ("downwards", {"rx_position": ROOM * [1, 1, -1]}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "setting, changes",
+    [
+        ("feet", {"rx_position": ROOM / 0.3048, "tx_position": AT / 0.3048}),
+        ("exchange_xy", {"rx_position": ROOM[:, [1, 0, 2]]}),
+        ("downwards", {"rx_position": ROOM * [1, 1, -1]}),
+    ],
+)
 def test_places_of_another_frame_were_good(tmp_path, setting, changes):
     """Feet were called delays that had been taken out; axes of one end alone were not noticed."""
     np.savez(tmp_path / "mine.npz", **{**KNOWN, "csi": CHANNELS, **changes})

@@ -40,10 +40,16 @@ def test_what_was_spent_before_and_elsewhere_counts(monkeypatch):
     assert there.cpu_seconds == pytest.approx(8.5, abs=0.01) and watch.cpu_elsewhere == 7.0
 
 
-@pytest.mark.parametrize(("command", "word"), [
-    ("train", "budget_s=60"), ("train", "+budget_clock=wall"), ("train", "model.budget_s=3"),
-    ("compare", "budgets=[{seconds: 5, seeds: [0]}]"), ("map", "promise.budget_s=1"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("command", "word"),
+    [
+        ("train", "budget_s=60"),
+        ("train", "+budget_clock=wall"),
+        ("train", "model.budget_s=3"),
+        ("compare", "budgets=[{seconds: 5, seeds: [0]}]"),
+        ("map", "promise.budget_s=1"),
+    ],
+)
 def test_seconds_on_the_command_line_are_refused_with_what_to_say_instead(command, word):
     answer = knock(COMMANDS[command].run, command, [word])
     assert answer.status == 1 and answer.err == [f"error: {word.lstrip('+')}: {INSTEAD}"]
@@ -53,11 +59,16 @@ def test_seconds_on_the_command_line_are_refused_with_what_to_say_instead(comman
 def test_seconds_of_a_file_or_in_python_are_refused():
     with pytest.raises(ValueError, match="budget_s=60: no seconds end a fit"):
         RunSettings.from_config(compose("+budget_s=60", "logger=none"))
-    refused("budget_s=1: no seconds end a fit", gsparc.fit, rx=[[0.0, 0, 0]], rssi=[1.0], budget_s=1)
+    refused(
+        "budget_s=1: no seconds end a fit", gsparc.fit, rx=[[0.0, 0, 0]], rssi=[1.0], budget_s=1
+    )
 
 
 def test_a_run_that_seconds_ended_goes_on_without_them(tmp_path):
-    notes = {"overrides.yaml": ["budget_s=9", "seed=3"], "hydra.yaml": {"hydra": {"runtime": {"cwd": "/"}}}}
+    notes = {
+        "overrides.yaml": ["budget_s=9", "seed=3"],
+        "hydra.yaml": {"hydra": {"runtime": {"cwd": "/"}}},
+    }
     (tmp_path / ".hydra").mkdir()
     for name, told in notes.items():
         (tmp_path / ".hydra" / name).write_text(yaml.safe_dump(told))

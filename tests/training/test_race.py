@@ -27,14 +27,17 @@ def test_a_candidate_behind_goes_on_where_its_errors_are_its_own():
 
 def test_a_candidate_ends_that_stays_far_behind():
     one = race()
-    with pytest.raises(FellBehind, match=r"^far: \d+ times the error of the best so far \(error 0\.0"):
+    with pytest.raises(
+        FellBehind, match=r"^far: \d+ times the error of the best so far \(error 0\.0"
+    ):
         one.check_candidate("far", ROWS, 5 * OWN[1], [25.0])
     assert one.check_candidate("falling", ROWS, 5 * OWN[1], [100.0]) == pytest.approx(25, rel=0.2)
 
 
 def test_a_candidate_ends_that_misses_what_the_best_misses():
     with pytest.raises(
-        FellBehind, match=r"^near: averaging it with the best so far \(error 0\.0\d+ .* gains -?\d+% ±"
+        FellBehind,
+        match=r"^near: averaging it with the best so far \(error 0\.0\d+ .* gains -?\d+% ±",
     ):
         race().check_candidate("near", ROWS, OWN[0] + 0.1 * OWN[1])
     falling = race().check_candidate("falling", ROWS, OWN[0] + 0.1 * OWN[1], [3.0])

@@ -1,4 +1,6 @@
-"""Dashboards get settings, names, series, pictures and the final table; read back from what they wrote."""
+"""Dashboards get settings, names, series, pictures and the final table;
+read back from what they wrote.
+"""
 
 import json
 import os
@@ -22,7 +24,13 @@ from PIL import Image
 
 from gsparc.commands.train import main
 from gsparc.field.optimizer import OptimizerSettings
-from gsparc.training.tracking import PartLogger, log_picture, log_table, tensorboard_logger, wandb_logger
+from gsparc.training.tracking import (
+    PartLogger,
+    log_picture,
+    log_table,
+    tensorboard_logger,
+    wandb_logger,
+)
 
 BLOCK, HEAD, START = 32768, 7, 7  # bytes
 
@@ -67,7 +75,11 @@ def offline_run(folder: Path) -> Offline:
         record.ParseFromString(one)
         kind = record.WhichOneof("record_type")
         if kind == "run" and record.run.display_name:
-            run.name, run.group, run.tags = record.run.display_name, record.run.run_group, [*record.run.tags]
+            run.name, run.group, run.tags = (
+                record.run.display_name,
+                record.run.run_group,
+                [*record.run.tags],
+            )
         if kind == "config":
             run.config |= {item.key: json.loads(item.value_json) for item in record.config.update}
         if kind == "history":
@@ -105,7 +117,10 @@ def test_weights_and_biases_gets_files_and_tables(file):
     logger = Records()
     log_picture([logger], "predictions", file, 7)
     log_table([logger], "results", ["method", "dB"], [["gp", "3.1"]])
-    assert logger.said == [("predictions", [str(file)], 7), ("results", ["method", "dB"], [["gp", "3.1"]])]
+    assert logger.said == [
+        ("predictions", [str(file)], 7),
+        ("results", ["method", "dB"], [["gp", "3.1"]]),
+    ]
 
 
 def test_tensorboard_gets_pixels_and_markdown(file, tmp_path):
@@ -136,14 +151,20 @@ def test_a_part_has_pictures_and_figures_under_its_name(file):
     part = PartLogger(PartLogger(logger, "fold1"), "refit")
     part.log_metrics({"train/loss": 0.5}, 9)
     log_picture([part], "predictions", file, 7)
-    assert logger.said == [({"fold1/refit/train/loss": 0.5}, 9), ("fold1/refit/predictions", [str(file)], 7)]
+    assert logger.said == [
+        ({"fold1/refit/train/loss": 0.5}, 9),
+        ("fold1/refit/predictions", [str(file)], 7),
+    ]
 
 
 @pytest.fixture(scope="module")
 def sweep(tmp_path_factory) -> list[Path]:
     """Folders of two jobs with a refit each, told to all dashboards."""
     folder = tmp_path_factory.mktemp("told")
-    board = "{_target_: gsparc.training.tracking.tensorboard_logger, save_dir: '${hydra:runtime.output_dir}'}"
+    board = (
+        "{_target_: gsparc.training.tracking.tensorboard_logger, save_dir: "
+        "'${hydra:runtime.output_dir}'}"
+    )
     words = [word for word in brief(spectra(folder / "own.npz")) if word != "logger=none"]
     words += ["logger=wandb", "logger.wandb.offline=true", "~hydra.callbacks.sweep"]
     words += [f"+logger.tensorboard={board}"] if find_spec("tensorboard") else []
@@ -171,10 +192,16 @@ def test_the_environment_s_mode_of_wandb_was_overridden_by_the_configuration(off
 
 @pytest.mark.slow
 def test_wandb_warned_of_what_the_program_itself_had_said(tmp_path):
-    code = f"from gsparc.training.tracking import wandb_logger as w; w(save_dir={str(tmp_path)!r}).experiment"
+    code = (
+        "from gsparc.training.tracking import wandb_logger as w; "
+        f"w(save_dir={str(tmp_path)!r}).experiment"
+    )
     env = {name: value for name, value in os.environ.items() if not name.startswith("WANDB")}
     said = subprocess.run(
-        [sys.executable, "-c", code], env={**env, "HOME": str(tmp_path)}, capture_output=True, text=True
+        [sys.executable, "-c", code],
+        env={**env, "HOME": str(tmp_path)},
+        capture_output=True,
+        text=True,
     )
     assert said.returncode == 0 and "WARNING" not in said.stderr, said.stderr
 
@@ -184,7 +211,9 @@ def rises(steps) -> bool:
 
 
 @pytest.mark.slow
-def test_dashboards_knew_neither_settings_nor_name_nor_sweep_and_a_refit_began_its_series_again(sweep):
+def test_dashboards_knew_neither_settings_nor_name_nor_sweep_and_a_refit_began_its_series_again(
+    sweep,
+):
     for folder, (job, count) in zip(sweep, COUNTS.items(), strict=True):
         run = offline_run(folder)
         assert (run.name, run.group) == (f"{job} model.field.count={count}", "swept")
@@ -196,7 +225,11 @@ def test_dashboards_knew_neither_settings_nor_name_nor_sweep_and_a_refit_began_i
             assert rises([step for step, _ in run.series(key)]), key
         told = {key for row in run.rows for key in row}
         rates = {key.removeprefix("rate/") for key in told if key.startswith("rate/")}
-        assert {"positions", "emission"} < rates <= {setting.name for setting in fields(OptimizerSettings)}
+        assert (
+            {"positions", "emission"}
+            < rates
+            <= {setting.name for setting in fields(OptimizerSettings)}
+        )
         assert {"final/test/psnr_db", "test rows.filenames", "results.path"} <= told
         settings = yaml.safe_load((folder / "csv" / "version_0" / "hparams.yaml").read_text())
         assert settings["model"]["field"]["count"] == count and settings["seed"] == 0

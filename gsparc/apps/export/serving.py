@@ -34,10 +34,12 @@ from gsparc.prediction.query import read_places
 from gsparc.prediction.updating import ToldBefore
 
 RAW = "application/octet-stream"
-PLACE, BYTES, MORE = 12, 64, 8192  # bytes of a place, raw and at most as JSON, and of what is around places
+# Bytes of a place, raw and at most as JSON, and of what is around places
+PLACE, BYTES, MORE = 12, 64, 8192
 PIECE = 8192  # numbers that are written at once: a millisecond, in which nobody else is answered
 QUEUE = 2048  # connections that wait in the kernel
-KEEP_S, STOP_S = 5, 10  # that a connection without a request stays, that requests have when the server stops
+# That a connection without a request stays, that requests have when the server stops
+KEEP_S, STOP_S = 5, 10
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,8 @@ class PlacesBody(BaseModel):
 class RowsBody(PlacesBody):
     """A request's body: the same, and levels there of each station; null is not measured.
 
-    Rows of a `key` are taken once; without one as often as they come, as a sensor that stands still repeats.
+    Rows of a `key` are taken once; without one as often as they come,
+    as a sensor that stands still repeats.
     """
 
     levels: Annotated[list[list[float | None]], FailFast()]
@@ -89,7 +92,9 @@ class Connection(H11Protocol):
         self.end = self.loop.call_later(self.limits.request_s, transport.abort)
         if len(self.connections) <= self.limits.connections:
             return
-        others = [one for one in self.connections if isinstance(one, Connection) and one is not self]
+        others = [
+            one for one in self.connections if isinstance(one, Connection) and one is not self
+        ]
         works = [one for one in others if one.works()]
         # Half the room is for those whose request is not read yet.
         if 2 * len(works) > self.limits.connections:
@@ -100,9 +105,13 @@ class Connection(H11Protocol):
         other.transport.abort()
 
     def works(self) -> bool:
-        """Return whether the answer to a whole request is computed, or written to a client that reads."""
+        """Return whether the answer to a whole request is computed,
+        or written to a client that reads.
+        """
         cycle = self.cycle
-        return bool(cycle) and not (cycle.more_body or cycle.response_complete or self.flow.write_paused)
+        return bool(cycle) and not (
+            cycle.more_body or cycle.response_complete or self.flow.write_paused
+        )
 
     def on_response_complete(self) -> None:
         """See the base class; the next request has its own time."""
@@ -117,13 +126,18 @@ class Connection(H11Protocol):
 
 
 class LimitedServer(uvicorn.Server):
-    """uvicorn within limits: of requests nothing is logged, and the log is the command's, which is open."""
+    """uvicorn within limits: of requests nothing is logged, and the log is the command's,
+    which is open.
+    """
 
     def __init__(self, app: ASGIApp, limits: Limits, **listen: Any) -> None:
         listen |= {"ws": "none", "log_config": None, "log_level": "error", "access_log": False}
         listen |= {"timeout_keep_alive": KEEP_S, "timeout_graceful_shutdown": STOP_S}
-        at_once = max(1, limits.connections // 8)  # until the first of them is read, thrice as many may come
-        super().__init__(uvicorn.Config(app, http=partial(Connection, limits), backlog=at_once, **listen))  # type: ignore[arg-type]
+        # Until the first of them is read, thrice as many may come
+        at_once = max(1, limits.connections // 8)
+        super().__init__(
+            uvicorn.Config(app, http=partial(Connection, limits), backlog=at_once, **listen)
+        )  # type: ignore[arg-type]
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """See the base class; the kernel lets more wait than are taken at once."""
@@ -134,7 +148,9 @@ class LimitedServer(uvicorn.Server):
 
 
 class WaitingRequest(NamedTuple):
-    """A request that waits: how many places its body holds if it is sound, and where its answer comes."""
+    """A request that waits: how many places its body holds if it is sound,
+    and where its answer comes.
+    """
 
     size: int
     body: bytes
@@ -153,15 +169,21 @@ class Batcher:
         lock: held while the model is asked.
     """
 
-    def __init__(self, predictor: Predictor, what: str, delay_s: float, most: int, lock: Lock) -> None:
+    def __init__(
+        self, predictor: Predictor, what: str, delay_s: float, most: int, lock: Lock
+    ) -> None:
         self.predictor, self.delay_s, self.most = predictor, delay_s, most
         self.what, self.lock = what, lock
         self.waiting: list[WaitingRequest] = []
         self.some = asyncio.Event()
 
     async def ask(self, size: int, body: bytes, raw: bool) -> np.ndarray:
-        """Answers (n, ...) at the world places (n, 3) [m] of a body; raises what reading and the model do."""
-        self.waiting.append(WaitingRequest(size, body, raw, asyncio.get_running_loop().create_future()))
+        """Answers (n, ...) at the world places (n, 3) [m] of a body;
+        raises what reading and the model do.
+        """
+        self.waiting.append(
+            WaitingRequest(size, body, raw, asyncio.get_running_loop().create_future())
+        )
         self.some.set()
         return await self.waiting[-1].answer
 
@@ -169,17 +191,22 @@ class Batcher:
         """Until cancelled; a request whose client left is dropped."""
         while True:
             await self.some.wait()
-            # A first request waits 2 ms by default: those that come meanwhile share its matrix products.
+            # A first request waits 2 ms by default: those
+            # that come meanwhile share its matrix products.
             await asyncio.sleep(self.delay_s)
             batch = self._next()
             # In a thread: while the model computes others can connect and be refused.
-            for one, found in zip(batch, await asyncio.to_thread(self._answers, batch), strict=True):
+            for one, found in zip(
+                batch, await asyncio.to_thread(self._answers, batch), strict=True
+            ):
                 if not one.answer.done():
                     failed = isinstance(found, Exception)
                     (one.answer.set_exception if failed else one.answer.set_result)(found)  # type: ignore[arg-type]
 
     def _next(self) -> list[WaitingRequest]:
-        """The request that waits longest, and the smallest others: few places do not wait for many."""
+        """The request that waits longest, and the smallest others:
+        few places do not wait for many.
+        """
         waiting = [one for one in self.waiting if not one.answer.done()]
         batch, capacity = waiting[:1], self.most
         # By size: a request for a thousand places would otherwise delay many for one.
@@ -197,19 +224,23 @@ class Batcher:
         try:
             places = [np.zeros((0, 3)), *(_read(site.moving_end, one) for one in batch)]
             with self.lock:
-                values = getattr(self.predictor, self.what)(**site.name_moving(np.concatenate(places)))
+                values = getattr(self.predictor, self.what)(
+                    **site.name_moving(np.concatenate(places))
+                )
             values = np.stack([values.real, values.imag], -1) if np.iscomplexobj(values) else values
             parts = np.split(values.astype("<f4"), np.cumsum([len(one) for one in places])[:-1])
             return [part.copy() for part in parts[1:]]  # a view would keep the others' answers
         except Exception as error:
-            # One faulty request must not spoil a batch: each is asked again alone, to find whose fault it is.
+            # One faulty request must not spoil a batch: each is asked again alone,
+            # to find whose fault it is.
             return [error] if len(batch) == 1 else [self._answers([one])[0] for one in batch]
 
 
 def build_application(
     predictor: Predictor, limits: Limits, token: str | None, told: ToldFile | None = None
 ) -> ASGIApp:
-    """Return the routes: POST /predict, and /std for its deviations, GET /healthz; POST /update where wanted.
+    """Return the routes: POST /predict, and /std for its deviations, GET /healthz;
+    POST /update where wanted.
 
     Args:
         predictor: of one end that moves and one station.
@@ -218,23 +249,31 @@ def build_application(
         told: the model's file, for updates; None: there are none.
 
     Raises:
-        SettingError: updates without a token, or more numbers in the answer at one place than `limits` allow.
+        SettingError: updates without a token, or more numbers in the answer at one place than
+            `limits` allow.
     """
     site, lock, telling = predictor.site, Lock(), asyncio.Lock()
     if told is not None and token is None:
         raise SettingError(
-            "updates=true: whoever reaches it changes the model; set GSPARC_TOKEN, or say token=WORD"
+            "updates=true: whoever reaches it changes the model; set GSPARC_TOKEN, or say "
+            "token=WORD"
         )
-    middle = getattr(predictor, site.kind)(**site.name_moving(site.moving_box.mean(0) + site.origin))
+    middle = getattr(predictor, site.kind)(
+        **site.name_moving(site.moving_box.mean(0) + site.origin)
+    )
     # Real and imaginary part count as two numbers.
     each = np.size(middle) * (2 if np.iscomplexobj(middle) else 1)
     if each > limits.numbers:
-        raise SettingError(f"numbers={limits.numbers}: one place's answer holds {each}; say {each} or more")
+        raise SettingError(
+            f"numbers={limits.numbers}: one place's answer holds {each}; say {each} or more"
+        )
     # Both limits hold: of places, and of numbers in the answer.
     most = min(limits.most, limits.numbers // each)
     # One thread writes for all: text of numbers holds the interpreter's lock anyhow.
     routes, writer = {"/predict": site.kind, "/std": "std"}, ThreadPoolExecutor(1)
-    batchers = {r: Batcher(predictor, what, limits.delay_ms / 1e3, most, lock) for r, what in routes.items()}
+    batchers = {
+        r: Batcher(predictor, what, limits.delay_ms / 1e3, most, lock) for r, what in routes.items()
+    }
 
     @asynccontextmanager
     async def life(_: FastAPI) -> AsyncIterator[None]:
@@ -244,12 +283,18 @@ def build_application(
             task.cancel()
         writer.shutdown(wait=False, cancel_futures=True)
 
-    app = FastAPI(title="gsparc", lifespan=life, docs_url=None, redoc_url=None)  # scripts from elsewhere
+    # Scripts from elsewhere
+    app = FastAPI(title="gsparc", lifespan=life, docs_url=None, redoc_url=None)
 
     @app.get("/healthz")
     async def healthz() -> dict[str, Any]:
         stations = {} if site.stations is None else {"stations": site.stations.name}
-        model = {"model": predictor.method.name, "end": site.moving_end, "unit": predictor.unit, **stations}
+        model = {
+            "model": predictor.method.name,
+            "end": site.moving_end,
+            "unit": predictor.unit,
+            **stations,
+        }
         return {"status": "ok", "kind": site.kind, **model}
 
     async def stream_blocks(values: np.ndarray, raw: bool) -> AsyncIterator[bytes]:
@@ -263,9 +308,13 @@ def build_application(
         try:
             async for part in request.stream():
                 body += part
-                # A bracket opens each place and one all of them: enough to refuse a body before it is parsed.
+                # A bracket opens each place and one all of them:
+                # enough to refuse a body before it is parsed.
                 count = len(body) // PLACE if raw else (body.count(b"[") - lists) // lists
-                if count > most or len(body) > most * BYTES * (1 if lists == 1 else 1 + each) + MORE:
+                if (
+                    count > most
+                    or len(body) > most * BYTES * (1 if lists == 1 else 1 + each) + MORE
+                ):
                     message = f"at most {most} places, {each} numbers each"
                     raise HTTPException(413, message, {"connection": "close"})
         except ClientDisconnect:
@@ -279,7 +328,11 @@ def build_application(
         assert told is not None
         more = {"rssi": rows.levels, "key": rows.key}
         found = told.tell(predictor, lock, limits.request_s / 2, **where, **more)
-        return {"rows": found.rows.tolist(), "skipped": found.skipped, "alarms": [*map(asdict, found.alarms)]}
+        return {
+            "rows": found.rows.tolist(),
+            "skipped": found.skipped,
+            "alarms": [*map(asdict, found.alarms)],
+        }
 
     async def update(request: Request) -> dict[str, Any]:
         body, _ = await read_body(request, False, lists=2)
@@ -295,7 +348,9 @@ def build_application(
         except ToldBefore as error:
             raise HTTPException(409, str(error)) from error
         except ValueError as error:  # of a body, too
-            wanted = '{"places": [[x, y, z], ...], "levels": [[level or null of each station], ...]}'
+            wanted = (
+                '{"places": [[x, y, z], ...], "levels": [[level or null of each station], ...]}'
+            )
             message = f"expected {wanted}" if isinstance(error, ValidationError) else str(error)
             raise HTTPException(422, message) from error
 
@@ -306,14 +361,17 @@ def build_application(
     @app.post("/predict")
     async def predict(request: Request) -> Response:
         # Media types are compared without case (RFC 9110, 8.3.1).
-        kinds = {one.partition(";")[0].strip().lower() for one in request.headers.getlist("content-type")}
+        kinds = {
+            one.partition(";")[0].strip().lower() for one in request.headers.getlist("content-type")
+        }
         if len(kinds) > 1:
             raise HTTPException(422, f"Content-Type twice: {', '.join(sorted(kinds))}; say one")
         raw = kinds == {RAW}
         body, count = await read_body(request, raw)
         request.scope["places"] = count = max(count, 1)
         work = asyncio.ensure_future(batchers[request.url.path].ask(count, body, raw))
-        gone = asyncio.ensure_future(request.receive())  # after a body nothing but the client's leaving
+        # After a body nothing but the client's leaving
+        gone = asyncio.ensure_future(request.receive())
         await asyncio.wait((work, gone), return_when=asyncio.FIRST_COMPLETED)
         gone.cancel()
         if not work.done():
@@ -322,7 +380,9 @@ def build_application(
         try:
             values = work.result()
         except Exception as error:
-            raise HTTPException(422 if isinstance(error, ValueError) else 500, str(error)) from error
+            raise HTTPException(
+                422 if isinstance(error, ValueError) else 500, str(error)
+            ) from error
         kind = RAW if raw else "application/json"
         about = {"x-shape": ",".join(map(str, values.shape)), "x-unit": quote(predictor.unit)}
         if values.size <= PIECE:
@@ -334,17 +394,23 @@ def build_application(
 
 
 def _guarded(app: ASGIApp, wanted: bytes | None) -> ASGIApp:
-    """Requests have one end, and whatever is asked, but for /healthz, needs the token, if there is one."""
+    """Requests have one end, and whatever is asked, but for /healthz, needs the token,
+    if there is one.
+    """
 
     async def guard(scope: Scope, receive: Receive, send: Send) -> None:
         heads = dict(scope.get("headers", ()))
         free = wanted is None or scope["type"] == "lifespan" or scope["path"] == "/healthz"
         fault, status = "", 400
-        if heads.keys() >= {b"content-length", b"transfer-encoding"}:  # two ends hide a second request
+        # Two ends hide a second request
+        if heads.keys() >= {b"content-length", b"transfer-encoding"}:
             fault = "Content-Length beside Transfer-Encoding"
         elif not free and not hmac.compare_digest(heads.get(b"authorization", b""), wanted or b""):
             fault, status = "Authorization: Bearer TOKEN is needed", 401
-        elif any(k == b"content-encoding" and v.lower() != b"identity" for k, v in scope.get("headers", ())):
+        elif any(
+            k == b"content-encoding" and v.lower() != b"identity"
+            for k, v in scope.get("headers", ())
+        ):
             fault, status = "Content-Encoding: bodies are read as they come; leave it out", 415
         elif scope.get("query_string"):
             fault, status = "nothing is read after ? in the address; leave it out", 422
@@ -357,12 +423,17 @@ def _guarded(app: ASGIApp, wanted: bytes | None) -> ASGIApp:
 def _read(end: str, asked: WaitingRequest) -> np.ndarray:
     """World places (n, 3) float64 [m] of a body; raises ValueError."""
     try:
-        if not asked.raw and asked.body.count(b'"') != 2:  # of one key: of two alike the last would count
+        # Of one key: of two alike the last would count
+        if not asked.raw and asked.body.count(b'"') != 2:
             raise ValueError
         raw = np.frombuffer(asked.body, "<f4").reshape(-1, 3) if asked.raw else None
         places = PlacesBody.model_validate_json(asked.body).places if raw is None else raw
     except (ValidationError, ValueError):
-        wanted = "little-endian float32, three a place" if asked.raw else '{"places": [[x, y, z], ...]}'
+        wanted = (
+            "little-endian float32, three a place"
+            if asked.raw
+            else ('{"places": [[x, y, z], ...]}')
+        )
         raise ValueError(f"expected {wanted}, finite metres, and nothing else") from None
     return read_places(end, places)
 
@@ -375,4 +446,8 @@ def _written(values: np.ndarray, raw: bool, unit: str, first: int, past: int) ->
     about = to_json({"shape": values.shape, "unit": unit})[:-1]
     head = b"," if first else about + b',"values":['
     # JSON has no word for the level of silence.
-    return head + to_json(part.tolist(), inf_nan_mode="null")[1:-1] + (b"" if past < len(values) else b"]}")
+    return (
+        head
+        + to_json(part.tolist(), inf_nan_mode="null")[1:-1]
+        + (b"" if past < len(values) else b"]}")
+    )

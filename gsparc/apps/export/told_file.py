@@ -14,7 +14,8 @@ from gsparc.prediction.updating import Found, versions_extra
 
 
 class ToldFile:
-    """What answers is what the file holds: rows that cannot be written are not told, those of others are.
+    """What answers is what the file holds: rows that cannot be written are not told,
+    those of others are.
 
     Args:
         stored: what the file held when the model was loaded.
@@ -36,15 +37,19 @@ class ToldFile:
             **rows: see `Predictor.update`.
 
         Raises:
-            CheckpointError: the file cannot be written, or holds another model now; nothing is changed.
+            CheckpointError: the file cannot be written, or holds another model now; nothing is
+                changed.
             ValueError: as `Predictor.update` does.
         """
         with checkpoint.rewriting(self.path, wait_s=wait_s) as file:
             told = copy(predictor)
-            if file.stored.sha256 != self._sha256:  # another process told it rows, or trained it again
+            # Another process told it rows, or trained it again
+            if file.stored.sha256 != self._sha256:
                 told = self.load(file.stored)
                 if _facts(told.site) != _facts(predictor.site):
-                    other = f"{self.path}: holds a model of other stations now; start the server again"
+                    other = (
+                        f"{self.path}: holds a model of other stations now; start the server again"
+                    )
                     raise checkpoint.CheckpointError(other)
             found = told.update(**rows)
             file.store(versions_extra(told.versions))

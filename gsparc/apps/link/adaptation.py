@@ -20,7 +20,8 @@ RULES = choice("carries_most", "target")  # how an MCS is chosen from a predicti
 OUTAGE = 0.5  # a transport block that fails more often than this carries nothing worth having
 NODES, WEIGHTS = np.polynomial.hermite_e.hermegauss(9)  # of a normal law
 # d(10 log10 |h|^2) = 20 / ln 10 times the relative error, whose real part has half of its power.
-SLOW_DECIBEL = 20 / np.log(10) / np.sqrt(2)  # SINR error [dB] of one flat tone per root of relative error
+# SINR error [dB] of one flat tone per root of relative error
+SLOW_DECIBEL = 20 / np.log(10) / np.sqrt(2)
 
 
 @dataclass(frozen=True)
@@ -70,16 +71,18 @@ class Band:
     @property
     def expected_power(self) -> Tensor:
         """E |h|^2 (n, K): a mean that was shrunk by its doubt is no estimate of power."""
-        # E|h|^2 = |mean|^2 + variance; |mean|^2 alone would choose too low a rate where doubt is large.
+        # E|h|^2 = |mean|^2 + variance; |mean|^2 alone would choose too low a rate
+        # where doubt is large.
         return self.predicted.abs().square() + self.variance[:, None]
 
 
 class Adaptation:
     """MCS by effective SINR (EESM) and Sionna's block error tables, PUSCH, MCS table 1.
 
-    The oracle takes the highest MCS whose blocks fail in at most `bler_target`; so does a prediction by the
-    rule `target` (the paper). By `carries_most` it takes the MCS that is expected to carry most, the
-    effective SINR being normal in dB with a spread that grows with the expected error.
+    The oracle takes the highest MCS whose blocks fail in at most `bler_target`; so does a
+    prediction by the rule `target` (the paper). By `carries_most` it takes the MCS that is expected
+    to carry most, the effective SINR being normal in dB with a spread that grows
+    with the expected error.
 
     Args:
         bler_target: of a transport block.
@@ -87,20 +90,24 @@ class Adaptation:
         symbols_per_s: OFDM symbols a second (paper: 28,000).
     """
 
-    def __init__(self, bler_target: float = 0.1, subcarriers: int = 624, symbols_per_s: float = 28e3) -> None:
+    def __init__(
+        self, bler_target: float = 0.1, subcarriers: int = 624, symbols_per_s: float = 28e3
+    ) -> None:
         from sionna.phy.nr.utils import decode_mcs_index
         from sionna.sys import PHYAbstraction
 
         self.abstraction = PHYAbstraction()
         self.bler_target = bler_target
         self.subcarriers, self.symbols_per_s = subcarriers, symbols_per_s
-        # 28: table 6.1.4.1-1 of TS 38.214, which Sionna takes for PUSCH; 28 to 31 are for retransmissions.
+        # 28: table 6.1.4.1-1 of TS 38.214, which Sionna takes for PUSCH;
+        # 28 to 31 are for retransmissions.
         order, rate = decode_mcs_index(torch.arange(28), table_index=1, is_pusch=True)
         efficiency = (order.double() * rate.double()).cpu()
         self.full_bps = efficiency * subcarriers * symbols_per_s
 
     def rates(self, band: Band, noise: float, care: float | None) -> Rates:
-        """Choose on the prediction, live with the truth; `noise` is the noise power, `care` as in `Rates`.
+        """Choose on the prediction, live with the truth; `noise` is the noise power,
+        `care` as in `Rates`.
 
         Without care the rule is `target`.
         """
@@ -113,7 +120,8 @@ class Adaptation:
         else:
             # 1e-30 keeps a silent prediction's doubt at its largest, 1, instead of NaN.
             loud = band.expected_power.mean(1).clamp_min(1e-30)
-            doubt = SLOW_DECIBEL * (band.variance / loud).clamp(0, 1).sqrt()  # root of the relative error
+            # Root of the relative error
+            doubt = SLOW_DECIBEL * (band.variance / loud).clamp(0, 1).sqrt()
             chosen = self._carries_most(guess, care * doubt)
         # Infinite where there is no such MCS: it carries nothing, as one that always fails.
         delivered = self.full_bps * (1 - fails.clamp_max(1))
@@ -122,10 +130,16 @@ class Adaptation:
             return table.gather(1, mcs[:, None])[:, 0].double().numpy()
 
         return Rates(
-            10 * math.log10(band.median_power / noise), oracle.numpy(), chosen.numpy(),
-            gathered(delivered, oracle), gathered(delivered, chosen), delivered.max(1).values.numpy(),
-            gathered(fails.clamp_max(1), chosen), gathered(fails, oracle) > OUTAGE, care,
-        )  # fmt: skip
+            10 * math.log10(band.median_power / noise),
+            oracle.numpy(),
+            chosen.numpy(),
+            gathered(delivered, oracle),
+            gathered(delivered, chosen),
+            delivered.max(1).values.numpy(),
+            gathered(fails.clamp_max(1), chosen),
+            gathered(fails, oracle) > OUTAGE,
+            care,
+        )
 
     def _effective_db(self, sinr: Tensor) -> Tensor:
         """Effective SINR [dB] (n, 28) under every MCS, from the SINR of the tones (n, K)."""
@@ -138,7 +152,9 @@ class Adaptation:
 
     def _fails(self, effective_db: Tensor) -> Tensor:
         """Transport-block error rates (n, 28); infinite where there is no such MCS."""
-        allocated = torch.full((len(effective_db), 28, 1), SYMBOLS * self.subcarriers, dtype=torch.int32)
+        allocated = torch.full(
+            (len(effective_db), 28, 1), SYMBOLS * self.subcarriers, dtype=torch.int32
+        )
         effective = from_decibels(effective_db)[..., None]
         rates = self._of_every_mcs(len(effective), sinr_eff=effective, num_allocated_re=allocated)
         return rates[3][..., 0].cpu().double()
@@ -152,7 +168,9 @@ class Adaptation:
         return torch.where(good >= 0, good, lowest)
 
     def _carries_most(self, effective_db: Tensor, spread_db: Tensor) -> Tensor:
-        """The MCS (n,) of the largest expected throughput; of equal ones, as where all fail, the lowest."""
+        """The MCS (n,) of the largest expected throughput; of equal ones, as where all fail,
+        the lowest.
+        """
         carried = torch.zeros(effective_db.shape, dtype=torch.float64)
         # Gauss-Hermite with 9 nodes is exact for polynomials to degree 17 under a normal density.
         for node, weight in zip(NODES, WEIGHTS / WEIGHTS.sum(), strict=True):

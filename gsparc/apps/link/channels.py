@@ -33,9 +33,11 @@ class BandChannels:
     """One band at n positions.
 
     Attributes:
-        true: (n, A, K) complex64; of simulated streets exact, else interpolated from measured tones.
+        true: (n, A, K) complex64; of simulated streets exact, else interpolated from measured
+            tones.
         predicted: (n, A, K) complex64.
-        variance: (n,) expected squared error per entry of this very band; NaN where the method gives none.
+        variance: (n,) expected squared error per entry of this very band; NaN where the method
+            gives none.
         confidence: (n,) the method's own; NaN where it has none.
         source: where the truth comes from, for the summary.
     """
@@ -58,9 +60,12 @@ class BandChannels:
 
 
 def predict_channels(
-    method: Method, data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray,
+    method: Method,
+    data: Measurements,
+    rows: np.ndarray,
+    frequency_hz: np.ndarray,
     antennas: slice = slice(None),
-) -> BandChannels:  # fmt: skip
+) -> BandChannels:
     """Return true and predicted channels of rows (n,) at absolute frequencies (K,) [Hz],
     of some of the antennas.
 
@@ -71,36 +76,51 @@ def predict_channels(
     parts: list[tuple[Tensor, Tensor, Tensor]] = []
     for start in range(0, len(rows), CHUNK):
         batch = data.batch(rows[start : start + CHUNK])
-        # What separates paths answers at any frequency; others are interpolated between measured tones.
+        # What separates paths answers at any frequency;
+        # others are interpolated between measured tones.
         if isinstance(method, SeparatesPaths) and batch.uplink is not None:
             wanted = torch.from_numpy(frequency_hz)
-            answer = method.predict_from_uplink(batch.uplink, wanted, batch.noise_variance, antennas)
+            answer = method.predict_from_uplink(
+                batch.uplink, wanted, batch.noise_variance, antennas
+            )
         else:
             answer = method.predict(batch)
             # The variance stays that of measured tones: interpolation is smooth between them.
-            mean = interpolate_tones(answer.mean[:, antennas], data.site.subcarriers_hz, frequency_hz)
+            mean = interpolate_tones(
+                answer.mean[:, antennas], data.site.subcarriers_hz, frequency_hz
+            )
             answer = Prediction(mean, answer.variance, answer.unknown)
         none = torch.full((len(batch),), torch.nan)
-        variance, confidence = (none if x is None else x for x in (answer.variance, answer.confidence))
+        variance, confidence = (
+            none if x is None else x for x in (answer.variance, answer.confidence)
+        )
         parts.append((answer.mean, variance, confidence))
     true, source = true_channels(data, rows, frequency_hz)
     predicted, variance, confidence = map(torch.cat, zip(*parts, strict=True))
     return BandChannels(true[:, antennas], predicted, variance, confidence, source)
 
 
-def true_channels(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> tuple[Tensor, str]:
+def true_channels(
+    data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray
+) -> tuple[Tensor, str]:
     """Return true channels (n, A, K) in the data's units and frame, and how they were come by."""
     assert data.site.subcarriers_hz is not None
     if data.site.name == "argos-sim" and data.uplink is not None:
         return _of_streets(data, rows, frequency_hz), "rays"
     measured = data.targets(rows)
-    return interpolate_tones(measured, data.site.subcarriers_hz, frequency_hz), "measured tones, interpolated"
+    return interpolate_tones(measured, data.site.subcarriers_hz, frequency_hz), (
+        "measured tones, interpolated"
+    )
 
 
 def band_evidence(band: BandChannels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
-    """Return evidence of `rows`, whose channels `band` holds: a fade of this band is no fade of another."""
+    """Return evidence of `rows`, whose channels `band` holds:
+    a fade of this band is no fade of another.
+    """
     prediction = Prediction(band.predicted, band.variance, 1 - band.confidence)
-    return score_answers(prediction, band.true, rows, data.moving[rows], Trusted.from_fold(data, fold))
+    return score_answers(
+        prediction, band.true, rows, data.moving[rows], Trusted.from_fold(data, fold)
+    )
 
 
 @lru_cache(maxsize=1)
@@ -111,7 +131,9 @@ def _streets(*facts: int) -> World:
 
 
 def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> Tensor:
-    """Rays at these frequencies, turned as each snapshot was (phase and timing, found on its uplink)."""
+    """Rays at these frequencies, turned as each snapshot was (phase
+    and timing, found on its uplink).
+    """
     site, uplink = data.site, data.uplink
     assert uplink is not None and site.uplink_hz is not None and site.antennas is not None
     there = _streets(*(int(data.provenance[name]) for name in FACTS if name in data.provenance))
@@ -119,7 +141,8 @@ def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) 
     # Simulated streets know the channel, but each snapshot was turned by its own phase and timing.
     clean = there.response(site.uplink_hz, rows)
     coarse = align_factors(heard, clean, site.uplink_hz, "phase+delay")
-    # The grid of delays leaves a tenth of a nanosecond: the slope of the remaining phase takes it out.
+    # The grid of delays leaves a tenth of a nanosecond:
+    # the slope of the remaining phase takes it out.
     rest = (heard * coarse[:, None] * clean.conj()).sum(1)
     away = site.uplink_hz - site.uplink_hz.mean()
     weight = np.abs(rest)

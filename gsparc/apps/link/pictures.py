@@ -26,9 +26,10 @@ STYLES = {
     "fallback": ("predicted, else pilots, all", PALETTE[4], "--"),
 }
 RATES = {
-    "oracle_bps": ("k-o", "from the true channel"), "best_bps": ("k:", "the most there is"),
+    "oracle_bps": ("k-o", "from the true channel"),
+    "best_bps": ("k:", "the most there is"),
     "chosen_bps": ("b--o", "from the predicted one"),
-}  # fmt: skip
+}
 
 
 def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, path: Path) -> None:
@@ -49,7 +50,9 @@ def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, pat
             reach = np.maximum([[-1], [1]] * (ends.T - bler), 0)
             # None failed: the limit alone is known, and a curve through it would show a floor.
             limit = ends[:, 1][curve.errors == 0]
-            axes[0, column].plot(curve.index[curve.errors == 0], limit, "v", color=colour, fillstyle="none")
+            axes[0, column].plot(
+                curve.index[curve.errors == 0], limit, "v", color=colour, fillstyle="none"
+            )
             style_above = {**style, "capsize": 2, "label": label, "linewidth": 1.2}
             axes[0, column].errorbar(curve.index, bler, reach, **style_above)
             axes[1, column].plot(curve.index, curve.ber.where(curve.ber > 0), **style)
@@ -66,13 +69,17 @@ def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, pat
 
 def draw_rates(
     rates: list[Rates], confidence: np.ndarray, least: float, title: str, path: Path
-) -> None:  # fmt: skip
-    """Draw throughput over noise, and the confidence of right and wrong choices, `least` of it accepted."""
+) -> None:
+    """Draw throughput over noise, and the confidence of right and wrong choices,
+    `least` of it accepted.
+    """
     figure, ((left, right),) = panels(11, 4, 1, 2)
     for name, (style, label) in RATES.items():
         mean = [getattr(one, name).mean() / 1e6 for one in rates]
         left.plot([one.snr_db for one in rates], mean, style, label=label)
-    left.set(xlabel="median signal-to-noise ratio [dB]", ylabel="mean throughput of one layer [Mbit/s]")
+    left.set(
+        xlabel="median signal-to-noise ratio [dB]", ylabel="mean throughput of one layer [Mbit/s]"
+    )
     left.set_title(title)
     left.legend()
     middle = rates[len(rates) // 2]
@@ -91,7 +98,9 @@ def draw_rates(
     save(figure, path)
 
 
-def draw_acceptance(acceptance: Mapping[str, tuple[float, pd.DataFrame]], share: float, path: Path) -> None:
+def draw_acceptance(
+    acceptance: Mapping[str, tuple[float, pd.DataFrame]], share: float, path: Path
+) -> None:
     """Draw the block error rate of the surest share of positions, as of `acceptance`,
     a panel a modulation.
     """
@@ -99,7 +108,9 @@ def draw_acceptance(acceptance: Mapping[str, tuple[float, pd.DataFrame]], share:
     for axis, (modulation, (ebno_db, rates)) in zip(grid[0], acceptance.items(), strict=True):
         for name in rates:
             label, colour, _ = STYLES[f"{name}@accepted"]
-            axis.plot(rates.index, rates[name], ".-", color=colour, label=label.removesuffix(", accepted"))
+            axis.plot(
+                rates.index, rates[name], ".-", color=colour, label=label.removesuffix(", accepted")
+            )
         axis.axvline(share, color="grey", linestyle=":", label="accepted")
         axis.set(xlabel="share of positions accepted, surest first", ylabel="block error rate")
         axis.set_title(f"{modulation.upper()} at {ebno_db:g} dB")

@@ -29,16 +29,21 @@ class Pusch:
         modulation: `qpsk` or `qam16`.
         blocks: resource blocks of 12 subcarriers.
         spacing_khz: subcarrier spacing [kHz].
-        correlation: frequency correlation at multiples of the subcarrier spacing (12 blocks,) complex, from
-            training channels; the LMMSE estimator's knowledge.
+        correlation: frequency correlation at multiples of the subcarrier spacing (12 blocks,)
+            complex, from training channels; the LMMSE estimator's knowledge.
         iterations: of the LDPC decoder.
         names: of the receivers, see `RECEIVERS`.
     """
 
     def __init__(
-        self, modulation: str, blocks: int, spacing_khz: int, correlation: np.ndarray, iterations: int = 20,
+        self,
+        modulation: str,
+        blocks: int,
+        spacing_khz: int,
+        correlation: np.ndarray,
+        iterations: int = 20,
         names: Sequence[str] = ("perfect", "lmmse", "predicted", "predicted_pilots"),
-    ) -> None:  # fmt: skip
+    ) -> None:
         from sionna.phy import nr
 
         config = nr.PUSCHConfig()
@@ -53,13 +58,18 @@ class Pusch:
         self.bits, self.rate = int(config.tb.num_bits_per_symbol), float(config.tb.target_coderate)
         self._known: dict[str, tuple[Tensor, Tensor]] = {}
         self._prior: tuple[Tensor, Tensor] | None = None
-        dmrs = config.dmrs.length, config.dmrs.additional_position, config.dmrs.num_cdm_groups_without_data
+        dmrs = (
+            config.dmrs.length,
+            config.dmrs.additional_position,
+            config.dmrs.num_cdm_groups_without_data,
+        )
         estimators: dict[str, Estimator] = {
             "perfect": lambda y, no: self._known["perfect"],
             "ls": nr.PUSCHLSChannelEstimator(self.grid, *dmrs, interpolation_type="lin"),
-            "lmmse": _Wiener(self.grid, correlation), "predicted": lambda y, no: self._known["predicted"],
+            "lmmse": _Wiener(self.grid, correlation),
+            "predicted": lambda y, no: self._known["predicted"],
             "predicted_pilots": _Wiener(self.grid, correlation, lambda: self._prior),
-        }  # fmt: skip
+        }
         decoder = nr.TBDecoder(self.transmitter._tb_encoder, num_bp_iter=iterations)
         how = {"tb_decoder": decoder, "return_tb_crc_status": True}
         factory = partial(nr.PUSCHReceiver, self.transmitter, **how)
@@ -74,8 +84,8 @@ class Pusch:
         """Send a block over each of `position` (n,), indices into the band.
 
         Returns:
-            A row per block and receiver: `ebno_db` [dB], `position`, `receiver`, `failed` (whether the
-            transport block's checksum was wrong) and `wrong` (share of wrong bits).
+            A row per block and receiver: `ebno_db` [dB], `position`, `receiver`, `failed` (whether
+            the transport block's checksum was wrong) and `wrong` (share of wrong bits).
         """
         from sionna.phy.channel import ApplyOFDMChannel
         from sionna.phy.utils import ebnodb2no
@@ -85,7 +95,8 @@ class Pusch:
         for start in range(0, len(position), batch):
             rows = position[start : start + batch]
             at = torch.from_numpy(rows)
-            # Each channel to mean power 1: Eb/N0 is then that of every block, not of the median place.
+            # Each channel to mean power 1: Eb/N0 is then that of every block,
+            # not of the median place.
             scale = band.true[at].abs().square().mean(1).sqrt()[:, None]
             self._prior = band.predicted[at] / scale, band.variance[at] / scale[:, 0] ** 2
             there, guess = (self._slots(h[at] / scale) for h in (band.true, band.predicted))
@@ -104,15 +115,19 @@ class Pusch:
     def _slots(self, channel: Tensor) -> Tensor:
         """(n, K) as [n, rx 1, rx_ant 1, tx 1, tx_ant 1, 14, K]."""
         count = self.grid.num_ofdm_symbols
-        return channel[:, None, None, None, None, None, :].expand(-1, 1, 1, 1, 1, count, -1).contiguous()
+        return (
+            channel[:, None, None, None, None, None, :]
+            .expand(-1, 1, 1, 1, 1, count, -1)
+            .contiguous()
+        )
 
 
 class _Wiener:
     """LMMSE interpolation of one layer's DMRS over frequency; symbols of a slot are averaged.
 
-    With a `prior`, means (n, K) and variances (n,) of the channels, pilots correct the prediction: what they
-    tell of its error is spread over frequency as channels are correlated. Without, the mean is 0 and the
-    variance 1.
+    With a `prior`, means (n, K) and variances (n,) of the channels, pilots correct the prediction:
+    what they tell of its error is spread over frequency as channels are correlated. Without, the
+    mean is 0 and the variance 1.
     """
 
     def __init__(self, grid, correlation: np.ndarray, prior: Prior | None = None) -> None:
@@ -134,9 +149,12 @@ class _Wiener:
         matched = (heard * self.pilots.conj()).sum(1) / energy
         noise = float(torch.as_tensor(no).flatten()[0]) / energy.double()
         prior = None if self.prior is None else self.prior()
-        mean, variance = (torch.zeros(1, self.whole.shape[0]), torch.ones(1)) if prior is None else prior
+        mean, variance = (
+            (torch.zeros(1, self.whole.shape[0]), torch.ones(1)) if prior is None else prior
+        )
         variance = variance.double().clamp_min(LEAST_VARIANCE)[:, None]
-        # In units of the prior variance: R_c (R_cc + N / v)^-1, a matrix for each position with its own.
+        # In units of the prior variance: R_c (R_cc + N / v)^-1,
+        # a matrix for each position with its own.
         doubt = torch.diag_embed((noise / variance).to(self.whole.dtype))
         gram = self.whole[self.comb][:, self.comb] + doubt
         cross = self.whole[:, self.comb]
@@ -144,14 +162,18 @@ class _Wiener:
         news = (matched - mean[:, self.comb]).to(filtering.dtype)
         smooth = mean + (filtering @ news[..., None])[..., 0].to(torch.complex64)
         # The error's variance, v (R - F C^H), which rounding may take below 0.
-        residual = (torch.diagonal(self.whole).real - (filtering * cross.conj()).sum(-1).real).clamp_min(0)
+        residual = (
+            torch.diagonal(self.whole).real - (filtering * cross.conj()).sum(-1).real
+        ).clamp_min(0)
         shape = (len(y), 1, 1, 1, 1, y.shape[3], y.shape[4])
         spread = (variance * residual).float().view(-1, 1, 1, 1, 1, 1, self.whole.shape[0])
         estimate = smooth.view(len(y), 1, 1, 1, 1, 1, -1).expand(shape).contiguous()
         return estimate, spread.expand(shape).contiguous()
 
 
-def frequency_correlation(channel: Tensor, tones_hz: np.ndarray, spacing_hz: float, count: int) -> np.ndarray:
+def frequency_correlation(
+    channel: Tensor, tones_hz: np.ndarray, spacing_hz: float, count: int
+) -> np.ndarray:
     """Return the normalised correlation over frequency at lags 0 to count - 1 of `spacing_hz`,
     from channels (n, K).
     """
@@ -160,7 +182,9 @@ def frequency_correlation(channel: Tensor, tones_hz: np.ndarray, spacing_hz: flo
     # Each channel to power 1, so that strong places do not decide the correlation.
     unit = (channel / channel.abs().square().mean(1, keepdim=True).sqrt().clamp_min(1e-30)).numpy()
     lags = np.arange(len(tones_hz))
-    values = np.array([(unit[:, lag:] * unit[:, : len(tones_hz) - lag].conj()).mean() for lag in lags])
+    values = np.array(
+        [(unit[:, lag:] * unit[:, : len(tones_hz) - lag].conj()).mean() for lag in lags]
+    )
     step = float(np.diff(np.sort(tones_hz)).min())
     # By lag 0, where `values` is 1 up to rounding and masked tones.
     return np.interp(np.arange(count) * spacing_hz, lags * step, values) / values[0].real

@@ -42,7 +42,9 @@ class LinkStudy:
         self.method, self.data, self.fold = run.methods[0], run.data, run.split.folds[0]
         site, self.antenna, self.shape = run.data.site, int(settings["antenna"]), settings["pusch"]
         if not site.target.is_complex or site.subcarriers_hz is None:
-            raise ValueError(f"gsparc link needs complex channels with their frequencies, not {site.kind}")
+            raise ValueError(
+                f"gsparc link needs complex channels with their frequencies, not {site.kind}"
+            )
         site.need_phase("gsparc link")
         RULES.check("rule", settings["rule"])
         for name in (receivers := list(settings["receivers"])):
@@ -51,7 +53,9 @@ class LinkStudy:
             raise ValueError(f"receivers={receivers}: {' and '.join(missing)} must be among them")
         or_null(SHARE).check("threshold", settings["threshold"])
         if not 0 <= self.antenna < (antennas := run.data.target.shape[1]):
-            raise ValueError(f"antenna={self.antenna}: the channels have {antennas}, numbered from 0")
+            raise ValueError(
+                f"antenna={self.antenna}: the channels have {antennas}, numbered from 0"
+            )
         self.tones, self.mcs, self.rule = site.subcarriers_hz, settings["mcs"], settings["rule"]
         self.count = SUBCARRIERS_PER_BLOCK * self.shape["blocks"]
         self.spacing_hz = 1e3 * self.shape["spacing_khz"]
@@ -72,22 +76,34 @@ class LinkStudy:
         self.aside = rows if len(rows) else aside
         states_variance = bool(grid.variance.isfinite().all())
         if not states_variance:
-            text = "%s states no error variance: rates are chosen as if it were exact, pilots do not mend it"
+            text = (
+                "%s states no error variance: rates are chosen as if it were exact, pilots do "
+                "not mend it"
+            )
             log.warning(text, self.method.name)
-        self.receivers = [name for name in receivers if name != "predicted_pilots" or states_variance]
+        self.receivers = [
+            name for name in receivers if name != "predicted_pilots" or states_variance
+        ]
         self.grid, bad = grid.select_positions(self.test), promise.is_bad(evidence.error[self.test])
         self.facts: dict[str, Any] = {
-            "seed": int(settings["seed"]), "positions": len(self.test), "confidence/kind": kind,
-            "accepted": float(self.accepted.mean()), "promise/limit_db": promise.limit_db,
-            "promise/bad_among_accepted": float(bad[self.accepted].mean()) if self.accepted.any() else None,
+            "seed": int(settings["seed"]),
+            "positions": len(self.test),
+            "confidence/kind": kind,
+            "accepted": float(self.accepted.mean()),
+            "promise/limit_db": promise.limit_db,
+            "promise/bad_among_accepted": float(bad[self.accepted].mean())
+            if self.accepted.any()
+            else None,
             "threshold": self.least if np.isfinite(self.least) else None,
             "model/states_variance": states_variance,
-        }  # fmt: skip
+        }
         if setting is None:  # a threshold by hand promises nothing
             self.facts |= {
-                "promise/alpha": promise.alpha, "promise/delta": promise.delta,
-                "promise/calibrated_on": threshold.accepted, "promise/bound": threshold.bound(promise.delta),
-            }  # fmt: skip
+                "promise/alpha": promise.alpha,
+                "promise/delta": promise.delta,
+                "promise/calibrated_on": threshold.accepted,
+                "promise/bound": threshold.bound(promise.delta),
+            }
 
     def beams(self) -> dict[str, Any]:
         """Return `beams/*` of all test positions, as nothing of a beam was chosen on any.
@@ -104,7 +120,9 @@ class LinkStudy:
     def rates(self) -> tuple[list[Rates], dict[str, Any]]:
         """Return rate adaptation at every noise level and its facts."""
         test_band, other = (
-            predict_channels(self.method, self.data, self.fold.test[rows], self.tones, self.one).band()
+            predict_channels(
+                self.method, self.data, self.fold.test[rows], self.tones, self.one
+            ).band()
             for rows in (self.test, self.aside)
         )
         rates = study.adapt_rates(test_band, other, self.mcs, self.rule)
@@ -119,7 +137,13 @@ class LinkStudy:
         heard = self.data.targets(self.fold.train)[:, self.antenna]
         correlation = frequency_correlation(heard, self.tones, self.spacing_hz, self.count)
         shape = self.shape
-        how = shape["blocks"], shape["spacing_khz"], correlation, shape["iterations"], self.receivers
+        how = (
+            shape["blocks"],
+            shape["spacing_khz"],
+            correlation,
+            shape["iterations"],
+            self.receivers,
+        )
         pusch = Pusch(modulation, *how)
         sizes = shape["coarse"], shape["fine"], shape["batch"]
         blocks = study.send_blocks(pusch, self.grid.band(), levels, sizes)
@@ -128,11 +152,14 @@ class LinkStudy:
         facts = study.pusch_facts(modulation, rates)
         for name in ("perfect", "predicted"):
             shares = surest[1][name].items()
-            facts |= {f"tradeoff/{modulation}/{name}/{share:.0%}": float(rate) for share, rate in shares}
+            facts |= {
+                f"tradeoff/{modulation}/{name}/{share:.0%}": float(rate) for share, rate in shares
+            }
         facts |= {
-            "pusch/truth": self.grid.source, "pilots/share_of_slot": pusch.pilot_share,
+            "pusch/truth": self.grid.source,
+            "pilots/share_of_slot": pusch.pilot_share,
             # An accepted position needs no pilots at all.
             "pilots/saved": pusch.pilot_share * float(self.accepted.mean()),
             f"time/pusch_{modulation}_s": time.perf_counter() - begun,
-        }  # fmt: skip
+        }
         return rates, surest, facts

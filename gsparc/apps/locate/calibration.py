@@ -19,7 +19,8 @@ LOOKS = 100  # trials
 
 
 def calibrate_trust(snapshots: Sequence[PlaceSearch], places: np.ndarray, start: Trust) -> Trust:
-    """Return the trust under which held-out places are most likely: of the highest mean log density there.
+    """Return the trust under which held-out places are most likely:
+    of the highest mean log density there.
 
     Args:
         snapshots: with their likelihoods over cells.
@@ -48,12 +49,15 @@ def calibrate_trust(snapshots: Sequence[PlaceSearch], places: np.ndarray, start:
 def calibrate_level(
     trust: Trust, snapshots: Sequence[PlaceSearch], places: np.ndarray, share: float
 ) -> Trust:
-    """Return the trust with the level whose areas hold a share of places (n, 3) [m], and the worst misfit.
+    """Return the trust with the level whose areas hold a share of places (n, 3) [m],
+    and the worst misfit.
 
-    The level is the conformal quantile of masses down to the truth: whatever the model's errors, areas of
-    that level hold the share of places that are exchangeable with these.
+    The level is the conformal quantile of masses down to the truth: whatever the model's errors,
+    areas of that level hold the share of places that are exchangeable with these.
     """
-    levels = [one.posterior(trust).mass_above(place) for one, place in zip(snapshots, places, strict=True)]
+    levels = [
+        one.posterior(trust).mass_above(place) for one, place in zip(snapshots, places, strict=True)
+    ]
     # Too few snapshots for this share: nothing less than the whole site is sure to hold it.
     level = min(conformal_quantile(levels, share), 1.0)
     return replace(trust, level=level, worst=max(one.least_misfit(trust) for one in snapshots))

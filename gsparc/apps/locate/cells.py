@@ -10,7 +10,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 THIN = 0.02  # of the longest side: what is shorter is no axis
-REACH = 3.0  # times the median distance between neighbouring trained places, within which one can stand
+# Times the median distance between neighbouring trained places, within which one can stand
+REACH = 3.0
 
 
 @dataclass(frozen=True)
@@ -47,11 +48,15 @@ class Cells:
 
     def join(self, others: Cells) -> Cells:
         """Return these cells and others."""
-        return Cells(np.concatenate([self.centre, others.centre]), np.concatenate([self.edge, others.edge]))
+        return Cells(
+            np.concatenate([self.centre, others.centre]), np.concatenate([self.edge, others.edge])
+        )
 
     def box(self) -> np.ndarray:
         """Return the corners (2, 3) [m] of all cells."""
-        return np.stack([(self.centre - self.edge / 2).min(0), (self.centre + self.edge / 2).max(0)])
+        return np.stack(
+            [(self.centre - self.edge / 2).min(0), (self.centre + self.edge / 2).max(0)]
+        )
 
     def index_of(self, place: np.ndarray) -> int:
         """Return the cell that a place (3,) is in, or that is nearest to it."""
@@ -60,20 +65,26 @@ class Cells:
 
 
 def beyond_box(places: np.ndarray, box: np.ndarray, margin: np.ndarray | float = 0.0) -> np.ndarray:
-    """Tell which places (n, 3) are beyond corners (2, 3), or within a margin [m], seen from above: (n,)."""
+    """Tell which places (n, 3) are beyond corners (2, 3), or within a margin [m], seen from above:
+    (n,).
+    """
     within = (places - margin > box[0]) & (places + margin < box[1])
     return ~within[:, :2][:, np.ptp(box, axis=0)[:2] > 0].all(1)
 
 
 def cover_box(
-    trained: np.ndarray, most: int, around: bool, open_at: Callable[[np.ndarray], np.ndarray] | None = None,
+    trained: np.ndarray,
+    most: int,
+    around: bool,
+    open_at: Callable[[np.ndarray], np.ndarray] | None = None,
     beyond: float = 0,
-) -> Cells:  # fmt: skip
+) -> Cells:
     """Return about `most` equal cells of the box of trained places (n, 3) [m].
 
     Args:
         trained, most: places [m, local], and cells of the whole box.
-        around: whether only cells near trained places are kept, as in a building one walked through.
+        around: whether only cells near trained places are kept, as in a building one walked
+            through.
         open_at: whether one can stand at places (m, 3) [m, local], by a floor plan.
         beyond: share of its sides that the box reaches further on each of its four sides.
 
@@ -89,7 +100,9 @@ def cover_box(
     count = np.where(live, np.maximum(np.ceil(extent / step), 1), 1).astype(int)
     edge = np.where(live, extent / count, 0.0)
     middle = np.median(trained, axis=0)
-    laid = [low[i] + edge[i] * (np.arange(count[i]) + 0.5) if live[i] else middle[[i]] for i in range(3)]
+    laid = [
+        low[i] + edge[i] * (np.arange(count[i]) + 0.5) if live[i] else middle[[i]] for i in range(3)
+    ]
     centre = np.stack(np.meshgrid(*laid, indexing="ij"), -1).reshape(-1, 3)
     if around:
         tree = cKDTree(np.unique(trained, axis=0))

@@ -30,7 +30,9 @@ def locate_fingerprints(config: DictConfig, run_dir: Path) -> Report:
     """
     chosen = config.dataset
     if chosen.file is None or not OmegaConf.is_missing(config, "ckpt"):
-        raise ValueError("dataset=fingerprints learns from its own rows: give dataset.file=FILE, and no ckpt")
+        raise ValueError(
+            "dataset=fingerprints learns from its own rows: give dataset.file=FILE, and no ckpt"
+        )
     if config.offset_db is not None or config.plan is not None or config.prior != "box":
         raise ValueError("offset_db, plan, prior: for trained models alone, not for fingerprints")
     POSITIVE.check("dataset.side_m", chosen.side_m)
@@ -39,17 +41,23 @@ def locate_fingerprints(config: DictConfig, run_dir: Path) -> Report:
     how: Any = "file" if config.data else chosen.split
     cut = float(chosen.side_m), float(chosen.held_out)
     if config.data:
-        reference, heard = rows, read_fingerprints(config.data, False).select_access_points(rows.access_point)
+        reference, heard = (
+            rows,
+            read_fingerprints(config.data, False).select_access_points(rows.access_point),
+        )
     else:
         reference, heard = map(rows.subset, split_fingerprints(rows, how, *cut, int(config.seed)))
     heard = heard.subset(sample_rows(config, len(heard.level)))
     both = fingerprint_snapshots(heard), fingerprint_snapshots(reference)
     place, each_ms, fit_s = locate_by_neighbours(METHOD, *both[::-1])
     facts = {
-        "dataset/name": Path(chosen.file).stem, "dataset/sha256": sha256(rows.level.tobytes()).hexdigest(),
-        "split/name": how, "split/train": len(reference.level), "time/fit_s": fit_s,
+        "dataset/name": Path(chosen.file).stem,
+        "dataset/sha256": sha256(rows.level.tobytes()).hexdigest(),
+        "split/name": how,
+        "split/train": len(reference.level),
+        "time/fit_s": fit_s,
         "time/locate_ms": each_ms,
-    }  # fmt: skip
+    }
     return report(run_dir, config, METHOD, *both, columns_of_places(place, heard.position), facts)
 
 

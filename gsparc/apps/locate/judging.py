@@ -38,7 +38,8 @@ log = logging.getLogger(__name__)
 Report = tuple[dict[str, Any], list[Table], list[str]]  # facts, tables and sentences
 SHOWN = 6  # snapshots, evenly over all
 ABOUT = ("modes", "doubt", "inside")  # columns of `Located`
-SIZES = {"length_m": "m", "area_m2": "m2", "volume_m3": "m3"}  # of areas, by how many axes are searched
+# Of areas, by how many axes are searched
+SIZES = {"length_m": "m", "area_m2": "m2", "volume_m3": "m3"}
 TRUST_IS_OF = ("share", "prior", "plan", "plan_points")  # settings
 
 
@@ -54,9 +55,16 @@ def columns_of_places(
 
 
 def report(
-    run_dir: Path, config: DictConfig, method: str, heard: Scans, trained: Scans,
-    columns: dict[str, Any], facts: dict[str, Any], promise: str = "", group: np.ndarray | None = None,
-) -> Report:  # fmt: skip
+    run_dir: Path,
+    config: DictConfig,
+    method: str,
+    heard: Scans,
+    trained: Scans,
+    columns: dict[str, Any],
+    facts: dict[str, Any],
+    promise: str = "",
+    group: np.ndarray | None = None,
+) -> Report:
     """Write `locate.csv`; facts, and where places are known, a table and a sentence of errors.
 
     Args:
@@ -88,7 +96,10 @@ def report(
         median, p90 = np.quantile(error, [0.5, 0.9]).tolist()
         facts |= {f"{stem}/median_m": median, f"{stem}/p90_m": p90}
         rows.append([name, median, p90])
-    title = f"{Path(config.data).stem if config.data else facts['dataset/name']}, {len(heard)} snapshots"
+    title = (
+        f"{Path(config.data).stem if config.data else facts['dataset/name']}, {len(heard)} "
+        "snapshots"
+    )
     heads = Column("method", ""), Column("median [m]", ".3g"), Column("p90 [m]", ".3g")
     tables = [Table(title, heads, rows)]
     facts["locate/coverage"] = None if inside is None else float(np.mean(inside))
@@ -129,17 +140,30 @@ def locate_by_model(
     run = open_files([config.ckpt], to_dict(config.dataset), to_dict(config.split))
     data, fold = run.data, run.split.folds[0]
     learned = np.sort(fold.learned())
-    unknown, share = Nuisances(bool(config.phase_known), float(config.offset_db or 0)), float(config.share)
+    unknown, share = (
+        Nuisances(bool(config.phase_known), float(config.offset_db or 0)),
+        float(config.share),
+    )
     # A plan is in world metres, cells are local.
     origin = data.site.origin
     light = None if open_at is None else lambda places: open_at(places[:, :2] + origin[:2])
     cells = partial(cover_box, most=locating.MOST, around=config.prior == "trained", open_at=light)
-    heard, placed = _snapshots(config, run)  # first: a file that cannot be read needs no calibration
-    box, wider = (cells(data.moving[learned][:, :3], beyond=beyond) for beyond in (0, locating.FURTHER))
+    # First: a file that cannot be read needs no calibration
+    heard, placed = _snapshots(config, run)
+    box, wider = (
+        cells(data.moving[learned][:, :3], beyond=beyond) for beyond in (0, locating.FURTHER)
+    )
     size = list(SIZES)[(box.edge.max(0) > 0).sum() - 1]
     # Not of names alone: a plan's image, and rows, change under the same name.
-    extra, cells_hash = run.stored[0].extra, joblib.hash((box, wider, learned, data.site.sha256))[:8]
-    how = {name: to_dict(config)[name] for name in TRUST_IS_OF} | asdict(unknown) | {"cells": cells_hash}
+    extra, cells_hash = (
+        run.stored[0].extra,
+        joblib.hash((box, wider, learned, data.site.sha256))[:8],
+    )
+    how = (
+        {name: to_dict(config)[name] for name in TRUST_IS_OF}
+        | asdict(unknown)
+        | {"cells": cells_hash}
+    )
     stored, other = extra.get(locating.KEY, {}), locating.find_other_settings(extra, how)
     anew = bool(config.calibrate and (config.renew or other))
     start, count = Trust() if anew else locating.restore_trust(extra, how), stored.get("count", 0)
@@ -147,11 +171,16 @@ def locate_by_model(
     if anew:
         if stored:
             log.info(
-                "the stored calibration was of %s: it is done again", ", ".join(other) or "the same settings"
+                "the stored calibration was of %s: it is done again",
+                ", ".join(other) or "the same settings",
             )
         seed = int(config.seed)
-        retraining = run.retraining(config.calibrate_effort, run_dir=run_dir / "left_out", seed=seed)
-        trust, count = locating.learn_trust(retraining, locator, share, int(config.calibrate), cells)
+        retraining = run.retraining(
+            config.calibrate_effort, run_dir=run_dir / "left_out", seed=seed
+        )
+        trust, count = locating.learn_trust(
+            retraining, locator, share, int(config.calibrate), cells
+        )
         locator = replace(locator, trust=trust)
         if config.store:
             entry = {"trust": asdict(trust), "how": how, "count": count}
@@ -170,7 +199,8 @@ def locate_by_model(
 
     located = write_as_found(locator.locate(heard), run_dir / "locate.csv", columns)
     trained = group_snapshots(data, learned)
-    status = "are promised" if config.calibrate or stored else "are not calibrated"  # of which was warned
+    # Of which was warned
+    status = "are promised" if config.calibrate or stored else "are not calibrated"
     claim = f"{share:.0%} {status}; {float(box.volume.sum()):.3g} {SIZES[size]} were searched"
     beyond = int(beyond_box(heard.place, box.box()).sum()) if placed else 0
     claim += f", {beyond} true places lie outside" * bool(beyond)
@@ -180,7 +210,9 @@ def locate_by_model(
     each_ms = float(np.median([one.seconds for one in located]) * 1e3)
     facts = {**run.facts(), "locate/calibrated_on": count, "time/locate_ms_p50": each_ms}
     group = run.group_places(trained.place, int(config.calibrate) or 3, int(config.seed))
-    return report(run_dir, config, run.methods[0].name, heard, trained, columns(located), facts, claim, group)
+    return report(
+        run_dir, config, run.methods[0].name, heard, trained, columns(located), facts, claim, group
+    )
 
 
 def _snapshots(config: DictConfig, run: Opened) -> tuple[Scans, bool]:
@@ -195,7 +227,9 @@ def _snapshots(config: DictConfig, run: Opened) -> tuple[Scans, bool]:
         data, placed = read_like_stored(run.stored[0], config.data)
     heard = group_snapshots(data, np.arange(len(data)) if rows is None else rows)
     if not placed:
-        log.info("%s: %d snapshots in %d rows, at unknown places", config.data, len(heard), len(data))
+        log.info(
+            "%s: %d snapshots in %d rows, at unknown places", config.data, len(heard), len(data)
+        )
         heard = replace(heard, place=np.full_like(heard.place, np.nan))
     return heard.subset(sample_rows(config, len(heard))), placed
 
@@ -208,14 +242,18 @@ def sample_rows(config: DictConfig, count: int) -> np.ndarray:
     return draw_rows(count, config.rows, int(config.seed))
 
 
-def draw_posteriors(found: Sequence[Located], true: np.ndarray | None, known: np.ndarray, path: Path) -> None:
+def draw_posteriors(
+    found: Sequence[Located], true: np.ndarray | None, known: np.ndarray, path: Path
+) -> None:
     """Draw masses of the cells of a few snapshots from above, as one PNG.
 
     `true` (n, 3) [m] in the coordinates of `found`, or None; `known` (m, 3): places learned from.
     """
     some = np.unique(np.linspace(0, len(found) - 1, SHOWN).round().astype(int))
     columns = min(len(some), 3)
-    figure, axes = panels(9, 3.2 * -(-len(some) // columns), -(-len(some) // columns), columns, grid=False)
+    figure, axes = panels(
+        9, 3.2 * -(-len(some) // columns), -(-len(some) // columns), columns, grid=False
+    )
     for axis in axes.flat[len(some) :]:
         axis.axis("off")
     for axis, number in zip(axes.flat, some, strict=False):
@@ -230,8 +268,12 @@ def draw_posteriors(found: Sequence[Located], true: np.ndarray | None, known: np
         axis.plot(*known[:, :2].T, ".", color="0.7", markersize=1, label="learned from")
         axis.plot(*one.place[:2], "x", color=PALETTE[1], label="located")
         if true is not None:
-            axis.plot(*true[number, :2], "o", markerfacecolor="none", color="black", label="heard at")
+            axis.plot(
+                *true[number, :2], "o", markerfacecolor="none", color="black", label="heard at"
+            )
         axis.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-        axis.set_title(f"snapshot {number}: {one.modes} mode{'s' if one.modes > 1 else ''}", fontsize=9)
+        axis.set_title(
+            f"snapshot {number}: {one.modes} mode{'s' if one.modes > 1 else ''}", fontsize=9
+        )
     axes.flat[0].legend(fontsize=7)
     save(figure, path)

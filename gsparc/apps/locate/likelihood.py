@@ -1,7 +1,7 @@
 """How well snapshots fit places: squared errors by their variance, and log-likelihoods of them.
 
-n snapshots of P values against mean and variance of the same values at G places. What differs by chance
-between snapshots is taken out: the phase of a carrier, a device's offset in decibels.
+n snapshots of P values against mean and variance of the same values at G places. What differs by
+chance between snapshots is taken out: the phase of a carrier, a device's offset in decibels.
 """
 
 from __future__ import annotations
@@ -40,18 +40,20 @@ class Misfit:
 
     def subset(self, places: np.ndarray) -> Misfit:
         """Return the misfit at places (g,) by number."""
-        return Misfit(self.squared[:, places], self.size[:, places], self.count, self.silent[:, places])
+        return Misfit(
+            self.squared[:, places], self.size[:, places], self.count, self.silent[:, places]
+        )
 
 
 @dataclass(frozen=True)
 class Trust:
     """How far a field's own variances are trusted.
 
-    Errors of nearby pixels, tones and stations are not independent, which the temperature answers for, and
-    some snapshots are worse than all others (somebody stood in the way), which the tail does: variances of a
-    snapshot are known up to a factor of a scaled inverse chi-square distribution, so that its likelihood is
-    that of a multivariate t (K. L. Lange et al., "Robust statistical modeling using the t distribution", JASA
-    84 (1989)).
+    Errors of nearby pixels, tones and stations are not independent, which the temperature answers
+    for, and some snapshots are worse than all others (somebody stood in the way), which the tail
+    does: variances of a snapshot are known up to a factor of a scaled inverse chi-square
+    distribution, so that its likelihood is that of a multivariate t (K. L. Lange et al., "Robust
+    statistical modeling using the t distribution", JASA 84 (1989)).
 
     Attributes:
         inflation: of variances.
@@ -59,7 +61,8 @@ class Trust:
         tail: degrees of freedom.
         spread: standard deviation of recorded places about the likelihood's along each axis [m].
         level: mass of the area that holds the promised share of places.
-        worst: largest misfit at the likeliest place of any snapshot that was left out (see `Search.misfit`).
+        worst: largest misfit at the likeliest place of any snapshot that was left out (see
+            `Search.misfit`).
     """
 
     inflation: float = 1.0
@@ -106,15 +109,20 @@ def channel_misfit(values: Tensor, mean: Tensor, variance: Tensor, phase_known: 
 
 
 def level_misfit(
-    values: Tensor, mean: Tensor, variance: Tensor, offset_db: float = 0.0, floor: Tensor | None = None
+    values: Tensor,
+    mean: Tensor,
+    variance: Tensor,
+    offset_db: float = 0.0,
+    floor: Tensor | None = None,
 ) -> Misfit:
-    """Return the misfit of powers (n, P) [dB], NaN where missing, by means, variances (G, P) [dB, dB^2].
+    """Return the misfit of powers (n, P) [dB], NaN where missing, by means, variances (G, P) [dB,
+    dB^2].
 
     Args:
         values: what was heard.
         mean, variance: of the places; NaN where a station has no prediction.
-        offset_db: standard deviation of an offset that all powers of a snapshot share [dB]; it is integrated
-            out in closed form.
+        offset_db: standard deviation of an offset that all powers of a snapshot share [dB]; it is
+            integrated out in closed form.
         floor: (n, P) levels [dB] below which a silent power lies, NaN of those that were heard.
     """
     heard, seen = _where(values)
@@ -122,7 +130,8 @@ def level_misfit(
     weighed = means * precision
     square = heard.square() @ precision.T - 2 * heard @ weighed.T + seen @ (means * weighed).T
     slope = heard @ precision.T - seen @ weighed.T
-    # Sherman and Morrison: (D + o^2 1 1^T)^-1 takes one rank out; its determinant is |D| times this.
+    # Sherman and Morrison: (D + o^2 1 1^T)^-1 takes one rank out;
+    # its determinant is |D| times this.
     shared = 1 + offset_db**2 * (seen @ precision.T)
     squared = (square - offset_db**2 * slope.square() / shared).clamp_min(0)
     size = seen @ log_variance.T + shared.log()
@@ -142,7 +151,9 @@ def _where(values: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _moments(mean: Tensor, variance: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Means, inverse variances and logarithms of variances (G, P), all 0 where nothing is predicted."""
+    """Means, inverse variances and logarithms of variances (G, P),
+    all 0 where nothing is predicted.
+    """
     is_predicted = ~torch.isnan(mean.real)
     safe = torch.where(is_predicted, variance.clamp_min(TINY), torch.ones_like(variance))
     precision = torch.where(is_predicted, 1 / safe, torch.zeros_like(safe))

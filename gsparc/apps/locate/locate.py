@@ -22,9 +22,16 @@ log = logging.getLogger(__name__)
 
 
 def locate(
-    predictor: Predictor, values: Any, *, silent: Any = None, where: Any = None, phase_known: bool = False,
-    offset_db: float = 0.0, share: float = 0.9, unit: str | None = None,
-) -> list[Located]:  # fmt: skip
+    predictor: Predictor,
+    values: Any,
+    *,
+    silent: Any = None,
+    where: Any = None,
+    phase_known: bool = False,
+    offset_db: float = 0.0,
+    share: float = 0.9,
+    unit: str | None = None,
+) -> list[Located]:
     """Find where snapshots were heard, by the likelihood of a model, in world coordinates.
 
     >>> locate(gsparc.load("city.ckpt"), [[-90.0, -75.2]])[0].place.shape  # (n, stations) [dBm]
@@ -32,8 +39,8 @@ def locate(
 
     Args:
         predictor: of a model with a variance whose one end alone moves.
-        values: (n, ...) spectra, channels or powers; where there are stations (n, stations, ...), NaN
-            where one is missing.
+        values: (n, ...) spectra, channels or powers; where there are stations (n, stations, ...),
+            NaN where one is missing.
         silent: bool like powers, True where the value is the level below which nothing was heard.
         where: (m, 3) world places near which one can stand; None: in the box of the measured ones.
         phase_known: whether channels come in the phase of the trained ones.
@@ -51,14 +58,22 @@ def locate(
         stored = site.power_unit(unit or predictor.unit).stored(torch.as_tensor(values))
         values = stored * site.target_scale
     heard = snapshots_of_values(site, values, silent)
-    places = None if where is None else tuple(map(tuple, np.atleast_2d(read_places("where", where)).tolist()))
+    places = (
+        None
+        if where is None
+        else tuple(map(tuple, np.atleast_2d(read_places("where", where)).tolist()))
+    )
     found = _locator(predictor, places, Nuisances(phase_known, offset_db), share).locate(heard)
     return [to_world(one, site.origin) for one in found]
 
 
-@lru_cache(maxsize=4)  # what a model says of the coarse grid is most of the time of the first snapshot
+# What a model says of the coarse grid is most of the time of the first snapshot
+@lru_cache(maxsize=4)
 def _locator(
-    predictor: Predictor, places: tuple[tuple[float, ...], ...] | None, unknown: Nuisances, share: float
+    predictor: Predictor,
+    places: tuple[tuple[float, ...], ...] | None,
+    unknown: Nuisances,
+    share: float,
 ) -> Locator:
     """Of world places (m, 3); None: of the box of the measured ones."""
     site = predictor.site
@@ -68,5 +83,7 @@ def _locator(
     before = how.get("prior"), how.get("plan")
     if how and before != ("box" if places is None else "where", None):
         log.warning("locate: areas were calibrated with prior=%s, plan=%s, not here", *before)
-    cells, wider = (cover_box(local, MOST, places is not None, beyond=beyond) for beyond in (0, FURTHER))
+    cells, wider = (
+        cover_box(local, MOST, places is not None, beyond=beyond) for beyond in (0, FURTHER)
+    )
     return Locator(SiteField(predictor), cells, wider, unknown, trust)

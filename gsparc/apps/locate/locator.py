@@ -27,7 +27,8 @@ from gsparc.prediction.refit import Learned
 log = logging.getLogger(__name__)
 
 MOST = 3_000  # cells of the coarse grid
-# Snapshots left out, drawn evenly, that trust is learned from, at first and in all: so many tell a share of
+# Snapshots left out, drawn evenly, that trust is learned from, at first and in all:
+# so many tell a share of
 # 90 % to 3 points.
 TRUSTED, HELD_OUT = 30, 100
 HALVED = 16  # cells that are halved at a time
@@ -49,8 +50,8 @@ class Located:
         modes: parts of that area that are apart, each of some mass.
         posterior: masses of cells.
         seconds: that it took.
-        doubt: why its area promises nothing: it lies beyond the places that were learned from, or the
-            snapshot fits no place; empty: neither.
+        doubt: why its area promises nothing: it lies beyond the places that were learned from, or
+            the snapshot fits no place; empty: neither.
         inside: 1 where the true place lies in that area, else 0; None where it is unknown.
     """
 
@@ -91,12 +92,17 @@ class Locator:
         """Of the larger box; one, as what it says of its coarse grid takes as long."""
         return replace(self, cells=self.wider)
 
-    def search_cells(self, heard: Scans, trust: Trust, before: PlaceSearch | None = None) -> PlaceSearch:
-        """Return one snapshot's misfit at cells that are halved as long as few of them hold the mass.
+    def search_cells(
+        self, heard: Scans, trust: Trust, before: PlaceSearch | None = None
+    ) -> PlaceSearch:
+        """Return one snapshot's misfit at cells that are halved as long as few
+        of them hold the mass.
 
         `before`: the same under another trust, whose cells are halved further.
         """
-        current = before or PlaceSearch(self.cells, compute_misfit(heard, self._coarse, self.unknown))
+        current = before or PlaceSearch(
+            self.cells, compute_misfit(heard, self._coarse, self.unknown)
+        )
         for _ in range(LEVELS):
             cells = current.cells
             likely = densest_cells(current.log_density(trust), cells.volume, KEPT)
@@ -106,9 +112,13 @@ class Locator:
                 break
             chosen = likely[wide >= 0.75 * wide[:HALVED].max()][:HALVED]
             finer = cells.subset(chosen).halve()
-            more = compute_misfit(heard, self.field.moments_at(torch.from_numpy(finer.centre)), self.unknown)
+            more = compute_misfit(
+                heard, self.field.moments_at(torch.from_numpy(finer.centre)), self.unknown
+            )
             rest = np.setdiff1d(np.arange(len(cells)), chosen)
-            current = PlaceSearch(cells.subset(rest).join(finer), current.misfit.subset(rest) + more)
+            current = PlaceSearch(
+                cells.subset(rest).join(finer), current.misfit.subset(rest) + more
+            )
         return current
 
     def locate(self, heard: Scans) -> Iterator[Located]:
@@ -121,14 +131,20 @@ class Locator:
             search = self.search_cells(one, self.trust)
             unlike = search.least_misfit(self.trust) > self.trust.worst
             volume = search.cells.volume
-            likely = search.cells.subset(densest_cells(search.log_density(self.trust), volume, KEPT))
+            likely = search.cells.subset(
+                densest_cells(search.log_density(self.trust), volume, KEPT)
+            )
             # What may be as likely beyond the edge touches it; 1 % for rounding.
             if unlike or beyond_box(likely.centre, box, 0.51 * likely.edge).any():
                 doubt = DOUBTS["unlike"] * unlike
                 wide = self._further.search_cells(one, self.trust)
                 if beyond_box(wide.posterior(self.trust).peak()[None], box)[0]:
                     search, doubt = wide, DOUBTS["beyond"]
-            posterior, mass, volume = search.posterior(self.trust), self.trust.level, search.cells.volume
+            posterior, mass, volume = (
+                search.posterior(self.trust),
+                self.trust.level,
+                search.cells.volume,
+            )
             area = float(volume[densest_cells(posterior.log_density, volume, mass)].sum())
             estimate = posterior.peak(), area, posterior.count_modes(mass), posterior
             seconds, true = time.perf_counter() - started, heard.place[number]
@@ -139,31 +155,42 @@ class Locator:
 
 
 def learn_trust(
-    learned: Learned, locator: Locator, share: float, folds: int, cells: Callable[[np.ndarray], Cells]
+    learned: Learned,
+    locator: Locator,
+    share: float,
+    folds: int,
+    cells: Callable[[np.ndarray], Cells],
 ) -> tuple[Trust, int]:
-    """Return how far such a method is trusted, from training places that it left out, and their number.
+    """Return how far such a method is trusted, from training places that it left out,
+    and their number.
 
-    The method is trained again without each of a few groups (`folds`) of its training rows, cut as the test
-    rows were; `locator` is that of the whole method, `share` that of places which areas hold, `cells` lays
-    cells by trained places (n, 3) [m, local].
+    The method is trained again without each of a few groups (`folds`) of its training rows, cut as
+    the test rows were; `locator` is that of the whole method, `share` that of places which areas
+    hold, `cells` lays cells by trained places (n, 3) [m, local].
     """
     pairs: list[tuple[Locator, Scans]] = []
     data, seed = learned.data, learned.context.seed
     inner_folds = learned.cut_folds(folds, seed).folds
     for number, inner in enumerate(inner_folds):
-        log.info("calibration %d of %d: without %d rows", number + 1, len(inner_folds), len(inner.test))
+        log.info(
+            "calibration %d of %d: without %d rows", number + 1, len(inner_folds), len(inner.test)
+        )
         method = learned.refit(inner, learned.context.for_part(f"group{number}"))
         field, trained = SiteField(Predictor(method, data.site)), np.union1d(inner.train, inner.val)
         without = replace(locator, field=field, cells=cells(data.moving[trained][:, :3]))
         heard = group_snapshots(data, inner.test)
         pairs += [(without, heard.subset(np.array([row]))) for row in range(len(heard))]
-    pairs = [pairs[number] for number in np.random.default_rng(seed).permutation(len(pairs))[:HELD_OUT]]
+    pairs = [
+        pairs[number] for number in np.random.default_rng(seed).permutation(len(pairs))[:HELD_OUT]
+    ]
     places = np.concatenate([heard.place for _, heard in pairs])
     found, trust = list[PlaceSearch](), locator.trust
 
     def search(count: int) -> list[PlaceSearch]:
         pieces = [(*pair, one) for pair, one in zip_longest(pairs[:count], found)]
-        return run_all(lambda one: one[0].search_cells(one[1], trust, one[2]), pieces, "left-out snapshots")
+        return run_all(
+            lambda one: one[0].search_cells(one[1], trust, one[2]), pieces, "left-out snapshots"
+        )
 
     # Some first, as the rest is sought faster under a trust that is nearly right.
     for count in (TRUSTED, HELD_OUT):
@@ -180,14 +207,19 @@ def learn_trust(
 
 
 def find_other_settings(extra: Mapping[str, Any], how: Mapping[str, Any]) -> list[str]:
-    """Return `name=value` of settings other than `how` that the trust in `extra` was learned for."""
+    """Return `name=value` of settings other than `how` that the trust
+    in `extra` was learned for.
+    """
     stored = extra.get(KEY, {})
     before = {"share": stored.get("share")} | stored.get("how", {}) | stored.get("unknown", {})
-    return [f"{name}={before.get(name)}" for name, value in how.items() if before.get(name) != value]
+    return [
+        f"{name}={before.get(name)}" for name, value in how.items() if before.get(name) != value
+    ]
 
 
 def restore_trust(extra: Mapping[str, Any], how: Mapping[str, Any]) -> Trust:
-    """Return the trust that a checkpoint's `extra` holds for settings `how`, of which `share` is one.
+    """Return the trust that a checkpoint's `extra` holds for settings `how`,
+    of which `share` is one.
 
     Where nothing was, a tenth of the values counts as independent (see `Trust`), which is logged.
 
@@ -196,7 +228,9 @@ def restore_trust(extra: Mapping[str, Any], how: Mapping[str, Any]) -> Trust:
     """
     stored = extra.get(KEY)
     if stored is None:
-        log.warning("locate: not calibrated: areas may be several times too large; gsparc locate calibrates")
+        log.warning(
+            "locate: not calibrated: areas may be several times too large; gsparc locate calibrates"
+        )
         return Trust(level=how["share"])
     if other := find_other_settings(extra, how):
         raise ValueError(

@@ -1,6 +1,7 @@
 """Places by the nearest rows in feature space: beside a model's answers, and of fingerprints.
 
-P. Bahl and V. Padmanabhan, "RADAR: an in-building RF-based user location and tracking system", INFOCOM 2000.
+P. Bahl and V. Padmanabhan, "RADAR: an in-building RF-based user location and tracking system",
+INFOCOM 2000.
 """
 
 from __future__ import annotations
@@ -13,7 +14,8 @@ from sklearn.neighbors import KNeighborsRegressor
 
 from gsparc.apps.locate.snapshots import Scans
 
-PLAIN = {"nearest": (1,), "weighted_knn": (1, 2, 3, 4, 5, 7, 9, 13)}  # numbers of neighbours that are tried
+# Numbers of neighbours that are tried
+PLAIN = {"nearest": (1,), "weighted_knn": (1, 2, 3, 4, 5, 7, 9, 13)}
 FOLDS = 5  # of places, that choose the number where no groups are given
 MAX_ROWS = 2_000  # that choose it
 BELOW = 0.02  # of the range of values, that a silent one is put below the least
@@ -22,14 +24,16 @@ BELOW = 0.02  # of the range of values, that a silent one is put below the least
 def locate_by_neighbours(
     name: str, trained: Scans, heard: Scans, group: np.ndarray | None = None
 ) -> tuple[np.ndarray, float, float]:
-    """Return places (n, 3) of snapshots by the nearest trained ones, weighed by their inverse distances.
+    """Return places (n, 3) of snapshots by the nearest trained ones,
+    weighed by their inverse distances.
 
     Args:
-        name: of `PLAIN`; of several numbers of neighbours the one of least error at places left out is taken.
+        name: of `PLAIN`; of several numbers of neighbours the one of least error at places left out
+            is taken.
         trained: snapshots of known places, in whose coordinates places come [m].
         heard: snapshots to be placed.
-        group: (m,) int64 of trained ones, left out together to choose that number, -1 where never; None:
-            fifths of the places.
+        group: (m,) int64 of trained ones, left out together to choose that number, -1 where never;
+            None: fifths of the places.
 
     Returns:
         Places, milliseconds of each, and seconds of learning.
@@ -44,7 +48,9 @@ def locate_by_neighbours(
     floor = np.nanmin(features) - BELOW * (np.nanmax(features) - np.nanmin(features))
     features, queries = (np.where(np.isfinite(one), one, floor) for one in (features, queries))
     count = _count(PLAIN[name], features, places, group)
-    nearest = KNeighborsRegressor(count, weights="distance", algorithm="brute").fit(features, places)
+    nearest = KNeighborsRegressor(count, weights="distance", algorithm="brute").fit(
+        features, places
+    )
     fitted = time.perf_counter()
     place = nearest.predict(queries)
     return place, (time.perf_counter() - fitted) / max(len(heard), 1) * 1e3, fitted - started
@@ -53,8 +59,8 @@ def locate_by_neighbours(
 def feature_vectors(heard: Scans) -> np.ndarray:
     """Return real rows (n, P), NaN where nothing was heard.
 
-    Of channels the real and imaginary parts after the first value that was heard was turned to be real and
-    positive, so that a common phase changes nothing.
+    Of channels the real and imaginary parts after the first value that was heard was turned to be
+    real and positive, so that a common phase changes nothing.
     """
     values = heard.values.numpy()
     if not np.iscomplexobj(values):
@@ -65,7 +71,9 @@ def feature_vectors(heard: Scans) -> np.ndarray:
     return np.hstack([turned.real, turned.imag])
 
 
-def _count(counts: tuple[int, ...], known: np.ndarray, places: np.ndarray, group: np.ndarray | None) -> int:
+def _count(
+    counts: tuple[int, ...], known: np.ndarray, places: np.ndarray, group: np.ndarray | None
+) -> int:
     """The number of neighbours of least median error at places left out; else the first."""
     rows = np.random.default_rng(0).permutation(len(known))[:MAX_ROWS]
     place = np.unique(places[rows], axis=0, return_inverse=True)[1].reshape(-1)
@@ -77,7 +85,11 @@ def _count(counts: tuple[int, ...], known: np.ndarray, places: np.ndarray, group
     def score(fitted: KNeighborsRegressor, asked: np.ndarray, true: np.ndarray) -> float:
         return -float(np.median(np.linalg.norm(fitted.predict(asked) - true, axis=1)))
 
-    folds = GroupKFold(FOLDS).split(rows, groups=place) if group is None else PredefinedSplit(group[rows])
+    folds = (
+        GroupKFold(FOLDS).split(rows, groups=place)
+        if group is None
+        else PredefinedSplit(group[rows])
+    )
     model = KNeighborsRegressor(weights="distance", algorithm="brute")
     search = GridSearchCV(model, {"n_neighbors": possible}, scoring=score, cv=folds)
     return int(search.fit(known[rows], places[rows]).best_params_["n_neighbors"])

@@ -1,4 +1,6 @@
-"""What is known of one place: masses of cells, an area that holds it, and how many places it may be."""
+"""What is known of one place: masses of cells, an area that holds it,
+and how many places it may be.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,8 @@ from gsparc.apps.locate.cells import Cells
 MODE = 0.05  # of the mass, that a further mode has at least
 BLURRED = 0.999  # of the mass: cells beyond it stay as they are
 LEAST = 1e-300
-SHIFTS, NEAR = 20, 0.01  # steps up the density at most, and of a width that the last one is shorter than
+# Steps up the density at most, and of a width that the last one is shorter than
+SHIFTS, NEAR = 20, 0.01
 
 
 def densest_cells(log_density: np.ndarray, size: np.ndarray, share: float) -> np.ndarray:
@@ -29,8 +32,9 @@ def densest_cells(log_density: np.ndarray, size: np.ndarray, share: float) -> np
 class PlacePosterior:
     """Masses of the cells in which something was heard.
 
-    Places are recorded with errors, so that the density is that of the likelihood after a convolution with a
-    Gaussian: a kernel density of the cells, each as wide as it is itself and as the errors are.
+    Places are recorded with errors, so that the density is that of the likelihood after a
+    convolution with a Gaussian: a kernel density of the cells,
+    each as wide as it is itself and as the errors are.
 
     Attributes:
         cells: G of them.
@@ -48,7 +52,9 @@ class PlacePosterior:
         if not self.spread:
             return self.sharp
         # Cells beyond the blurred ones stay sharp: blurring them all would cost G^2.
-        density = self._parts(self.cells.centre)[0].sum(1) + np.where(self._blurred, 0.0, np.exp(self.sharp))
+        density = self._parts(self.cells.centre)[0].sum(1) + np.where(
+            self._blurred, 0.0, np.exp(self.sharp)
+        )
         logarithm = np.log(density + LEAST)
         # Normalised again: densities at centres do not sum to 1, and a blur leaves the site.
         return np.asarray(logarithm - logsumexp(logarithm, b=self.cells.volume))
@@ -67,10 +73,14 @@ class PlacePosterior:
         return float(np.log(self._parts(place[None])[0].sum() + rest + LEAST))
 
     def mass_above(self, place: np.ndarray) -> float:
-        """Return the mass of all cells more likely than a place (3,), and half of that of those as likely."""
+        """Return the mass of all cells more likely than a place (3,),
+        and half of that of those as likely.
+        """
         here, mass = self.log_density_at(place), self.mass
         # Half of those as likely, so that equal densities have a level in the middle of their mass.
-        return float(mass[self.log_density > here].sum() + 0.5 * mass[self.log_density == here].sum())
+        return float(
+            mass[self.log_density > here].sum() + 0.5 * mass[self.log_density == here].sum()
+        )
 
     @cached_property
     def _blurred(self) -> np.ndarray:
@@ -79,26 +89,38 @@ class PlacePosterior:
         return np.isin(np.arange(len(self.cells)), densest)
 
     def _parts(self, places: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What b blurred cells add to the density at places (m, b), their centres and precisions (b, d)."""
+        """What b blurred cells add to the density at places (m, b),
+        their centres and precisions (b, d).
+        """
         live = self.cells.edge.max(0) > 0
-        centre, edge = (part[self._blurred][:, live] for part in (self.cells.centre, self.cells.edge))
+        centre, edge = (
+            part[self._blurred][:, live] for part in (self.cells.centre, self.cells.edge)
+        )
         # A uniform density over an edge has the variance edge^2 / 12.
         precision = 1 / (self.spread**2 + edge**2 / 12)
         # About the middle: squares of large coordinates cancel in the product below.
         middle = centre.mean(0)
         near, offset = centre - middle, places[:, live] - middle
-        squared = offset**2 @ precision.T + (near**2 * precision).sum(1) - 2 * offset @ (near * precision).T
+        squared = (
+            offset**2 @ precision.T
+            + (near**2 * precision).sum(1)
+            - 2 * offset @ (near * precision).T
+        )
         mass = np.exp(self.sharp[self._blurred]) * self.cells.volume[self._blurred]
         weight = mass * np.sqrt(precision / (2 * np.pi)).prod(1)
         return np.exp(-0.5 * squared.clip(0)) * weight, centre, precision
 
     def peak(self) -> np.ndarray:
-        """Return the likeliest place (3,) [m, local]: up the density's gradient from the likeliest cell.
+        """Return the likeliest place (3,) [m, local]:
+        up the density's gradient from the likeliest cell.
 
-        By mean shift, which needs no step length (D. Comaniciu and P. Meer, "Mean shift: a robust approach
-        toward feature space analysis", IEEE TPAMI 24 (2002)).
+        By mean shift, which needs no step length (D. Comaniciu and P. Meer, "Mean shift: a robust
+        approach toward feature space analysis", IEEE TPAMI 24 (2002)).
         """
-        place, live = self.cells.centre[self.log_density.argmax()].copy(), self.cells.edge.max(0) > 0
+        place, live = (
+            self.cells.centre[self.log_density.argmax()].copy(),
+            self.cells.edge.max(0) > 0,
+        )
         for _ in range(SHIFTS):
             part, centre, precision = self._parts(place[None])
             pull = part[0][:, None] * precision
@@ -111,10 +133,19 @@ class PlacePosterior:
         """Return how many connected parts the area that holds a share of the mass has."""
         some = densest_cells(self.log_density, self.cells.volume, share)
         centre, edge = self.cells.centre[some], self.cells.edge[some]
-        pairs = cKDTree(centre).query_pairs(1.01 * np.linalg.norm(edge, axis=1).max(), output_type="ndarray")
-        # Cells touch where centres are no farther apart than half the sum of edges, 1 % for rounding.
-        pairs = pairs[(np.abs(centre[pairs[:, 0]] - centre[pairs[:, 1]])
-                 <= 0.51 * (edge[pairs[:, 0]] + edge[pairs[:, 1]]) + 1e-9).all(1)]  # fmt: skip
-        graph = csr_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(some), len(some)))
+        pairs = cKDTree(centre).query_pairs(
+            1.01 * np.linalg.norm(edge, axis=1).max(), output_type="ndarray"
+        )
+        # Cells touch where centres are no farther apart than half the sum of edges,
+        # 1 % for rounding.
+        pairs = pairs[
+            (
+                np.abs(centre[pairs[:, 0]] - centre[pairs[:, 1]])
+                <= 0.51 * (edge[pairs[:, 0]] + edge[pairs[:, 1]]) + 1e-9
+            ).all(1)
+        ]
+        graph = csr_matrix(
+            (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(some), len(some))
+        )
         part = connected_components(graph, directed=False)[1]
         return max(int((np.bincount(part, self.mass[some]) >= MODE).sum()), 1)

@@ -38,12 +38,19 @@ class PlaceSearch:
 
     def log_density(self, trust: Trust) -> np.ndarray:
         """Return log densities (G,) of total mass 1."""
-        log_like, log_size = trust.log_likelihood(self.misfit)[0], torch.from_numpy(np.log(self.cells.volume))
+        log_like, log_size = (
+            trust.log_likelihood(self.misfit)[0],
+            torch.from_numpy(np.log(self.cells.volume)),
+        )
         return np.asarray(log_like - torch.logsumexp(log_like + log_size, 0))
 
     def least_misfit(self, trust: Trust) -> float:
-        """Return the squared error by the variance, a mean over the values, at the likeliest cell."""
-        return float(self.misfit.squared[0, self.log_density(trust).argmax()] / self.misfit.count[0])
+        """Return the squared error by the variance, a mean over the values,
+        at the likeliest cell.
+        """
+        return float(
+            self.misfit.squared[0, self.log_density(trust).argmax()] / self.misfit.count[0]
+        )
 
     def posterior(self, trust: Trust) -> PlacePosterior:
         """Return what is known of the place."""
@@ -56,5 +63,9 @@ def compute_misfit(heard: Scans, there: HeardMoments, unknown: Nuisances) -> Mis
     if facts.is_image:
         return likelihood.spectrum_misfit(heard.values, there.mean, there.variance)
     if facts.is_complex:
-        return likelihood.channel_misfit(heard.values, there.mean, there.variance, unknown.phase_known)
-    return likelihood.level_misfit(heard.values, there.mean, there.variance, unknown.offset_db, heard.floor)
+        return likelihood.channel_misfit(
+            heard.values, there.mean, there.variance, unknown.phase_known
+        )
+    return likelihood.level_misfit(
+        heard.values, there.mean, there.variance, unknown.offset_db, heard.floor
+    )

@@ -1,4 +1,6 @@
-"""A trained model as a field of snapshots: mean and variance of all that would be heard at a place."""
+"""A trained model as a field of snapshots:
+mean and variance of all that would be heard at a place.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,8 @@ from gsparc.apps.locate.snapshots import flatten_targets
 from gsparc.data.query import Query
 from gsparc.prediction.predictor import Predictor
 
-CHUNK = 1024  # values that are asked for at a time: all stations of some places, which share their work
+# Values that are asked for at a time: all stations of some places, which share their work
+CHUNK = 1024
 
 
 @dataclass(frozen=True)
@@ -20,7 +23,8 @@ class HeardMoments:
 
     Attributes:
         mean: (G, P) as in `Snapshots.values`; NaN where a station has no prediction.
-        variance: (G, P) expected squared error of a measurement, of powers in dB^2; of spectra (G, 1).
+        variance: (G, P) expected squared error of a measurement, of powers in dB^2; of spectra (G,
+            1).
     """
 
     mean: Tensor
@@ -51,15 +55,21 @@ class SiteField:
             ValueError: the model states no variance.
         """
         parts = [self._chunk(chunk) for chunk in places.split(max(CHUNK // self.count, 1))]
-        return HeardMoments(torch.cat([p.mean for p in parts]), torch.cat([p.variance for p in parts]))
+        return HeardMoments(
+            torch.cat([p.mean for p in parts]), torch.cat([p.variance for p in parts])
+        )
 
     def _chunk(self, places: Tensor) -> HeardMoments:
         site = self.site
-        station = torch.arange(self.count).repeat(len(places)) if site.stations is not None else None
+        station = (
+            torch.arange(self.count).repeat(len(places)) if site.stations is not None else None
+        )
         query = Query.from_places(site, places.float().repeat_interleave(self.count, 0), station)
         prediction = self.predictor.predict_query(query)
         if prediction.variance is None:
-            raise ValueError(f"locate: {self.predictor.method.name} states no variance of what is heard")
+            raise ValueError(
+                f"locate: {self.predictor.method.name} states no variance of what is heard"
+            )
         mean, variance = flatten_targets(prediction.mean), prediction.variance.double()[:, None]
         if site.target.is_image:
             return HeardMoments(mean.double(), variance)
@@ -69,4 +79,6 @@ class SiteField:
 
     def _joined(self, mean: Tensor, variance: Tensor) -> HeardMoments:
         """Of rows by place and station (G T, p): (G, T p)."""
-        return HeardMoments(*(part.reshape(-1, self.count * part.shape[1]) for part in (mean, variance)))
+        return HeardMoments(
+            *(part.reshape(-1, self.count * part.shape[1]) for part in (mean, variance))
+        )

@@ -1,4 +1,6 @@
-"""Snapshots: all that was heard at one moment, of every station and antenna, as one row of values."""
+"""Snapshots: all that was heard at one moment, of every station and antenna,
+as one row of values.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,8 @@ from gsparc.data.moments import number_moments
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.target import Kind
 
-PIXELS = 1_000  # about as many of a spectrum are compared: an array's have far fewer degrees of freedom
+# About as many of a spectrum are compared: an array's have far fewer degrees of freedom
+PIXELS = 1_000
 
 
 @dataclass(frozen=True)
@@ -22,7 +25,8 @@ class Scans:
     Attributes:
         kind: of the values.
         values: (n, P) float64 spectra, or complex128 channels, or decibels; NaN where missing.
-        floor: (n, P) levels [dB] of powers that were too weak to be heard, NaN of the rest; None without any.
+        floor: (n, P) levels [dB] of powers that were too weak to be heard, NaN of the rest; None
+            without any.
         place: (n, 3) [m, local], where they were heard.
         row: (n,) what each one's first row in its file is called; None: not known.
     """
@@ -45,7 +49,8 @@ class Scans:
 
 
 def group_snapshots(data: Measurements, rows: np.ndarray) -> Scans:
-    """Return rows (m,) of measurements as snapshots: rows of one place at different stations are one.
+    """Return rows (m,) of measurements as snapshots:
+    rows of one place at different stations are one.
 
     Of several visits of a station to a place the first is of the first snapshot there, and so on.
     """
@@ -68,7 +73,9 @@ def group_snapshots(data: Measurements, rows: np.ndarray) -> Scans:
     quiet[which, station] = (side > 0)[:, None]
     parts = _without_silence(values.flatten(1), quiet.flatten(1) if quiet.any() else None)
     names = np.array([name.partition(", station")[0] for name in data.row_names])
-    return Scans(site.kind, *parts, data.moving[rows][first], names[rows][first] if len(names) else None)
+    return Scans(
+        site.kind, *parts, data.moving[rows][first], names[rows][first] if len(names) else None
+    )
 
 
 def snapshots_of_values(
@@ -78,10 +85,10 @@ def snapshots_of_values(
 
     Args:
         site: with T stations, or one static end.
-        values: (n, ...), where there are stations (n, T, ...): spectra, channels or linear powers in physical
-            units; NaN where a station is missing.
-        silent: bool like powers (n, T) or (n, 1): True where nothing was heard, and the value is the level
-            below which it was.
+        values: (n, ...), where there are stations (n, T, ...): spectra, channels or linear powers
+            in physical units; NaN where a station is missing.
+        silent: bool like powers (n, T) or (n, 1): True where nothing was heard, and the value is
+            the level below which it was.
 
     Raises:
         ValueError: of another kind or shape than what the site was measured with, or nothing in it.
@@ -92,9 +99,13 @@ def snapshots_of_values(
     shaped = heard.ndim == ndim and (not count or heard.shape[1] == count)
     if heard.is_complex() != site.target.is_complex or not shaped:
         stations = "" if count is None else f" of {count} stations"
-        raise ValueError(f"locate: values {tuple(heard.shape)} {heard.dtype} are no {site.kind}{stations}")
+        raise ValueError(
+            f"locate: values {tuple(heard.shape)} {heard.dtype} are no {site.kind}{stations}"
+        )
     if silent is not None and (not site.target.is_level or np.shape(silent) != tuple(heard.shape)):
-        raise ValueError(f"locate: silent {np.shape(silent)} is not like powers {tuple(heard.shape)}")
+        raise ValueError(
+            f"locate: silent {np.shape(silent)} is not like powers {tuple(heard.shape)}"
+        )
     if torch.isnan(heard.real).flatten(1).all(1).any():
         raise ValueError("locate: there is a snapshot in which nothing was heard")
     scaled = heard.to(torch.complex128 if heard.is_complex() else torch.float64) / site.target_scale
@@ -113,7 +124,9 @@ def flatten_targets(targets: Tensor) -> Tensor:
 
 
 def _without_silence(values: Tensor, silent: Tensor | None) -> tuple[Tensor, Tensor | None]:
-    """Values (n, P), NaN where `silent`, and the levels there, NaN elsewhere; None: everything was heard."""
+    """Values (n, P), NaN where `silent`, and the levels there, NaN elsewhere; None:
+    everything was heard.
+    """
     if silent is None:
         return values, None
     gap = torch.full_like(values, np.nan)

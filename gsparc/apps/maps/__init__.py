@@ -1,4 +1,6 @@
-"""Maps of a trained model with calibrated intervals, where to measure next, where to put a station."""
+"""Maps of a trained model with calibrated intervals, where to measure next,
+where to put a station.
+"""
 
 from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.making import predict_map

@@ -65,16 +65,23 @@ class Grid:
 
 
 def lay_grid(
-    site: Site | None, area: Any = None, height_m: float | None = None, step_m: float | None = None,
-    plan: FloorPlan | None = None, stations: int = 1, buildings: Any = None, indoors: bool = False,
-) -> Grid:  # fmt: skip
+    site: Site | None,
+    area: Any = None,
+    height_m: float | None = None,
+    step_m: float | None = None,
+    plan: FloorPlan | None = None,
+    stations: int = 1,
+    buildings: Any = None,
+    indoors: bool = False,
+) -> Grid:
     """Return the cells of a map.
 
     Args:
         site: of the model; None before there is one: then an area or a plan says where.
-        area: (x0, y0, x1, y1) [m], world; a GeoJSON file of polygons; None: the plan's extent, or where was
-            measured.
-        height_m: of all cells, world; None: the height at which the moving end was, the middle of several.
+        area: (x0, y0, x1, y1) [m], world; a GeoJSON file of polygons; None: the plan's extent, or
+            where was measured.
+        height_m: of all cells, world; None: the height at which the moving end was, the middle of
+            several.
         step_m: side of a cell; None: about `CELLS` of them.
         plan: beneath the map.
         stations: layers of each cell, for what memory is needed.
@@ -82,9 +89,12 @@ def lay_grid(
         indoors: they are kept, and told.
 
     Raises:
-        DataError: an area that is none, no height, a step that gives no cells, or more than memory holds.
+        DataError: an area that is none, no height, a step that gives no cells, or more than memory
+            holds.
     """
-    check_arguments(locals(), step_m=or_null(POSITIVE), height_m=or_null(number(-FARTHEST, FARTHEST)))
+    check_arguments(
+        locals(), step_m=or_null(POSITIVE), height_m=or_null(number(-FARTHEST, FARTHEST))
+    )
     low, high, contains = _outline(site, area, plan)
     height = _height(site, height_m)
     width = high - low
@@ -93,7 +103,8 @@ def lay_grid(
     needed = float(count.prod()) * (BYTES * stations + BYTES_MORE)
     if needed > SHARE_OF_MEMORY * machine_memory():
         raise DataError(
-            f"step_m={step:g}: {count.prod():.3g} squares of {stations} station(s) need {needed / 2**30:.3g} "
+            f"step_m={step:g}: {count.prod():.3g} squares of {stations} station(s) need "
+            f"{needed / 2**30:.3g} "
             f"GiB, more than half of this machine's memory; take a larger step or a smaller area"
         )
     nx, ny = (max(int(n), 1) for n in count)
@@ -107,12 +118,16 @@ def lay_grid(
         within = np.array([is_built(row) for row in rows])
     inside &= indoors | ~within
     if not inside.any():
-        raise DataError(f"area={area}: no centre of a {step:g} m cell lies in it; draw it wider or map finer")
+        raise DataError(
+            f"area={area}: no centre of a {step:g} m cell lies in it; draw it wider or map finer"
+        )
     about = None if site is None else site.georeference
     return Grid(x, y, height, step, inside, about, within & inside if indoors else None)
 
 
-def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.ndarray, np.ndarray, Any]:
+def _outline(
+    site: Site | None, area: Any, plan: FloorPlan | None
+) -> tuple[np.ndarray, np.ndarray, Any]:
     """Corners (2,) of a rectangle, and what says which places (n, 2) are inside; None: all."""
     box = None if site is None else site.moving_box
     width = 0.0 if box is None else float(np.ptp(box[:, -3:-1], axis=0).max())
@@ -122,14 +137,18 @@ def _outline(site: Site | None, area: Any, plan: FloorPlan | None) -> tuple[np.n
     if area is not None:
         low, high = _rectangle(area)
         if (high - low).max() < LEAST * width:
-            fault = f"{(high - low).max():.2g} m wide, the site {width:.3g} m; a rectangle is in metres"
+            fault = (
+                f"{(high - low).max():.2g} m wide, the site {width:.3g} m; a rectangle is in metres"
+            )
             raise DataError(f"area={area}: {fault}, polygons of a *.geojson may be in degrees")
         return low, high, None
     if plan is not None:
         corners = plan.corners()
         return corners.min(axis=0), corners.max(axis=0), Outline(corners).contains_points
     if site is None:
-        raise DataError("area: nothing says where; give ckpt=FILE, area=[x0,y0,x1,y1] or plan=IMAGE")
+        raise DataError(
+            "area: nothing says where; give ckpt=FILE, area=[x0,y0,x1,y1] or plan=IMAGE"
+        )
     low, high = site.moving_box[:, -3:][:, :2] + site.origin[:2]
     margin = 0.02 * max(float((high - low).max()), 1e-6)
     return low - margin, high + margin, None

@@ -1,4 +1,6 @@
-"""Where, and by how much, the strongest station's level changed since a map was learned (`gsparc update`)."""
+"""Where, and by how much, the strongest station's level changed since a map was learned
+(`gsparc update`).
+"""
 
 from __future__ import annotations
 
@@ -12,13 +14,16 @@ from gsparc.apps.maps.pictures import Layer, Legend
 from gsparc.prediction.predictor import Predictor
 
 CHANGE, DEVIATION = "change_db", "change_deviation_db"
-SURE, LEAST = 2.0, 1.0  # deviations that a change is said to be sure from; least end of the colours [dB]
+# Deviations that a change is said to be sure from; least end of the colours [dB]
+SURE, LEAST = 2.0, 1.0
 
 
 def add_changes(field: FieldMap, predictor: Predictor, dry: bool = False) -> FieldMap:
-    """Return a map with two further layers (ny, nx) [dB]: the mean of what changed, and its deviation.
+    """Return a map with two further layers (ny, nx) [dB]: the mean of what changed,
+    and its deviation.
 
-    Of a model that no later rows were told to it is returned as it is. `dry`: the layers without values.
+    Of a model that no later rows were told to it is returned as it is. `dry`:
+    the layers without values.
     """
     if not predictor.versions or not len(predictor.rows):
         return field
@@ -39,6 +44,8 @@ def change_layers(field: FieldMap) -> Iterator[Layer]:
     change, deviation = field.extra[CHANGE], field.extra[DEVIATION]
     most = max(float(np.nanmax(np.abs(change), initial=0.0)), LEAST)
     doubt = np.abs(change) < SURE * deviation, f"within {SURE:g} deviations of no change"
-    yield Layer("change", change, Legend("change of the level [dB]", -most, most, "RdBu_r"), unsure=doubt)
+    yield Layer(
+        "change", change, Legend("change of the level [dB]", -most, most, "RdBu_r"), unsure=doubt
+    )
     label = "deviation of the change [dB]"
     yield Layer("change_deviation", deviation, Legend.over(label, deviation, "cividis"))

@@ -15,8 +15,10 @@ from gsparc.prediction.query import query_ends, to_local
 
 BETWEEN = (0.25, 4.0)  # what held-out blocks may multiply a variance with
 DRAWS = 200  # of levels, that tell how likely a station is the strongest
-SHADOWING_DB, NOISE = 6.0, 0.1  # before anything is measured: deviation, and noise relative to its square
-SHARE_OF_SIDE = 0.15  # of the longer side: the length over which powers are alike, where nobody says it
+# Before anything is measured: deviation, and noise relative to its square
+SHADOWING_DB, NOISE = 6.0, 0.1
+# Of the longer side: the length over which powers are alike, where nobody says it
+SHARE_OF_SIDE = 0.15
 
 
 @dataclass
@@ -24,9 +26,11 @@ class ErrorCovariance:
     """Errors at S places, all variances in dB^2.
 
     Attributes:
-        covariance: (S, S) of the power without a measurement's own noise; changes as places are measured.
+        covariance: (S, S) of the power without a measurement's own noise; changes as places are
+            measured.
         noise: variance of one measurement.
-        measured: (S,) the same of a measurement at each place, infinite where it would not list the station.
+        measured: (S,) the same of a measurement at each place, infinite where it would not list the
+            station.
         weight: (S,) what held-out blocks say that variances are to be multiplied with.
     """
 
@@ -41,24 +45,33 @@ class ErrorCovariance:
         self.covariance -= np.outer(column, column / (column[place] + self.measured[place]))
 
     def variance_reductions(self, targets: np.ndarray) -> np.ndarray:
-        """Return what a measurement at each place takes off the sum of variances at `targets` (S,) bool."""
+        """Return what a measurement at each place takes off the sum of variances at `targets` (S,)
+        bool.
+        """
         explained = (self.weight * targets) @ self.covariance**2
         return explained / (np.maximum(self.covariance.diagonal(), 0) + self.measured)
 
     def variances(self) -> np.ndarray:
-        """Return variances of a measurement's error at each place (S,), as held-out blocks scale it."""
+        """Return variances of a measurement's error at each place (S,),
+        as held-out blocks scale it.
+        """
         return self.weight * (np.maximum(self.covariance.diagonal(), 0) + self.noise)
 
 
 def error_covariances(
-    predictor: Predictor, places: np.ndarray, stations: Sequence[str], promise: Promise | None,
-    other_end: Sequence[float] | None = None, goal: str = "all", threshold_db: float | None = None,
-) -> list[ErrorCovariance]:  # fmt: skip
+    predictor: Predictor,
+    places: np.ndarray,
+    stations: Sequence[str],
+    promise: Promise | None,
+    other_end: Sequence[float] | None = None,
+    goal: str = "all",
+    threshold_db: float | None = None,
+) -> list[ErrorCovariance]:
     """Return error covariances at world places (S, 3) [m] of every station, by its process.
 
-    Held-out blocks of `promise` scale the variances, and what shall be known weighs them, see `weigh_goal`.
-    What is measured at a place lists those that are predicted strongest there, as many as training rows have
-    in the mean.
+    Held-out blocks of `promise` scale the variances, and what shall be known weighs them, see
+    `weigh_goal`. What is measured at a place lists those that are predicted strongest there, as
+    many as training rows have in the mean.
 
     Raises:
         ValueError: the model has no process.
@@ -76,11 +89,14 @@ def error_covariances(
         number, asking = names.index(name), ask[name]
         covariance, noise = asking.covariance(**query_ends(asking.site, places, other_end))
         weight = np.ones(len(places))
-        if promise is not None:  # expected squared errors of held-out blocks over the process's variance
+        # Expected squared errors of held-out blocks over the process's variance
+        if promise is not None:
             calibration = promise.calibration()
             far = promise.distance(to_local(asking.site, places, other_end), number)
             inside = np.minimum(far, calibration.reach)  # beyond it, as at its edge
-            _, error = calibration.half_and_error(answers[name][1], inside, np.full(len(far), number))
+            _, error = calibration.half_and_error(
+                answers[name][1], inside, np.full(len(far), number)
+            )
             ratio = error**2 / (np.maximum(covariance.diagonal(), 0) + noise)
             weight = np.clip(np.nan_to_num(ratio, nan=1.0), *BETWEEN)
         measured = noise + more[every.index(name)]
@@ -93,16 +109,24 @@ def weigh_goal(
 ) -> np.ndarray:
     """Return weights (T, S), of mean 1, of variances of T stations at S places.
 
-    Of goal `strongest` the chance of each to be that; with a threshold times the variance of whether one
-    reaches it.
+    Of goal `strongest` the chance of each to be that; with a threshold times the variance of
+    whether one reaches it.
 
     >>> weigh_goal(np.array([[-60.0], [-90.0]]), np.ones((2, 1)), "strongest").ravel()
     array([2., 0.])
     """
     if goal == "all" and threshold_db is None:
         return np.ones_like(level_db)
-    rng, wins, reached = np.random.default_rng(0), np.zeros(level_db.shape), np.zeros(level_db.shape[1])
-    mean, spread, at = np.nan_to_num(level_db, nan=-np.inf), np.nan_to_num(spread_db), np.arange(len(reached))
+    rng, wins, reached = (
+        np.random.default_rng(0),
+        np.zeros(level_db.shape),
+        np.zeros(level_db.shape[1]),
+    )
+    mean, spread, at = (
+        np.nan_to_num(level_db, nan=-np.inf),
+        np.nan_to_num(spread_db),
+        np.arange(len(reached)),
+    )
     for _ in range(DRAWS):
         drawn = mean + spread * rng.normal(size=mean.shape)
         wins[drawn.argmax(0), at] += 1

@@ -1,4 +1,6 @@
-"""How surely a share of a map's squares is covered: near squares share their errors, and all share some."""
+"""How surely a share of a map's squares is covered: near squares share their errors,
+and all share some.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ SHARE = 0.9
 
 
 def covered_between(field: FieldMap, predictor: Predictor, promise: Promise) -> tuple[float, float]:
-    """Return the ends of the 90 % interval of the share of predicted squares that some station covers.
+    """Return the ends of the 90 % interval of the share of predicted squares
+    that some station covers.
 
     Args:
         field: a map with `threshold_db`.
@@ -31,10 +34,12 @@ def covered_between(field: FieldMap, predictor: Predictor, promise: Promise) -> 
 def draw_strongest(
     field: FieldMap, predictor: Predictor, promise: Promise | None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return squares (n,) of a thinned grid, and the strongest station's level there, drawn (n, DRAWS) [dB].
+    """Return squares (n,) of a thinned grid, and the strongest station's level there,
+    drawn (n, DRAWS) [dB].
 
-    Errors of the strongest stations are drawn together by the model's own covariance, each as large as
-    held-out blocks say. See `covered_between`; without a promise only each square's own spread is right.
+    Errors of the strongest stations are drawn together by the model's own covariance, each as large
+    as held-out blocks say. See `covered_between`;
+    without a promise only each square's own spread is right.
     """
     level, error = (one.reshape(len(one), -1) for one in (field.power_db, field.expected_error_db))
     cells = np.flatnonzero(np.isfinite(level).any(0))
@@ -44,7 +49,8 @@ def draw_strongest(
     rank, at = np.nonzero(np.isfinite(np.take_along_axis(few, station, axis=0)))
     station = station[rank, at]
     places, spread = field.grid.places(square)[at], error[station, square[at]]
-    # The mean of all errors is known no better than the blocks tell it: the correlations hold none of it.
+    # The mean of all errors is known no better than the blocks tell it:
+    # the correlations hold none of it.
     block_m, common = (1.0, 0.0) if promise is None else (promise.block_m, mean_error(promise) ** 2)
     alike = _pair_correlation(predictor, places, field.number[station], block_m)
     drawn = few[station, at][:, None] + draw_errors(np.outer(spread, spread) * alike + common)
@@ -54,14 +60,18 @@ def draw_strongest(
 
 
 def draw_errors(covariance: np.ndarray, seed: int = 0) -> np.ndarray:
-    """Return normal errors (n, DRAWS) of a covariance (n, n), whose diagonal may be short of rounding."""
+    """Return normal errors (n, DRAWS) of a covariance (n, n),
+    whose diagonal may be short of rounding.
+    """
     covariance = covariance + 1e-6 * covariance.diagonal().max() * np.eye(len(covariance))
     lower = Factor.from_gram(torch.from_numpy(covariance)).lower.numpy()
     return np.asarray(lower @ np.random.default_rng(seed).normal(size=(len(covariance), DRAWS)))
 
 
 def share_between(drawn: np.ndarray, expected: float) -> tuple[float, float]:
-    """Return the ends of the 90 % interval of a share (DRAWS,), about what all squares expect of it."""
+    """Return the ends of the 90 % interval of a share (DRAWS,),
+    about what all squares expect of it.
+    """
     low, high = (end - float(drawn.mean()) + expected for end in central_interval(drawn, SHARE))
     return max(low, 0.0), min(high, 1.0)
 
@@ -73,16 +83,21 @@ def mean_error(promise: Promise) -> float:
 
 
 def shadowing(places: np.ndarray, block_m: float) -> np.ndarray:
-    """Return correlations (n, n) of errors at places (n, 3), which decay over a block as shadowing does."""
+    """Return correlations (n, n) of errors at places (n, 3),
+    which decay over a block as shadowing does.
+    """
     return np.exp(-cdist(places, places) / block_m)
 
 
 def _pair_correlation(
     predictor: Predictor, places: np.ndarray, number: np.ndarray, block_m: float
 ) -> np.ndarray:
-    """Correlations (n, n) of errors of stations (n,) at places (n, 3); variances alone hold the noise."""
+    """Correlations (n, n) of errors of stations (n,) at places (n, 3);
+    variances alone hold the noise.
+    """
     if (joint := predictor.predict_joint(places[None], number)) is None:
-        # Of 32 simulated shares 24 lay in these intervals, 23 in those by each station's own process.
+        # Of 32 simulated shares 24 lay in these intervals,
+        # 23 in those by each station's own process.
         return np.where(number[:, None] == number, shadowing(places, block_m), 0.0)
     variance = joint.covariance[0].diagonal()
     return (joint.covariance[0] - np.diag(joint.noise)) / np.sqrt(np.outer(variance, variance))

@@ -1,4 +1,6 @@
-"""What a map holds, its layers over all stations (which serves, its ratio, its outage), and its files."""
+"""What a map holds, its layers over all stations (which serves, its ratio, its outage),
+and its files.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,8 @@ from gsparc.physics.decibels import from_decibels, to_decibels
 REFUSED = -1  # of `best_server`
 NO_CLASS = 65535  # in a file of classes
 OVERLAP_DB = 6.0  # below the strongest, where another disturbs and hands over
-SHARES = ((np.arange(16) + 0.5) / 16)[:, None]  # quantiles of the strongest that rivals are weighed against
+# Quantiles of the strongest that rivals are weighed against
+SHARES = ((np.arange(16) + 0.5) / 16)[:, None]
 OF_STATIONS = ("power_db", "lower_db", "upper_db", "expected_error_db")
 ARRAYS = (*OF_STATIONS, "sinr_db", "outage", "best_server", "server_chance")
 
@@ -84,11 +87,15 @@ class FieldMap:
 
     @property
     def unsure(self) -> np.ndarray:
-        """Cells (ny, nx) bool whose best server is less likely than not strongest and above its floor."""
+        """Cells (ny, nx) bool whose best server is less likely than not strongest
+        and above its floor.
+        """
         return np.nan_to_num(self.server_chance, nan=1.0) < 0.5
 
     def at_best_server(self, layers: np.ndarray) -> np.ndarray:
-        """Return, of layers (T, ny, nx), each cell's strongest station's (ny, nx); NaN where refused."""
+        """Return, of layers (T, ny, nx), each cell's strongest station's (ny, nx);
+        NaN where refused.
+        """
         number = np.maximum(self.best_server, 0).astype(np.int64)
         chosen = np.take_along_axis(layers, number[None], axis=0)[0]
         return np.where(self.best_server == REFUSED, np.nan, chosen)
@@ -109,32 +116,49 @@ class FieldMap:
     def save(self, path: str | Path) -> None:
         """Write as npz, whole or not at all."""
         arrays = {
-            "x": self.grid.x, "y": self.grid.y, "height": np.array(self.grid.height),
-            "inside": self.grid.inside, "stations": np.array(self.stations), "share": np.array(self.share),
-            "calibrated": np.array(self.calibrated), "threshold_db": np.array(self.threshold_db),
-            "unit": np.array(self.unit), "bands": np.array(self.bands, str),
-            **{name: getattr(self, name) for name in ARRAYS}, **self.extra,
-        }  # fmt: skip
+            "x": self.grid.x,
+            "y": self.grid.y,
+            "height": np.array(self.grid.height),
+            "inside": self.grid.inside,
+            "stations": np.array(self.stations),
+            "share": np.array(self.share),
+            "calibrated": np.array(self.calibrated),
+            "threshold_db": np.array(self.threshold_db),
+            "unit": np.array(self.unit),
+            "bands": np.array(self.bands, str),
+            **{name: getattr(self, name) for name in ARRAYS},
+            **self.extra,
+        }
         write_archive(path, arrays)
 
     def summarise(self) -> dict[str, float | int | str | None]:
         """Return `map/*` for `summary.json`; shares are of the cells that something is said of."""
         mask = self.grid.inside & ~self.refused
 
-        def reduce(layer: np.ndarray, reduced: Callable[[np.ndarray], Any] = np.mean) -> float | None:
+        def reduce(
+            layer: np.ndarray, reduced: Callable[[np.ndarray], Any] = np.mean
+        ) -> float | None:
             values = layer[mask & np.isfinite(layer)]
             return float(reduced(values)) if len(values) else None
 
         power = self.layer("power_db")
         figures = {
-            "cells": int(self.grid.inside.sum()), "refused": int(self.refused.sum()),
-            "step_m": self.grid.step, "height_m": self.grid.height, "stations": len(self.stations),
-            "lowest_db": reduce(power, np.min), "highest_db": reduce(power, np.max),
+            "cells": int(self.grid.inside.sum()),
+            "refused": int(self.refused.sum()),
+            "step_m": self.grid.step,
+            "height_m": self.grid.height,
+            "stations": len(self.stations),
+            "lowest_db": reduce(power, np.min),
+            "highest_db": reduce(power, np.max),
             "width_db": reduce(self.at_best_server(self.upper_db - self.lower_db)),
-            "expected_error_db": reduce(self.layer("expected_error_db"), lambda v: np.sqrt(np.mean(v**2))),
-            "threshold_db": self.threshold_db, "outage": reduce(self.outage),
-            "sinr_db": reduce(self.sinr_db), "server_unsure": reduce(1.0 * self.unsure),
-        }  # fmt: skip
+            "expected_error_db": reduce(
+                self.layer("expected_error_db"), lambda v: np.sqrt(np.mean(v**2))
+            ),
+            "threshold_db": self.threshold_db,
+            "outage": reduce(self.outage),
+            "sinr_db": reduce(self.sinr_db),
+            "server_unsure": reduce(1.0 * self.unsure),
+        }
         return {f"map/{name}": value for name, value in figures.items()} | {"map/unit": self.unit}
 
 
@@ -154,18 +178,24 @@ def best_server(power_db: np.ndarray) -> np.ndarray:
 
 
 def server_chance(
-    power_db: np.ndarray, error_db: np.ndarray, floor_db: np.ndarray, alike: np.ndarray | float = 0.0
+    power_db: np.ndarray,
+    error_db: np.ndarray,
+    floor_db: np.ndarray,
+    alike: np.ndarray | float = 0.0,
 ) -> np.ndarray:
-    """Return the probability (n,) that the strongest of (T, n) powers is, and lies above its station's floor.
+    """Return the probability (n,) that the strongest of (T, n) powers is,
+    and lies above its station's floor.
 
-    Errors are taken for normal. Given the strongest's own level its rivals are taken for independent: who
-    beats one station is likelier to beat another, and the product of all chances alone is far too small.
+    Errors are taken for normal. Given the strongest's own level its rivals are taken for
+    independent: who beats one station is likelier to beat another,
+    and the product of all chances alone is far too small.
 
     Args:
-        power_db, error_db: predicted, and expected errors; NaN where unknown, which counts as weaker: far
-            from where a station was measured it is some 25 dB below its usual level.
+        power_db, error_db: predicted, and expected errors; NaN where unknown, which counts as
+            weaker: far from where a station was measured it is some 25 dB below its usual level.
         floor_db: (T,) power below which a station is not told from noise; -inf: any is.
-        alike: (T, n) correlations of errors with the strongest's: sectors of a site share its shadowing.
+        alike: (T, n) correlations of errors with the strongest's: sectors of a site share its
+            shadowing.
 
     Returns:
         NaN where no power is known.
@@ -179,19 +209,25 @@ def server_chance(
 
 
 def _strongest(power_db: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whether a power of (T, n) is known in each cell (n,), the strongest's number there, and the cell's."""
+    """Whether a power of (T, n) is known in each cell (n,), the strongest's number there,
+    and the cell's.
+    """
     number = best_server(power_db)
     return number != REFUSED, np.maximum(number, 0), np.arange(power_db.shape[1])
 
 
 def outage_probability(
-    power_db: np.ndarray, error_db: np.ndarray, threshold_db: float, alike: np.ndarray, below: np.ndarray
+    power_db: np.ndarray,
+    error_db: np.ndarray,
+    threshold_db: float,
+    alike: np.ndarray,
+    below: np.ndarray,
 ) -> np.ndarray:
     """Return the probability (n,) that all of (T, n) powers lie below a threshold:
     who misses one may hear another.
 
-    Errors are normal; given the strongest's level its rivals are independent, and what is unknown counts as
-    below, as in `server_chance`.
+    Errors are normal; given the strongest's level its rivals are independent, and what is unknown
+    counts as below, as in `server_chance`.
 
     Args:
         power_db, error_db, alike: see `server_chance`.
@@ -200,19 +236,30 @@ def outage_probability(
     """
     z = ndtri(np.clip(below, 1e-12, 1) * SHARES)  # equally likely levels of the strongest below it
     limit, first = np.full(z.shape, threshold_db), np.maximum(best_server(power_db), 0)
-    return (below * _chance_all_below(limit, power_db, error_db, alike, z, first)).astype(np.float32)
+    return (below * _chance_all_below(limit, power_db, error_db, alike, z, first)).astype(
+        np.float32
+    )
 
 
 def _chance_all_below(
-    limit: np.ndarray, rival: np.ndarray, wrong: np.ndarray, alike: np.ndarray | float, z: np.ndarray,
+    limit: np.ndarray,
+    rival: np.ndarray,
+    wrong: np.ndarray,
+    alike: np.ndarray | float,
+    z: np.ndarray,
     first: np.ndarray,
-) -> np.ndarray:  # fmt: skip
-    """Chance (n,) that all of (T, n) rivals lie below limits (K, n), mean over K normal errors of `first`.
+) -> np.ndarray:
+    """Chance (n,) that all of (T, n) rivals lie below limits (K, n),
+    mean over K normal errors of `first`.
 
     Unknown ones do.
     """
     # Of a rival given the strongest: never 0, which would divide.
-    spread, total, cell = wrong * np.sqrt(np.maximum(1 - np.square(alike), 1e-6)), 0.0, np.arange(len(first))
+    spread, total, cell = (
+        wrong * np.sqrt(np.maximum(1 - np.square(alike), 1e-6)),
+        0.0,
+        np.arange(len(first)),
+    )
     for level, error in zip(limit, z, strict=True):
         below = ndtr((level - rival - alike * wrong * error) / spread)
         below[first, cell] = 1.0
@@ -221,9 +268,13 @@ def _chance_all_below(
 
 
 def sinr(
-    power_db: np.ndarray, load: np.ndarray, noise_db: float | None, carrier: np.ndarray | None = None
+    power_db: np.ndarray,
+    load: np.ndarray,
+    noise_db: float | None,
+    carrier: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Signal over interference and noise (n,) [dB] of the strongest of (T, n) powers, within its carrier.
+    """Signal over interference and noise (n,) [dB] of the strongest of (T, n) powers,
+    within its carrier.
 
     Args:
         power_db: NaN where unknown: such a station is taken for silent.
@@ -261,9 +312,12 @@ def count_overlap(power_db: np.ndarray, carrier: np.ndarray) -> np.ndarray:
 
 
 def read_loads(
-    load: float | Sequence[float] | Mapping[str, float], stations: Sequence[str], labels: Sequence[str] = ()
+    load: float | Sequence[float] | Mapping[str, float],
+    stations: Sequence[str],
+    labels: Sequence[str] = (),
 ) -> np.ndarray:
-    """Return loads (T,) in [0, 1] of one number, one per station, or by name or label (the others 1).
+    """Return loads (T,) in [0, 1] of one number, one per station,
+    or by name or label (the others 1).
 
     Raises:
         DataError: another number of them, an unknown name, or no share.
@@ -271,9 +325,15 @@ def read_loads(
     if isinstance(load, Mapping):
         if wrong := sorted(load.keys() - {*stations, *labels}):
             raise DataError(f"load: no station {wrong[0]!r}; there are {', '.join(stations)}")
-        load = [load.get(a, load.get(b, 1.0)) for a, b in zip(stations, labels or stations, strict=True)]
+        load = [
+            load.get(a, load.get(b, 1.0)) for a, b in zip(stations, labels or stations, strict=True)
+        ]
     values = finite_array(load)
-    if values.ndim > 1 or values.size not in (1, len(stations)) or not ((values >= 0) & (values <= 1)).all():
+    if (
+        values.ndim > 1
+        or values.size not in (1, len(stations))
+        or not ((values >= 0) & (values <= 1)).all()
+    ):
         fault = f"shares from 0 to 1 are needed: one number, or {len(stations)}, one per station"
         raise DataError(f"load={load}: {fault}")
     return np.broadcast_to(values, (len(stations),))
@@ -294,9 +354,10 @@ def check_geotiff(wanted: bool | None) -> bool:
 def write_geotiff(path: str | Path, raster: FieldMap) -> None:
     """Write float32 bands, north up; named, NaN where nothing is said.
 
-    Bands are of the strongest station: `power_db`, `lower_db`, `upper_db`, `expected_error_db`, `sinr_db`,
-    `outage`, `best_server` (number of the station, as in `write_classes`), `server_chance`, and then the
-    power of each of several stations. Tags give unit, threshold and height.
+    Bands are of the strongest station: `power_db`, `lower_db`, `upper_db`, `expected_error_db`,
+    `sinr_db`, `outage`, `best_server` (number of the station, as in `write_classes`),
+    `server_chance`, and then the power of each of several stations. Tags give unit,
+    threshold and height.
     """
     import rasterio
 
@@ -305,7 +366,9 @@ def write_geotiff(path: str | Path, raster: FieldMap) -> None:
         bands |= {f"power_db {name}": raster.power_db[i] for i, name in enumerate(raster.stations)}
     profile = raster_profile(raster, count=len(bands), dtype="float32", nodata=float("nan"))
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
-        file.update_tags(unit=raster.unit, threshold_db=raster.threshold_db, height_m=raster.grid.height)
+        file.update_tags(
+            unit=raster.unit, threshold_db=raster.threshold_db, height_m=raster.grid.height
+        )
         for number, (name, values) in enumerate(bands.items(), 1):
             # GeoTIFF rows go from north to south, ours from south to north.
             file.write(np.flipud(values).astype(np.float32), number)
@@ -315,9 +378,15 @@ def write_geotiff(path: str | Path, raster: FieldMap) -> None:
 
 
 def write_classes(
-    path: str | Path, raster: FieldMap, number: np.ndarray, names: Sequence[str], colours: np.ndarray
-) -> None:  # fmt: skip
-    """Write numbers (ny, nx) of classes with a table of their colours (k, 3), and named areas as GeoJSON."""
+    path: str | Path,
+    raster: FieldMap,
+    number: np.ndarray,
+    names: Sequence[str],
+    colours: np.ndarray,
+) -> None:
+    """Write numbers (ny, nx) of classes with a table of their colours (k, 3),
+    and named areas as GeoJSON.
+    """
     import rasterio
     from rasterio.features import shapes
     from rasterio.warp import transform_geom
@@ -326,11 +395,17 @@ def write_classes(
     profile = raster_profile(raster, count=1, dtype="uint16", nodata=NO_CLASS)
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
         # Before the values, which fix what colours mean.
-        file.write_colormap(1, {i: tuple((255 * one[:3]).astype(int)) for i, one in enumerate(colours)})
+        file.write_colormap(
+            1, {i: tuple((255 * one[:3]).astype(int)) for i, one in enumerate(colours)}
+        )
         file.write(values, 1)
     named = []
     for area, one in shapes(values, values != NO_CLASS, transform=profile["transform"]):
-        area = area if raster.grid.origin is None else transform_geom(profile["crs"], "EPSG:4326", area)
+        area = (
+            area
+            if raster.grid.origin is None
+            else transform_geom(profile["crs"], "EPSG:4326", area)
+        )
         named.append((area, {"number": int(one), "station": names[int(one)]}))
     write_shapes(Path(path).with_suffix(".geojson"), named)
 
@@ -338,8 +413,8 @@ def write_classes(
 def raster_profile(raster: FieldMap, **bands: Any) -> dict[str, Any]:
     """What rasterio is told of a file and its `bands`, in the projection of `Georeference`.
 
-    Azimuthal equidistant, in which squares of the grid are squares: UTM would turn and resample them. Without
-    an origin coordinates are metres.
+    Azimuthal equidistant, in which squares of the grid are squares: UTM would turn and resample
+    them. Without an origin coordinates are metres.
     """
     from rasterio.transform import from_origin
 
@@ -348,7 +423,12 @@ def raster_profile(raster: FieldMap, **bands: Any) -> dict[str, Any]:
     form = "+proj=aeqd +datum=WGS84 +lat_0={0!r} +lon_0={1!r} +title=equidistant_about_{0}_{1}"
     place = None if origin is None else form.format(origin.latitude, origin.longitude)
     return {
-        "driver": "GTiff", "width": len(raster.grid.x), "height": len(raster.grid.y), "crs": place, **bands,
+        "driver": "GTiff",
+        "width": len(raster.grid.x),
+        "height": len(raster.grid.y),
+        "crs": place,
+        **bands,
         "transform": from_origin(left, high, raster.grid.step, raster.grid.step),
-        "compress": "deflate", "tiled": True,
-    }  # fmt: skip
+        "compress": "deflate",
+        "tiled": True,
+    }

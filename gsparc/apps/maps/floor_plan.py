@@ -17,7 +17,9 @@ from gsparc.data.assemble import FARTHEST
 LEAST_PIXELS = 2.0  # between the reference points: nearer ones tell no scale
 DARK = 128  # of 255: walls are darker
 LARGEST = 4000  # pixels of the longer side that are kept
-SHOW = "say plan_points=[[column,row,x,y],[column,row,x,y]], pixels from the upper left corner, metres"
+SHOW = (
+    "say plan_points=[[column,row,x,y],[column,row,x,y]], pixels from the upper left corner, metres"
+)
 
 
 @dataclass(frozen=True)
@@ -69,12 +71,18 @@ def read_floor_plan(path: str | Path, points: Sequence[Sequence[float]] | None) 
             size = tuple(max(1, round(side / shrink)) for side in picture.size)
             image = np.asarray(picture.convert("RGB").resize(size))  # type: ignore[arg-type]
     except Image.DecompressionBombError as error:
-        most = f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels are read, {LARGEST} a side are kept"
+        most = (
+            f"at most {2 * (Image.MAX_IMAGE_PIXELS or 0):,} pixels are read, {LARGEST} a side "
+            "are kept"
+        )
         raise DataError(
-            f"plan={path}: too large an image ({explain_error(error).partition(' exceeds')[0]}); {most}"
+            f"plan={path}: too large an image ({explain_error(error).partition(' exceeds')[0]}); "
+            f"{most}"
         ) from None
     except (UnidentifiedImageError, OSError, ValueError):
-        raise DataError(f"plan={path}: not an image that can be read; expected PNG or JPEG") from None
+        raise DataError(
+            f"plan={path}: not an image that can be read; expected PNG or JPEG"
+        ) from None
     if points is None:
         raise DataError(f"plan={path}: has no scale; {SHOW}")
     pairs = _checked(points, path)
@@ -89,18 +97,30 @@ def _checked(points: Any, path: str | Path) -> np.ndarray:
     if pairs.shape != (2, 4):
         raise DataError(f"plan_points={points}: two points of four numbers are needed; {SHOW}")
     if np.hypot(*(pairs[1, :2] - pairs[0, :2])) < LEAST_PIXELS:
-        raise DataError(f"plan={path}: plan_points are one pixel, which gives no scale; take two far apart")
-    if not 0 < np.hypot(*(pairs[1, 2:] - pairs[0, 2:])) < FARTHEST or np.abs(pairs[:, 2:]).max() > FARTHEST:
-        raise DataError(f"plan={path}: its two points are one place, or not in metres; take two far apart")
+        raise DataError(
+            f"plan={path}: plan_points are one pixel, which gives no scale; take two far apart"
+        )
+    if (
+        not 0 < np.hypot(*(pairs[1, 2:] - pairs[0, 2:])) < FARTHEST
+        or np.abs(pairs[:, 2:]).max() > FARTHEST
+    ):
+        raise DataError(
+            f"plan={path}: its two points are one place, or not in metres; take two far apart"
+        )
     return pairs
 
 
 def read_plan_settings(settings: Mapping[str, Any]) -> FloorPlan | None:
-    """Return the floor plan that `plan` and `plan_points` of settings name; None where they name none.
+    """Return the floor plan that `plan` and `plan_points` of settings name;
+    None where they name none.
 
     Raises:
         DataError: points without an image, or one that cannot be read.
     """
     if settings["plan"] is None and settings["plan_points"] is not None:
         raise DataError("plan_points: goes with an image, plan=FILE")
-    return None if settings["plan"] is None else read_floor_plan(settings["plan"], settings["plan_points"])
+    return (
+        None
+        if settings["plan"] is None
+        else read_floor_plan(settings["plan"], settings["plan_points"])
+    )

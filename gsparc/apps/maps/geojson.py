@@ -60,10 +60,13 @@ def _geometries(path: str | Path) -> list[Any]:
 
 
 def _in_degrees(places: np.ndarray, origin: Georeference) -> Iterator[tuple[str, np.ndarray]]:
-    """Longitudes and latitudes (n, 2) of places (n, 2) by each way to write them, the standard's first."""
+    """Longitudes and latitudes (n, 2) of places (n, 2) by each way to write them,
+    the standard's first.
+    """
     yield "", places
     yield "latitude, longitude", places[:, ::-1]
-    zone = f"EPSG:{326 if origin.latitude >= 0 else 327}{int((origin.longitude + 180) // 6) % 60 + 1:02d}"
+    hemisphere = 326 if origin.latitude >= 0 else 327
+    zone = f"EPSG:{hemisphere}{int((origin.longitude + 180) // 6) % 60 + 1:02d}"
     for name in (zone, "EPSG:3857"):  # of the site, and of maps on the web
         yield (
             f"metres of {name}",
@@ -72,12 +75,16 @@ def _in_degrees(places: np.ndarray, origin: Georeference) -> Iterator[tuple[str,
 
 
 def _to_metres(places: np.ndarray, origin: Georeference, where: str) -> np.ndarray:
-    """Metres (n, 2) of places (n, 2), as the standard has them unless that is far and another way near."""
+    """Metres (n, 2) of places (n, 2), as the standard has them unless that is far
+    and another way near.
+    """
     read = {}
     for name, degrees in _in_degrees(places, origin):
         if find_invalid_coordinate(degrees[:, 1], degrees[:, 0]) is None:
             read[name] = origin.from_degrees(degrees[:, 1], degrees[:, 0])
-    near = [name for name, metres in read.items() if np.abs(np.median(metres, axis=0)).max() < FAR_M]
+    near = [
+        name for name, metres in read.items() if np.abs(np.median(metres, axis=0)).max() < FAR_M
+    ]
     if near and near[0]:
         log.warning("%s: read as %s, as the site is there", where, near[0])
     if not near and "" not in read:
@@ -87,18 +94,24 @@ def _to_metres(places: np.ndarray, origin: Georeference, where: str) -> np.ndarr
 
 
 def read_shapes(
-    path: str | Path, key: str, origin: Georeference | None, lines_too: bool = False, site_m: float = 0.0
+    path: str | Path,
+    key: str,
+    origin: Georeference | None,
+    lines_too: bool = False,
+    site_m: float = 0.0,
 ) -> tuple[BaseGeometry, list[LineString]]:
     """Return the union of a file's polygons, and its lines, in metres.
 
-    Coordinates are degrees where the model knows its place on Earth, or metres of the site's UTM zone.
+    Coordinates are degrees where the model knows its place on Earth,
+    or metres of the site's UTM zone.
 
     Args:
         path: `*.geojson`, `*.json` or `*.wkt`, or a polygon in well-known text.
         key: setting that named it, for messages.
         origin: of the model's metres; None: the file's coordinates are metres themselves.
         lines_too: whether lines will do where there are no polygons.
-        site_m: width of the site [m], of which everything drawn must not be a speck: it is in degrees then.
+        site_m: width of the site [m], of which everything drawn must not be a speck: it is in
+            degrees then.
 
     Raises:
         DataError: no file, no GeoJSON, no such shapes, one without extent, or degrees.
@@ -120,7 +133,9 @@ def read_shapes(
         parts = shapely.get_parts(parts)
     kind = shapely.get_type_id(parts)
     if not (kind == POLYGON).any() and not (lines_too and (kind == LINE).any()):
-        raise DataError(f"{where}: holds no polygon{' and no line' * lines_too}; draw one, as in a GIS")
+        raise DataError(
+            f"{where}: holds no polygon{' and no line' * lines_too}; draw one, as in a GIS"
+        )
     parts, kind = parts[np.isin(kind, (LINE, POLYGON))], kind[np.isin(kind, (LINE, POLYGON))]
 
     def in_metres(places: np.ndarray) -> np.ndarray:
@@ -130,7 +145,9 @@ def read_shapes(
             return _to_metres(places, origin, where)
         if np.abs(places).max(initial=0) > FARTHEST:
             far = f"{np.abs(places).max():.3g} is no coordinate in metres"
-            raise DataError(f"{where}: {far}; give those of the measurements, within {FARTHEST:g} m")
+            raise DataError(
+                f"{where}: {far}; give those of the measurements, within {FARTHEST:g} m"
+            )
         return places
 
     parts = shapely.transform(parts, in_metres)

@@ -1,9 +1,10 @@
-"""Intervals that hold a measurement as often as they say, learned from whole blocks of places held out.
+"""Intervals that hold a measurement as often as they say,
+learned from whole blocks of places held out.
 
 The field alone, without the noise of a measurement, lies in them more often.
-A prediction's own deviation is scaled by what it took to cover the errors of held-out rows as far from data
-(split conformal prediction with a scale, J. Lei et al., J. Amer. Stat. Assoc. 113 (2018), in bins of
-distance). Farther than any held-out row nothing is known, and nothing is said.
+A prediction's own deviation is scaled by what it took to cover the errors of held-out rows as far
+from data (split conformal prediction with a scale, J. Lei et al., J. Amer. Stat. Assoc. 113 (2018),
+in bins of distance). Farther than any held-out row nothing is known, and nothing is said.
 """
 
 from __future__ import annotations
@@ -36,9 +37,11 @@ class IntervalScales:
         distance: (K,) middles of bins [m].
         half: (K,) half of an interval, in deviations.
         rms: (K,) expected error, in deviations.
-        tail: (Q,) quantiles `TAIL` of errors in expected errors; None where censored rows hide some of them.
+        tail: (Q,) quantiles `TAIL` of errors in expected errors; None where censored rows hide some
+            of them.
         reach: beyond this distance nothing is said [m].
-        station: (T,) what deviations of each are multiplied with before; of those not among them, 1.
+        station: (T,) what deviations of each are multiplied with before; of those not among them,
+            1.
         least: deviation that smaller ones are taken for [dB].
     """
 
@@ -60,7 +63,9 @@ class IntervalScales:
         """
         scale = np.append(self.station, 1.0)[np.minimum(station, len(self.station))]
         scaled = np.where(distance <= self.reach, scale * np.maximum(spread_db, self.least), np.nan)
-        half, rms = (scaled * np.interp(distance, self.distance, factor) for factor in (self.half, self.rms))
+        half, rms = (
+            scaled * np.interp(distance, self.distance, factor) for factor in (self.half, self.rms)
+        )
         return half, rms
 
     def half_of(self, rows: HeldOutLevels) -> np.ndarray:
@@ -70,7 +75,9 @@ class IntervalScales:
     def probability_below(
         self, level_db: float | np.ndarray, mean_db: np.ndarray, expected_db: np.ndarray
     ) -> np.ndarray:
-        """Return the probability (n,) that a measurement lies below a level; NaN where it is not known."""
+        """Return the probability (n,) that a measurement lies below a level;
+        NaN where it is not known.
+        """
         standard = (level_db - mean_db) / expected_db
         if self.tail is None:
             return ndtr(standard)
@@ -95,7 +102,9 @@ def calibrate(evidence: HeldOutLevels, share: float = 0.9) -> IntervalScales:
     heard = used.heard
     if heard.sum() < LEAST_ROWS:
         fault = f"{heard.sum()} of them were held out, {LEAST_ROWS} at least are needed"
-        raise ValueError(f"too few rows to test intervals ({fault}); promised=false draws without a promise")
+        raise ValueError(
+            f"too few rows to test intervals ({fault}); promised=false draws without a promise"
+        )
     least = LEAST_SPREAD * float(np.median(used.spread_db))
     used = replace(used, spread_db=np.maximum(used.spread_db, least))
     blocks = len(np.unique(used.block))
@@ -109,8 +118,13 @@ def calibrate(evidence: HeldOutLevels, share: float = 0.9) -> IntervalScales:
     count = len(first) + 1
     which = np.searchsorted(first, used.distance, side="right")
     bins = [used.subset(which == number) for number in range(count)]
-    middle, typical = np.array([(np.median(one.distance), np.median(one.spread_db)) for one in bins]).T
-    scales, weight = np.array([_half_and_rms(one, level) for one in bins]).T, [len(one) for one in bins]
+    middle, typical = np.array(
+        [(np.median(one.distance), np.median(one.spread_db)) for one in bins]
+    ).T
+    scales, weight = (
+        np.array([_half_and_rms(one, level) for one in bins]).T,
+        [len(one) for one in bins],
+    )
     half, rms = (isotonic_regression(one * typical, weights=weight).x / typical for one in scales)
     scaled = used.error / np.interp(used.distance, middle, rms)
     tail = np.quantile(scaled, TAIL) if heard.all() else None
@@ -125,7 +139,9 @@ def _half_and_rms(part: HeldOutLevels, level: float) -> tuple[float, float]:
 
 
 def _of_stations(used: HeldOutLevels, level: float) -> np.ndarray:
-    """How much larger each station's errors are than all (T,); drawn towards 1 where blocks are few."""
+    """How much larger each station's errors are than all (T,);
+    drawn towards 1 where blocks are few.
+    """
     whole, factors = _half_and_rms(used, level)[0], np.ones(int(used.station.max()) + 1)
     for number in np.unique(used.station) if len(factors) > 1 and whole > 0 else ():
         rows = used.subset(used.station == number)
@@ -161,6 +177,8 @@ def cross_validate(evidence: HeldOutLevels, share: float) -> Coverage:
     half = np.full(len(evidence), np.nan)
     for turn in range(min(PARTS, len(blocks))):
         in_test = (part == turn) & evidence.heard
-        half[in_test] = calibrate(evidence.subset(part != turn), share).half_of(evidence.subset(in_test))
+        half[in_test] = calibrate(evidence.subset(part != turn), share).half_of(
+            evidence.subset(in_test)
+        )
     coverage, width = coverage_and_width(evidence.level_db - evidence.mean_db, half)
     return Coverage(coverage, width, int(np.isfinite(half).sum()), len(blocks))

@@ -21,7 +21,8 @@ OPACITY = 0.75  # of images, through which the ground is seen
 
 
 def write_kmz(path: str | Path, field: FieldMap, layers: Sequence[Layer]) -> None:
-    """Write layers, the first shown and the others to be switched on; the map must know its place on Earth.
+    """Write layers, the first shown and the others to be switched on;
+    the map must know its place on Earth.
 
     Cells of a grid of metres become those of one of degrees, each with the nearest's colour.
     """
@@ -32,7 +33,9 @@ def write_kmz(path: str | Path, field: FieldMap, layers: Sequence[Layer]) -> Non
     profile = raster_profile(field)
     size = profile["width"], profile["height"]
     left, right, low, high = field.grid.extent
-    to, width, height = calculate_default_transform(profile["crs"], DEGREES, *size, left, low, right, high)
+    to, width, height = calculate_default_transform(
+        profile["crs"], DEGREES, *size, left, low, right, high
+    )
     west, south, east, north = array_bounds(height, width, to)
     box = {"north": north, "south": south, "east": east, "west": west}
     kml = Element("kml", xmlns=NAMESPACE)
@@ -47,8 +50,11 @@ def write_kmz(path: str | Path, field: FieldMap, layers: Sequence[Layer]) -> Non
             imsave(picture, np.ascontiguousarray(np.moveaxis(image, 0, 2)))
             archive.writestr(file, picture.getvalue())
             overlay = SubElement(folder, "GroundOverlay")
-            for name, text in {"name": layer.name, "visibility": str(int(number == 0)),
-                               "description": _explain(layer)}.items():  # fmt: skip
+            for name, text in {
+                "name": layer.name,
+                "visibility": str(int(number == 0)),
+                "description": _explain(layer),
+            }.items():
                 SubElement(overlay, name).text = text
             SubElement(SubElement(overlay, "Icon"), "href").text = file
             edges = SubElement(overlay, "LatLonBox")
@@ -74,4 +80,6 @@ def _explain(layer: Layer) -> str:
         return f"{layer.legend.label}: {ends}, colours of {layer.legend.colours}"
     rows = layer.class_table()
     lines = zip(rows["colour"], rows["station"], rows["share"], strict=True)
-    return "<br>".join(f'<font color="{c}">&#9632;</font> {name} ({share:.1%})' for c, name, share in lines)
+    return "<br>".join(
+        f'<font color="{c}">&#9632;</font> {name} ({share:.1%})' for c, name, share in lines
+    )

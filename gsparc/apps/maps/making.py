@@ -40,14 +40,25 @@ BANDS = 1 << 16  # cells at a time of what follows from predictions
 
 
 def predict_map(
-    predictor: Predictor, area: Any = None, *, height_m: float | None = None, step_m: float | None = None,
-    threshold_db: float = -100.0, stations: Sequence[str | int] | None = None,
-    load: float | Sequence[float] | Mapping[str, float] = 1.0, noise_db: float | None = None,
-    other_end: Sequence[float] | None = None, plan: FloorPlan | None = None,
-    promise: Promise | Literal["stored"] | None = "stored", share: float = 0.9, tolerance_db: float = 0.1,
-    unit: str | None = None, dry: bool = False, buildings: Any = None,
+    predictor: Predictor,
+    area: Any = None,
+    *,
+    height_m: float | None = None,
+    step_m: float | None = None,
+    threshold_db: float = -100.0,
+    stations: Sequence[str | int] | None = None,
+    load: float | Sequence[float] | Mapping[str, float] = 1.0,
+    noise_db: float | None = None,
+    other_end: Sequence[float] | None = None,
+    plan: FloorPlan | None = None,
+    promise: Promise | Literal["stored"] | None = "stored",
+    share: float = 0.9,
+    tolerance_db: float = 0.1,
+    unit: str | None = None,
+    dry: bool = False,
+    buildings: Any = None,
     indoor_db: Sequence[float] | None = None,
-) -> FieldMap:  # fmt: skip
+) -> FieldMap:
     """Predict every cell of an area.
 
     >>> field = predict_map(gsparc.load("model.ckpt"), step_m=0.5)
@@ -62,12 +73,13 @@ def predict_map(
         load, noise_db: see `sinr`.
         other_end: (3,) world place of the end that the map is not of, where both moved [m].
         plan: beneath the map.
-        promise: evidence of held-out blocks, or what the checkpoint holds of it; None: intervals are the
-            model's own deviations, and nothing is refused.
+        promise: evidence of held-out blocks, or what the checkpoint holds of it; None: intervals
+            are the model's own deviations, and nothing is refused.
         share: of measurements that intervals are to hold.
-        tolerance_db: error of cells that are interpolated, in maps of more than `ALL_CELLS`; 0 asks about
-            every cell. Known places must be stored with the model.
-        unit: of the map's levels, and of `threshold_db` and `noise_db`: dBm or dBW; None: as measured.
+        tolerance_db: error of cells that are interpolated, in maps of more than `ALL_CELLS`; 0 asks
+            about every cell. Known places must be stored with the model.
+        unit: of the map's levels, and of `threshold_db` and `noise_db`: dBm or dBW; None: as
+            measured.
         dry: predict one cell of each station alone: whether everything asked for is possible.
         buildings: see `lay_grid`.
         indoor_db: (2,) loss of squares in buildings, which are mapped then, and its deviation [dB].
@@ -77,12 +89,16 @@ def predict_map(
     """
     site = predictor.site
     if site.kind not in MAPPED:
-        raise DataError(f"this model predicts spectra of {site.name}, which have no received power to map")
+        raise DataError(
+            f"this model predicts spectra of {site.name}, which have no received power to map"
+        )
     promise = read_promise(predictor.extra) if promise == "stored" else promise
     names, notes = choose_stations(predictor, stations, promise)
     loss = None if indoor_db is None else finite_array(indoor_db)
     if loss is not None and (loss.shape != (2,) or (loss < 0).any() or buildings is None):
-        raise DataError(f"indoor_db={indoor_db}: a loss and its deviation, [15,6], beside buildings=FILE")
+        raise DataError(
+            f"indoor_db={indoor_db}: a loss and its deviation, [15,6], beside buildings=FILE"
+        )
     grid = lay_grid(site, area, height_m, step_m, plan, len(names), buildings, loss is not None)
     numbers = np.array([site.every_station.name.index(name) for name in names])
     about = station_facts(site, numbers)
@@ -103,20 +119,30 @@ def predict_map(
     if tolerance_db > 0 and len(every) > ALL_CELLS and promise is not None:
         # Cells asked about everywhere are no farther apart than what was measured.
         stride = max(int(neighbour_distance(promise.known[:, -3:-1]) / grid.step / 2), 1)
-    alike, computed = _fill_levels(values, predictor, grid, other_end, names, numbers, stride, tolerance_db)
+    alike, computed = _fill_levels(
+        values, predictor, grid, other_end, names, numbers, stride, tolerance_db
+    )
     if computed < len(names) * len(every):
         most = f"{computed} of {len(names) * len(every)} levels were predicted"
         notes.append(f"{most}, the others interpolated to about {tolerance_db:g} dB (tolerance_db)")
     bands = about["bands"]
     carrier = np.unique(bands or ("",) * len(names), return_inverse=True)[1].reshape(-1)
     scoring = Scoring(
-        calibration, numbers, load_of, carrier, _hearing_floors(promise, numbers, noise_db), threshold_db,
-        noise_db, loss,
-    )  # fmt: skip
+        calibration,
+        numbers,
+        load_of,
+        carrier,
+        _hearing_floors(promise, numbers, noise_db),
+        threshold_db,
+        noise_db,
+        loss,
+    )
     values["overlap"] = np.full(grid.inside.shape, np.nan, np.float32)
     flat = {name: array.reshape(*array.shape[:-2], -1) for name, array in values.items()}
     for cells in _chunks(every, BANDS):
-        mean, spread = (flat[name][:, cells].astype(np.float64) for name in ("power_db", "expected_error_db"))
+        mean, spread = (
+            flat[name][:, cells].astype(np.float64) for name in ("power_db", "expected_error_db")
+        )
         far = np.zeros(mean.shape)
         if promise is not None:
             local = to_local(site, grid.places(cells), other_end)
@@ -127,39 +153,69 @@ def predict_map(
             flat[name][..., cells] = layer
     if promise is not None and not np.isfinite(values["power_db"]).any():
         fault = f"every square lies more than {calibration.reach:.3g} m from what was measured"
-        raise DataError(f"area: {fault}, where no error was tested; map nearer, or a larger promise.block_m")
+        raise DataError(
+            f"area: {fault}, where no error was tested; map nearer, or a larger promise.block_m"
+        )
     overlap = values.pop("overlap")
     extra = {} if len(names) == 1 else {"overlap": overlap}
     places = np.zeros((0, 2)) if promise is None else promise.known[:, -3:-1] + site.origin[:2]
     return FieldMap(
-        grid, **values, share=share, calibrated=promise is not None,
-        threshold_db=threshold_db, extra=extra, places=np.unique(places, axis=0), notes=tuple(notes),
-        unit=site.level_unit, **about,
-    ).to_unit(level.raised_db, level.name)  # fmt: skip
+        grid,
+        **values,
+        share=share,
+        calibrated=promise is not None,
+        threshold_db=threshold_db,
+        extra=extra,
+        places=np.unique(places, axis=0),
+        notes=tuple(notes),
+        unit=site.level_unit,
+        **about,
+    ).to_unit(level.raised_db, level.name)
 
 
-def _notes_of_threshold(threshold_db: float, promise: Promise | None, level: PowerUnit) -> list[str]:
-    """Say where a threshold [dB] lies outside of what was measured; levels are named in the map's unit."""
+def _notes_of_threshold(
+    threshold_db: float, promise: Promise | None, level: PowerUnit
+) -> list[str]:
+    """Say where a threshold [dB] lies outside of what was measured;
+    levels are named in the map's unit.
+    """
     if promise is None:
         return []
-    measured, threshold = promise.evidence.level_db + level.raised_db, threshold_db + level.raised_db
-    # Of what was not heard the level that it lies below; to whole decibels, as next to nothing lies between.
+    measured, threshold = (
+        promise.evidence.level_db + level.raised_db,
+        threshold_db + level.raised_db,
+    )
+    # Of what was not heard the level that it lies below; to whole decibels,
+    # as next to nothing lies between.
     if threshold_db <= np.ceil(measured.min() - level.raised_db):
-        at = f"threshold_db={threshold:g} is at or below what was measured (lowest {measured.min():.4g})"
+        at = (
+            f"threshold_db={threshold:g} is at or below what was measured (lowest "
+            f"{measured.min():.4g})"
+        )
         return [f"{at}: it says nothing of weaker places"]
     if threshold > measured.max():
-        at = f"threshold_db={threshold:g} is above all that was measured (highest {measured.max():.4g})"
+        at = (
+            f"threshold_db={threshold:g} is above all that was measured (highest "
+            f"{measured.max():.4g})"
+        )
         return [f"{at}: hardly any place can reach it"]
     return []
 
 
 def _fill_levels(
-    values: dict[str, np.ndarray], predictor: Predictor, grid: Grid, other_end: Sequence[float] | None,
-    names: Sequence[str], numbers: np.ndarray, stride: int, tolerance_db: float,
-) -> tuple[np.ndarray, int]:  # fmt: skip
+    values: dict[str, np.ndarray],
+    predictor: Predictor,
+    grid: Grid,
+    other_end: Sequence[float] | None,
+    names: Sequence[str],
+    numbers: np.ndarray,
+    stride: int,
+    tolerance_db: float,
+) -> tuple[np.ndarray, int]:
     """Write levels and the model's own deviations to `values`.
 
-    Return the correlation (T, ny, nx) of errors with the strongest's, and how many levels were predicted.
+    Return the correlation (T, ny, nx) of errors with the strongest's,
+    and how many levels were predicted.
     """
     first, computed = grid.places(np.flatnonzero(grid.inside)[:1]), 0
     joint = joint_levels(predictor, first, numbers) is not None
@@ -184,13 +240,16 @@ def uncalibrated(share: float) -> IntervalScales:
 
 
 def choose_stations(
-    predictor: Predictor, wanted: Sequence[str | int] | None, promise: Promise | None = None,
+    predictor: Predictor,
+    wanted: Sequence[str | int] | None,
+    promise: Promise | None = None,
     key: str = "stations",
-) -> tuple[list[str], list[str]]:  # fmt: skip
+) -> tuple[list[str], list[str]]:
     """Return names of the stations that are mapped, and notes on the others.
 
-    Those are stations that the model does not answer for, and, where something is promised, stations that it
-    never heard: what was held out tells nothing of them. `key` is the setting that `wanted` comes from.
+    Those are stations that the model does not answer for, and, where something is promised,
+    stations that it never heard: what was held out tells nothing of them.
+    `key` is the setting that `wanted` comes from.
 
     Raises:
         DataError: one of them was asked for, or none is left.
@@ -198,13 +257,17 @@ def choose_stations(
     stations = predictor.site.stations
     if stations is None:
         if wanted is not None:
-            raise DataError(f"{key}={list(wanted)}: {predictor.site.name} has one station; leave it out")
+            raise DataError(
+                f"{key}={list(wanted)}: {predictor.site.name} has one station; leave it out"
+            )
         return [""], []
     names: list[str] = []
     for one in wanted if wanted is not None else stations.name:
         number = find_station(one, stations)
         if number is None:
-            raise DataError(f"{key}: no station {one!r}{suggest_or_list(str(one), all_names(stations))}")
+            raise DataError(
+                f"{key}: no station {one!r}{suggest_or_list(str(one), all_names(stations))}"
+            )
         names.append(stations.name[number])
     if not names:
         raise DataError("stations=[]: name one at least, or all")
@@ -214,7 +277,9 @@ def choose_stations(
         try:
             predictor.select_station(name)
             if promise is not None and not (promise.station == stations.name.index(name)).any():
-                raise DataError(f"station {name} was never heard, so that nothing can be promised of its map")
+                raise DataError(
+                    f"station {name} was never heard, so that nothing can be promised of its map"
+                )
         except ValueError as error:
             if wanted is not None:
                 raise DataError(str(error)) from None
@@ -230,26 +295,37 @@ def _chunks(rows: np.ndarray, size: int) -> list[np.ndarray]:
 
 
 def _asker(
-    predictor: Predictor, joint: bool, grid: Grid, other_end: Sequence[float] | None,
-    names: Sequence[str], numbers: np.ndarray,
-) -> Callable[[np.ndarray], np.ndarray]:  # fmt: skip
+    predictor: Predictor,
+    joint: bool,
+    grid: Grid,
+    other_end: Sequence[float] | None,
+    names: Sequence[str],
+    numbers: np.ndarray,
+) -> Callable[[np.ndarray], np.ndarray]:
     """Levels and deviations [dB] of cells (n,), in chunks, as many at once as torch has threads.
 
-    Of one station (n, 2), or of those that are known together (n, 3 T), with the correlation of their
-    errors with the strongest's.
+    Of one station (n, 2), or of those that are known together (n, 3 T), with the correlation of
+    their errors with the strongest's.
     """
     model = predictor if joint else predictor.ask_station(int(numbers[0]))
 
     def one(cells: np.ndarray) -> np.ndarray:
-        if (every := joint_levels(model, grid.places(cells), numbers) if joint else None) is not None:
+        if (
+            every := joint_levels(model, grid.places(cells), numbers) if joint else None
+        ) is not None:
             return every.reshape(len(cells), -1)
         return np.column_stack(predict_levels(model, grid.places(cells), other_end))
 
     name = f" of {names[0]}" if len(names) == 1 and names[0] else ""
 
     def ask(cells: np.ndarray) -> np.ndarray:
-        levels, parts = np.zeros((len(cells), 3 * len(numbers) if joint else 2)), _chunks(cells, CHUNK)
-        for number, values in run_each(one, parts, f"blocks of cells{name}", threads=torch.get_num_threads()):
+        levels, parts = (
+            np.zeros((len(cells), 3 * len(numbers) if joint else 2)),
+            _chunks(cells, CHUNK),
+        )
+        for number, values in run_each(
+            one, parts, f"blocks of cells{name}", threads=torch.get_num_threads()
+        ):
             levels[number * CHUNK : number * CHUNK + len(values)] = values
         return levels
 
@@ -257,9 +333,11 @@ def _asker(
 
 
 def predict_levels(
-    predictor: Predictor, places: np.ndarray, other_end: Sequence[float] | None = None,
+    predictor: Predictor,
+    places: np.ndarray,
+    other_end: Sequence[float] | None = None,
     station: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the level and its deviation (n,) [dB] at world places (n, 3).
 
     See `predicted_levels` and `query_ends`.
@@ -272,8 +350,12 @@ def predict_levels(
     return level, spread
 
 
-def _hearing_floors(promise: Promise | None, numbers: np.ndarray, noise_db: float | None) -> np.ndarray:
-    """Levels (T,) below which stations are not heard, else the weakest but for 1 % measured [dB]."""
+def _hearing_floors(
+    promise: Promise | None, numbers: np.ndarray, noise_db: float | None
+) -> np.ndarray:
+    """Levels (T,) below which stations are not heard,
+    else the weakest but for 1 % measured [dB].
+    """
     floor = np.full(len(numbers), -np.inf if noise_db is None else noise_db)
     if promise is None:
         return floor
@@ -283,12 +365,16 @@ def _hearing_floors(promise: Promise | None, numbers: np.ndarray, noise_db: floa
             quiet = levels.level_db[levels.side > 0]
             # The least level: those of lists are of their weakest cells, far above what is heard.
             # 1 %, not the least: one faulty row would place the floor anywhere.
-            floor[row] = max(floor[row], quiet.min() if len(quiet) else np.quantile(levels.level_db, 0.01))
+            floor[row] = max(
+                floor[row], quiet.min() if len(quiet) else np.quantile(levels.level_db, 0.01)
+            )
     return floor
 
 
 def station_facts(site: Site, numbers: np.ndarray) -> dict[str, Any]:
-    """Return what a `FieldMap` says of stations (T,): names, as in a list of cells, places, carriers, ..."""
+    """Return what a `FieldMap` says of stations (T,): names, as in a list of cells, places,
+    carriers, ...
+    """
     stations = site.every_station
     carrier = np.zeros(1) if stations.carrier_hz is None else stations.carrier_hz[numbers]
     several = len(np.unique(carrier)) > 1

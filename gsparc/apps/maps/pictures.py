@@ -80,28 +80,39 @@ class Layer:
     group: np.ndarray | None = None
 
     def table(self) -> np.ndarray:
-        """Return colours (n, 4) from the lower to the upper end of the legend: of each class, or 256."""
+        """Return colours (n, 4) from the lower to the upper end of the legend: of each class,
+        or 256.
+        """
         if not self.words:
             return colormaps[self.legend.colours](np.linspace(0, 1, 256))
         every = np.arange(len(self.words)) if self.group is None else self.group
         number = np.unique(every, return_inverse=True)[1]
         where = np.append(number, np.nan)[np.nan_to_num(self.values, nan=len(number)).astype(int)]
         tint = assign_colours(where, int(number.max()) + 1)[number]  # fewer than plain stations
-        colours, rank = np.asarray(colormaps["tab10"](tint)), np.tril(tint[:, None] == tint, -1).sum(1)
+        colours, rank = (
+            np.asarray(colormaps["tab10"](tint)),
+            np.tril(tint[:, None] == tint, -1).sum(1),
+        )
         shade = np.array(SHADES)[rank % len(SHADES)][:, None]
         # A positive share goes to white, a negative one to black.
         colours[:, :3] += np.abs(shade) * ((shade > 0) - colours[:, :3])
         return colours
 
     def class_table(self) -> dict[str, list[Any]]:
-        """Return columns of its classes, largest first: number, name, share of the map and colour."""
-        count = np.bincount(self.values[np.isfinite(self.values)].astype(int), minlength=len(self.words))
+        """Return columns of its classes, largest first: number, name,
+        share of the map and colour.
+        """
+        count = np.bincount(
+            self.values[np.isfinite(self.values)].astype(int), minlength=len(self.words)
+        )
         order = np.argsort(-count, kind="stable").tolist()
         share, colour = count / max(count.sum(), 1), self.table()
         return {
-            "number": order, "station": [self.words[k] for k in order],
-            "share": [round(float(share[k]), 4) for k in order], "colour": [to_hex(colour[k]) for k in order],
-        }  # fmt: skip
+            "number": order,
+            "station": [self.words[k] for k in order],
+            "share": [round(float(share[k]), 4) for k in order],
+            "colour": [to_hex(colour[k]) for k in order],
+        }
 
 
 def assign_colours(classes: np.ndarray, count: int) -> np.ndarray:
@@ -128,7 +139,9 @@ def assign_colours(classes: np.ndarray, count: int) -> np.ndarray:
 
 
 def label_places(classes: np.ndarray, words: tuple[str, ...]) -> Iterator[tuple[int, int, str]]:
-    """Return row, column and name for each area of classes (ny, nx) that is wide enough to be written on."""
+    """Return row, column and name for each area of classes (ny, nx)
+    that is wide enough to be written on.
+    """
     # Deeper than a letter at the picture's size, or the name hides its area.
     least = max(DEEP * max(classes.shape), 1.5)
     for number in np.unique(classes[np.isfinite(classes)]).astype(int):
@@ -137,11 +150,16 @@ def label_places(classes: np.ndarray, words: tuple[str, ...]) -> Iterator[tuple[
             # Padded, since the map's edge ends an area as well.
             deep = distance_transform_edt(np.pad(parts == part, 1))[1:-1, 1:-1]
             if deep.max() >= least:
-                yield *(int(at) for at in np.unravel_index(deep.argmax(), deep.shape)), words[number]
+                yield (
+                    *(int(at) for at in np.unravel_index(deep.argmax(), deep.shape)),
+                    words[number],
+                )
 
 
 def list_layers(field: FieldMap) -> Iterator[Layer]:
-    """List every layer of a map that says something; of several stations, also the power of each."""
+    """List every layer of a map that says something; of several stations,
+    also the power of each.
+    """
     several, unit = len(field.stations) > 1, field.unit
     of = " of the strongest station" if several else ""
     layer = field.layer("power_db")
@@ -156,7 +174,9 @@ def list_layers(field: FieldMap) -> Iterator[Layer]:
             continue
         strongest = best_server(powers.reshape(len(powers), -1)).reshape(field.grid.inside.shape)
         level = np.take_along_axis(powers, np.maximum(strongest, 0).astype(np.int64)[None], 0)[0]
-        yield Layer(f"power {band}", level, Legend.over(f"received power at {band} [{unit}]", level))
+        yield Layer(
+            f"power {band}", level, Legend.over(f"received power at {band} [{unit}]", level)
+        )
         where = np.where(strongest == REFUSED, np.nan, strongest)
         yield _servers(f"best_server {band}", where, names, field.site[its], None)
     if np.isfinite(field.sinr_db).any():
@@ -164,7 +184,10 @@ def list_layers(field: FieldMap) -> Iterator[Layer]:
         yield Layer("sinr", field.sinr_db, Legend.over(label, field.sinr_db))
     label = f"probability of less than {field.threshold_db:g} {unit}"
     yield Layer("outage", field.outage, Legend(label, 0.0, 1.0, "magma_r"))
-    error, width = field.layer("expected_error_db"), field.at_best_server(field.upper_db - field.lower_db)
+    error, width = (
+        field.layer("expected_error_db"),
+        field.at_best_server(field.upper_db - field.lower_db),
+    )
     yield Layer("expected_error", error, Legend.over("expected error [dB]", error, "cividis"))
     label = f"width of the {field.share:.0%} interval [dB]"
     yield Layer("width", width, Legend.over(label, width, "cividis"))
@@ -173,10 +196,14 @@ def list_layers(field: FieldMap) -> Iterator[Layer]:
         yield Layer("overlap", field.extra["overlap"], Legend(label, 1.0, MOST_OVERLAP, "YlOrRd"))
     for name, layer in zip(field.stations, field.power_db, strict=True) if several else ():
         if np.isfinite(layer).any():
-            yield Layer(f"power {name}", layer, Legend.over(f"received power of {name} [{unit}]", layer))
+            yield Layer(
+                f"power {name}", layer, Legend.over(f"received power of {name} [{unit}]", layer)
+            )
 
 
-def _servers(name: str, number: np.ndarray, stations: tuple[str, ...], site: np.ndarray, doubt: Any) -> Layer:
+def _servers(
+    name: str, number: np.ndarray, stations: tuple[str, ...], site: np.ndarray, doubt: Any
+) -> Layer:
     legend = Legend("strongest station", -0.5, len(stations) - 0.5)
     return Layer(name, number, legend, stations, doubt, site if len(site) else None)
 
@@ -186,23 +213,33 @@ def file_name(layer: Layer, suffix: str = ".png") -> str:
     return "".join(c if c.isalnum() or c in "-_." else "_" for c in layer.name) + suffix
 
 
-def draw_layer(field: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None) -> None:
+def draw_layer(
+    field: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None
+) -> None:
     """Save one layer, over a floor plan, in the format of the file's ending."""
     left, right, low, high = field.grid.extent
-    width, height = (side / max(right - left, high - low) * INCHES for side in (right - left, high - low))
-    figure, axes = panels(max(width, 0.45 * INCHES) + 2.0, max(height, 0.4 * INCHES) + 1.2, grid=False)
+    width, height = (
+        side / max(right - left, high - low) * INCHES for side in (right - left, high - low)
+    )
+    figure, axes = panels(
+        max(width, 0.45 * INCHES) + 2.0, max(height, 0.4 * INCHES) + 1.2, grid=False
+    )
     axis = axes[0, 0]
     nothing = np.where(field.refused, 1.0, np.nan)
     grey = ListedColormap(["0.82"])
     axis.imshow(nothing, origin="lower", extent=field.grid.extent, cmap=grey, zorder=1, alpha=0.6)
     legend, values = layer.legend, layer.values[np.isfinite(layer.values)]
     limits = {"vmin": legend.low, "vmax": legend.high}
-    image = _cells(axis, field.grid, layer.values, plan, cmap=ListedColormap(layer.table()), **limits)
+    image = _cells(
+        axis, field.grid, layer.values, plan, cmap=ListedColormap(layer.table()), **limits
+    )
     if layer.words:
         _name_areas(axis, field.grid, layer)
     else:
         beyond = bool((values < legend.low).any()), bool((values > legend.high).any())
-        ends = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(beyond, "neither")
+        ends = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(
+            beyond, "neither"
+        )
         figure.colorbar(image, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
     if layer.unsure is not None:
         _hatch(axis, field, *layer.unsure)
@@ -220,10 +257,22 @@ def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
     (ny, nx), free = layer.values.shape, layer.values.copy()
     free[: ny // 10, : nx // 6] = np.nan  # the scale bar is there
     for row, column, word in label_places(free, layer.words):
-        axis.text(grid.x[column], grid.y[row], word, ha="center", va="center", fontsize="small", zorder=5,
-                  path_effects=from_above.OUTLINE)  # fmt: skip
+        axis.text(
+            grid.x[column],
+            grid.y[row],
+            word,
+            ha="center",
+            va="center",
+            fontsize="small",
+            zorder=5,
+            path_effects=from_above.OUTLINE,
+        )
     listed = layer.class_table()
-    areas = [row for row in zip(listed["colour"], listed["station"], listed["share"], strict=True) if row[2]]
+    areas = [
+        row
+        for row in zip(listed["colour"], listed["station"], listed["share"], strict=True)
+        if row[2]
+    ]
     more = len(areas) - MOST_COLOURS if len(areas) > MOST_LISTED else 0
     for colour, word, _ in areas[: len(areas) - more]:
         axis.plot([], [], "s", color=colour, label=word)
@@ -235,13 +284,21 @@ def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
 def _hatch(axis: Any, field: FieldMap, cells: np.ndarray, why: str) -> None:
     """Hatch cells (ny, nx) of a map; a map of a single row or column has no area to hatch."""
     if min(cells.shape) > 1:
-        how: dict[str, Any] = {"hatches": ["", "////"], "levels": [-0.5, 0.5, 1.5], "colors": "none"}
+        how: dict[str, Any] = {
+            "hatches": ["", "////"],
+            "levels": [-0.5, 0.5, 1.5],
+            "colors": "none",
+        }
         hatches = axis.contourf(field.grid.x, field.grid.y, cells.astype(float), zorder=2.5, **how)
         hatches.set(edgecolor="black", linewidth=0.0)
-        axis.fill([], [], facecolor="white", edgecolor="black", linewidth=0.0, hatch="////", label=why)
+        axis.fill(
+            [], [], facecolor="white", edgecolor="black", linewidth=0.0, hatch="////", label=why
+        )
 
 
-def _cells(axis: Any, grid: Grid, values: np.ndarray, plan: FloorPlan | None, **colours: Any) -> Any:
+def _cells(
+    axis: Any, grid: Grid, values: np.ndarray, plan: FloorPlan | None, **colours: Any
+) -> Any:
     """Values (ny, nx) of cells, through which a plan beneath them is seen."""
     if plan is not None:
         draw_floor_plan(axis, plan)
@@ -286,13 +343,21 @@ def draw_measurement_plan(
     left, right, low, high = batch.grid.extent
     wide, tall = np.array([right - left, high - low]) / max(right - left, high - low)
     figure, ((before, after, curve),) = panels(
-        11 * max(wide, 0.5) + 4.5, 5.0 * max(tall, 0.5) + 1.0, 1, 3, grid=False, width_ratios=[1, 1, 0.7]
+        11 * max(wide, 0.5) + 4.5,
+        5.0 * max(tall, 0.5) + 1.0,
+        1,
+        3,
+        grid=False,
+        width_ratios=[1, 1, 0.7],
     )
     errors = np.concatenate([batch.error_before, batch.error_after])
     # 99.5 %: a single corner far from all rows would flatten the rest.
     limits = {"vmin": float(errors.min()), "vmax": float(np.percentile(errors, 99.5)) + 1e-9}
     done = f"after these {len(batch.places)}"
-    for axis, values, title in ((before, batch.error_before, "now"), (after, batch.error_after, done)):
+    for axis, values, title in (
+        (before, batch.error_before, "now"),
+        (after, batch.error_after, done),
+    ):
         image = np.full(batch.grid.inside.shape, np.nan)
         image[batch.grid.inside] = values
         mesh = _cells(axis, batch.grid, image, plan, cmap="cividis", **limits)
@@ -302,12 +367,16 @@ def draw_measurement_plan(
         places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
         from_above.draw_measured(before, places)
     after.plot(*batch.path.T, color="red", linewidth=1, zorder=3)
-    after.plot(*batch.places[:, :2].T, "o", color="red", markeredgecolor="white", markersize=6, zorder=3)
+    after.plot(
+        *batch.places[:, :2].T, "o", color="red", markeredgecolor="white", markersize=6, zorder=3
+    )
     for number, place in enumerate(batch.places[:60], 1):
         from_above.annotate(after, str(number), place[:2])
     figure.colorbar(mesh, ax=[before, after], label="expected error [dB]", shrink=0.8)
     curve.plot(np.append(batch.before_db, batch.expected_db[np.argsort(batch.chosen)]), ".-")
-    curve.set(xlabel="places measured, the most telling first", ylabel="expected error over the area [dB]")
+    curve.set(
+        xlabel="places measured, the most telling first", ylabel="expected error over the area [dB]"
+    )
     curve.grid(alpha=0.3)
     save(figure, path, 100)
 
@@ -315,12 +384,18 @@ def draw_measurement_plan(
 def draw_placement(placing: Placement, path: Path, threshold_db: float, unit: str = "dB") -> None:
     """Save the goal at every candidate, the stations that stand, and the best place, as PNG."""
     left, right, low, high = placing.grid.extent
-    figure, ((axis,),) = panels(8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False)
-    dots = axis.scatter(*placing.places[:, :2].T, c=placing.coverage, s=60, marker="s", cmap="viridis")
+    figure, ((axis,),) = panels(
+        8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False
+    )
+    dots = axis.scatter(
+        *placing.places[:, :2].T, c=placing.coverage, s=60, marker="s", cmap="viridis"
+    )
     label = f"share of the predicted area with {threshold_db:g} {unit} or more, with a station here"
     figure.colorbar(dots, ax=axis, label=label, shrink=0.85)
     from_above.draw_stations(axis, placing.stations)
-    from_above.draw_stations(axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18)
+    from_above.draw_stations(
+        axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18
+    )
     from_above.set_bounds(axis, (left, low), (right, high), placing.grid.origin)
     from_above.scale_bar(axis)
     from_above.legend_below(figure)

@@ -1,4 +1,6 @@
-"""Where one more station serves an area best, as the model predicts stations that were never there."""
+"""Where one more station serves an area best,
+as the model predicts stations that were never there.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,14 @@ from scipy.spatial.distance import cdist
 from scipy.stats import t
 
 from gsparc.apps.maps.area import Grid
-from gsparc.apps.maps.covered import DRAWS, SHARE, draw_errors, draw_strongest, shadowing, share_between
+from gsparc.apps.maps.covered import (
+    DRAWS,
+    SHARE,
+    draw_errors,
+    draw_strongest,
+    shadowing,
+    share_between,
+)
 from gsparc.apps.maps.geojson import draws_shapes
 from gsparc.apps.maps.making import predict_levels, predict_map
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
@@ -98,7 +107,10 @@ class NewAntenna(Checked):
         beams = "one antenna alike in all directions"
         if self.azimuth is not None:
             towards = ", ".join(f"{one:g}" for one in self.sectors()[:, 0])
-            beams = f"sectors towards {towards} deg, tilt {self.tilt:g}, {self.width:g} x {self.height:g}"
+            beams = (
+                f"sectors towards {towards} deg, tilt {self.tilt:g}, {self.width:g} x "
+                f"{self.height:g}"
+            )
         return f"{beams}, {self.power_db:g} dB over the mean power of those that stand"
 
 
@@ -109,7 +121,8 @@ class NewStationError:
     Attributes:
         offset_db: deviation of the mean error of a whole site [dB].
         within: deviation of errors about that mean, in deviations that the model states.
-        stations: sites left out, one at a time; 0: none was, and the model's own deviations are taken.
+        stations: sites left out, one at a time; 0: none was, and the model's own deviations are
+            taken.
     """
 
     offset_db: float = 0.0
@@ -133,11 +146,11 @@ class Placement:
 
     Attributes:
         places: (n, 3) world [m].
-        coverage: (n,) expected share of the area that is not refused with the threshold or more, with a
-            station there.
+        coverage: (n,) expected share of the area that is not refused with the threshold or more,
+            with a station there.
         gain: (n,) what a station there adds to the share as it is.
-        between: (n, 4) ends of 90 % intervals of both, old and new share drawn together; NaN where no site
-            was left out, or nothing is promised.
+        between: (n, 4) ends of 90 % intervals of both, old and new share drawn together; NaN where
+            no site was left out, or nothing is promised.
         nearest_m: (n,) to the next station that stands [m].
         before: the share as it is.
         refused: share of the area where the promise says nothing.
@@ -159,10 +172,15 @@ class Placement:
 
 
 def place_station(
-    predictor: Predictor, area: Any = None, *, threshold_db: float = -100.0,
-    promise: Promise | None = None, error: NewStationError = NewStationError(),
-    antenna: NewAntenna = NewAntenna(), **where: Any,
-) -> Placement:  # fmt: skip
+    predictor: Predictor,
+    area: Any = None,
+    *,
+    threshold_db: float = -100.0,
+    promise: Promise | None = None,
+    error: NewStationError = NewStationError(),
+    antenna: NewAntenna = NewAntenna(),
+    **where: Any,
+) -> Placement:
     """Try one more station at every candidate.
 
     Args:
@@ -179,17 +197,27 @@ def place_station(
     grid, candidates, columns = lay_candidates(predictor, area, antenna=antenna, **where)
     left, right, south, north = grid.extent
     now = predict_map(
-        predictor, [left, south, right, north], height_m=grid.height, step_m=grid.step,
-        threshold_db=threshold_db, promise=promise,
-    )  # fmt: skip
+        predictor,
+        [left, south, right, north],
+        height_m=grid.height,
+        step_m=grid.step,
+        threshold_db=threshold_db,
+        promise=promise,
+    )
     # Refused squares are left out: as unserved they would count against the stations that stand,
     # and draw a new one to where nothing was tested.
     mask = grid.inside & ~now.refused
     if not mask.any():
-        raise DataError("area: all of it is too far from what was measured; map nearer, or promised=false")
+        raise DataError(
+            "area: all of it is too far from what was measured; map nearer, or promised=false"
+        )
     now = replace(now, power_db=np.where(mask, now.power_db, np.nan))
     square, best = draw_strongest(now, predictor, promise)
-    old, cells, before = best >= threshold_db, grid.places(square), 1 - float(now.outage[mask].mean())
+    old, cells, before = (
+        best >= threshold_db,
+        grid.places(square),
+        1 - float(now.outage[mask].mean()),
+    )
     alike = shadowing(cells, 1.0 if promise is None else promise.block_m)
     errors = error.within * draw_errors(alike, seed=1)  # errors of a new station are its own
     # Student's t, as few stations tell the deviation: the normal's ends held too little.
@@ -209,16 +237,31 @@ def place_station(
     gain, still = scores[order, 0], now.station_place
     nearest = np.fmin.reduce(cdist(places[:, :2], still), axis=1)
     return Placement(
-        places, before + gain, gain, scores[order, 1:], nearest, before,
-        1 - float(mask.sum() / grid.inside.sum()), grid, still, columns,
-    )  # fmt: skip
+        places,
+        before + gain,
+        gain,
+        scores[order, 1:],
+        nearest,
+        before,
+        1 - float(mask.sum() / grid.inside.sum()),
+        grid,
+        still,
+        columns,
+    )
 
 
 def lay_candidates(
-    predictor: Predictor, area: Any = None, *, height_m: float | None = None, sites: Any = None,
-    station_height_m: float | None = None, count: int = 100, antenna: NewAntenna = NewAntenna(),
-) -> tuple[Grid, np.ndarray, dict[str, np.ndarray]]:  # fmt: skip
-    """Return the area, places (n, 3) [m] where a station is tried, and other columns (n,) of their table.
+    predictor: Predictor,
+    area: Any = None,
+    *,
+    height_m: float | None = None,
+    sites: Any = None,
+    station_height_m: float | None = None,
+    count: int = 100,
+    antenna: NewAntenna = NewAntenna(),
+) -> tuple[Grid, np.ndarray, dict[str, np.ndarray]]:
+    """Return the area, places (n, 3) [m] where a station is tried, and other columns (n,)
+    of their table.
 
     Args:
         predictor, antenna: see `place_station`, which can be asked about all that is returned.
@@ -229,16 +272,21 @@ def lay_candidates(
         count: candidates, about.
 
     Raises:
-        DataError: the model cannot predict a station that was never there, or anything else that is wrong.
+        DataError: the model cannot predict a station that was never there, or anything else that is
+            wrong.
     """
     site = predictor.site
     check_arguments(locals(), count=whole(1))
     if site.stations is None or site.paired:
-        raise DataError(f"place: {site.name} has no stations; several that were trained together are needed")
+        raise DataError(
+            f"place: {site.name} has no stations; several that were trained together are needed"
+        )
     grid = coarse_grid(predictor, area, height_m)
     heights = site.stations.position[:, 2] + site.origin[2]
     if station_height_m is None and np.isnan(heights).all():
-        raise DataError("station_height_m: no station's height is known; say station_height_m=METRES")
+        raise DataError(
+            "station_height_m: no station's height is known; say station_height_m=METRES"
+        )
     height = float(np.nanmedian(heights) if station_height_m is None else station_height_m)
     lattice = grid if sites is not None else coarse_grid(predictor, area, height_m, count=count)
     candidates, columns = _candidates(lattice, sites, predictor, height, count)
@@ -280,11 +328,14 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
         where = queries.ends[end]
         above = np.full(len(queries), height) if where.height is None else where.height
         columns = {head: words for head, role, words in queries.table if role in (None, "row_name")}
-        return to_world(replace(queries, ends={end: replace(where, height=above)}), site)[end], columns
+        return to_world(replace(queries, ends={end: replace(where, height=above)}), site)[
+            end
+        ], columns
     if sites is not None:
         every, _ = walkable_places(sites, grid, "sites")
     else:
-        every, count = grid.places(), 2 * count  # so many more lie in an area that the lattice missed
+        # So many more lie in an area that the lattice missed
+        every, count = grid.places(), 2 * count
     few = every[evenly_spaced(len(every), count)]
     return np.column_stack([few[:, :2], np.full(len(few), height)]), {}
 
@@ -295,7 +346,9 @@ def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: Ne
     prediction = predictor.predict_new(cells, place, antenna.sectors(), like)
     if prediction is None and (antenna.azimuth is not None or like is not None):
         lacks = (
-            "carrier_hz: {} knows no bands" if antenna.azimuth is None else "azimuth: {} knows no patterns"
+            "carrier_hz: {} knows no bands"
+            if antenna.azimuth is None
+            else "azimuth: {} knows no patterns"
         )
         raise DataError(f"antenna.{lacks.format(predictor.method.name)}; model=gsparc does")
     if prediction is None:

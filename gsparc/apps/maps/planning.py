@@ -1,7 +1,7 @@
 """Where to measure next: the places that together take most off the expected error over an area.
 
-Greedy choice of the largest drop of the mean posterior variance (A-optimal design; A. Krause, A. Singh and
-C. Guestrin, J. Mach. Learn. Res. 9 (2008), choose greedily by information instead).
+Greedy choice of the largest drop of the mean posterior variance (A-optimal design; A. Krause, A.
+Singh and C. Guestrin, J. Mach. Learn. Res. 9 (2008), choose greedily by information instead).
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ from gsparc.prediction.query import read_place
 # Covariances are over all places: 900 targets and 900 candidates are 26 MB in float64.
 TARGETS = 900  # places that the error is averaged over, about
 CANDIDATES = 900  # where somebody may measure, at most
-WORTH = 0.02  # share of the expected error over an area, that places must take away to be worth their walk
+# Share of the expected error over an area, that places must take away to be worth their walk
+WORTH = 0.02
 
 
 @dataclass(frozen=True)
@@ -37,15 +38,16 @@ class MeasurementPlan:
 
     Attributes:
         places: (n, 3) world [m].
-        expected_db: (n,) expected error over the area once this place and those chosen before it are
-            measured [dB].
+        expected_db: (n,) expected error over the area once this place and those chosen before it
+            are measured [dB].
         before_db: the same before any of them is.
         chosen: (n,) int64, which the greedy choice took first, 0 to n - 1.
         length_m: of the shortest walk through them that was found [m].
         grid: the area.
         error_before, error_after: (S,) expected error at `at` [dB].
         at: (S, 3) places that errors were averaged over [m].
-        scatter_db: of these errors, that of a single measurement, which no other place takes away [dB].
+        scatter_db: of these errors, that of a single measurement, which no other place takes away
+            [dB].
         metres: (n,) walked at each place [m]; (0,) where the order is that of gains.
         path: (m, 2) corners of the walk [m], along the lines of `walkable`; (0, 2) likewise.
         stopped: why there are fewer than were asked for; "" where there are not.
@@ -77,19 +79,33 @@ class MeasurementPlan:
         if not len(self.places) or gain >= WORTH * self.before_db:
             return ""
         return (
-            f"hardly worth measuring: {len(self.places)} places (a walk of {self.length_m:.0f} m) lower the "
-            f"expected error of {self.before_db:.2f} dB by {gain:.2g} dB; {self.scatter_db:.2f} dB of it are "
+            f"hardly worth measuring: {len(self.places)} places (a walk of {self.length_m:.0f} "
+            "m) lower the "
+            f"expected error of {self.before_db:.2f} dB by {gain:.2g} dB; {self.scatter_db:.2f} "
+            "dB of it are "
             "scatter of single measurements; set area= to where less was measured"
         )
 
 
 def plan_measurements(
-    predictor: Predictor | None, count: int = 20, area: Any = None, *, height_m: float | None = None,
-    walkable: Any = None, plan: FloorPlan | None = None, stations: Sequence[str | int] | None = None,
-    other_end: Sequence[float] | None = None, promise: Promise | None = None, least_gain_db: float = 0.0,
-    route: bool = True, start: Sequence[float] | None = None, route_m: float | None = None,
-    length_m: float | None = None, goal: str = "strongest", threshold_db: float | None = None,
-) -> MeasurementPlan:  # fmt: skip
+    predictor: Predictor | None,
+    count: int = 20,
+    area: Any = None,
+    *,
+    height_m: float | None = None,
+    walkable: Any = None,
+    plan: FloorPlan | None = None,
+    stations: Sequence[str | int] | None = None,
+    other_end: Sequence[float] | None = None,
+    promise: Promise | None = None,
+    least_gain_db: float = 0.0,
+    route: bool = True,
+    start: Sequence[float] | None = None,
+    route_m: float | None = None,
+    length_m: float | None = None,
+    goal: str = "strongest",
+    threshold_db: float | None = None,
+) -> MeasurementPlan:
     """Choose places to measure next, as a batch.
 
     >>> plan = gsparc.apps.maps.plan_measurements(gsparc.load("model.ckpt"), count=20, route=True)
@@ -99,14 +115,17 @@ def plan_measurements(
     Args:
         predictor: of powers; None before anything is measured, with `area` or `plan`.
         count: places wanted.
-        area, height_m, plan: see `lay_grid`; with a promise and neither area nor plan, what it answers for.
-        walkable: GeoJSON file of where somebody may measure: polygons, or lines such as streets, along which
-            the walk then goes; None: the whole area.
+        area, height_m, plan: see `lay_grid`; with a promise and neither area nor plan, what it
+            answers for.
+        walkable: GeoJSON file of where somebody may measure: polygons, or lines such as streets,
+            along which the walk then goes; None: the whole area.
         stations, other_end: see `predict_map`; whose error is to fall.
-        promise: evidence of held-out blocks, which scales the model's own variances, and tells how many
-            stations a place lists, those that are predicted strongest there; None: a place measures all.
+        promise: evidence of held-out blocks, which scales the model's own variances, and tells how
+            many stations a place lists, those that are predicted strongest there; None: a place
+            measures all.
         least_gain_db: stop where a place takes less than this off the expected error.
-        route: whether places are put in the order of a short walk, or drive; else the most telling first.
+        route: whether places are put in the order of a short walk, or drive; else the most telling
+            first.
         start: (2,) where the walk starts [m]; None: anywhere.
         route_m: longest walk [m]; None: any.
         length_m: before anything is measured, over which powers are alike [m].
@@ -116,7 +135,10 @@ def plan_measurements(
         DataError: anything wrong with what is asked for.
     """
     metres = {"route_m": or_null(POSITIVE), "length_m": or_null(POSITIVE)}
-    metres |= {"goal": choice("strongest", "all"), "threshold_db": or_null(number(-MOST_DB, MOST_DB))}
+    metres |= {
+        "goal": choice("strongest", "all"),
+        "threshold_db": or_null(number(-MOST_DB, MOST_DB)),
+    }
     check_arguments(locals(), count=whole(1), least_gain_db=number(0), **metres)
     grid = coarse_grid(predictor, area, height_m, plan, promise)
     targets, streets = grid.places(), None
@@ -129,28 +151,48 @@ def plan_measurements(
         unknown = prior_covariances(places, length_m)
     else:
         names, _ = choose_stations(predictor, stations)
-        unknown = error_covariances(predictor, places, names, promise, other_end, goal, threshold_db)
+        unknown = error_covariances(
+            predictor, places, names, promise, other_end, goal, threshold_db
+        )
     begin = np.zeros((0, 2)) if start is None else read_place("start", start, 2)[None, :2]
     ways = Ways.between(np.concatenate([places[first:, :2], begin]), streets)
     tour = Tour(ways.length, len(places) - first if len(begin) else None, route_m)
     wanted = np.arange(len(places)) < len(targets)
     before = mean_error(unknown)
     before_db = float(np.sqrt(np.mean(before[wanted] ** 2)))
-    chosen, expected, stopped = choose_greedily(unknown, first, wanted, count, least_gain_db, tour, before_db)
-    order = np.array([chosen.index(one) for one in (tour.walk[1:-1] if route else chosen)], np.int64)
+    chosen, expected, stopped = choose_greedily(
+        unknown, first, wanted, count, least_gain_db, tour, before_db
+    )
+    order = np.array(
+        [chosen.index(one) for one in (tour.walk[1:-1] if route else chosen)], np.int64
+    )
     path = ways.path_through(tour.walk[0 if len(begin) else 1 : -1]) if route else np.zeros((0, 2))
     scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
     return MeasurementPlan(
-        places[first:][np.array(chosen, np.int64)[order]], np.array(expected)[order], before_db, order,
-        float(tour.metres[-1:].sum()), grid, before[wanted], mean_error(unknown)[wanted], places[wanted],
-        scatter, tour.metres if route else np.zeros(0), path, stopped,
-    )  # fmt: skip
+        places[first:][np.array(chosen, np.int64)[order]],
+        np.array(expected)[order],
+        before_db,
+        order,
+        float(tour.metres[-1:].sum()),
+        grid,
+        before[wanted],
+        mean_error(unknown)[wanted],
+        places[wanted],
+        scatter,
+        tour.metres if route else np.zeros(0),
+        path,
+        stopped,
+    )
 
 
 def coarse_grid(
-    predictor: Predictor | None, area: Any, height_m: float | None, plan: FloorPlan | None = None,
-    promise: Promise | None = None, count: int = TARGETS,
-) -> Grid:  # fmt: skip
+    predictor: Predictor | None,
+    area: Any,
+    height_m: float | None,
+    plan: FloorPlan | None = None,
+    promise: Promise | None = None,
+    count: int = TARGETS,
+) -> Grid:
     """Return about `count` cells; where nobody says which, those that a promise reaches."""
     fine = lay_grid(None if predictor is None else predictor.site, area, height_m, None, plan)
     if area is None and plan is None and promise is not None and predictor is not None:
@@ -162,16 +204,22 @@ def coarse_grid(
     share = fine.inside.mean()
     step = float(np.sqrt((right - left) * (high - low) * share / count))
     x, y = (np.arange(a + step / 2, b, step) for a, b in ((left, right), (low, high)))
-    column, row = (((v - a) / fine.step).astype(int).clip(0, n - 1)
-                   for v, a, n in ((x, left, len(fine.x)), (y, low, len(fine.y))))  # fmt: skip
+    column, row = (
+        ((v - a) / fine.step).astype(int).clip(0, n - 1)
+        for v, a, n in ((x, left, len(fine.x)), (y, low, len(fine.y)))
+    )
     inside = fine.inside[np.ix_(row, column)]
     if not inside.any():
         return fine
     return replace(fine, x=x, y=y, step=step, inside=inside)
 
 
-def walkable_places(path: Any, grid: Grid, key: str = "walkable") -> tuple[np.ndarray, StreetGraph | None]:
-    """Return places (n, 3) in polygons or along lines of a file, and these lines; None: it holds none."""
+def walkable_places(
+    path: Any, grid: Grid, key: str = "walkable"
+) -> tuple[np.ndarray, StreetGraph | None]:
+    """Return places (n, 3) in polygons or along lines of a file, and these lines; None:
+    it holds none.
+    """
     left, right, south, north = grid.extent
     area, lines = read_shapes(path, key, grid.origin, True, max(right - left, north - south))
     from shapely import contains_xy
@@ -199,12 +247,18 @@ def walkable_places(path: Any, grid: Grid, key: str = "walkable") -> tuple[np.nd
 
 
 def choose_greedily(
-    unknown: list[ErrorCovariance], first: int, wanted: np.ndarray, count: int, least_gain_db: float,
-    tour: Tour, error: float,
-) -> tuple[list[int], list[float], str]:  # fmt: skip
+    unknown: list[ErrorCovariance],
+    first: int,
+    wanted: np.ndarray,
+    count: int,
+    least_gain_db: float,
+    tour: Tour,
+    error: float,
+) -> tuple[list[int], list[float], str]:
     """Return chosen candidates, expected error after each, and why it stopped early.
 
-    Candidates are the places from `first` on, by whose numbers they are in `tour`; `error` is that before.
+    Candidates are the places from `first` on, by whose numbers they are in `tour`;
+    `error` is that before.
     """
     free = np.ones(len(wanted) - first, bool)
     chosen: list[int] = []
@@ -220,7 +274,11 @@ def choose_greedily(
         # Mean square errors subtract, roots do not.
         error_after = float(np.sqrt(max(error**2 - gains[best] / (len(unknown) * wanted.sum()), 0)))
         if (gain := error - error_after) < least_gain_db:
-            return chosen, expected, f"the next place gains {gain:.2g} dB, less than {least_gain_db:g} dB"
+            return (
+                chosen,
+                expected,
+                (f"the next place gains {gain:.2g} dB, less than {least_gain_db:g} dB"),
+            )
         for one in unknown:
             one.condition_on(first + best)
         error = error_after

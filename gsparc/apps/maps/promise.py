@@ -1,4 +1,6 @@
-"""What a map promises: by the model's method fitted anew without whole blocks, and asked about them."""
+"""What a map promises: by the model's method fitted anew without whole blocks,
+and asked about them.
+"""
 
 from __future__ import annotations
 
@@ -36,7 +38,8 @@ class PromiseSettings(Checked):
         share: of measurements that intervals hold.
         folds: fits, each without other blocks; more of few rows, until `ROWS_OUT` are held out.
         rows: of each fold that are asked about, at most, drawn evenly.
-        block_m: side of the blocks, every second fold's twice that [m]; None: a tenth of the longer side.
+        block_m: side of the blocks, every second fold's twice that [m]; None: a tenth of the longer
+            side.
         effort: of each refit; None: as the model was trained.
         seed: of the blocks.
     """
@@ -76,11 +79,16 @@ class Promise:
         return max(round(each * float((self.evidence.side <= 0).mean())), 1)
 
     def distance(self, places: np.ndarray, station: int) -> np.ndarray:
-        """Return how far local places (n, D) are from the nearest that was learned from (n,) [m]."""
+        """Return how far local places (n, D) are from the nearest that was learned from (n,)
+        [m].
+        """
         return nearest_distances(self.known, self.station, places, np.full(len(places), station))
 
-    def expected_errors(self, places: np.ndarray, station: np.ndarray, spread_db: np.ndarray) -> np.ndarray:
-        """Return root mean square errors (n,) [dB] of levels at local places (n, D) of stations (n,).
+    def expected_errors(
+        self, places: np.ndarray, station: np.ndarray, spread_db: np.ndarray
+    ) -> np.ndarray:
+        """Return root mean square errors (n,) [dB] of levels at local places (n, D)
+        of stations (n,).
 
         NaN where they are refused: farther from what was learned than any error was tested.
         """
@@ -97,8 +105,12 @@ def read_promise(extra: Mapping[str, Any]) -> Promise | None:
     state = extra.get(KEY)
     if state is None:
         return None
-    evidence = HeldOutLevels(**{name: np.asarray(value) for name, value in state["evidence"].items()})
-    return Promise(evidence, np.asarray(state["known"]), np.asarray(state["station"]), state["block_m"])
+    evidence = HeldOutLevels(
+        **{name: np.asarray(value) for name, value in state["evidence"].items()}
+    )
+    return Promise(
+        evidence, np.asarray(state["known"]), np.asarray(state["station"]), state["block_m"]
+    )
 
 
 def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
@@ -120,7 +132,9 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
     # A tenth of the site: blocks large against the distance between rows, and some hundred of them.
     side = settings.block_m or longest / 10
     if not side > 0:
-        raise DataError("all rows are at one place: tested intervals need several; or promised=false")
+        raise DataError(
+            "all rows are at one place: tested intervals need several; or promised=false"
+        )
 
     def evidence_without(number: int) -> HeldOutLevels:
         # Every second fold with sides twice as long, for evidence at larger distances.
@@ -144,7 +158,8 @@ def read_or_gather(path: str, settings: Mapping[str, Any]) -> Promise | None:
 
     Args:
         path: the model's file.
-        settings: `promised`, without which there is none; `promise`, `dataset` and `renew` of conf/map.yaml.
+        settings: `promised`, without which there is none; `promise`, `dataset` and `renew` of
+            conf/map.yaml.
 
     Raises:
         DataError: the training data are gone, or are others.
@@ -161,7 +176,8 @@ def read_or_gather(path: str, settings: Mapping[str, Any]) -> Promise | None:
     learned = reopen_training(path, settings["dataset"])
     log.info("testing the intervals of maps: fits without blocks of places")
     promise = gather_promise(learned, how)
-    cross_validate(promise.evidence, how.share)  # too little evidence is said before anything is stored
+    # Too little evidence is said before anything is stored
+    cross_validate(promise.evidence, how.share)
     promise.store(path)
     return promise
 
@@ -180,7 +196,9 @@ def reopen_training(path: str, dataset: dict[str, Any]) -> Learned:
         raise DataError(f"{why}: dataset.file=..., or promised=false") from None
     # Rows of other data are no evidence of what this model has not seen.
     if run.learned != 0 or run.foreign is not None:
-        raise DataError(f"{path} was trained on {run.foreign}; give its own data, or promised=false")
+        raise DataError(
+            f"{path} was trained on {run.foreign}; give its own data, or promised=false"
+        )
     return learned
 
 
@@ -194,7 +212,8 @@ def map_notes(
         chance = np.nanmean(field.server_chance[field.grid.inside])
         doubt = f"unsure in {unsure:.1%} of squares (hatched): another or none is likelier"
         notes.append(
-            f"best_server: the named cell is strongest with chance {chance:.2f} in the mean; {doubt}"
+            f"best_server: the named cell is strongest with chance {chance:.2f} in the mean; "
+            f"{doubt}"
         )
     if (outage := figures["map/outage"]) is not None:
         level = f"{field.threshold_db:g} {field.unit} or more of some station (mean of 1 - outage)"
@@ -207,7 +226,9 @@ def map_notes(
     if coverage is None:
         caveat = "they are the model's own deviations, and no place is refused as too far from data"
         return [*notes, f"intervals are not tested: {caveat}"]
-    tested = f"{coverage.share:.1%} of {coverage.rows} heard rows in {coverage.blocks} held-out blocks"
+    tested = (
+        f"{coverage.share:.1%} of {coverage.rows} heard rows in {coverage.blocks} held-out blocks"
+    )
     of_map = f"on the map {figures['map/width_db']:.1f} dB for the strongest station"
     width = f"mean width {coverage.width_db:.1f} dB, {of_map}"
     notes.append(f"{field.share:.0%} intervals held {tested}; {width}")

@@ -1,4 +1,6 @@
-"""Large maps from fewer predictions: cells between others are interpolated where that is exact enough."""
+"""Large maps from fewer predictions: cells between others are interpolated where
+that is exact enough.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +14,13 @@ Ask = Callable[[np.ndarray], np.ndarray]  # flat cells (n,) -> values (n, C)
 LEAST_NODES = 16  # along a side
 
 
-def sample_adaptively(ask: Ask, inside: np.ndarray, stride: int, tolerance: float) -> tuple[np.ndarray, int]:
+def sample_adaptively(
+    ask: Ask, inside: np.ndarray, stride: int, tolerance: float
+) -> tuple[np.ndarray, int]:
     """Return values (C, ny, nx) float32 of cells, NaN outside, and how many were asked about.
 
-    A lattice is asked about, and every cell near which interpolation from it and from every second of its
-    nodes differ by more than linear interpolation within the tolerance allows.
+    A lattice is asked about, and every cell near which interpolation from it and from every second
+    of its nodes differ by more than linear interpolation within the tolerance allows.
 
     Args:
         ask: values of cells.

@@ -1,4 +1,6 @@
-"""Layers of squares from predicted levels, their deviations and what held-out rows tell of these."""
+"""Layers of squares from predicted levels,
+their deviations and what held-out rows tell of these.
+"""
 
 from __future__ import annotations
 
@@ -62,7 +64,11 @@ class Scoring:
             wider, strongest = np.hypot(error, doubt), (mean.argmax(0), np.arange(len(indoors)))
             # What is not known of the loss is one error of all stations.
             related = (related * error * error[strongest] + doubt**2) / (wider * wider[strongest])
-            mean, half, error = mean - loss, np.hypot(half, half_width(self.scales.share) * doubt), wider
+            mean, half, error = (
+                mean - loss,
+                np.hypot(half, half_width(self.scales.share) * doubt),
+                wider,
+            )
         # The strongest before anything is refused, to which `related` is the correlation.
         first, mean = best_server(mean), np.where(np.isfinite(half), mean, np.nan)
         error = np.where(np.isfinite(mean), error, np.nan)
@@ -73,9 +79,13 @@ class Scoring:
         below = self.scales.probability_below(self.threshold_db, power[strongest], error[strongest])
         alike = np.where(first == best, np.nan_to_num(related), 0.0)
         return {
-            "power_db": power, "lower_db": mean - half, "upper_db": mean + half, "expected_error_db": error,
-            "best_server": best, "sinr_db": sinr(power, self.load, self.noise_db, self.carrier),
+            "power_db": power,
+            "lower_db": mean - half,
+            "upper_db": mean + half,
+            "expected_error_db": error,
+            "best_server": best,
+            "sinr_db": sinr(power, self.load, self.noise_db, self.carrier),
             "server_chance": server_chance(power, error, self.floor, alike),
             "outage": outage_probability(power, error, self.threshold_db, alike, below),
             "overlap": count_overlap(power, self.carrier),
-        }  # fmt: skip
+        }

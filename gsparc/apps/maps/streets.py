@@ -39,7 +39,9 @@ class StreetGraph:
         corner, piece = shapely.get_coordinates(pieces, return_index=True)
         # To the micrometre: ends that are computed from two lines are one node.
         node, number = np.unique(corner.round(6), axis=0, return_inverse=True)
-        pairs = np.stack([number.reshape(-1)[:-1], number.reshape(-1)[1:]])[:, piece[1:] == piece[:-1]]
+        pairs = np.stack([number.reshape(-1)[:-1], number.reshape(-1)[1:]])[
+            :, piece[1:] == piece[:-1]
+        ]
         lengths = np.linalg.norm(node[pairs[0]] - node[pairs[1]], axis=1)
         return cls(node, csr_matrix((lengths, pairs), shape=(len(node), len(node))))
 
@@ -82,7 +84,9 @@ class Ways:
         corners = [self.places[order[:1]]]
         for one, two in pairwise(order):
             if self.streets is not None and self.along[one, two]:
-                before = dijkstra(self.streets.length, False, self.near[one], return_predecessors=True)[1]
+                before = dijkstra(
+                    self.streets.length, False, self.near[one], return_predecessors=True
+                )[1]
                 way = [self.near[two]]
                 while before[way[-1]] >= 0:
                     way.append(before[way[-1]])
@@ -102,7 +106,8 @@ class Tour:
     """
 
     def __init__(self, length: np.ndarray, start: int | None, longest: float | None) -> None:
-        nowhere = len(length)  # a place as near to all: what is before the first stop, and after the last
+        # A place as near to all: what is before the first stop, and after the last
+        nowhere = len(length)
         self.length, self.longest = np.pad(length, (0, 1)), longest
         self.walk = np.array([nowhere if start is None else start, nowhere])
 
@@ -118,18 +123,24 @@ class Tour:
         return self.metres[-1:].sum() + self._added().min(axis=0)[:-1] <= self.longest
 
     def add(self, place: int) -> None:
-        """Put a place where it lengthens the walk least, then turn parts around where that shortens it."""
+        """Put a place where it lengthens the walk least,
+        then turn parts around where that shortens it.
+        """
         self.walk = np.insert(self.walk, self._added()[:, place].argmin() + 1, place)
         while True:  # 2-opt: G. A. Croes, Oper. Res. 6 (1958)
             before, after = self.walk[:-1], self.walk[1:]
             now, length = self.length[before, after], self.length
-            gain = now[:, None] + now - length[np.ix_(before, before)] - length[np.ix_(after, after)]
+            gain = (
+                now[:, None] + now - length[np.ix_(before, before)] - length[np.ix_(after, after)]
+            )
             one, two = np.unravel_index(np.triu(gain, 2).argmax(), gain.shape)
             if gain[one, two] < 1e-6 or two <= one:
                 return
             self.walk[one + 1 : two + 1] = self.walk[one + 1 : two + 1][::-1].copy()
 
     def _added(self) -> np.ndarray:
-        """What each place adds to the walk before each stop, or at its end: (stops + 1, S + 1) [m]."""
+        """What each place adds to the walk before each stop, or at its end: (stops + 1, S + 1)
+        [m].
+        """
         before, after = self.walk[:-1], self.walk[1:]
         return self.length[before] + self.length[after] - self.length[before, after][:, None]

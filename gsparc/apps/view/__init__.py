@@ -1,1 +1,3 @@
-"""A model in three dimensions: what is drawn, what a place answers, pages, pictures and splat files of it."""
+"""A model in three dimensions: what is drawn, what a place answers, pages,
+pictures and splat files of it.
+"""

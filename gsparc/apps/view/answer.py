@@ -46,7 +46,8 @@ class PlacePaths:
     Attributes:
         gain_db: (N,) mean over antennas.
         delay_ns: (N,).
-        towards: (N, 3) unit vectors in the world towards where each comes from; None where not known.
+        towards: (N, 3) unit vectors in the world towards where each comes from; None where not
+            known.
     """
 
     gain_db: np.ndarray
@@ -55,13 +56,16 @@ class PlacePaths:
 
 
 def predict_answer(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
-    """Predict at world places (3,) [m] of the ends that move, of one station where there are several.
+    """Predict at world places (3,) [m] of the ends that move,
+    of one station where there are several.
 
     Raises:
         ValueError: a place that cannot be.
     """
     site, facts = predictor.site, predictor.site.target
-    prediction = predictor.predict_linear(**{end: np.atleast_2d(place) for end, place in ends.items()})
+    prediction = predictor.predict_linear(
+        **{end: np.atleast_2d(place) for end, place in ends.items()}
+    )
     mean = prediction.mean[0].numpy()
     known = site.every_station.position[0] + site.origin
     still: dict[str, np.ndarray] = {} if np.isnan(known).any() else {site.still_end: known}
@@ -69,11 +73,14 @@ def predict_answer(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answ
     if not facts.is_image:
         level, spread = (float(value[0]) for value in predicted_levels(prediction, site.kind))
     return Answer(
-        {**still, **ends}, level, spread,
+        {**still, **ends},
+        level,
+        spread,
         None if prediction.confidence is None else float(prediction.confidence[0]),
-        mean if facts.is_image else None, mean if facts.is_complex else None,
+        mean if facts.is_image else None,
+        mean if facts.is_complex else None,
         _rays(predictor, ends),
-    )  # fmt: skip
+    )
 
 
 def azimuth_elevation(towards: np.ndarray) -> tuple[float, float]:
@@ -93,7 +100,8 @@ def _rays(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> PlacePaths | 
 
 
 def merge_paths(gain: np.ndarray, delay_ns: np.ndarray, towards: np.ndarray | None) -> PlacePaths:
-    """Return paths as they are shown; those that several searches found alike are one, of their summed gain.
+    """Return paths as they are shown; those that several searches found alike are one,
+    of their summed gain.
 
     Args:
         gain: (A, N) complex, with their phases.

@@ -41,7 +41,10 @@ REACH = 0.8  # of the extent, that rays are drawn to at most
 MIRROR, BOX = (205, 92, 92), (31, 119, 180)
 SURFACES = {MIRROR: "mirror planes that were found", BOX: "boxes that were found"}
 PATHS = Legend(
-    "gain of a path [dB of the strongest]; it ends at an image of the transmitter", -SILENT_DB, 0.0, "plasma"
+    "gain of a path [dB of the strongest]; it ends at an image of the transmitter",
+    -SILENT_DB,
+    0.0,
+    "plasma",
 )
 VALUES, GAUSSIANS, SPHERE, RAYS, SOURCES = "measured", "gaussians", "sphere", "rays", "sources"
 
@@ -49,7 +52,9 @@ VALUES, GAUSSIANS, SPHERE, RAYS, SOURCES = "measured", "gaussians", "sphere", "r
 def build_scene(
     viewed: Viewed, plan: FloorPlan | None, station: str | None, seen: Measured | None
 ) -> DrawnScene:
-    """Build everything that stands still, with the measurements and the Gaussians of one station."""
+    """Build everything that stands still, with the measurements
+    and the Gaussians of one station.
+    """
     stands = {name: at for name in viewed.stations if (at := viewed.static_place(name)) is not None}
     points = [viewed.box(), *(at[None] for at in stands.values())]
     if viewed.site.paired:
@@ -83,7 +88,9 @@ def build_scene(
     cloud = model_gaussians(viewed, station, seen)
     if cloud is not None:
         legends[GAUSSIANS], colours = cloud_colours(cloud)
-        size = float(np.clip(extent / 90 / max(len(cloud) / 500, 1) ** (1 / 3), extent / 600, extent / 90))
+        size = float(
+            np.clip(extent / 90 / max(len(cloud) / 500, 1) ** (1 / 3), extent / 600, extent / 90)
+        )
         parts.append(Points(GAUSSIANS, cloud.means, colours, size))
     faces = np.array(box_faces(*viewed.box()))
     sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2, 3)
@@ -95,14 +102,18 @@ def build_scene(
 
 
 def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
-    """Return what colours mean, and those (N, 3) uint8 of Gaussians by emission, below the strongest."""
+    """Return what colours mean, and those (N, 3) uint8 of Gaussians by emission,
+    below the strongest.
+    """
     most = float(np.abs(cloud.strengths).max(initial=0.0))
     level = 20 * np.log10(np.maximum(np.abs(cloud.strengths), most * 1e-6 + 1e-300) / (most or 1.0))
     legend = Legend(f"{cloud.label} [dB of the strongest]", -RANGE_DB, 0.0, "plasma")
     return legend, legend.to_colours(level)
 
 
-def model_gaussians(viewed: Viewed, station: str | None, measured: Measured | None) -> GaussianCloud | None:
+def model_gaussians(
+    viewed: Viewed, station: str | None, measured: Measured | None
+) -> GaussianCloud | None:
     """Return Gaussians that are rendered, in world coordinates; None: of a model without."""
     low, high = viewed.box()
     places = np.random.default_rng(0).uniform(low, high, (QUERIES, 3))
@@ -126,7 +137,9 @@ def _square(plane: np.ndarray, middle: np.ndarray, side: float) -> np.ndarray:
     return foot + side / 2 * np.array([-one - two, one - two, one + two, two - one])
 
 
-def _mesh(name: str, faces: Sequence[np.ndarray], colour: tuple[int, int, int], opacity: float) -> Faces:
+def _mesh(
+    name: str, faces: Sequence[np.ndarray], colour: tuple[int, int, int], opacity: float
+) -> Faces:
     """Flat faces (C, 3) as triangles, each face a fan about its first corner."""
     fans = [face[[0, i, i + 1]] for face in faces for i in range(1, len(face) - 1)]
     return Faces(name, np.array(fans).reshape(-1, 3, 3), colour, opacity)
@@ -152,7 +165,9 @@ class Sphere:
         """Return directions of a site of spectra; not more than `DIRECTIONS`."""
         assert site.grid is not None
         directions = site.grid.directions().numpy()
-        every = max(1, int(np.ceil(np.sqrt(directions.shape[0] * directions.shape[1] / DIRECTIONS))))
+        every = max(
+            1, int(np.ceil(np.sqrt(directions.shape[0] * directions.shape[1] / DIRECTIONS)))
+        )
         high, wide = directions.shape[:2]
         row, column = (a.reshape(-1) for a in np.mgrid[0:high:every, 0:wide:every])
         turn = np.eye(3) if site.rx_rotation is None else site.rx_rotation
@@ -190,4 +205,6 @@ def start_place(viewed: Viewed, measured: Measured | None) -> np.ndarray:
     if measured is None:
         return viewed.box().mean(axis=0)
     middle = np.median(measured.places, axis=0)
-    return np.asarray(measured.places[int(np.linalg.norm(measured.places - middle, axis=1).argmin())])
+    return np.asarray(
+        measured.places[int(np.linalg.norm(measured.places - middle, axis=1).argmin())]
+    )

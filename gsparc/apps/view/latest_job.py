@@ -1,4 +1,6 @@
-"""Work that is asked for faster than it is done: of each kind only the newest is, in a thread of its own."""
+"""Work that is asked for faster than it is done: of each kind only the newest is,
+in a thread of its own.
+"""
 
 from __future__ import annotations
 
@@ -13,11 +15,12 @@ OVER = object()
 
 
 class LatestJobQueue:
-    """Runs jobs one step at a time; a job of a key replaces the one before, also in the midst of it.
+    """Runs jobs one step at a time; a job of a key replaces the one before,
+    also in the midst of it.
 
     A job is a generator function: after each `yield` another job may have its turn. Those that
-    are urgent go first, the others follow in rotation, so that a long job does not delay a short one by more
-    than one of its steps, and a client that asks often does not keep others waiting.
+    are urgent go first, the others follow in rotation, so that a long job does not delay a short
+    one by more than one of its steps, and a client that asks often does not keep others waiting.
     """
 
     def __init__(self) -> None:
@@ -54,7 +57,10 @@ class LatestJobQueue:
                 self._wake.wait_for(lambda: self._jobs or self._over)
                 if self._over:
                     return
-                key = next((key for key, (urgent, _) in self._jobs.items() if urgent), next(iter(self._jobs)))
+                key = next(
+                    (key for key, (urgent, _) in self._jobs.items() if urgent),
+                    next(iter(self._jobs)),
+                )
                 entry = self._jobs[key]
             done = True
             try:

@@ -43,14 +43,20 @@ def panel_image(answer: Answer, site: Site) -> np.ndarray | None:
         how: dict[str, Any] = {"origin": "lower", "extent": site.grid.edges(), "aspect": "auto"}
         axis.imshow(answer.spectrum, cmap=SPECTRUM.colours, vmin=0, vmax=1, **how)
         axis.grid(False)
-        axis.set(xlabel="azimuth at the receiver [°]", ylabel="elevation [°]", title="power by direction")
+        axis.set(
+            xlabel="azimuth at the receiver [°]", ylabel="elevation [°]", title="power by direction"
+        )
     elif response is not None and response.shape[1] > 1:
         tones, count = site.subcarriers_hz, response.shape[1]
         has_tones = tones is not None and len(tones) == count
         x = np.asarray(tones, np.float64) / 1e6 if has_tones else np.arange(count)
         for line in response_db(response):
             axis.plot(x, line)
-        axis.set(xlabel="frequency [MHz]" if has_tones else "subcarrier", ylabel="dB", title="over the band")
+        axis.set(
+            xlabel="frequency [MHz]" if has_tones else "subcarrier",
+            ylabel="dB",
+            title="over the band",
+        )
     elif paths is not None and len(paths.gain_db):
         bottom = paths.gain_db.min() - 3
         axis.vlines(paths.delay_ns, bottom, paths.gain_db)

@@ -1,4 +1,6 @@
-"""Predicted power over a plane: coarse at once, then finer, in steps that others may come between."""
+"""Predicted power over a plane: coarse at once, then finer,
+in steps that others may come between.
+"""
 
 from __future__ import annotations
 
@@ -67,7 +69,8 @@ def refine_plane(
 def plane_sheet(
     name: str, grid: Grid, values: np.ndarray, legend: Legend, beneath: float = 0.0
 ) -> PlacedPicture:
-    """Return a picture of values (ny, nx) over the cells, clear where not finite, `beneath` [m] lower.
+    """Return a picture of values (ny, nx) over the cells, clear where not finite,
+    `beneath` [m] lower.
 
     Half a dot lower, dots of the same height are seen whole.
     """
@@ -75,9 +78,12 @@ def plane_sheet(
     image = np.concatenate([legend.to_colours(values), clear], axis=-1)
     left, right, low, high = grid.extent
     return PlacedPicture(
-        name, np.array([left, high, grid.height - beneath]), np.array([right - left, 0.0, 0.0]),
-        np.array([0.0, low - high, 0.0]), image[::-1],
-    )  # fmt: skip
+        name,
+        np.array([left, high, grid.height - beneath]),
+        np.array([right - left, 0.0, 0.0]),
+        np.array([0.0, low - high, 0.0]),
+        image[::-1],
+    )
 
 
 def weakest_place(plane: Plane, seen: Sequence[np.ndarray] = ()) -> np.ndarray | None:

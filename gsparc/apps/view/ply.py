@@ -1,7 +1,8 @@
 """Gaussians as a PLY file that viewers of Gaussian splats open.
 
-Layout: the reference implementation of Kerbl et al. 2023 ("3D Gaussian Splatting for Real-Time Radiance Field
-Rendering"), spherical harmonics of degree 0. Axes stay those of the site, z upwards; units are metres.
+Layout: the reference implementation of Kerbl et al. 2023 ("3D Gaussian Splatting for Real-Time
+Radiance Field Rendering"), spherical harmonics of degree 0. Axes stay those of the site,
+z upwards; units are metres.
 """
 
 from __future__ import annotations
@@ -15,9 +16,24 @@ from gsparc.base.files import write_whole
 from gsparc.data.site_objects import GaussianCloud
 
 FIELDS = (
-    "x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2",
-    "rot_0", "rot_1", "rot_2", "rot_3",
-)  # fmt: skip
+    "x",
+    "y",
+    "z",
+    "nx",
+    "ny",
+    "nz",
+    "f_dc_0",
+    "f_dc_1",
+    "f_dc_2",
+    "opacity",
+    "scale_0",
+    "scale_1",
+    "scale_2",
+    "rot_0",
+    "rot_1",
+    "rot_2",
+    "rot_3",
+)
 Y00 = 0.28209479177387814  # spherical harmonic of degree 0: 1 / (2 sqrt(pi))
 LEAST_M = 1e-6  # of a standard deviation, whose logarithm is stored
 LEAST_SHARE = 1e-6  # of opacities, whose logits are
@@ -34,10 +50,14 @@ def write_ply(path: str | Path, cloud: GaussianCloud, colours: np.ndarray) -> No
     share = np.clip(cloud.opacities, LEAST_SHARE, 1 - LEAST_SHARE)
     columns = np.column_stack(
         [
-            cloud.means, np.zeros_like(cloud.means), (colours / 255 - 0.5) / Y00, np.log(share / (1 - share)),
-            np.log(np.maximum(cloud.scales, LEAST_M)), cloud.quats,
+            cloud.means,
+            np.zeros_like(cloud.means),
+            (colours / 255 - 0.5) / Y00,
+            np.log(share / (1 - share)),
+            np.log(np.maximum(cloud.scales, LEAST_M)),
+            cloud.quats,
         ]
-    ).astype("<f4")  # fmt: skip
+    ).astype("<f4")
     if not len(columns) or not np.isfinite(columns).all():
         raise DataError("there are no Gaussians to write, or one is not finite")
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(columns)}"]

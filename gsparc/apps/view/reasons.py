@@ -1,4 +1,6 @@
-"""Why a level is what it is: how far the other end and measurements are, what paths the model holds."""
+"""Why a level is what it is: how far the other end and measurements are,
+what paths the model holds.
+"""
 
 from __future__ import annotations
 
@@ -32,7 +34,9 @@ def explain_level(answer: Answer, moving: str, tree: cKDTree | None) -> list[str
         lines.append(f"{float(np.linalg.norm(here - there)):.3g} m from the other end")
     if tree is not None:
         distance = float(tree.query(here)[0])
-        lines.append("measured here" if distance < 1e-3 else f"nearest measurement: {distance:.3g} m away")
+        lines.append(
+            "measured here" if distance < 1e-3 else f"nearest measurement: {distance:.3g} m away"
+        )
     return lines + _paths(answer)
 
 
@@ -42,7 +46,9 @@ def _paths(answer: Answer) -> list[str]:
         return []
     more = ""
     if rays.towards is not None:
-        more = " from azimuth {:.0f}°, elevation {:.0f}°".format(*azimuth_elevation(rays.towards[0]))
+        more = " from azimuth {:.0f}°, elevation {:.0f}°".format(
+            *azimuth_elevation(rays.towards[0])
+        )
     lines = [
         f"{len(rays.gain_db)} paths within {SILENT_DB:g} dB; strongest {rays.gain_db[0]:.1f} dB at "
         f"{rays.delay_ns[0]:.1f} ns{more}"
@@ -52,7 +58,9 @@ def _paths(answer: Answer) -> list[str]:
         gap = answer.level_db - to_decibels(from_decibels(rays.gain_db).sum())
         if abs(gap) >= PHASES_DB:
             how = "cancel each other" if gap < 0 else "add up"
-            lines.append(f"they {how}: {abs(gap):.1f} dB {'less' if gap < 0 else 'more'} than their powers")
+            lines.append(
+                f"they {how}: {abs(gap):.1f} dB {'less' if gap < 0 else 'more'} than their powers"
+            )
     return lines
 
 
@@ -65,11 +73,14 @@ def summarise_answer(answer: Answer, unit: str = "dB") -> str:
     return f"{answer.level_db:.1f}{spread} {unit}, {sure}"
 
 
-def answer_markdown(answer: Answer, moving: Sequence[str], reasons: Iterable[str], unit: str = "dB") -> str:
+def answer_markdown(
+    answer: Answer, moving: Sequence[str], reasons: Iterable[str], unit: str = "dB"
+) -> str:
     """Return an answer and why, for a panel."""
     lines = [f"**{summarise_answer(answer, unit)}**", ""]
     lines += [
-        f"- {ENDS[end]} at {', '.join(f'{value:.2f}' for value in np.round(answer.ends[end], 2) + 0.0)} m"
+        f"- {ENDS[end]} at "
+        f"{', '.join(f'{value:.2f}' for value in np.round(answer.ends[end], 2) + 0.0)} m"
         for end in moving  # + 0.0: no minus before nought
     ]
     lines += [f"- {reason}" for reason in reasons]
@@ -81,7 +92,9 @@ def legend_html(legends: Iterable[Legend], surfaces: Iterable[Part] = ()) -> str
     rows = []
     for colour in dict.fromkeys(part.colour for part in surfaces if isinstance(part, Faces)):
         swatch = f'<span style="background:rgb{colour};opacity:.6">&emsp;</span>'
-        rows.append(f'<div style="margin:.35em .7em;font-size:.8em">{swatch} {SURFACES[colour]}</div>')
+        rows.append(
+            f'<div style="margin:.35em .7em;font-size:.8em">{swatch} {SURFACES[colour]}</div>'
+        )
     for legend in dict.fromkeys(legends):
         strip = legend.to_colours(np.linspace(legend.low, legend.high, 16))
         stops = ",".join(f"rgb({r},{g},{b})" for r, g, b in strip)

@@ -12,7 +12,8 @@ from gsparc.apps.maps.pictures import Legend
 
 THICKNESS = 1.5  # of lines [pixels]
 STATION = (40, 40, 40)
-EXTENT = 10.0  # of a site in drawn units: near and far planes, controls and camera are then alike everywhere
+# Of a site in drawn units: near and far planes, controls and camera are then alike everywhere
+EXTENT = 10.0
 
 
 @dataclass(frozen=True)
@@ -57,11 +58,18 @@ class Points:
     size: float
 
     def draw(self, api: Any, frame: DrawingFrame) -> Any:
-        """Add it to a scene of viser under its name, in place of what had it; returns viser's handle."""
+        """Add it to a scene of viser under its name, in place of what had it;
+        returns viser's handle.
+        """
         return api.add_point_cloud(
-            node_path(self.name), frame.to_drawn(self.places), self.colours, point_shape="circle",
-            point_size=self.size * frame.scale, precision="float32", point_shading="flat",
-        )  # fmt: skip
+            node_path(self.name),
+            frame.to_drawn(self.places),
+            self.colours,
+            point_shape="circle",
+            point_size=self.size * frame.scale,
+            precision="float32",
+            point_shading="flat",
+        )
 
 
 @dataclass(frozen=True)
@@ -92,14 +100,22 @@ class Faces:
         """See `Points.draw`."""
         corners = frame.to_drawn(self.triangles).reshape(-1, 3)
         return api.add_mesh_simple(
-            node_path(self.name), corners, np.arange(len(corners)).reshape(-1, 3), color=self.colour,
-            opacity=self.opacity, side="double", flat_shading=True, cast_shadow=False, receive_shadow=False,
-        )  # fmt: skip
+            node_path(self.name),
+            corners,
+            np.arange(len(corners)).reshape(-1, 3),
+            color=self.colour,
+            opacity=self.opacity,
+            side="double",
+            flat_shading=True,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
 
 
 @dataclass(frozen=True)
 class PlacedPicture:
-    """A picture (h, w, 3 or 4) uint8 that lies in space: its upper left corner, its upper and its left edge.
+    """A picture (h, w, 3 or 4) uint8 that lies in space: its upper left corner,
+    its upper and its left edge.
 
     Attributes:
         corner, right, down: (3,) [m], world.
@@ -116,12 +132,19 @@ class PlacedPicture:
         wide, tall = np.linalg.norm(self.right), np.linalg.norm(self.down)
         # A picture's columns run along x of its node, its rows along y.
         x, y = self.right / wide, self.down / tall
-        turn = Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)])).as_quat(scalar_first=True)
+        turn = Rotation.from_matrix(np.column_stack([x, y, np.cross(x, y)])).as_quat(
+            scalar_first=True
+        )
         return api.add_image(
-            node_path(self.name), self.image, float(wide * frame.scale), float(tall * frame.scale),
-            cast_shadow=False, receive_shadow=False, wxyz=turn,
+            node_path(self.name),
+            self.image,
+            float(wide * frame.scale),
+            float(tall * frame.scale),
+            cast_shadow=False,
+            receive_shadow=False,
+            wxyz=turn,
             position=frame.to_drawn(self.corner + (self.right + self.down) / 2),
-        )  # fmt: skip
+        )
 
 
 @dataclass(frozen=True)
@@ -137,7 +160,9 @@ class Mark:
         name, where = node_path(self.name), frame.to_drawn(self.place)
         ball = api.add_icosphere(name, radius=0.012 * EXTENT, color=STATION, position=where)
         if self.text:
-            api.add_label(f"{name}/name", self.text, position=(0, 0, 0.02 * EXTENT), anchor="bottom-center")
+            api.add_label(
+                f"{name}/name", self.text, position=(0, 0, 0.02 * EXTENT), anchor="bottom-center"
+            )
         return ball
 
 

@@ -71,7 +71,9 @@ class SiteView:
         return self.viewed.site.level_unit
 
     def station(self, name: str | None) -> StationView:
-        """Return the view of a station, made when first asked for, in seconds; those made wait for nobody."""
+        """Return the view of a station, made when first asked for, in seconds;
+        those made wait for nobody.
+        """
         if name not in self.made:
             # Two clients that ask for a new station at once wait for one making of it.
             with self._lock:
@@ -94,7 +96,11 @@ class SiteView:
     def sphere(self, name: str | None) -> Sphere | None:
         """Return directions of a spectrum; None of other kinds."""
         site = self.viewed.site
-        return Sphere.from_site(site, self.extent(name)) if site.target.is_image and site.grid else None
+        return (
+            Sphere.from_site(site, self.extent(name))
+            if site.target.is_image and site.grid
+            else None
+        )
 
     def initial_places(self, name: str | None) -> dict[str, np.ndarray]:
         """Return world places (3,) where the ends that move first stand."""
@@ -109,8 +115,8 @@ class SiteView:
         return places
 
     def plane(self, name: str | None, grid: Grid) -> Plane:
-        """Return the power over all of some cells, the transmitter where it first stands if both ends
-        move.
+        """Return the power over all of some cells, the transmitter where it first stands if both
+        ends move.
         """
         other = self.initial_places(name)["tx"].tolist() if self.viewed.site.paired else None
         *_, plane = refine_plane(self.viewed.predictor_of(name), grid, other)
@@ -119,14 +125,20 @@ class SiteView:
 
 
 def lay_power_plane(viewed: Viewed, settings: Mapping[str, Any], plan: Any = None) -> Grid | None:
-    """Return cells of planes of power, as `gsparc map` lays them; None where the model predicts none."""
+    """Return cells of planes of power, as `gsparc map` lays them;
+    None where the model predicts none.
+    """
     if viewed.site.kind not in MAPPED:
         return None
-    return lay_grid(viewed.site, settings.get("area"), settings.get("height_m"), settings.get("step_m"), plan)
+    return lay_grid(
+        viewed.site, settings.get("area"), settings.get("height_m"), settings.get("step_m"), plan
+    )
 
 
 def walk_places(view: SiteView, name: str | None, count: int) -> Sequence[np.ndarray]:
-    """Return at most `count` measured places in the order of measuring, or along the box's diagonal."""
+    """Return at most `count` measured places in the order of measuring,
+    or along the box's diagonal.
+    """
     measured = view.station(name).measured
     if measured is None:
         low, high = view.viewed.box()

@@ -97,7 +97,9 @@ class Viewed:
         places = data.moving[rows][:, -3:] + data.site.origin
         if data.site.target.is_image:
             chunks = (rows[i : i + CHUNK] for i in range(0, len(rows), CHUNK))
-            values = np.concatenate([data.targets(part).flatten(1).mean(1).numpy() for part in chunks])
+            values = np.concatenate(
+                [data.targets(part).flatten(1).mean(1).numpy() for part in chunks]
+            )
             label = "mean of a measured spectrum"
         else:
             values, side = levels.measured_levels(data, rows)
@@ -109,9 +111,11 @@ class Viewed:
 
 
 def open_model(
-    path: str | Path, dataset: Mapping[str, Any] | None = None, station: str | int | None = None,
+    path: str | Path,
+    dataset: Mapping[str, Any] | None = None,
+    station: str | int | None = None,
     unit: str | None = None,
-) -> Viewed:  # fmt: skip
+) -> Viewed:
     """Read a checkpoint, and its data where they are still there.
 
     Args:
@@ -134,11 +138,15 @@ def open_model(
     # Data are gone or changed: a model can be looked at without them.
     except (ValueError, OSError) as error:
         predictor = load(path)
-        notes.append(f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=...")
+        notes.append(
+            f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=..."
+        )
     predictor = predictor.in_levels(unit)
     site = predictor.site
     data = None if data is None else align_to_site(data, site)
-    names, missing = choose_stations(predictor, None if station is None else [station], key="station")
+    names, missing = choose_stations(
+        predictor, None if station is None else [station], key="station"
+    )
     for note in missing:
         log.warning(note)
     stations = tuple(name or None for name in names)

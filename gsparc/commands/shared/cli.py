@@ -1,4 +1,6 @@
-"""Commands: Hydra around a task, an error in one clear line, an exit status that tells the truth."""
+"""Commands: Hydra around a task, an error in one clear line,
+an exit status that tells the truth.
+"""
 
 from __future__ import annotations
 
@@ -26,17 +28,28 @@ from gsparc.base.files import check_yaml, list_causes
 from gsparc.base.instantiate import GROUPS, plugins
 from gsparc.commands.shared.plugins import offer_plugins, offer_scenes
 from gsparc.evaluation import console
-from gsparc.evaluation.console import CONFIGS, FULL_ERROR, config_folder, error_in_one_line, list_choices
+from gsparc.evaluation.console import (
+    CONFIGS,
+    FULL_ERROR,
+    config_folder,
+    error_in_one_line,
+    list_choices,
+)
 from gsparc.models import registry
 from gsparc.runs.run_lock import InUse, release_folders
 from gsparc.training.effort import refuse_seconds
 
-RETRY_S, MOST_RETRIES = 0.01, 100  # of an interrupt inside `logging`; writing a log may wait for its reader
+# Of an interrupt inside `logging`; writing a log may wait for its reader
+RETRY_S, MOST_RETRIES = 0.01, 100
 # Options of Hydra that a value follows, which is no override.
 VALUED = (
-    "--cfg -c", "--package -p", "--config-path -cp", "--config-name -cn", "--config-dir -cd",
+    "--cfg -c",
+    "--package -p",
+    "--config-path -cp",
+    "--config-name -cn",
+    "--config-dir -cd",
     "--experimental-rerun",
-)  # fmt: skip
+)
 LAUNCHERS = ("submitit.", "joblib.externals.loky.", "ray.")  # where their errors are defined
 
 
@@ -51,8 +64,8 @@ class _Failed(BaseException):
 def run(task: Callable[[DictConfig], object], config: str) -> None:
     """Run `task` under Hydra with `conf/<config>.yaml` and the command line's overrides.
 
-    An error is one line on stderr and exit status 1 (130 after an interrupt); with `HYDRA_FULL_ERROR=1` the
-    traceback comes instead.
+    An error is one line on stderr and exit status 1 (130 after an interrupt); with
+    `HYDRA_FULL_ERROR=1` the traceback comes instead.
 
     Args:
         task: called with the composed configuration.
@@ -80,7 +93,9 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
             for folder in (options.config_dir, options.config_path):
                 check_yaml(folder)
             if options.cfg and options.multirun:
-                raise ValueError("--cfg shows one job: leave out -m, and give one value of each setting")
+                raise ValueError(
+                    "--cfg shows one job: leave out -m, and give one value of each setting"
+                )
             if options.cfg in ("job", "all"):
                 _show_whole(main)
             else:
@@ -108,7 +123,9 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
 
 
 def _read_options(words: list[str]) -> tuple[argparse.Namespace, list[str]]:
-    """Options of Hydra, of which some are looked at before it runs, and the overrides among words."""
+    """Options of Hydra, of which some are looked at before it runs,
+    and the overrides among words.
+    """
     parser = argparse.ArgumentParser(add_help=False)
     for name in VALUED:
         parser.add_argument(*name.split())
@@ -123,7 +140,8 @@ def _show_whole(main: Callable[[], object]) -> None:
     with redirect_stdout(StringIO()) as output:
         main()
     config = DictConfig(OmegaConf.create(output.getvalue()))
-    node = config if "_target_" in config else config.get("model")  # the former with `--package model`
+    # The former with `--package model`
+    node = config if "_target_" in config else config.get("model")
     if isinstance(node, DictConfig):
         registry.fill_defaults(node)
     sys.stdout.write(OmegaConf.to_yaml(config))
@@ -131,7 +149,9 @@ def _show_whole(main: Callable[[], object]) -> None:
 
 @contextmanager
 def _noting(interrupts: list[int]) -> Iterator[None]:
-    """Within, Ctrl-C also leaves its number: compiled code may swallow it and raise an error of its own."""
+    """Within, Ctrl-C also leaves its number:
+    compiled code may swallow it and raise an error of its own.
+    """
     before = signal.getsignal(signal.SIGINT)
     if threading.current_thread() is not threading.main_thread() or not callable(before):
         yield  # nothing arrives here, or Ctrl-C is ignored
@@ -140,7 +160,8 @@ def _noting(interrupts: list[int]) -> Iterator[None]:
     later: list[threading.Timer] = []
 
     def noted(signum: int, frame: FrameType | None) -> object:
-        # Every thread needs the lock of `logging`, which would be left taken: tried again when it is out.
+        # Every thread needs the lock of `logging`, which would be left taken:
+        # tried again when it is out.
         if len(later) < MOST_RETRIES and _in_logging(frame):
             again = partial(signal.pthread_kill, threading.get_ident(), signum)
             later.append(threading.Timer(RETRY_S, again))
@@ -165,7 +186,9 @@ def _in_logging(frame: FrameType | None) -> bool:
 
 
 def _began_as_interrupt(error: BaseException | None) -> bool:
-    """A clean-up that meets what Ctrl-C left half done raises an error of its own over the interrupt."""
+    """A clean-up that meets what Ctrl-C left half done raises an error
+    of its own over the interrupt.
+    """
     return any(isinstance(one, KeyboardInterrupt) for one in list_causes(error))
 
 
@@ -173,7 +196,11 @@ def _multirun_advice() -> str:
     """How all jobs of a multirun go on, in the same folder."""
     hydra_config = HydraConfig.get()
     told = any(word.startswith("hydra.sweep.dir=") for word in hydra_config.overrides.hydra)
-    again = "the same command" if told else f"the same command with hydra.sweep.dir={hydra_config.sweep.dir}"
+    again = (
+        "the same command"
+        if told
+        else (f"the same command with hydra.sweep.dir={hydra_config.sweep.dir}")
+    )
     begun = "unfinished ones resume from last.ckpt, or start again"
     return f"interrupted; finished jobs are kept: {again} goes on; {begun}"
 
@@ -199,18 +226,31 @@ def help_text(answers: str, config: str) -> str:
     text = (config_folder() / f"{config}.yaml").read_text(encoding="utf-8")
     texts = [answers, text.partition("\nhydra:")[0].rstrip()]
     defaults = yaml.safe_load(text).get("defaults", ())
-    groups = {group: choice for one in defaults if isinstance(one, dict) for group, choice in one.items()}
+    groups = {
+        group: choice for one in defaults if isinstance(one, dict) for group, choice in one.items()
+    }
     if "kind" in groups:  # settings of the command itself
         kinds = [word.partition("=")[2] for word in sys.argv if word.startswith("kind=")]
         file = config_folder() / "kind" / f"{[groups['kind'], *kinds][-1]}.yaml"
-        texts += [f"# {file.stem}\n{file.read_text(encoding='utf-8').rstrip()}"] if file.exists() else []
-    named = {group: {*list_choices(group), *(plugins(group) if group in GROUPS else ())} for group in groups}
-    texts.append("\n".join(f"  {group}={'|'.join(sorted(names))}" for group, names in named.items()))
-    return "\n\n".join(texts) + f"\n\n`gsparc {config} key=value ... --cfg job` shows every value.\n"
+        texts += (
+            [f"# {file.stem}\n{file.read_text(encoding='utf-8').rstrip()}"] if file.exists() else []
+        )
+    named = {
+        group: {*list_choices(group), *(plugins(group) if group in GROUPS else ())}
+        for group in groups
+    }
+    texts.append(
+        "\n".join(f"  {group}={'|'.join(sorted(names))}" for group, names in named.items())
+    )
+    return "\n\n".join(texts) + (
+        f"\n\n`gsparc {config} key=value ... --cfg job` shows every value.\n"
+    )
 
 
 def _complete(config: DictConfig) -> None:
-    """Add the settings of a model that its file leaves to its class, also to what Hydra has written."""
+    """Add the settings of a model that its file leaves to its class,
+    also to what Hydra has written.
+    """
     registry.fill_defaults(config.model)
     hydra_config = HydraConfig.get()
     if hydra_config.output_subdir is not None:
@@ -220,7 +260,9 @@ def _complete(config: DictConfig) -> None:
 
 
 def _refuse_folder_of_one_run() -> None:
-    """Raise ValueError where jobs of a multirun are given the folder of one run, which Hydra ignores."""
+    """Raise ValueError where jobs of a multirun are given the folder of one run,
+    which Hydra ignores.
+    """
     own = HydraConfig.get()
     names = {word.lstrip("+").partition("=")[0] for word in own.overrides.hydra}
     if own.mode == RunMode.MULTIRUN and "hydra.run.dir" in names and "hydra.sweep.dir" not in names:
@@ -241,7 +283,8 @@ def _bypass(task: Callable[[DictConfig], object]) -> Callable[[DictConfig], obje
         except KeyboardInterrupt as stopped:
             if HydraConfig.get().mode == RunMode.RUN:
                 raise
-            raise KeyboardInterrupt(_multirun_advice()) from stopped  # a job's own is of that job alone
+            # A job's own is of that job alone
+            raise KeyboardInterrupt(_multirun_advice()) from stopped
         except Exception as error:
             if HydraConfig.get().mode == RunMode.RUN:
                 raise _Failed(error) from error

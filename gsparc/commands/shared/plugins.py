@@ -1,4 +1,6 @@
-"""Plugins as choices of `model=` and `dataset=`, scenes that come with Sionna as choices of `scene=`."""
+"""Plugins as choices of `model=` and `dataset=`,
+scenes that come with Sionna as choices of `scene=`.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,9 @@ def offer_plugins() -> None:
                 log.warning("plugin %s (%s) is left out: %s", name, path, error)
                 continue
             if hasattr(import_target(path), "plain_place"):
-                log.warning("plugin %s: no baseline; plain_place is called baseline_order now", name)
+                log.warning(
+                    "plugin %s: no baseline; plain_place is called baseline_order now", name
+                )
             shared: dict[str, Any] = {"name": name, "batch_size": 16} if group == "dataset" else {}
             if group == "model" and "seed" in defaults:
                 # What a plugin draws follows the seed of the run.
@@ -38,7 +42,9 @@ def offer_plugins() -> None:
 
 
 def offer_scenes() -> None:
-    """Make every scene that comes with Sionna a choice of `scene=`, and `scene=help`, which lists them."""
+    """Make every scene that comes with Sionna a choice of `scene=`, and `scene=help`,
+    which lists them.
+    """
     written = resources.files("gsparc.conf") / "scene"
     # Scenes that have a file of ours keep its settings.
     bare = [name for name in list_shipped_scenes() if not (written / f"{name}.yaml").is_file()]

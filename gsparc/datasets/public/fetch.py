@@ -1,4 +1,6 @@
-"""Fetch public data from their makers' pinned revisions, checked by hash, into one folder of the cache."""
+"""Fetch public data from their makers' pinned revisions, checked by hash,
+into one folder of the cache.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ MIRROR = "GSPARC_DATA_URL"  # environment variable: a server laid out as GitHub'
 RAW = "https://raw.githubusercontent.com"
 STALLED_S = 30.0  # without a byte
 CHUNK = 2**16  # bytes
-SLOWEST, PATIENCE = 20e3, 10  # bytes a second of a whole file, beside so many times the wait for a byte
+# Bytes a second of a whole file, beside so many times the wait for a byte
+SLOWEST, PATIENCE = 20e3, 10
 
 
 @dataclass(frozen=True)
@@ -83,14 +86,19 @@ class PublicSet:
             path = self.folder / source.path.removeprefix(f"{self.strip}/")
             # On Windows a backslash parts folders as well, and could lead out of this one.
             if not path.resolve().is_relative_to(top) or "\\" in source.path:
-                raise DataError(f"{self.name}: {source.path} would leave {self.folder}; nothing is fetched")
+                raise DataError(
+                    f"{self.name}: {source.path} would leave {self.folder}; nothing is fetched"
+                )
             placed[path] = source
         return placed
 
     def missing(self) -> list[Path]:
         """Return files that are not there in full size."""
-        # By size alone: hashes are checked when files are fetched, and reading all at each start takes long.
-        return [p for p, one in self.files().items() if not p.is_file() or p.stat().st_size != one.bytes]
+        # By size alone: hashes are checked when files are fetched,
+        # and reading all at each start takes long.
+        return [
+            p for p, one in self.files().items() if not p.is_file() or p.stat().st_size != one.bytes
+        ]
 
 
 @cache
@@ -99,8 +107,12 @@ def public_sets() -> dict[str, PublicSet]:
     sources: dict[str, list[Source]] = {}
     for row in read_shipped_table("gsparc.datasets.public", "sources.csv"):
         place = row["repository"], row["revision"], row["path"]
-        sources.setdefault(row["dataset"], []).append(Source(*place, int(row["bytes"]), row["sha256"]))
-    about = yaml.safe_load(files("gsparc.datasets.public").joinpath("sets.yaml").read_text(encoding="utf-8"))
+        sources.setdefault(row["dataset"], []).append(
+            Source(*place, int(row["bytes"]), row["sha256"])
+        )
+    about = yaml.safe_load(
+        files("gsparc.datasets.public").joinpath("sets.yaml").read_text(encoding="utf-8")
+    )
     sets = {}
     for name, facts in about.items():
         # Several sets may share the files of one release (`of`), each with its own part (`match`).
@@ -111,7 +123,8 @@ def public_sets() -> dict[str, PublicSet]:
 
 
 def fetched_path(choice: str, setting: str = "file") -> Path:
-    """Return what `dataset=<choice>` reads where its setting names nothing: the set as it was fetched.
+    """Return what `dataset=<choice>` reads where its setting names nothing:
+    the set as it was fetched.
 
     Raises:
         DataError: nothing is fetched, or only a part; says in one line how to get it.
@@ -144,7 +157,8 @@ def fetch(name: str, accept: bool = False, timeout_s: float = STALLED_S, retries
         retries: attempts after the first, of each file.
 
     Raises:
-        DataError: unknown, fetched by hand only, not accepted, no network, a wrong file, or no room.
+        DataError: unknown, fetched by hand only, not accepted, no network, a wrong file, or no
+            room.
     """
     wanted = public_sets().get(name)
     if wanted is None:
@@ -189,7 +203,8 @@ def _licence(wanted: PublicSet, accept: bool) -> None:
         log.info("%s: licence %s; cite %s", wanted.name, wanted.licence, wanted.cite)
     elif not accept:
         raise DataError(
-            f"{wanted.name}: its makers state no licence: ask them before you pass it on ({wanted.cite}); to "
+            f"{wanted.name}: its makers state no licence: ask them before you pass it on "
+            f"({wanted.cite}); to "
             f"fetch it for yourself say `gsparc data {wanted.name} accept=true`"
         )
 
@@ -201,7 +216,9 @@ def _fetch_files(wanted: PublicSet, timeout_s: float, retries: int) -> None:
     from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
 
     pooch.get_logger().setLevel(logging.WARNING)
-    files = {path.relative_to(wanted.folder).as_posix(): one for path, one in wanted.files().items()}
+    files = {
+        path.relative_to(wanted.folder).as_posix(): one for path, one in wanted.files().items()
+    }
     store = pooch.create(
         wanted.folder,
         base_url="",
@@ -255,10 +272,21 @@ def _fault(source: Source, error: Exception, name: str) -> str:
     if isinstance(error, requests.HTTPError | requests.TooManyRedirects):
         return f"{source.url}: {explain_error(error).partition(' for url')[0]}; {again}"
     if "timed out" in str(error):
-        slowly = "too little in the time that such a file may take" if "after" in str(error) else "nothing"
+        slowly = (
+            ("too little in the time that such a file may take")
+            if "after" in str(error)
+            else "nothing"
+        )
         return f"{source.url}: the server sends {slowly}; {again}"
-    if isinstance(error, requests.exceptions.ChunkedEncodingError) or "IncompleteRead" in str(error):
+    if isinstance(error, requests.exceptions.ChunkedEncodingError) or "IncompleteRead" in str(
+        error
+    ):
         return f"{source.url}: cut short; {again}"
     if isinstance(error, requests.RequestException):
-        return f"{source.url}: not reached; is there a network? {MIRROR}=URL names a mirror; {again}"
-    return f"{source.url}: not the {source.bytes:,} bytes of the pinned revision (SHA-256); it was not kept"
+        return (
+            f"{source.url}: not reached; is there a network? {MIRROR}=URL names a mirror; {again}"
+        )
+    return (
+        f"{source.url}: not the {source.bytes:,} bytes of the pinned revision (SHA-256); it "
+        "was not kept"
+    )

@@ -1,4 +1,6 @@
-"""Fetch a set from a hub of data sets: one revision, its sum kept at the first fetch and compared later."""
+"""Fetch a set from a hub of data sets: one revision,
+its sum kept at the first fetch and compared later.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ def fetch_from_hub(repository: str, part: str, folder: Path) -> Path:
         folder: what it is stored in.
 
     Raises:
-        DataError: no client, no network, no such folder there, or files that differ from their first fetch.
+        DataError: no client, no network, no such folder there, or files that differ from their
+            first fetch.
     """
     place, facts = folder / part, folder / FACTS
     first = json.loads(facts.read_text(encoding="utf-8")) if facts.is_file() else {}
@@ -33,15 +36,21 @@ def fetch_from_hub(repository: str, part: str, folder: Path) -> Path:
         first["revision"] = _download(repository, part, folder, first.get("revision"), facts)
     size, found = _sum_of(place)
     if "sha256" in first and found != first["sha256"]:
-        what = f"{size:,} bytes, SHA-256 {found}, are not those of the first fetch ({first['sha256']})"
+        what = (
+            f"{size:,} bytes, SHA-256 {found}, are not those of the first fetch ({first['sha256']})"
+        )
         raise DataError(f"{place}: {what}; delete {folder} and fetch again")
-    log.info("%s at %s: %s bytes, SHA-256 %s", repository, first["revision"][:10], f"{size:,}", found)
+    log.info(
+        "%s at %s: %s bytes, SHA-256 %s", repository, first["revision"][:10], f"{size:,}", found
+    )
     write_whole(facts, json.dumps({**first, "bytes": size, "sha256": found}) + "\n")
     return place
 
 
 def _download(repository: str, part: str, folder: Path, revision: str | None, facts: Path) -> str:
-    """Fetch what is missing and return the revision: the newest, or that of a fetch that was cut off."""
+    """Fetch what is missing and return the revision: the newest,
+    or that of a fetch that was cut off.
+    """
     try:
         import httpx2
         from huggingface_hub import HfApi, snapshot_download
@@ -49,9 +58,13 @@ def _download(repository: str, part: str, folder: Path, revision: str | None, fa
         raise DataError(WANTS) from None
     try:
         about = HfApi().dataset_info(repository, revision=revision, files_metadata=True)
-        sizes = [one.size or 0 for one in about.siblings or () if one.rfilename.startswith(f"{part}/")]
+        sizes = [
+            one.size or 0 for one in about.siblings or () if one.rfilename.startswith(f"{part}/")
+        ]
         if not sizes or about.sha is None:
-            raise DataError(f"{repository} has no folder {part} any more; what it has is listed at the hub")
+            raise DataError(
+                f"{repository} has no folder {part} any more; what it has is listed at the hub"
+            )
         log.info("%s: %s files, %.0f MB", repository, f"{len(sizes):,}", sum(sizes) / 1e6)
         write_whole(facts, json.dumps({"revision": about.sha}) + "\n")
         snapshot_download(
@@ -72,6 +85,8 @@ def _sum_of(folder: Path) -> tuple[int, str]:
     total, size = sha256(), 0
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         content = path.read_bytes()
-        total.update(f"{path.relative_to(folder).as_posix()} {sha256(content).hexdigest()}\n".encode())
+        total.update(
+            f"{path.relative_to(folder).as_posix()} {sha256(content).hexdigest()}\n".encode()
+        )
         size += len(content)
     return size, total.hexdigest()

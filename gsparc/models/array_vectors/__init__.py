@@ -1,1 +1,3 @@
-"""Spectra of an array: phase retrieval and a vector GP where it is static, image sources where it moves."""
+"""Spectra of an array: phase retrieval and a vector GP where it is static,
+image sources where it moves.
+"""

@@ -1,8 +1,9 @@
-"""Kernel length and noise of the vector GP by cross-validation with a gap around each held-out sample.
+"""Kernel length and noise of the vector GP by cross-validation
+with a gap around each held-out sample.
 
-Plain leave-one-out tests interpolation over millimetres only and picks a length that fails beyond them. Here
-each sample is predicted without all others within a gap, for several gaps; the score is the PSNR of the
-spectra, averaged over samples and gaps.
+Plain leave-one-out tests interpolation over millimetres only and picks a length that fails beyond
+them. Here each sample is predicted without all others within a gap, for several gaps; the score is
+the PSNR of the spectra, averaged over samples and gaps.
 """
 
 from __future__ import annotations
@@ -48,10 +49,16 @@ class ChosenKernel:
 
 
 def choose_kernel(
-    vectors: np.ndarray, positions: np.ndarray, images: np.ndarray, matrix: np.ndarray, wavelength: float,
-    partner: np.ndarray | None, seed: int = 0,
-) -> ChosenKernel:  # fmt: skip
-    """Choose the kernel of the least mean logarithm of errors at rows left out; return these errors, too.
+    vectors: np.ndarray,
+    positions: np.ndarray,
+    images: np.ndarray,
+    matrix: np.ndarray,
+    wavelength: float,
+    partner: np.ndarray | None,
+    seed: int = 0,
+) -> ChosenKernel:
+    """Choose the kernel of the least mean logarithm of errors at rows left out;
+    return these errors, too.
 
     Args:
         vectors: (n, M) complex, phases and twins unknown.
@@ -70,10 +77,13 @@ def choose_kernel(
         vectors, positions, images = vectors[rows], positions[rows], images[rows]
     pixels = rng.choice(images.shape[1], min(PIXELS, images.shape[1]), replace=False)
     samples = _Samples(
-        images=images[:, pixels].astype(np.float64), matrix=matrix[:, pixels].conj(),
-        background=background[pixels] ** 2, centres=draw_rows(len(positions), CENTRES, rng),
-        gaps=np.array(GAPS) * wavelength, distance=cdist(positions, positions),
-    )  # fmt: skip
+        images=images[:, pixels].astype(np.float64),
+        matrix=matrix[:, pixels].conj(),
+        background=background[pixels] ** 2,
+        centres=draw_rows(len(positions), CENTRES, rng),
+        gaps=np.array(GAPS) * wavelength,
+        distance=cdist(positions, positions),
+    )
     aligned = align_along_tree(vectors, positions, partner)
 
     def kernel_at(parameters: np.ndarray) -> Kernel:
@@ -83,10 +93,14 @@ def choose_kernel(
     def inverse_gram(kernel: Kernel) -> np.ndarray:
         return Factor.from_gram(kernel.gram(torch.from_numpy(positions))).inverse.numpy()
 
-    def held_out_log_error(parameters: np.ndarray, start: np.ndarray = aligned, sweeps: int = 4) -> float:
+    def held_out_log_error(
+        parameters: np.ndarray, start: np.ndarray = aligned, sweeps: int = 4
+    ) -> float:
         kernel = kernel_at(parameters)
         inverse = inverse_gram(kernel)
-        predicted = samples.predict(kernel, inverse, refine_alignment(start, inverse, partner, sweeps))[1]
+        predicted = samples.predict(
+            kernel, inverse, refine_alignment(start, inverse, partner, sweeps)
+        )[1]
         return mean_log_error(samples.squared_errors(predicted))  # up to a factor, minus the PSNR
 
     starts = [np.log([length, NOISE]) for length in LENGTHS]
@@ -96,15 +110,22 @@ def choose_kernel(
     first = min(starts, key=held_out_log_error)
     refined = refine_alignment(aligned, inverse_gram(kernel_at(first)), partner)
     optimum = minimize(
-        held_out_log_error, first, args=(refined,), method="Nelder-Mead",
+        held_out_log_error,
+        first,
+        args=(refined,),
+        method="Nelder-Mead",
         options={
-            "maxfev": STEPS, "xatol": 0.03, "fatol": 1e-3,
+            "maxfev": STEPS,
+            "xatol": 0.03,
+            "fatol": 1e-3,
             "initial_simplex": first + np.array([[0.0, 0.0], [0.4, 0.0], [0.0, -1.0]]),
         },
-    )  # fmt: skip
+    )
     kernel = kernel_at(optimum.x)
     inverse = inverse_gram(kernel)
-    unknown, predicted = samples.predict(kernel, inverse, refine_alignment(refined, inverse, partner))
+    unknown, predicted = samples.predict(
+        kernel, inverse, refine_alignment(refined, inverse, partner)
+    )
     error = samples.squared_errors(predicted)
     seen = ~np.isnan(error)
     left_out = LeftOut(positions, samples.images, samples.centres, samples.gaps, predicted)
@@ -127,7 +148,9 @@ class _Samples:
 
         NaN where no other is left.
         """
-        mean, variance = means_and_variances(inverse, vectors, self.distance, self.centres, self.gaps)
+        mean, variance = means_and_variances(
+            inverse, vectors, self.distance, self.centres, self.gaps
+        )
         unknown = np.clip(variance - kernel.noise, 0.0, 1.0)
         power = np.abs(mean @ self.matrix) ** 2 + unknown[..., None] * self.background
         return unknown, np.sqrt(power)

@@ -1,7 +1,8 @@
 """The complex vectors behind published spectra: least squares on lags, then Levenberg-Marquardt.
 
-A spectrum `g |A^H h| + o` (gain g absorbed into h, offset o only when the minimum was subtracted) fixes h up
-to a global phase and, for arrays symmetric about a point, its twin `conj(h)` in reversed element order.
+A spectrum `g |A^H h| + o` (gain g absorbed into h, offset o only when the minimum was subtracted)
+fixes h up to a global phase and, for arrays symmetric about a point,
+its twin `conj(h)` in reversed element order.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ STARTS = (24, 48, 96, 384)  # random starts of the rows still unsolved, round by
 SCREENING, ITERATIONS = 12, 60  # iterations until most starts end, and of the others
 GOES_ON = 8  # one start in this many goes on after the screening, and at least half as many
 AT_ONCE = 1536  # starts of all rows that are searched together: memory
-ENOUGH = 1.0  # a residual within the lags this many quantisation errors large is consistent with zero
+# A residual within the lags this many quantisation errors large is consistent with zero
+ENOUGH = 1.0
 SUSPECT = 4.0  # misfit over quantisation error above which an image is reported
 
 
@@ -36,9 +38,11 @@ class RecoveredVectors:
     """Array vectors of n spectra.
 
     Attributes:
-        vectors: (n, M) complex128, scaled so that `|A^H h|` is the published spectrum (plus `offset`).
+        vectors: (n, M) complex128, scaled so that `|A^H h|` is the published spectrum (plus
+            `offset`).
         offset: (n,) what was subtracted before publishing; 0 unless the normalisation is `minmax`.
-        residual: (n,) root mean square over pixels of `|A^H h|^2 - image^2`, the part inside the lags.
+        residual: (n,) root mean square over pixels of `|A^H h|^2 - image^2`, the part inside the
+            lags.
         floor: (n,) the same for the part that no array vector can explain.
         expected: (n,) the same as quantisation alone would make it.
     """
@@ -56,7 +60,11 @@ class RecoveredVectors:
 
 
 def recover_vectors(
-    site: Site, images: np.ndarray, positions: np.ndarray, seed: int = 0, max_restarts: int = Effort.restarts
+    site: Site,
+    images: np.ndarray,
+    positions: np.ndarray,
+    seed: int = 0,
+    max_restarts: int = Effort.restarts,
 ) -> RecoveredVectors:
     """Return array vectors of spectra.
 
@@ -65,8 +73,9 @@ def recover_vectors(
         images: (n, H, W) uint8 (255 = 1) or float.
         positions: (n, 3) [m] of the transmitter; neighbours start each other's search.
         seed: of the random starts.
-        max_restarts: every row is solved once from its neighbours or from random starts; of restarts there
-            are at most so many, rows times starts, as spectra of another array never converge.
+        max_restarts: every row is solved once from its neighbours or from random starts; of
+            restarts there are at most so many, rows times starts,
+            as spectra of another array never converge.
     """
     problem = _Problem.from_images(site, images)
     generator = torch.Generator().manual_seed(seed)
@@ -104,9 +113,13 @@ def recover_vectors(
                 keep_better(part, _minimise(problem, part, state[around].flatten(0, 1), enough))
             if int((cost <= enough).sum()) - before < max(1, len(rows) // 20):
                 break
-        log.debug("%d of %d spectra unsolved after %d starts each", int((cost > enough).sum()), n, starts)
+        log.debug(
+            "%d of %d spectra unsolved after %d starts each", int((cost > enough).sum()), n, starts
+        )
     for rows in every.split(AT_ONCE):
-        keep_better(rows, _minimise(problem, rows, state[rows], torch.zeros_like(enough), SCREENING))
+        keep_better(
+            rows, _minimise(problem, rows, state[rows], torch.zeros_like(enough), SCREENING)
+        )
     return problem.to_vectors(state, cost)
 
 
@@ -116,7 +129,9 @@ def _nearest_solved(positions: np.ndarray, rows: np.ndarray, solved: np.ndarray)
     if not len(solved_rows):
         return None
     wanted = np.arange(1, min(NEIGHBOURS, len(solved_rows)) + 1)
-    return torch.from_numpy(solved_rows[cKDTree(positions[solved_rows]).query(positions[rows], k=wanted)[1]])
+    return torch.from_numpy(
+        solved_rows[cKDTree(positions[solved_rows]).query(positions[rows], k=wanted)[1]]
+    )
 
 
 @dataclass(frozen=True)
@@ -169,8 +184,11 @@ class _Problem:
 
     def draw_flat_starts(self, rows: Tensor, starts: int, generator: torch.Generator) -> Tensor:
         """Return starting points (len(rows) * starts, unknowns) of about the spectra's power."""
-        start = torch.randn(len(rows), starts, self.dimension, generator=generator, dtype=torch.float64)
-        # z2[0] is the mean square of the image up to sign: the first whitened column is the constant.
+        start = torch.randn(
+            len(rows), starts, self.dimension, generator=generator, dtype=torch.float64
+        )
+        # z2[0] is the mean square of the image up to sign:
+        # the first whitened column is the constant.
         start *= (self.z2[rows, :1].abs() / len(self.forms)).sqrt()[:, :, None]
         return start.flatten(0, 1)
 
@@ -198,8 +216,8 @@ def _minimise(
 ) -> tuple[Tensor, Tensor]:
     """Best of several starts per row: state (n, unknowns) and sum of squared errors (n,).
 
-    Levenberg-Marquardt with all starts of all rows in one batch; after a few iterations only the best ones
-    continue, and rows at the quantisation floor end.
+    Levenberg-Marquardt with all starts of all rows in one batch; after a few iterations only the
+    best ones continue, and rows at the quantisation floor end.
     """
     n, starts = len(rows), len(start) // len(rows)
     best = torch.zeros(n, problem.dimension, dtype=torch.float64)
@@ -212,7 +230,11 @@ def _minimise(
         normal = slope.transpose(1, 2) @ slope
         lift = damping * normal.diagonal(dim1=1, dim2=2).mean(1) + 1e-12
         normal.diagonal(dim1=1, dim2=2).add_(lift[:, None])
-        step = Factor.from_gram(normal, "ignore").solve(slope.transpose(1, 2) @ error[:, :, None]).squeeze(2)
+        step = (
+            Factor.from_gram(normal, "ignore")
+            .solve(slope.transpose(1, 2) @ error[:, :, None])
+            .squeeze(2)
+        )
         new_state = state - step
         new_error, new_slope = problem.errors_and_slopes(new_state, rows[owner])
         new_cost = new_error.square().sum(1)

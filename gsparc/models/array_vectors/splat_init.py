@@ -1,9 +1,9 @@
 """A splatted field whose array vectors are the posterior of the vector process, in closed form.
 
-Footprints are fixed, so the vectors are linear in the emissions: h = s G with G = A times the frozen plan.
-Emissions are linear in features of the process (`gsparc.processes.features`), whose weights give its
-posterior mean h(x) = phi(x) W: the emissions of least norm are phi(x) W G^+. The same features tell the
-unknown share.
+Footprints are fixed, so the vectors are linear in the emissions: h = s G with G = A times the
+frozen plan. Emissions are linear in features of the process (`gsparc.processes.features`), whose
+weights give its posterior mean h(x) = phi(x) W: the emissions of least norm are phi(x) W G^+. The
+same features tell the unknown share.
 """
 
 from __future__ import annotations
@@ -26,7 +26,11 @@ from gsparc.field.model import GaussianModel
 from gsparc.field.response import ArrayResponse
 from gsparc.models.array_vectors.cross_validation import choose_kernel
 from gsparc.models.array_vectors.vector_cache import recover_cached, write_recovery_report
-from gsparc.models.array_vectors.vector_gp import align_by_likelihood, align_to_nearest, index_mirror_elements
+from gsparc.models.array_vectors.vector_gp import (
+    align_by_likelihood,
+    align_to_nearest,
+    index_mirror_elements,
+)
 from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.models.target_rows import training_targets
 from gsparc.ops import Pose
@@ -37,7 +41,8 @@ from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
-MOST_ROWS = 5000  # spectra whose vectors are aligned as one, in their number cubed: more follow their nearest
+# Spectra whose vectors are aligned as one, in their number cubed: more follow their nearest
+MOST_ROWS = 5000
 RIDGE = 1e-3  # of the largest singular value of G: bounds the norm of emissions
 
 
@@ -69,21 +74,28 @@ def start_from_vectors(task: InitTask) -> Start:
     assert task.receiver is not None
     if task.settings.emission.hidden or task.settings.attenuation.inverse_distance:
         raise ValueError(
-            "init=vectors solves a linear read-out: leave init=auto, or set model.emission.hidden=0 and "
+            "init=vectors solves a linear read-out: leave init=auto, or set "
+            "model.emission.hidden=0 and "
             "model.attenuation.inverse_distance=false"
         )
     process = learn_vector_process(
         task.data, task.rows, task.most_anchors, task.seed, task.run_dir, task.watch
     )
     return Start(
-        process.prior, partial(set_emissions, process=process, receiver=task.receiver), process.left_out
+        process.prior,
+        partial(set_emissions, process=process, receiver=task.receiver),
+        process.left_out,
     )
 
 
 def learn_vector_process(
-    data: Measurements, rows: np.ndarray, anchors: int, seed: int, run_dir: Path,
+    data: Measurements,
+    rows: np.ndarray,
+    anchors: int,
+    seed: int,
+    run_dir: Path,
     watch: Stopwatch | None = None,
-) -> VectorProcess:  # fmt: skip
+) -> VectorProcess:
     """Retrieve the vectors of the given rows (cached where known) and fit their process.
 
     Args:
@@ -110,24 +122,36 @@ def learn_vector_process(
     partner, places = index_mirror_elements(array), data.tx[rows]
     core = covering_rows(places, MOST_ROWS, seed)
     images = data.site.target.to_real(training_targets(data, rows[core]))
-    tuned = choose_kernel(recovery.vectors[core], places[core], images, matrix, wavelength, partner, seed)
+    tuned = choose_kernel(
+        recovery.vectors[core], places[core], images, matrix, wavelength, partner, seed
+    )
     kernel = tuned.kernel
     vectors = np.empty(recovery.vectors.shape, np.complex128)
     vectors[core] = align_by_likelihood(recovery.vectors[core], places[core], partner, kernel)
     rest = np.setdiff1d(np.arange(len(rows)), core)
     if len(rest):
-        log.info("array: %d of %d spectra, which cover the site, align the others", len(core), len(rows))
+        log.info(
+            "array: %d of %d spectra, which cover the site, align the others", len(core), len(rows)
+        )
         others = recovery.vectors[rest], places[rest]
         vectors[rest] = align_to_nearest(*others, vectors[core], places[core], partner)
-    stored = torch.from_numpy(places).float().double()  # as queries come: they are told by differences
+    # As queries come: they are told by differences
+    stored = torch.from_numpy(places).float().double()
     features = whitened_features(stored, kernel.length, kernel.noise, "smooth_rough", anchors)
     log.info(
         "array: length %.3g m, noise %.2g of the field's variance, %d features of %d spectra",
-        kernel.length, kernel.noise, len(features.places), len(rows),
-    )  # fmt: skip
+        kernel.length,
+        kernel.noise,
+        len(features.places),
+        len(rows),
+    )
     return VectorProcess(
         Smoothness(
-            features.places.float(), kernel.length, kernel.noise, "smooth_rough", features.whitening.float()
+            features.places.float(),
+            kernel.length,
+            kernel.noise,
+            "smooth_rough",
+            features.whitening.float(),
         ),
         features.weigh.to(torch.complex128) @ torch.from_numpy(vectors),
         torch.from_numpy(images.mean(0)).view(grid.height, grid.width),
@@ -144,7 +168,9 @@ def set_emissions(model: GaussianModel, process: VectorProcess, receiver: Pose) 
     view = gaussian_vectors(model, receiver)  # (N, M)
     left, size, right = torch.linalg.svd(view.to(torch.complex128), full_matrices=False)
     # Tikhonov's inverse: what the array hardly sees gets no large emissions.
-    damped = size / (size.square() + (RIDGE * size[:1]).square()).clamp_min(torch.finfo(size.dtype).tiny)
+    damped = size / (size.square() + (RIDGE * size[:1]).square()).clamp_min(
+        torch.finfo(size.dtype).tiny
+    )
     readout = process.weights @ ((right.mH * damped) @ left.mH)  # (E, N)
     model.emission.weight2.copy_(torch.view_as_real(readout.T.contiguous()))
     model.emission.bias2.zero_()

@@ -25,7 +25,9 @@ AT_ONCE = 1024  # rows solved together, which bounds the memory
 
 @lru_cache(maxsize=1)
 def _solved_rows(key: str) -> dict[int, tuple[tuple[Any, ...], float, Stopwatch]]:
-    """By row of the data last asked for its parts of `RecoveredVectors`, their seconds, and who paid last."""
+    """By row of the data last asked for its parts of `RecoveredVectors`, their seconds,
+    and who paid last.
+    """
     return {}
 
 
@@ -37,8 +39,8 @@ def recover_cached(
 ) -> RecoveredVectors:
     """Return array vectors of the given rows.
 
-    Only these rows are read: vectors of a test set are never computed for a training run. Rows that this
-    process has solved for the same data, as a refit's are, are not solved again.
+    Only these rows are read: vectors of a test set are never computed for a training run. Rows that
+    this process has solved for the same data, as a refit's are, are not solved again.
 
     Args:
         data: spectra of a static array.
@@ -53,7 +55,10 @@ def recover_cached(
     unpaid = [row for row in rows.tolist() if row in cache and cache[row][2] is not watch]
     if unpaid:
         more = sum(cache[row][1] for row in unpaid)
-        message = "array vectors of %d spectra were computed before, by a fit whose %.2f s count here, too"
+        message = (
+            "array vectors of %d spectra were computed before, by a fit whose %.2f s count "
+            "here, too"
+        )
         log.info(message, len(unpaid), more)
         watch.charge(more)
         cache.update((row, (*cache[row][:2], watch)) for row in unpaid)
@@ -62,11 +67,17 @@ def recover_cached(
         recovery = recover_vectors(data.site, training_targets(data, part), data.tx[part], seed)
         parts = zip(*(getattr(recovery, name) for name in names), strict=True)
         each = (watch.seconds - began) / len(part)
-        cache.update((row, (one, each, watch)) for row, one in zip(part.tolist(), parts, strict=True))
-    return RecoveredVectors(*map(np.stack, zip(*(cache[row][0] for row in rows.tolist()), strict=True)))
+        cache.update(
+            (row, (one, each, watch)) for row, one in zip(part.tolist(), parts, strict=True)
+        )
+    return RecoveredVectors(
+        *map(np.stack, zip(*(cache[row][0] for row in rows.tolist()), strict=True))
+    )
 
 
-def write_recovery_report(result: RecoveredVectors, data: Measurements, rows: np.ndarray, path: Path) -> None:
+def write_recovery_report(
+    result: RecoveredVectors, data: Measurements, rows: np.ndarray, path: Path
+) -> None:
     """Write the residual of each image as CSV and log the suspect ones."""
     names = data.row_names or [f"row {i}" for i in range(len(data))]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -75,16 +86,25 @@ def write_recovery_report(result: RecoveredVectors, data: Measurements, rows: np
         writer.writerow(["row", "name", "residual", "outside_the_array", "quantisation", "suspect"])
         for i, row in enumerate(rows):
             figures = (result.residual[i], result.floor[i], result.expected[i])
-            writer.writerow([row, names[row], *(f"{v:.3e}" for v in figures), int(result.is_suspect[i])])
+            writer.writerow(
+                [row, names[row], *(f"{v:.3e}" for v in figures), int(result.is_suspect[i])]
+            )
     bad = rows[result.is_suspect]
     log.info(
         "array vectors of %d spectra: median residual %.1e, quantisation %.1e",
-        len(rows), np.median(result.residual), np.median(result.expected),
-    )  # fmt: skip
+        len(rows),
+        np.median(result.residual),
+        np.median(result.expected),
+    )
     if len(bad):
         called, them = ("spectrum", "it") if len(bad) == 1 else ("spectra", "them")
         log.warning(
-            "%d %s cannot come from this array: %s; used all the same, check %s and array_position, "
+            "%d %s cannot come from this array: %s; used all the same, check %s and "
+            "array_position, "
             "%s has the figures",
-            len(bad), called, list_first([names[i] for i in bad]), them, path.name,
-        )  # fmt: skip
+            len(bad),
+            called,
+            list_first([names[i] for i in bad]),
+            them,
+            path.name,
+        )

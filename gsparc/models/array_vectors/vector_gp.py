@@ -1,8 +1,9 @@
-"""Array vectors whose phases and twins are unknown, aligned under a Gaussian process; used in training only.
+"""Array vectors whose phases and twins are unknown, aligned under a Gaussian process;
+used in training only.
 
-Each spectrum gives its vector up to a global phase and a twin. Both are free parameters of every sample, set
-in turn to the value under which its vector is most likely given all others (coordinate ascent of the
-likelihood).
+Each spectrum gives its vector up to a global phase and a twin. Both are free parameters of every
+sample, set in turn to the value under which its vector is most likely given all others (coordinate
+ascent of the likelihood).
 """
 
 from __future__ import annotations
@@ -22,7 +23,8 @@ TWIN_MARGIN = 1.02  # factor by which a twin's overlap must be larger for a swap
 
 
 def twin_vectors(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:
-    """Return vectors (n, M) with the same spectra: conjugate, elements reflected through the array's centre.
+    """Return vectors (n, M) with the same spectra: conjugate,
+    elements reflected through the array's centre.
 
     Args:
         partner: (M,) index of each element's mirror element.
@@ -31,7 +33,9 @@ def twin_vectors(vectors: np.ndarray, partner: np.ndarray) -> np.ndarray:
 
 
 def index_mirror_elements(array: np.ndarray) -> np.ndarray | None:
-    """Return indices (M,) of elements reflected through the array's centre; None of an asymmetric one."""
+    """Return indices (M,) of elements reflected through the array's centre;
+    None of an asymmetric one.
+    """
     centred = array - array.mean(0)
     distance = cdist(centred, -centred)
     partner = distance.argmin(1)
@@ -40,8 +44,11 @@ def index_mirror_elements(array: np.ndarray) -> np.ndarray | None:
     return partner if symmetric else None
 
 
-def align_along_tree(vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None) -> np.ndarray:
-    """Return vectors (n, M) with twins and phases that match a neighbour's, along a tree of short steps.
+def align_along_tree(
+    vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None
+) -> np.ndarray:
+    """Return vectors (n, M) with twins and phases that match a neighbour's,
+    along a tree of short steps.
 
     The tree is the minimum spanning one of the positions (n, 3) [m].
     """
@@ -57,7 +64,9 @@ def align_along_tree(vectors: np.ndarray, positions: np.ndarray, partner: np.nda
 def match_phase_and_twin(
     vector: np.ndarray, expected: np.ndarray, partner: np.ndarray | None, margin: float = 1.0
 ) -> np.ndarray:
-    """Return a vector (M,), or its twin if that overlaps more with the expected one, in its phase."""
+    """Return a vector (M,), or its twin if that overlaps more with the expected one,
+    in its phase.
+    """
     overlap = np.vdot(vector, expected)
     if partner is not None:
         other = twin_vectors(vector, partner)
@@ -71,8 +80,8 @@ def refine_alignment(
 ) -> np.ndarray:
     """Return phases and twins (n, M) of largest likelihood, one sample at a time given all others.
 
-    The leave-one-out mean of sample i is `x_i - (K^-1 X)_i / (K^-1)_ii` (Rasmussen and Williams 2006,
-    eq. 5.12).
+    The leave-one-out mean of sample i is `x_i - (K^-1 X)_i / (K^-1)_ii` (Rasmussen and Williams
+    2006, eq. 5.12).
     """
     aligned = np.ascontiguousarray(vectors, dtype=np.complex128)
     aligned = aligned.copy() if aligned is vectors else aligned
@@ -95,7 +104,8 @@ def refine_alignment(
 def align_by_likelihood(
     vectors: np.ndarray, positions: np.ndarray, partner: np.ndarray | None, kernel: Kernel
 ) -> np.ndarray:
-    """Return vectors (n, M) complex128 with the phases and twins that are most likely under a kernel.
+    """Return vectors (n, M) complex128 with the phases and twins
+    that are most likely under a kernel.
 
     Args:
         vectors: (n, M) complex, phases and twins unknown.
@@ -108,10 +118,14 @@ def align_by_likelihood(
 
 
 def align_to_nearest(
-    vectors: np.ndarray, positions: np.ndarray, known: np.ndarray, places: np.ndarray,
+    vectors: np.ndarray,
+    positions: np.ndarray,
+    known: np.ndarray,
+    places: np.ndarray,
     partner: np.ndarray | None,
-) -> np.ndarray:  # fmt: skip
-    """Return vectors (m, M) complex128 of the phases and twins that match the nearest of aligned ones.
+) -> np.ndarray:
+    """Return vectors (m, M) complex128 of the phases and twins
+    that match the nearest of aligned ones.
 
     Args:
         vectors, positions: (m, M) complex and (m, 3) [m], phases and twins unknown.
@@ -119,4 +133,6 @@ def align_to_nearest(
         partner: of `index_mirror_elements`.
     """
     near = known[cKDTree(places).query(positions)[1]]
-    return np.stack([match_phase_and_twin(*pair, partner) for pair in zip(vectors, near, strict=True)])
+    return np.stack(
+        [match_phase_and_twin(*pair, partner) for pair in zip(vectors, near, strict=True)]
+    )

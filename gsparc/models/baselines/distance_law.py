@@ -1,11 +1,12 @@
-"""`model=distance_law`: received power falls with the logarithm of the distance, and with nothing else.
+"""`model=distance_law`: received power falls with the logarithm of the distance,
+and with nothing else.
 
-The log-distance law of path loss, T. S. Rappaport, "Wireless Communications", 2nd ed. (2002), section 4.9,
-with residuals of Huber's density, Gaussian within `CORNER` scales and exponential beyond: an outlier bends
-little, and skewed shadowing is not cut off as Student's t cuts it (P. J. Huber, "Robust estimation of a
-location parameter", Ann. Math. Stat. 35 (1964)). Where nothing was heard, or a receiver was saturated, the
-likelihood is that of a power below or above the level (J. Tobin, "Estimation of relationships for limited
-dependent variables", Econometrica 26 (1958)).
+The log-distance law of path loss, T. S. Rappaport, "Wireless Communications", 2nd ed. (2002),
+section 4.9, with residuals of Huber's density, Gaussian within `CORNER` scales and exponential
+beyond: an outlier bends little, and skewed shadowing is not cut off as Student's t cuts it (P. J.
+Huber, "Robust estimation of a location parameter", Ann. Math. Stat. 35 (1964)). Where nothing was
+heard, or a receiver was saturated, the likelihood is that of a power below or above the level (J.
+Tobin, "Estimation of relationships for limited dependent variables", Econometrica 26 (1958)).
 """
 
 from __future__ import annotations
@@ -42,9 +43,14 @@ PARAMETERS = 3  # a, n and the scale
 
 def _mass_and_variance(corner: float) -> tuple[float, float]:
     """Integral of exp(-Huber's loss), and the variance of that density."""
-    edge, middle = math.exp(-(corner**2) / 2), math.sqrt(2 * math.pi) * math.erf(corner / math.sqrt(2))
+    edge, middle = (
+        math.exp(-(corner**2) / 2),
+        math.sqrt(2 * math.pi) * math.erf(corner / math.sqrt(2)),
+    )
     mass = middle + 2 * edge / corner
-    return mass, (middle - 2 * corner * edge + 2 * edge * (corner + 2 / corner + 2 / corner**3)) / mass
+    return mass, (
+        middle - 2 * corner * edge + 2 * edge * (corner + 2 / corner + 2 / corner**3)
+    ) / mass
 
 
 MASS, VARIANCE = _mass_and_variance(CORNER)
@@ -69,7 +75,8 @@ def log_probability_below(z: np.ndarray) -> np.ndarray:
 def likelihood_slopes(
     residual: np.ndarray, side: np.ndarray, scale: float
 ) -> tuple[float, np.ndarray, float]:
-    """Return the negative log likelihood of residuals (n,) [dB], its slopes by each (n,) and by log(scale).
+    """Return the negative log likelihood of residuals (n,) [dB], its slopes by each (n,)
+    and by log(scale).
 
     Where `side` (n,) is 1 or -1 the residual is of a level that the power lies below or above.
     """
@@ -82,8 +89,12 @@ def likelihood_slopes(
     return value, slope / scale, float((side == 0).sum() - (slope * z).sum())
 
 
-def _posterior(p: np.ndarray, loss: np.ndarray, rows: PowerRows) -> tuple[float, list[float], np.ndarray]:
-    """Negative log posterior of level, exponent and log scale, its slopes by these and by residuals (n,)."""
+def _posterior(
+    p: np.ndarray, loss: np.ndarray, rows: PowerRows
+) -> tuple[float, list[float], np.ndarray]:
+    """Negative log posterior of level, exponent and log scale,
+    its slopes by these and by residuals (n,).
+    """
     level, exponent, log_scale = p[:PARAMETERS]
     residual = rows.decibels - level + exponent * loss
     value, slope, by_scale = likelihood_slopes(residual, rows.side, math.exp(log_scale))
@@ -92,7 +103,9 @@ def _posterior(p: np.ndarray, loss: np.ndarray, rows: PowerRows) -> tuple[float,
     return value + 0.5 * away**2, slopes, slope
 
 
-def fit_level_and_exponent(loss: np.ndarray, rows: PowerRows, start: np.ndarray) -> tuple[float, np.ndarray]:
+def fit_level_and_exponent(
+    loss: np.ndarray, rows: PowerRows, start: np.ndarray
+) -> tuple[float, np.ndarray]:
     """Return the least negative log posterior, its (level, exponent, log scale).
 
     `loss` (n,) [dB] is that of exponent 1.
@@ -127,7 +140,8 @@ def fit_law(rows: PowerRows, end: np.ndarray | None) -> Law:
     law = Law(0.0, USUAL, 0.0, 1.0, at)
     places = torch.from_numpy(np.ascontiguousarray(rows.places, np.float64))
     far = law.distance(places).numpy()
-    # From the nearest row (no floor) to the median: beyond, half of the rows would tell nothing of n.
+    # From the nearest row (no floor) to the median: beyond,
+    # half of the rows would tell nothing of n.
     low, high = np.maximum(np.quantile(far, [0.0, 0.5]), TINY_M)
     start = at_best = _initial_parameters(to_decibels(far), rows)
     best = np.inf
@@ -138,7 +152,8 @@ def fit_law(rows: PowerRows, end: np.ndarray | None) -> Law:
     if law.floor <= low:  # rows show none: nearer than all of them powers rise on
         law = replace(law, floor=max(float(low) / UNSEEN, TINY_M))
     count = int((~rows.silent).sum())
-    few = math.sqrt(count / max(count - PARAMETERS, 1)) if count else 1.0  # parameters swallow residuals
+    # Parameters swallow residuals
+    few = math.sqrt(count / max(count - PARAMETERS, 1)) if count else 1.0
     level, exponent, scale = (float(value) for value in at_best)
     return replace(law, level=level, exponent=exponent, scale=math.exp(scale) * few)
 
@@ -146,7 +161,8 @@ def fit_law(rows: PowerRows, end: np.ndarray | None) -> Law:
 def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
     """Return the place (3,) [m] of a still end that explains powers best, from several starts.
 
-    Heights above and below the places' own plane fit alike: of places at one height the upper one is taken.
+    Heights above and below the places' own plane fit alike:
+    of places at one height the upper one is taken.
     """
     rng = np.random.default_rng(seed)
     if len(rows.places) > LOOKED_AT:
@@ -173,7 +189,9 @@ def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
         place = place + 0.05 * size * flat  # in the plane itself heights have no slope
         loss = to_decibels(((place - rows.places) ** 2).sum(1) + tiny) / 2
         start = np.concatenate([_initial_parameters(loss, rows), place / size])
-        result.append(minimize(neg_log_posterior, start, jac=True, method="L-BFGS-B", bounds=limits))
+        result.append(
+            minimize(neg_log_posterior, start, jac=True, method="L-BFGS-B", bounds=limits)
+        )
     place = min(result, key=lambda one: float(one.fun)).x[PARAMETERS:] * size
     if flat[2]:  # its mirror image fits as well, and few stations stand under the ground
         place[2] = low[2] + abs(place[2] - low[2])
@@ -193,7 +211,9 @@ def fit_site_law(rows: PowerRows, site: Site) -> tuple[Law, tuple[str, ...]]:
     if site.static_position is not None and np.isfinite(site.static_position).all():
         return fit_law(rows, site.static_position), ()
     place = locate_still_end(rows)
-    return fit_law(rows, place), (f"the {ENDS[site.still_end]}'s place {say_estimated(place + site.origin)}",)
+    return fit_law(rows, place), (
+        f"the {ENDS[site.still_end]}'s place {say_estimated(place + site.origin)}",
+    )
 
 
 class DistanceLaw(Differentiable):
@@ -206,7 +226,9 @@ class DistanceLaw(Differentiable):
     uses_censored = True
 
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        raise ValueError(f"distance_law: needs received powers (rssi), not {self.kind}; take model=gp")
+        raise ValueError(
+            f"distance_law: needs received powers (rssi), not {self.kind}; take model=gp"
+        )
 
     def _learn_powers(self, rows: PowerRows) -> tuple[str, ...]:
         started = Stopwatch()

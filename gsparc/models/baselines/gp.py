@@ -1,4 +1,6 @@
-"""A Gaussian process on whole targets: one kernel shared by all entries, set by leave-one-out likelihood."""
+"""A Gaussian process on whole targets: one kernel shared by all entries,
+set by leave-one-out likelihood.
+"""
 
 from __future__ import annotations
 
@@ -61,10 +63,14 @@ class Components:
     lost: float
 
 
-def principal_components(targets: np.ndarray, target: Target, limit: int, block: int = 2048) -> Components:
-    """Return all components, or the `limit` largest, of stored targets (n, ...) by the method of snapshots.
+def principal_components(
+    targets: np.ndarray, target: Target, limit: int, block: int = 2048
+) -> Components:
+    """Return all components, or the `limit` largest, of stored targets (n, ...)
+    by the method of snapshots.
 
-    Works through blocks of `block` entries, so that thousands of byte images never become floats at once.
+    Works through blocks of `block` entries, so that thousands
+    of byte images never become floats at once.
     """
     n = len(targets)
     flat = targets.reshape(n, -1)
@@ -84,15 +90,21 @@ def principal_components(targets: np.ndarray, target: Target, limit: int, block:
         solid[-1] = True
     values, vectors = values[solid], vectors[:, solid]
     length = np.sqrt(np.maximum(values, TINY))
-    axes = [(vectors / length).T @ (target.to_real(p) - m) for p, m in zip(blocks, means, strict=True)]
+    axes = [
+        (vectors / length).T @ (target.to_real(p) - m) for p, m in zip(blocks, means, strict=True)
+    ]
     mean, scores = np.concatenate(means), vectors * np.sqrt(np.maximum(values, 0.0))
     # A small difference of large sums may round below 0.
     residual = max(0.0, energy - float((scores**2).sum())) / (n * len(mean))
-    return Components(mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, residual)
+    return Components(
+        mean.astype(np.float32), np.concatenate(axes, 1).astype(np.float32), scores, residual
+    )
 
 
 def kernel_of_targets(data: Measurements, rows: np.ndarray, components: int) -> Kernel:
-    """Return the likeliest kernel of one length for rows (n,), by so many components of their targets."""
+    """Return the likeliest kernel of one length for rows (n,),
+    by so many components of their targets.
+    """
     parts = principal_components(training_targets(data, rows), data.site.target, components)
     return choose_left_out_kernel(data.moving[rows], parts.scores, len(parts.mean), 1)
 
@@ -100,12 +112,14 @@ def kernel_of_targets(data: Measurements, rows: np.ndarray, components: int) -> 
 class GaussianProcess(Differentiable, ClosedForm):
     """Matern-3/2 of two lengths, isotropic, over the moving end's position, about the mean target.
 
-    Powers are learned in decibels, with one or two lengths, about a constant or a distance law, and from rows
-    where nothing was heard too (`gsparc.processes.powers`).
+    Powers are learned in decibels, with one or two lengths, about a constant or a distance law, and
+    from rows where nothing was heard too (`gsparc.processes.powers`).
 
     Args:
-        components: largest number of principal components kept; all of them when the training set is smaller.
-        mean: of powers: `constant`, `distance`, or `auto`, the one of larger leave-one-out likelihood.
+        components: largest number of principal components kept; all of them when the training set
+            is smaller.
+        mean: of powers: `constant`, `distance`, or `auto`, the one of larger leave-one-out
+            likelihood.
     """
 
     name = "gp"
@@ -127,7 +141,9 @@ class GaussianProcess(Differentiable, ClosedForm):
         self.powers = None
         parts = principal_components(targets, self.target, self.limit)
         looked_at = draw_rows(len(targets), CHOSEN_ON, 0)
-        kernel = choose_left_out_kernel(positions[looked_at], parts.scores[looked_at], len(parts.mean))
+        kernel = choose_left_out_kernel(
+            positions[looked_at], parts.scores[looked_at], len(parts.mean)
+        )
         at, scores = torch.from_numpy(positions), torch.from_numpy(parts.scores)
         self.scores = Exact.from_values(Prior(kernel), at, scores)
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
@@ -140,7 +156,9 @@ class GaussianProcess(Differentiable, ClosedForm):
         return tuple(notes)
 
     def _learn_many(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        """Learn rows too many for one factor: components of some over the site, scores by the nearest."""
+        """Learn rows too many for one factor: components of some over the site,
+        scores by the nearest.
+        """
         # Rows that cover the site: components of crowded parts would miss what is seen elsewhere.
         rows = covering_rows(positions, CHOSEN_ON, 0)
         parts = principal_components(targets[rows], self.target, self.limit)
@@ -151,8 +169,14 @@ class GaussianProcess(Differentiable, ClosedForm):
         values = PlaceValues(positions, torch.from_numpy(scores), once)
         self.scores = condition_on_nearest(Prior(kernel), values, 0)
         self.mean, self.axes = torch.from_numpy(parts.mean), torch.from_numpy(parts.axes)
-        basis = f"{len(parts.axes)} components of {len(rows)} rows, mean square left out {self.lost:.2e}"
-        scheme = f"each query is predicted from the {NEIGHBOURS} nearest of {len(targets)} rows (Vecchia)"
+        basis = (
+            f"{len(parts.axes)} components of {len(rows)} rows, mean square left out "
+            f"{self.lost:.2e}"
+        )
+        scheme = (
+            f"each query is predicted from the {NEIGHBOURS} nearest of {len(targets)} rows "
+            "(Vecchia)"
+        )
         return tuple(f"gp: {note}" for note in (kernel.description, fit_note, scheme, basis))
 
     def _learn_powers(self, rows: PowerRows) -> tuple[str, ...]:
@@ -162,7 +186,9 @@ class GaussianProcess(Differentiable, ClosedForm):
     @property
     def label(self) -> str:
         """The name, and how many nearest rows tell of a place where not all do."""
-        return approximation_label(self.name, self.scores if self.powers is None else self.powers.posterior)
+        return approximation_label(
+            self.name, self.scores if self.powers is None else self.powers.posterior
+        )
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
@@ -173,16 +199,23 @@ class GaussianProcess(Differentiable, ClosedForm):
         if self.powers is None:
             return None
         result = copy.copy(self)
-        result.powers, _ = condition_on_powers(power_rows(data, rows), self.powers.posterior.prior, 0)
+        result.powers, _ = condition_on_powers(
+            power_rows(data, rows), self.powers.posterior.prior, 0
+        )
         return result
 
     def _predict_at(self, queries: Tensor, dtype: torch.dtype) -> Prediction:
         if self.powers is not None:
             decibels, spread, share = self.powers.answer(queries)
             power = self._to_targets(decibels[:, None].to(dtype))
-            return Prediction(power, self.target.entry_variance(spread.to(dtype), power), share.to(dtype))
+            return Prediction(
+                power, self.target.entry_variance(spread.to(dtype), power), share.to(dtype)
+            )
         assert self.scores is not None
-        result, kernel = self.scores.answer(queries, dtype == torch.float64), self.scores.prior.kernel
+        result, kernel = (
+            self.scores.answer(queries, dtype == torch.float64),
+            self.scores.prior.kernel,
+        )
         mean = self._targets_of_scores(result.mean, dtype)
         # What the components leave out is an error of every prediction.
         variance = (kernel.amplitude * result.variance + self.lost).to(dtype)
@@ -205,9 +238,11 @@ class GaussianProcess(Differentiable, ClosedForm):
         return self._to_targets(rows)
 
     def with_strongest(self, lost: float) -> GaussianProcess:
-        """Return it with the fewest components that leave out at most a share `lost` of what targets vary.
+        """Return it with the fewest components that leave out at most a share `lost`
+        of what targets vary.
 
-        Spectra are then made of the few numbers that an array resolves: a query reads these, not all pixels.
+        Spectra are then made of the few numbers that an array resolves: a query reads these,
+        not all pixels.
         """
         if not isinstance(self.scores, Exact):
             return self
@@ -222,7 +257,11 @@ class GaussianProcess(Differentiable, ClosedForm):
             shape = self.shape[0], self.shape[1]
             basis, mean, axes = separate_axes(self.mean, result.axes * size, shape, lost * FINER)
             if 2 * len(mean) <= len(self.mean):  # else nothing is gained
-                result.mean, result.axes, result.pixels = mean, axes / size, (basis.rows, basis.columns)
+                result.mean, result.axes, result.pixels = (
+                    mean,
+                    axes / size,
+                    (basis.rows, basis.columns),
+                )
         return result
 
     def _with_components(self, chosen: Tensor) -> GaussianProcess:
@@ -240,14 +279,20 @@ class GaussianProcess(Differentiable, ClosedForm):
         return ("keep", "confidence", *(("stride",) if self.kind == "spectrum" else ()))
 
     def reduce(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Method.reduce`: the strongest components (`keep`, a share) on fewer pixels (`stride`)."""
+        """See `Method.reduce`: the strongest components (`keep`, a share)
+        on fewer pixels (`stride`).
+        """
         if set(settings) <= {"confidence"} and settings.get("confidence", True):
             return self
         if not isinstance(self.scores, Exact):
             return MeanOnly(self, self.mean_at)
         stride, grid = int(settings.get("stride", 1)), self.fitted_site.grid
         count = max(1, math.ceil(float(settings.get("keep", 1.0)) * len(self.axes)))
-        chosen = self.scores.weights.square().sum(0).topk(count).indices if count < len(self.axes) else None
+        chosen = (
+            self.scores.weights.square().sum(0).topk(count).indices
+            if count < len(self.axes)
+            else None
+        )
         lean = copy.copy(self) if chosen is None else self._with_components(chosen)
         if stride > 1:
             if lean.pixels is not None:
@@ -255,7 +300,8 @@ class GaussianProcess(Differentiable, ClosedForm):
                 lean.pixels = few.rows, few.columns
             else:
                 parts = (
-                    part.unflatten(-1, self.shape)[..., ::stride, ::stride] for part in (lean.mean, lean.axes)
+                    part.unflatten(-1, self.shape)[..., ::stride, ::stride]
+                    for part in (lean.mean, lean.axes)
                 )
                 lean.mean, lean.axes = (part.flatten(-2).contiguous() for part in parts)
             lean.shape = tuple(-(-side // stride) for side in self.shape)
@@ -267,19 +313,24 @@ class GaussianProcess(Differentiable, ClosedForm):
 def project_targets(
     targets: np.ndarray, target: Target, mean: np.ndarray, axes: np.ndarray
 ) -> tuple[np.ndarray, float]:
-    """Return scores (n, P) float32 of stored targets (n, ...), and their mean square per number beyond."""
+    """Return scores (n, P) float32 of stored targets (n, ...),
+    and their mean square per number beyond.
+    """
     scores, beyond = np.empty((len(targets), len(axes)), np.float32), 0.0
     for part in row_blocks(targets):
         rows = target.to_real(targets[part]) - mean
         scores[part] = result = rows @ axes.T
-        beyond += float((rows.astype(np.float64) ** 2).sum()) - float((result.astype(np.float64) ** 2).sum())
+        beyond += float((rows.astype(np.float64) ** 2).sum()) - float(
+            (result.astype(np.float64) ** 2).sum()
+        )
     return scores, max(beyond, 0.0) / (len(targets) * len(mean))
 
 
 def choose_nearest_kernel(
     places: np.ndarray, scores: np.ndarray, entries: int, start: Kernel, seed: int
 ) -> tuple[Kernel, str]:
-    """Return lengths and noise likeliest given the nearest rows, by the strongest components, and a note.
+    """Return lengths and noise likeliest given the nearest rows, by the strongest components,
+    and a note.
 
     Args:
         places, scores: (n, D) [m] and (n, P) float32.

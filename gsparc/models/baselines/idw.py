@@ -41,7 +41,8 @@ class InverseDistance(Interpolator):
         some = positions[:: -(-len(positions) // SPACING_ON)]
         nearest = self.tree.query(some, k=[2])[0][:, 0]  # infinite where there is no second place
         spacings = nearest[(nearest > 0) & np.isfinite(nearest)]
-        self.spacing = float(np.median(spacings)) if len(spacings) else 1.0  # [m], of neighbouring places
+        # [m], of neighbouring places
+        self.spacing = float(np.median(spacings)) if len(spacings) else 1.0
         return ()
 
     def _look_up(self, queries: np.ndarray) -> Prediction:

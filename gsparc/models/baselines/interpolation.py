@@ -21,16 +21,20 @@ from gsparc.training.stopwatch import Stopwatch
 
 
 def _runs_note(data: Measurements, rows: np.ndarray) -> tuple[str, ...]:
-    """What a reader must know of channels of several runs that are learned as if they were of one."""
+    """What a reader must know of channels of several runs that are learned as
+    if they were of one.
+    """
     count = len(np.unique(data.runs_of(rows))) if data.site.target.is_complex else 0
     note = (
-        f"channels of {count} runs, each with a factor of its own, are taken as one; dataset.runs=[...] keeps"
+        f"channels of {count} runs, each with a factor of its own, are taken as one; "
+        "dataset.runs=[...] keeps"
     )
     return (f"{note} some, model=complex_gp learns the factors",) if count > 1 else ()
 
 
 class Interpolator(Method):
-    """Learns from `fold.train` and `fold.val` together (nothing is chosen on `val`) and looks up positions.
+    """Learns from `fold.train` and `fold.val` together (nothing is chosen on `val`)
+    and looks up positions.
 
     The query is the position of the moving end; orientations are not used.
     """
@@ -40,7 +44,9 @@ class Interpolator(Method):
     seen = 0
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Fit on train and val rows; `ValueError` when there are none, or what it learned is not stored."""
+        """Fit on train and val rows; `ValueError` when there are none,
+        or what it learned is not stored.
+        """
         all_rows = fold.learned()
         rows = all_rows if self.uses_censored else heard_rows(data, all_rows)
         if not len(rows):
@@ -48,7 +54,8 @@ class Interpolator(Method):
         start = Stopwatch()
         # Before learning, which asks for the kind and shape of targets.
         self.site, self.shape, self.seen = data.site, tuple(data.target.shape[1:]), len(rows)
-        # What learning adds must be stored: a checkpoint that lost it would fail only when it is read.
+        # What learning adds must be stored: a checkpoint
+        # that lost it would fail only when it is read.
         before = set(vars(self))
         if self.uses_censored and data.site.target.is_level:
             notes = self._learn_powers(power_rows(data, rows))
@@ -58,7 +65,8 @@ class Interpolator(Method):
         names = sorted(set(vars(self)) - before - set(self.stored))
         if names and type(self)._relearn is Method._relearn:
             raise ValueError(
-                f"{self.name}: its checkpoint loses {', '.join(names)}: name it in `stored` (tensor, number, "
+                f"{self.name}: its checkpoint loses {', '.join(names)}: name it in `stored` "
+                "(tensor, number, "
                 "string) or make it again in `_relearn(state)`"
             )
         return FitReport(start.seconds, (*notes, *_runs_note(data, all_rows)))
@@ -100,10 +108,14 @@ class Interpolator(Method):
 
     @abstractmethod
     def _learn(self, positions: np.ndarray, targets: np.ndarray) -> tuple[str, ...]:
-        """Learn positions (n, 3) float64 [m] and stored targets (n, ...); return notes for the report."""
+        """Learn positions (n, 3) float64 [m] and stored targets (n, ...);
+        return notes for the report.
+        """
 
     def _learn_powers(self, rows: PowerRows) -> tuple[str, ...]:
-        """The same of powers, where it learns from rows of which a level is known too (`uses_censored`)."""
+        """The same of powers, where it learns from rows of
+        which a level is known too (`uses_censored`).
+        """
         raise NotImplementedError(f"{self.name}: learns nothing from rows where nothing was heard")
 
     @abstractmethod

@@ -1,11 +1,12 @@
 """Ordinary kriging of log power: the classical map of coverage.
 
-N. Cressie, "Statistics for Spatial Data" (1993), chapters 2 and 3; the exponential law is that of shadowing,
-M. Gudmundson, "Correlation model for shadow fading in mobile radio systems", Electronics Letters 27 (1991).
-Power is kriged in decibels; spectra pixel by pixel, channels entry by entry, with one variogram for all, so
-that one set of weights serves them. A channel's phase is that of the measured ones under the same weights: a
-map of power knows no better. Of more than `WHOLE` places each query is kriged from its `NEAREST` ones alone:
-they screen those farther away. Left out: drift with distance (universal kriging), anisotropy.
+N. Cressie, "Statistics for Spatial Data" (1993), chapters 2 and 3; the exponential law is that of
+shadowing, M. Gudmundson, "Correlation model for shadow fading in mobile radio systems", Electronics
+Letters 27 (1991). Power is kriged in decibels; spectra pixel by pixel, channels entry by entry,
+with one variogram for all, so that one set of weights serves them. A channel's phase is that of the
+measured ones under the same weights: a map of power knows no better. Of more than `WHOLE` places
+each query is kriged from its `NEAREST` ones alone: they screen those farther away. Left out: drift
+with distance (universal kriging), anisotropy.
 """
 
 from __future__ import annotations
@@ -58,7 +59,8 @@ class Variogram(Stored):
 
 
 def fit_variogram(positions: np.ndarray, values: np.ndarray, seed: int = 0) -> Variogram:
-    """Fit the empirical variogram up to half the extent by least squares, weighed by the number of pairs.
+    """Fit the empirical variogram up to half the extent by least squares,
+    weighed by the number of pairs.
 
     Args:
         positions: (n, 3) [m].
@@ -79,7 +81,9 @@ def fit_variogram(positions: np.ndarray, values: np.ndarray, seed: int = 0) -> V
     near = pair_distances <= limit
     number = np.bincount(which[near], minlength=len(edges) - 1)
     filled = number > 0
-    distance = np.bincount(which[near], pair_distances[near], len(edges) - 1)[filled] / number[filled]
+    distance = (
+        np.bincount(which[near], pair_distances[near], len(edges) - 1)[filled] / number[filled]
+    )
     gamma = np.bincount(which[near], half[near], len(edges) - 1)[filled] / number[filled]
 
     def variogram(r: np.ndarray, nugget: float, sill: float, length: float) -> np.ndarray:
@@ -89,7 +93,9 @@ def fit_variogram(positions: np.ndarray, values: np.ndarray, seed: int = 0) -> V
     start = [float(gamma[0]) / 2, spread, limit / 5]
     start = [min(max(s, a), b) for s, a, b in zip(start, low, high, strict=True)]
     weight = np.sqrt(number[filled])
-    found = least_squares(lambda p: weight * (variogram(distance, *p) - gamma), start, bounds=(low, high))
+    found = least_squares(
+        lambda p: weight * (variogram(distance, *p) - gamma), start, bounds=(low, high)
+    )
     return Variogram(*found.x.tolist())
 
 
@@ -120,9 +126,14 @@ class Kriging(Interpolator):
         self._factor_system()
         v = self.variogram
         few = (
-            f"; of {len(self.positions)} places each query's nearest {NEAREST}" if self.system is None else ""
+            f"; of {len(self.positions)} places each query's nearest {NEAREST}"
+            if self.system is None
+            else ""
         )
-        return (f"kriging: nugget {v.nugget:.3g} dB^2, sill {v.sill:.3g} dB^2, range {v.range:.3g} m{few}",)
+        return (
+            f"kriging: nugget {v.nugget:.3g} dB^2, sill {v.sill:.3g} dB^2, range "
+            f"{v.range:.3g} m{few}",
+        )
 
     def _to_decibels(self, targets: np.ndarray) -> np.ndarray:
         if self.target.is_complex:
@@ -143,18 +154,24 @@ class Kriging(Interpolator):
             self.system = lu_factor(self._kriging_matrix(cdist(self.positions, self.positions)))
 
     def _kriging_matrix(self, distance: np.ndarray) -> np.ndarray:
-        """Of the weights of n places and the multiplier that makes them sum to one: (..., n + 1, n + 1)."""
+        """Of the weights of n places and the multiplier that makes them sum to one:
+        (..., n + 1, n + 1).
+        """
         n = distance.shape[-1]
         system = np.ones((*distance.shape[:-2], n + 1, n + 1))
         system[..., :n, :n] = self._covariance(distance)
-        system[..., np.arange(n), np.arange(n)] += self.variogram.nugget + JITTER * self.variogram.variance
+        system[..., np.arange(n), np.arange(n)] += (
+            self.variogram.nugget + JITTER * self.variogram.variance
+        )
         system[..., n, n] = 0.0
         return system
 
     def _weights(self, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """For queries (Q, D): their places (Q, n), weights (Q, n), and variances [dB^2] (Q,)."""
         if self.tree is None:
-            place = np.broadcast_to(np.arange(len(self.positions)), (len(queries), len(self.positions)))
+            place = np.broadcast_to(
+                np.arange(len(self.positions)), (len(queries), len(self.positions))
+            )
             distance = cdist(queries, self.positions)
         else:
             distance, place = self.tree.query(queries, k=NEAREST)
@@ -162,7 +179,8 @@ class Kriging(Interpolator):
         right[:, :-1] = self._covariance(distance)  # without the nugget: noise is not kept
         if self.system is not None:
             factor, pivots = self.system
-            solved = lu_solve((factor, pivots.copy()), right.T).T  # pivots are counted from 1 meanwhile
+            # Pivots are counted from 1 meanwhile
+            solved = lu_solve((factor, pivots.copy()), right.T).T
         else:
             near = self.positions[place]
             pair_distances = np.linalg.norm(near[:, :, None] - near[:, None], axis=-1)
@@ -174,7 +192,8 @@ class Kriging(Interpolator):
         return self.variogram.sill * np.exp(-distance / self.variogram.range)
 
     def _look_up(self, queries: np.ndarray) -> Prediction:
-        block = max(1, min(BLOCK, BYTES // (NEAREST * self.values[:1].nbytes)))  # answered at a time
+        # Answered at a time
+        block = max(1, min(BLOCK, BYTES // (NEAREST * self.values[:1].nbytes)))
         if self.tree is not None and len(queries) > block:
             parts = [self._look_up(queries[i : i + block]) for i in range(0, len(queries), block)]
             return Prediction.joined(parts)
@@ -186,7 +205,10 @@ class Kriging(Interpolator):
                 return shares.to(kind) @ torch.from_numpy(values)
             return torch.einsum("qk,qkd->qd", shares.to(kind), torch.from_numpy(values[place]))
 
-        decibels, variance = weighted_sum(self.values, torch.float32), torch.from_numpy(variance_db2).float()
+        decibels, variance = (
+            weighted_sum(self.values, torch.float32),
+            torch.from_numpy(variance_db2).float(),
+        )
         power = self.kind == "rssi"
         if self.channels is None:
             mean = self._to_targets(decibels if power else from_decibels(decibels))
@@ -194,7 +216,9 @@ class Kriging(Interpolator):
             towards = weighted_sum(self.channels, torch.complex64)
             mean = torch.polar(from_decibels(decibels / 2), towards.angle()).view(-1, *self.shape)
         unknown = (variance / self.variogram.variance).clamp(0, 1)
-        return Prediction(mean, self.target.entry_variance(variance, mean) if power else None, unknown)
+        return Prediction(
+            mean, self.target.entry_variance(variance, mean) if power else None, unknown
+        )
 
     def _relearn(self, state: dict[str, Any]) -> None:
         super()._relearn(state)

@@ -18,11 +18,12 @@ from gsparc.training.context import FitContext, FitReport
 
 
 class Mean(Interpolator):
-    """Predicts the training mean everywhere (of decibels for RSSI), of several stations that of each.
+    """Predicts the training mean everywhere (of decibels for RSSI),
+    of several stations that of each.
 
     Attributes:
-        value: (T + 1, D) real numbers, the last of all rows, as stations of fewer than two have it; (1, D) of
-            one station.
+        value: (T + 1, D) real numbers, the last of all rows, as stations of fewer than two have it;
+            (1, D) of one station.
     """
 
     name = "mean"
@@ -56,7 +57,9 @@ class Mean(Interpolator):
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
         site = self.fitted_site
-        number = Ends.from_query(site, query).station if site.several else torch.zeros(len(query)).long()
+        number = (
+            Ends.from_query(site, query).station if site.several else torch.zeros(len(query)).long()
+        )
         return Prediction(self._to_targets(self.value.reshape(-1, self.value.shape[-1])[number]))
 
     def _look_up(self, queries: np.ndarray) -> Prediction:

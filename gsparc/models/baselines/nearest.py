@@ -6,7 +6,9 @@ from gsparc.models.baselines.idw import InverseDistance
 
 
 class Nearest(InverseDistance):
-    """Repeats the sample measured nearest to the query; its confidence falls off with the distance."""
+    """Repeats the sample measured nearest to the query;
+    its confidence falls off with the distance.
+    """
 
     name = "nearest"
     baseline_order = 30

@@ -1,4 +1,6 @@
-"""Ridge regression from the uplink's tones to the downlink's: one linear map, learned from all places."""
+"""Ridge regression from the uplink's tones to the downlink's: one linear map,
+learned from all places.
+"""
 
 from __future__ import annotations
 
@@ -20,10 +22,12 @@ PENALTIES = (10.0 ** np.arange(-6, 1)).tolist()  # of the Gram matrix's mean dia
 
 
 class Ridge(UplinkMethod):
-    """Complex ridge regression; penalty and scaling are chosen on validation rows, then both are learned.
+    """Complex ridge regression; penalty and scaling are chosen on validation rows,
+    then both are learned.
 
     Args:
-        inputs: `own`: each antenna's downlink from its own uplink (26 to 26); `all`: from all antennas'.
+        inputs: `own`: each antenna's downlink from its own uplink (26 to 26); `all`: from all
+            antennas'.
     """
 
     name = "ridge"
@@ -63,7 +67,9 @@ class Ridge(UplinkMethod):
         note = f"ridge: penalty {best[1]:g}, rows {'of unit power' if best[2] else 'as they are'}"
         return FitReport(started.seconds, (note,))
 
-    def _normal_equations(self, data: Measurements, rows: np.ndarray, unit: bool) -> tuple[Tensor, Tensor]:
+    def _normal_equations(
+        self, data: Measurements, rows: np.ndarray, unit: bool
+    ) -> tuple[Tensor, Tensor]:
         """Gram matrices (M, F, F) and products with the targets (M, F, O)."""
         batch = data.batch(rows)
         assert batch.uplink is not None

@@ -31,7 +31,9 @@ class CarriersAlone(Stored):
     processes: tuple[Exact | None, ...]
 
     @classmethod
-    def learn(cls, places: Tensor, values: Tensor, station: Tensor, count: int, entries: int) -> Self:
+    def learn(
+        cls, places: Tensor, values: Tensor, station: Tensor, count: int, entries: int
+    ) -> Self:
         """Choose kernels and condition on rows.
 
         Args:
@@ -42,7 +44,9 @@ class CarriersAlone(Stored):
             entries: pixels.
         """
         priors: list[Prior | None] = [None] * count
-        for number in (torch.bincount(station, minlength=count) >= LEAST_ROWS).nonzero()[:, 0].tolist():
+        for number in (
+            (torch.bincount(station, minlength=count) >= LEAST_ROWS).nonzero()[:, 0].tolist()
+        ):
             here = station == number
             centred = values[here] - values[here].mean(0)
             kernel = choose_left_out_kernel(places[here].numpy(), centred.numpy(), entries)
@@ -63,7 +67,9 @@ class CarriersAlone(Stored):
             here = station == number
             means[number] = values[here].mean(0) if prior else 0.0
             centred = values[here] - means[number]
-            processes.append(None if prior is None else Exact.from_values(prior, places[here], centred))
+            processes.append(
+                None if prior is None else Exact.from_values(prior, places[here], centred)
+            )
         return cls(means, tuple(processes))
 
     def add_unknown(self) -> Self:
@@ -72,7 +78,9 @@ class CarriersAlone(Stored):
         return replace(self, means=means, processes=(*self.processes, None))
 
     def left_out(self, station: Tensor) -> Tensor:
-        """Return what other rows miss of each that it was conditioned on (n, P); NaN without a process."""
+        """Return what other rows miss of each that it was conditioned on (n, P);
+        NaN without a process.
+        """
         result = torch.full((len(station), self.means.shape[1]), torch.nan, dtype=torch.float64)
         for number, one in enumerate(self.processes):
             if one is not None:
@@ -84,7 +92,9 @@ class CarriersAlone(Stored):
         return torch.tensor([one is not None for one in self.processes])[station]
 
     def answer(self, places: Tensor, station: Tensor) -> MeanVariance:
-        """Return values (n, P) at places (n, 3), and variances (n,) per pixel; NaN without a process."""
+        """Return values (n, P) at places (n, 3), and variances (n,) per pixel;
+        NaN without a process.
+        """
         mean = places.new_full((len(places), self.means.shape[1]), torch.nan)
         variance = places.new_full((len(places),), torch.nan)
         for number in station.unique().tolist():

@@ -25,7 +25,9 @@ from gsparc.training.context import FitContext
 
 
 def carriers_obstacle(site: Site) -> str | None:
-    """Return why spectra of this site are not those of one array at several carriers; None where they are."""
+    """Return why spectra of this site are not those of one array at several carriers;
+    None where they are.
+    """
     stations = site.every_station
     if not site.target.is_image or stations.carrier_hz is None:
         return "targets are no spectra at several carriers"
@@ -37,18 +39,28 @@ def carriers_obstacle(site: Site) -> str | None:
     if site.array is None or site.grid is None or len(site.array) < 2:
         return "the array is unknown"
     relative = _arrays(site) / (LIGHT / stations.carrier_hz)[:, None, None]
-    return None if np.allclose(relative, relative[0], atol=1e-3) else "carriers see through different arrays"
+    return (
+        None
+        if np.allclose(relative, relative[0], atol=1e-3)
+        else ("carriers see through different arrays")
+    )
 
 
 def _arrays(site: Site) -> np.ndarray:
     """Elements (T, M, 3) [m] of the array at each carrier."""
     assert site.array is not None
     elements = site.every_station.array
-    return np.repeat(site.array[None], len(site.every_station), axis=0) if elements is None else elements
+    return (
+        np.repeat(site.array[None], len(site.every_station), axis=0)
+        if elements is None
+        else elements
+    )
 
 
 class OneArray(Method):
-    """A method of spectra at several carriers, of which one array, alike in wavelengths, saw all."""
+    """A method of spectra at several carriers, of which one array, alike in wavelengths,
+    saw all.
+    """
 
     stored: ClassVar[tuple[str, ...]] = ("exponent", "places", "mean")
     both_ends = True
@@ -85,7 +97,9 @@ class OneArray(Method):
             raise ValueError(f"{self.name}: {problem}")
         self.site, self._spectra = data.site, None
         images = torch.from_numpy(data.site.target.to_real(training_targets(data, rows)))
-        self.places, which = torch.unique(torch.from_numpy(data.tx[rows]), dim=0, return_inverse=True)
+        self.places, which = torch.unique(
+            torch.from_numpy(data.tx[rows]), dim=0, return_inverse=True
+        )
         few = images[:: max(1, len(images) // 16)].unflatten(1, data.target.shape[1:])
         self.exponent, self.mean = pixel_exponent(self.lags(), few)[0], images.mean(0)
         return images, rows_of_groups(which.numpy())
@@ -111,7 +125,9 @@ class OneArray(Method):
         stations, turned = self._stations, self.fitted_site.rx_rotation
         rotation = stations.rotation[0] if stations.rotation is not None else turned
         turned = np.eye(3) if rotation is None else rotation
-        return torch.from_numpy(stations.position[0]), torch.from_numpy(np.asarray(turned, np.float64))
+        return torch.from_numpy(stations.position[0]), torch.from_numpy(
+            np.asarray(turned, np.float64)
+        )
 
     def array(self) -> tuple[np.ndarray, float]:
         """Return elements (M, 3) [m] at the first carrier, and its wavelength [m]."""
@@ -131,16 +147,22 @@ class OneArray(Method):
         return 1
 
     def expected(self, paths: SharedPaths, places: Tensor) -> Tensor:
-        """Return mean images (n, pixels) of the paths to places (n, 3), every `stride`-th row and column."""
+        """Return mean images (n, pixels) of the paths to places (n, 3),
+        every `stride`-th row and column.
+        """
         return self.expect_paths(paths.ways(places)[0], paths.powers(places))
 
     def expect_paths(self, directions: Tensor, powers: Tensor) -> Tensor:
-        """Return mean images (n, pixels) of waves from (n, K, 3), receiver frame, of powers (n, K)."""
+        """Return mean images (n, pixels) of waves from (n, K, 3), receiver frame,
+        of powers (n, K).
+        """
         if self._spectra is None:
             (array, wavelength), grid = self.array(), self.fitted_site.grid
             assert grid is not None
             grid = coarsen_grid(grid, self.stride)
-            renderer = SpectrumRenderer(array, grid, wavelength, torch.zeros(grid.height, grid.width))
+            renderer = SpectrumRenderer(
+                array, grid, wavelength, torch.zeros(grid.height, grid.width)
+            )
             turns = torch.from_numpy(2 * np.pi / wavelength * array).float()
             how = self.fitted_site.normalisation
             self._spectra = ExpectedSpectra(renderer, turns, how, self.exponent)

@@ -1,4 +1,6 @@
-"""A process over places and carriers: what carriers of one place tell of each other, and of places nearby."""
+"""A process over places and carriers: what carriers of one place tell of each other,
+and of places nearby.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +21,17 @@ from gsparc.processes.stored import Stored
 
 LENGTHS = (0.1, 0.2, 0.4, 0.8)  # of the site's diagonal, that are tried
 SHARES, NOISES = (0.5, 2.0, 8.0), (0.3, 1.0, 3.0)  # of what the carriers of a place share
-NEAR_CARRIERS, OCTAVES = (0.0, 0.5), 1.0  # of the same, what carriers within some octaves share besides
+# Of the same, what carriers within some octaves share besides
+NEAR_CARRIERS, OCTAVES = (0.0, 0.5), 1.0
 USUAL = 0.5  # places, as which the usual noise counts beside a place's own
-OWN, ALONE = (0.0, 2.0), 0.2  # of the same, what images within .2 octaves share at neighbouring places
+# Of the same, what images within .2 octaves share at neighbouring places
+OWN, ALONE = (0.0, 2.0), 0.2
 
 
 @dataclass(frozen=True)
 class Covariance(Stored):
-    """Covariance of residual images over places and carriers, in units of the part that a place shares.
+    """Covariance of residual images over places and carriers,
+    in units of the part that a place shares.
 
     Attributes:
         length: over places [m].
@@ -55,7 +60,9 @@ class Covariance(Stored):
 
     def gram(self, rows: Tensor, noise: Tensor | float) -> Tensor:
         """Return covariances (n, n) of rows (n, 4) with theirs (n,) of `row_noise`."""
-        return self.between(rows, rows) + self.noise * noise * torch.eye(len(rows), dtype=torch.float64)
+        return self.between(rows, rows) + self.noise * noise * torch.eye(
+            len(rows), dtype=torch.float64
+        )
 
     @property
     def prior(self) -> float:
@@ -65,7 +72,10 @@ class Covariance(Stored):
     @property
     def description(self) -> str:
         """Its numbers in words."""
-        parts = f"shared {self.shared:.3g}, near {self.near:.3g}, own {self.own:.3g}, noise {self.noise:.3g}"
+        parts = (
+            f"shared {self.shared:.3g}, near {self.near:.3g}, own {self.own:.3g}, noise "
+            f"{self.noise:.3g}"
+        )
         return f"length {self.length:.3g} m, {parts}"
 
 
@@ -100,9 +110,14 @@ def row_noise(images: Tensor, groups: list[Tensor]) -> Tensor:
 
 
 def choose_joint(
-    rows: Tensor, images: Tensor, paths: Tensor, noise: Tensor, groups: list[Tensor],
-    carriers: list[Tensor], entries: int,
-) -> JointChoice:  # fmt: skip
+    rows: Tensor,
+    images: Tensor,
+    paths: Tensor,
+    noise: Tensor,
+    groups: list[Tensor],
+    carriers: list[Tensor],
+    entries: int,
+) -> JointChoice:
     """Return the covariance and weight of paths of least error at places and at rows left out.
 
     Args:
@@ -123,11 +138,15 @@ def choose_joint(
         weighted_path = path / noise[:, None]
         weight = float((image * weighted_path).sum() / (path * weighted_path).sum().clamp_min(1e-9))
         weight = min(max(weight, 0.0), 1.0)
-        new, seen = (_without_paths(each, weight) for each in (away, left_out_residuals(inverse, solved)))
+        new, seen = (
+            _without_paths(each, weight) for each in (away, left_out_residuals(inverse, solved))
+        )
         # As of ratios in decibels: what is told well counts as much as what is not.
         error = sum(float(one.square().sum(1).clamp_min(1e-9).log().mean()) for one in (new, seen))
         if error < best:
-            scaled = replace(one, amplitude=float((new.square().sum(1) / away.variance).mean()) / entries)
+            scaled = replace(
+                one, amplitude=float((new.square().sum(1) / away.variance).mean()) / entries
+            )
             carrier = _without_paths(left_out_residuals(inverse, solved, carriers), weight)
             best, result = error, JointChoice(scaled, weight, new, seen, carrier)
     assert result is not None

@@ -1,9 +1,9 @@
 """`model=carriers`: spectra at several carriers in one field, which tell of each other at a place.
 
-The mean is what paths found from all spectra together are expected to look like, mixed with the mean image; a
-process over places and carriers learns what is left: rows of a place observed at some carriers tell the rest.
-Beside it stand processes of each carrier alone, weighed by rows that were left out. All of it is computed in
-the strongest principal components of the images.
+The mean is what paths found from all spectra together are expected to look like, mixed with the
+mean image; a process over places and carriers learns what is left: rows of a place observed at some
+carriers tell the rest. Beside it stand processes of each carrier alone, weighed by rows that were
+left out. All of it is computed in the strongest principal components of the images.
 """
 
 from __future__ import annotations
@@ -34,7 +34,8 @@ from gsparc.training.context import FitContext, FitReport
 from gsparc.training.stopwatch import Stopwatch
 
 COMPONENTS = 100  # of images: more of them hold under 1e-3 of what varies
-LOST, TINY = 1e-4, 1e-12  # of the energy of these by numbers of rows and columns; a component that is none
+# Of the energy of these by numbers of rows and columns; a component that is none
+LOST, TINY = 1e-4, 1e-12
 MOST_ROWS, CHOSEN_ON = 4000, 500  # rows that are learned from, and that settings are chosen on
 COARSE = 24  # rows of pixels, at least, that expected images are computed on
 
@@ -48,24 +49,39 @@ class CarrierField(OneArray):
 
     effects = "line_of_sight, specular"
     stored = (
-        *OneArray.stored, "paths", "weight", "covariance", "rows", "left", "pixels", "middle", "axes", "lost",
-        "alone", "shares", "carried", "noise",
-    )  # fmt: skip
+        *OneArray.stored,
+        "paths",
+        "weight",
+        "covariance",
+        "rows",
+        "left",
+        "pixels",
+        "middle",
+        "axes",
+        "lost",
+        "alone",
+        "shares",
+        "carried",
+        "noise",
+    )
     paths: SharedPaths
     weight: float  # of paths
     covariance: Covariance
     rows: Tensor  # (n, 4) float64, places [m] and log2 of carriers
     left: Tensor  # (n, P) float64, what paths do not explain as weights of the rows' covariances
-    pixels: tuple[Tensor, Tensor]  # rows (H, R) and columns (C, W) of images, by whose products are told
+    # Rows (H, R) and columns (C, W) of images, by whose products are told
+    pixels: tuple[Tensor, Tensor]
     middle: Tensor  # (R * C,) the mean image
     axes: Tensor  # (P, R * C) principal components, orthonormal in pixels
     lost: float  # mean square per pixel that the components leave out
     alone: CarriersAlone
     shares: tuple[float, float]  # of `alone` at new places, and at places with rows
-    carried: float = 1.0  # share of what is told of a carrier without rows; the rest is the mean image
+    # Share of what is told of a carrier without rows; the rest is the mean image
+    carried: float = 1.0
     noise: Tensor | float = 1.0  # (n,) of the rows, of the usual
     _inverse: Tensor | None = None
-    _thin: tuple[Tensor, Tensor] | None = None  # the mean (p,) and what gives components (p, P) of pixels
+    # The mean (p,) and what gives components (p, P) of pixels
+    _thin: tuple[Tensor, Tensor] | None = None
 
     def __init__(self, name: str = "carriers") -> None:
         self.name = name
@@ -81,7 +97,9 @@ class CarrierField(OneArray):
         images, groups = self.read_rows(data, fit_rows)
         carrier, grid, lags = data.carrier_hz, data.site.grid, self.lags()
         assert carrier is not None and grid is not None
-        power = [images[rows].unflatten(1, (grid.height, grid.width)) ** self.exponent for rows in groups]
+        power = [
+            images[rows].unflatten(1, (grid.height, grid.width)) ** self.exponent for rows in groups
+        ]
         seen = torch.stack([lags.to_lags(one).mean(0) for one in power])
         self.paths = find_paths(lags, seen, self.places, *self.pose())
         few = _at_covering_places(data.tx[fit_rows], CHOSEN_ON)
@@ -90,13 +108,18 @@ class CarrierField(OneArray):
         images.sub_(self.mean)
         values = (images @ axes.T).double()
         size = values.square().mean(0).sqrt().float()[:, None].clamp_min(TINY)
-        basis, self.middle, sized = separate_axes(self.mean, axes * size, (grid.height, grid.width), LOST)
+        basis, self.middle, sized = separate_axes(
+            self.mean, axes * size, (grid.height, grid.width), LOST
+        )
         self.axes, self.pixels = sized / size, (basis.rows, basis.columns)
         beyond = float(images.square().sum(dtype=torch.float64)) - float(values.square().sum())
         self.lost = max(beyond, 0.0) / images.numel()
 
         self.rows = torch.from_numpy(np.c_[data.tx[fit_rows], np.log2(carrier[fit_rows])])
-        place, station = torch.empty(len(fit_rows)).long(), torch.from_numpy(data.stations_of(fit_rows))
+        place, station = (
+            torch.empty(len(fit_rows)).long(),
+            torch.from_numpy(data.stations_of(fit_rows)),
+        )
         for number, rows in enumerate(groups):
             place[rows] = number
         self._inverse = self._thin = None
@@ -108,7 +131,9 @@ class CarrierField(OneArray):
         self.alone = self.alone.condition(self.rows[:, :3], values, station)
         planes = f"{len(self.paths.planes)} mirror planes, weight of paths {self.weight:.2g}"
         planes = planes if self.weight else "paths explain nothing here"
-        shares = "{:.0%} of new places and {:.0%} of known ones by carriers alone".format(*self.shares)
+        shares = ("{:.0%} of new places and {:.0%} of known ones by carriers alone").format(
+            *self.shares
+        )
         shares += f", {self.carried:.0%} of it for carriers without rows"
         chosen = f"{planes}; {self.covariance.description}; {shares}, chosen on rows left out"
         notes = [f"{self.name}: {chosen}"]
@@ -118,7 +143,13 @@ class CarrierField(OneArray):
         return FitReport(watch.seconds, tuple(notes))
 
     def _choose(
-        self, values: Tensor, paths: Tensor, noise: Tensor, place: Tensor, station: Tensor, rows: np.ndarray
+        self,
+        values: Tensor,
+        paths: Tensor,
+        noise: Tensor,
+        place: Tensor,
+        station: Tensor,
+        rows: np.ndarray,
     ) -> None:
         """Set settings by some rows (n,) whose places and carriers (n,) are numbered."""
         at, count, entries = self.rows[rows], len(self._stations), len(self.mean)
@@ -128,7 +159,9 @@ class CarrierField(OneArray):
         self.alone = CarriersAlone.learn(at[:, :3], values, station, count, entries)
         has_process = self.alone.has_process(station)
         missed, unit = self.alone.left_out(station)[has_process], place[has_process]
-        new, seen = (_second_share(one[has_process], missed, unit) for one in (joint.new, joint.seen))
+        new, seen = (
+            _second_share(one[has_process], missed, unit) for one in (joint.new, joint.seen)
+        )
         self.shares = new, seen
         # One carrier alone tells nothing of others.
         several = len(station.unique()) > 1
@@ -154,7 +187,9 @@ class CarrierField(OneArray):
             value = value + self.weight * self._expected_values(places)[which]
         measured = self.alone.has_process(station)
         value = torch.where(measured[:, None], value, self.carried * value)
-        variance = (one.prior - (cross @ self._inverse_of_rows() * cross).sum(1)).clamp(0, one.prior)
+        variance = (one.prior - (cross @ self._inverse_of_rows() * cross).sum(1)).clamp(
+            0, one.prior
+        )
         unknown, error = variance / one.prior, one.amplitude * (variance + one.noise)
         near = torch.cdist(places, self.places).amin(1)[which] < SAME_PLACE_M
         share = torch.tensor(self.shares, dtype=torch.float64)[near.long()] * measured
@@ -162,7 +197,8 @@ class CarrierField(OneArray):
             mean, carrier_error = (part.nan_to_num() for part in self.alone.answer(at, station))
             spread = (mean - value).square().sum(1) / len(self.mean)
             value = value.lerp(mean, share[:, None])
-            error = error.lerp(carrier_error, share) + share * (1 - share) * spread  # law of total variance
+            # Law of total variance
+            error = error.lerp(carrier_error, share) + share * (1 - share) * spread
         image = Separable(*self.pixels).images(torch.addmm(self.middle, value.float(), self.axes))
         image = self.answer_images(image.flatten(1), query)
         return Prediction(image, (error + self.lost).to(image.dtype), unknown.to(image.dtype))
@@ -189,7 +225,9 @@ class CarrierField(OneArray):
         """See `OneArray`: an array of few elements sees nothing finer."""
         grid = self.fitted_site.grid
         assert grid is not None
-        return next((one for one in (4, 3, 2) if not grid.width % one and grid.height >= one * COARSE), 1)
+        return next(
+            (one for one in (4, 3, 2) if not grid.width % one and grid.height >= one * COARSE), 1
+        )
 
     def _expected_values(self, places: Tensor) -> Tensor:
         """Components (n, P) float64 of what paths to places (n, 3) are expected to look like."""
@@ -202,7 +240,9 @@ class CarrierField(OneArray):
 
 
 def _second_share(first: Tensor, second: Tensor, unit: Tensor) -> float:
-    """Weight of the second of two predictions by errors (n, P) of rows of units (n,); 0 without rows."""
+    """Weight of the second of two predictions by errors (n, P) of rows of units (n,);
+    0 without rows.
+    """
     if not len(unit):
         return 0.0
     products = error_products([first, second], torch.zeros_like(first))

@@ -1,7 +1,8 @@
-"""Channels as groups of columns: those of one static place, one set of moving places and one wavelength.
+"""Channels as groups of columns: those of one static place,
+one set of moving places and one wavelength.
 
-Columns of one group share a covariance. Groups share its parameters but not their scales, and are otherwise
-independent: an antenna half a metre on hears another field.
+Columns of one group share a covariance. Groups share its parameters but not their scales, and are
+otherwise independent: an antenna half a metre on hears another field.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ from gsparc.processes.factor import Factor
 from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.places import ORIGIN, UNKNOWN
 
-BAND_RAD = 1.0  # tones whose phases turn no more than this against each other over all places are one band
+# Tones whose phases turn no more than this against each other over all places are one band
+BAND_RAD = 1.0
 
 
 @dataclass(frozen=True)
@@ -55,13 +57,17 @@ class Slot:
         ).to(target.dtype)
 
     def antenna_places(self, moving: Tensor, rotation: Tensor) -> Tensor:
-        """Return the antenna's places (B, 3) float64 [m]; of the moving end's (B, 3) and turns (B, 3, 3)."""
+        """Return the antenna's places (B, 3) float64 [m]; of the moving end's (B, 3)
+        and turns (B, 3, 3).
+        """
         if not self.element.any():
             return moving
         return moving + rotation @ self.element
 
     def state(self) -> dict[str, Any]:
-        """Return what `read` reads; a checkpoint holds finite numbers, so that an unknown place is none."""
+        """Return what `read` reads; a checkpoint holds finite numbers,
+        so that an unknown place is none.
+        """
         return {**vars(self), "end": self.end[:0] if self.end.isnan().any() else self.end}
 
     @classmethod
@@ -93,7 +99,8 @@ class Group(SlotPlaces):
         rows: (n,) int64 into the rows that were gathered.
         target: (n, D) complex128, stored units.
         run: (n,) int64 numbers of runs.
-        order: (n,) float64 numbers among the static end's measurements, in the order they were taken.
+        order: (n,) float64 numbers among the static end's measurements, in the order they were
+            taken.
     """
 
     rows: Tensor
@@ -110,7 +117,8 @@ class Group(SlotPlaces):
 
     def thin_rows(self, limit: int) -> Group:
         """Return at most so many rows, drawn evenly."""
-        # One seed for all: groups with equal places keep equal ones, whose matrices are computed once.
+        # One seed for all: groups with equal places keep equal ones,
+        # whose matrices are computed once.
         return self.select_rows(torch.from_numpy(draw_rows(len(self), limit, 0)))
 
     def _tensors(self) -> dict[str, Tensor]:
@@ -145,8 +153,8 @@ def group_channels(data: Measurements, rows: np.ndarray, by_antenna: bool) -> tu
     Args:
         data: kind csi; one end is static, or there are several static stations, or both ends move.
         rows: measurements; those with a masked entry of a group are no rows of that group.
-        by_antenna: whether antennas with places of their own and far tones are groups of their own; else
-            columns of a station are one, measured at the moving end's place at the carrier.
+        by_antenna: whether antennas with places of their own and far tones are groups of their own;
+            else columns of a station are one, measured at the moving end's place at the carrier.
     """
     require_waves(data.site)
     # A copy of one station, or of all as one end that moves, sees one.
@@ -164,7 +172,9 @@ def group_channels(data: Measurements, rows: np.ndarray, by_antenna: bool) -> tu
             if not len(measured):
                 continue
             here = torch.from_numpy(measured)
-            chosen = target[here][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(len(here), -1)
+            chosen = target[here][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(
+                len(here), -1
+            )
             places = slot.antenna_places(moving[here], turned[here])
             when = torch.from_numpy(run[measured]), torch.from_numpy(order[rows[measured]])
             groups.append(Group(slot, places, here, chosen, *when))
@@ -182,12 +192,19 @@ def _order_in_station(data: Measurements) -> np.ndarray:
     return order
 
 
-def _slots_of_station(data: Measurements, station: int, rows: np.ndarray, by_antenna: bool) -> list[Slot]:
+def _slots_of_station(
+    data: Measurements, station: int, rows: np.ndarray, by_antenna: bool
+) -> list[Slot]:
     site, (antennas, tones) = data.site, data.target.shape[1:]
-    centre, carrier = torch.from_numpy(site.every_station.position[station]), float(site.carriers[station])
+    centre, carrier = (
+        torch.from_numpy(site.every_station.position[station]),
+        float(site.carriers[station]),
+    )
     every = tuple(range(antennas))
     if not by_antenna:
-        return [Slot(station, every, tuple(range(tones)), centre, ORIGIN, 2 * math.pi * carrier / LIGHT)]
+        return [
+            Slot(station, every, tuple(range(tones)), centre, ORIGIN, 2 * math.pi * carrier / LIGHT)
+        ]
     # The longest way between places bounds how far two tones' phases turn against each other.
     reach = float(np.linalg.norm(np.ptp(data.moving[rows], axis=0)))
     frequency = site.tones() if len(site.tones()) == tones else np.full(tones, carrier)
@@ -195,19 +212,24 @@ def _slots_of_station(data: Measurements, station: int, rows: np.ndarray, by_ant
     if site.array is not None and antennas == len(site.array) and antennas > 1:
         offsets = torch.from_numpy(np.asarray(site.array, np.float64))
         rotation = torch.from_numpy(np.asarray(data.rx_rotation[rows[0]], np.float64))
-        # Antennas of a moving receiver are offsets in its frame, those of a static one are static ends.
+        # Antennas of a moving receiver are offsets in its frame,
+        # those of a static one are static ends.
         moves = site.static_end == "tx"
         both = [(centre, one) if moves else (centre + rotation @ one, ORIGIN) for one in offsets]
         elements = [((number,), *pair) for number, pair in enumerate(both)]
     slots = []
     for band in coherent_bands(frequency, reach):
         wavenumber = 2 * math.pi * float(frequency[list(band)].mean()) / LIGHT
-        slots += [Slot(station, ports, band, end, element, wavenumber) for ports, end, element in elements]
+        slots += [
+            Slot(station, ports, band, end, element, wavenumber) for ports, end, element in elements
+        ]
     return slots
 
 
 def coherent_bands(frequency: np.ndarray, reach: float) -> list[tuple[int, ...]]:
-    """Return tones (K,) [Hz] in bands within which a wave's phase differs by `BAND_RAD` over `reach` [m]."""
+    """Return tones (K,) [Hz] in bands within which a wave's phase differs
+    by `BAND_RAD` over `reach` [m].
+    """
     # Of rows at one place (1 mm) a band is 48 GHz wide: all tones.
     width = BAND_RAD * LIGHT / (2 * math.pi * max(reach, NEAR_M))
     number = np.floor((frequency - frequency.min()) / width).astype(int)
@@ -222,10 +244,11 @@ def count_static_ends(groups: tuple[Group, ...]) -> int:
 def fit_run_factors(
     groups: tuple[Group, ...], covariances: list[Tensor], runs: int, factors: Tensor | None = None
 ) -> tuple[Tensor, list[tuple[Group, Conditioned]]]:
-    """Return factors of runs (runs,) complex128, as measured over the largest's, and groups without them.
+    """Return factors of runs (runs,) complex128, as measured over the largest's,
+    and groups without them.
 
-    Of several ends that share them phases alone: what a run has changed beside its phase is each end's own,
-    and would be taken for a level of all.
+    Of several ends that share them phases alone: what a run has changed beside its phase is each
+    end's own, and would be taken for a level of all.
 
     Args:
         groups: as measured.
@@ -235,20 +258,30 @@ def fit_run_factors(
     """
     solved = [Factor.from_gram(covariance) for covariance in covariances]
     if factors is None:
-        factors = torch.ones(1, dtype=torch.complex128) if runs == 1 else _fit_factors(groups, solved, runs)
+        factors = (
+            torch.ones(1, dtype=torch.complex128)
+            if runs == 1
+            else _fit_factors(groups, solved, runs)
+        )
     solutions = []
     for group, factor in zip(groups, solved, strict=True):
         target = group.target / factors[group.run][:, None]
-        solutions.append((replace(group, target=target), Conditioned(factor, target, factor.solve(target))))
+        solutions.append(
+            (replace(group, target=target), Conditioned(factor, target, factor.solve(target)))
+        )
     return factors, solutions
 
 
 def negative_log_likelihood(factors: Tensor, known: list[tuple[Group, Conditioned]]) -> float:
-    """Return the negative log likelihood [nats] of what `fit_run_factors` says, scales profiled out."""
+    """Return the negative log likelihood [nats] of what `fit_run_factors` says,
+    scales profiled out.
+    """
     nll = 0.0
     for group, process in known:
         count, outputs = process.values.shape
-        nll += outputs * (count * math.log(max(process.power, TINY)) + float(process.factor.log_determinant))
+        nll += outputs * (
+            count * math.log(max(process.power, TINY)) + float(process.factor.log_determinant)
+        )
         # Jacobian of the division by factors: without it the largest would be the likeliest.
         nll += 2 * outputs * float(factors.abs().log()[group.run].sum())
     return nll
@@ -269,10 +302,15 @@ def _fit_factors(groups: tuple[Group, ...], factors: list[Factor], runs: int) ->
     return measured / measured.abs() if count_static_ends(groups) > 1 else measured
 
 
-def thin_groups(groups: tuple[Group, ...], max_groups: int, max_rows: int | None = None) -> tuple[Group, ...]:
-    """Return at most `max_groups` groups, spread over all, of at most `max_rows` rows each, drawn evenly.
+def thin_groups(
+    groups: tuple[Group, ...], max_groups: int, max_rows: int | None = None
+) -> tuple[Group, ...]:
+    """Return at most `max_groups` groups, spread over all, of at most `max_rows` rows each,
+    drawn evenly.
 
     Groups of as many rows keep the same ones.
     """
-    chosen = np.unique(np.linspace(0, len(groups) - 1, min(max_groups, len(groups))).round().astype(int))
+    chosen = np.unique(
+        np.linspace(0, len(groups) - 1, min(max_groups, len(groups))).round().astype(int)
+    )
     return tuple(groups[number].thin_rows(max_rows) for number in chosen)

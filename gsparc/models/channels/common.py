@@ -21,8 +21,8 @@ class SharedGains:
     """Gains of the direct wave and of images in shared planes (J,), and the level of ends.
 
     Attributes:
-        gain: (J,) complex128 [m], the ends' mean times distances to the places' middle; of images the smaller
-            the less sure it is: small where phases are unrelated.
+        gain: (J,) complex128 [m], the ends' mean times distances to the places' middle; of images
+            the smaller the less sure it is: small where phases are unrelated.
         explained: (J,) [m^2] what knowing it takes from the power.
         level: [m^2] power that covariances are in units of.
     """
@@ -32,7 +32,9 @@ class SharedGains:
     level: float
 
     @staticmethod
-    def from_groups(prior: ChannelPrior, known: Sequence[tuple[Group, Tensor, float]]) -> SharedGains:
+    def from_groups(
+        prior: ChannelPrior, known: Sequence[tuple[Group, Tensor, float]]
+    ) -> SharedGains:
         """Estimate from groups, their inverse covariances times targets (n, D), and scales."""
         gains, levels = [], []
         for group, alpha, scale in known:
@@ -64,12 +66,16 @@ class SharedGains:
 
 
 def _waves_and_powers(prior: ChannelPrior, at: SlotPlaces) -> tuple[Tensor, Tensor, Tensor]:
-    """Waves (J, n) of an end and its images, powers (J,) of fixed gains and distances to the middle (J,)."""
+    """Waves (J, n) of an end and its images, powers (J,)
+    of fixed gains and distances to the middle (J,).
+    """
     terms = [term for term in prior.terms if isinstance(term, Spherical)]
     if not terms:
         none = at.places.new_zeros(0)
         return at.places.new_zeros(0, len(at.places), dtype=torch.complex128), none, none
-    each = [(term.waves(at), term.split_powers[0], term.source_distances(at.slot)) for term in terms]
+    each = [
+        (term.waves(at), term.split_powers[0], term.source_distances(at.slot)) for term in terms
+    ]
     waves, power, away = (torch.cat(parts) for parts in zip(*each, strict=True))
     return waves, power, away
 
@@ -77,4 +83,6 @@ def _waves_and_powers(prior: ChannelPrior, at: SlotPlaces) -> tuple[Tensor, Tens
 def _distance_to_middle(prior: ChannelPrior, slot: Slot) -> Tensor:
     """Distance () [m] of the end to the places' middle; 1 where no wave of it is known."""
     direct = prior.find_term(Direct)
-    return torch.ones((), dtype=torch.float64) if direct is None else direct.source_distances(slot)[0]
+    return (
+        torch.ones((), dtype=torch.float64) if direct is None else direct.source_distances(slot)[0]
+    )

@@ -1,10 +1,12 @@
-"""`model=complex_gp`: a Gaussian process on complex channels from the carrier alone, without sources.
+"""`model=complex_gp`: a Gaussian process on complex channels from the carrier alone,
+without sources.
 
-Waves from all around make neighbouring channels correlated as sin(kd) / (kd) (R. K. Cook et al., "Measurement
-of correlation coefficients in reverberant sound fields", J. Acoust. Soc. Am. 27 (1955)); a Matern-3/2
-envelope over distance bounds the correlation. Real and imaginary parts share one kernel: the circular complex
-process. Rows of a run (`Measurements.run`) share an unknown complex factor, estimated by likelihood;
-predictions at places are those of the largest run, those of measured rows their own run's where it is known.
+Waves from all around make neighbouring channels correlated as sin(kd) / (kd) (R. K. Cook et al.,
+"Measurement of correlation coefficients in reverberant sound fields", J. Acoust. Soc. Am. 27
+(1955)); a Matern-3/2 envelope over distance bounds the correlation. Real and imaginary parts share
+one kernel: the circular complex process. Rows of a run (`Measurements.run`) share an unknown
+complex factor, estimated by likelihood; predictions at places are those of the largest run, those
+of measured rows their own run's where it is known.
 """
 
 from __future__ import annotations
@@ -34,7 +36,12 @@ from gsparc.processes.density import TINY
 from gsparc.processes.few_rows import covering_rows
 from gsparc.processes.fit_kernel import fit_two_lengths, initial_kernel
 from gsparc.processes.kernel import IsotropicWaves, Kernel, WhiteNoise
-from gsparc.processes.nearest import NeighbourSample, PlaceValues, condition_on_nearest, nearest_density
+from gsparc.processes.nearest import (
+    NeighbourSample,
+    PlaceValues,
+    condition_on_nearest,
+    nearest_density,
+)
 from gsparc.processes.neighbourhood import Neighbourhood
 from gsparc.processes.places import ORIGIN
 from gsparc.processes.posterior import Exact, Posterior, approximation_label
@@ -90,15 +97,23 @@ class ComplexGP(ClosedForm):
         return self.require_fitted(self.posterior).prior.kernel
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Fit to `train` and `val`; `ValueError` unless the data are channels of a known carrier."""
+        """Fit to `train` and `val`; `ValueError` unless the data are channels
+        of a known carrier.
+        """
         started = Stopwatch()
         if not data.site.has_waves:
-            raise ValueError("complex_gp: needs complex channels (csi) of a known carrier; take model=gp")
+            raise ValueError(
+                "complex_gp: needs complex channels (csi) of a known carrier; take model=gp"
+            )
         fit_rows = fold.learned()
         self.site, self.shape = data.site, tuple(data.target.shape[1:])
         one_run = len(np.unique(data.runs_of(fit_rows))) == 1  # factors of several need all rows
         many = len(fit_rows) > MOST_ROWS and one_run
-        notes = self._fit_by_neighbours(data, fit_rows) if many else self._fit_one_factor(data, fit_rows)
+        notes = (
+            self._fit_by_neighbours(data, fit_rows)
+            if many
+            else self._fit_one_factor(data, fit_rows)
+        )
         length, noise = float(self.kernel.length), self.kernel.noise
         envelope = f"envelope {length:.3g} m, noise {noise:.0e} of the signal's power"
         return FitReport(started.seconds, tuple(f"complex_gp: {n}" for n in (envelope, *notes)))
@@ -110,11 +125,16 @@ class ComplexGP(ClosedForm):
         return wavelength
 
     def _choose_two_lengths(self, places: Tensor, values: Tensor) -> Kernel | None:
-        """The kernel of values (n, R) at places (n, D) [m] that were turned to neighbours; else None."""
+        """The kernel of values (n, R) at places (n, D) [m] that were turned to neighbours;
+        else None.
+        """
         if self.fitted_site.phase_reference != "neighbours":
             return None
         at = places.numpy()
-        kernel, rows = initial_kernel(self._wavelength, neighbour_distance(at)), (at, values.numpy())
+        kernel, rows = (
+            initial_kernel(self._wavelength, neighbour_distance(at)),
+            (at, values.numpy()),
+        )
         for _ in range(REFINED):
             kernel = fit_two_lengths(*rows, self._wavelength, kernel)
         return replace(kernel, amplitude=1.0)
@@ -132,7 +152,11 @@ class ComplexGP(ClosedForm):
     ) -> list[str]:
         """Rows (n,) with one factor, settings chosen on some unless given; factors of runs."""
         places, notes, every = torch.from_numpy(data.moving[known]), [], torch.arange(len(known))
-        target = torch.from_numpy(np.asarray(data.target[known])).reshape(len(known), -1).to(torch.complex128)
+        target = (
+            torch.from_numpy(np.asarray(data.target[known]))
+            .reshape(len(known), -1)
+            .to(torch.complex128)
+        )
         runs = data.runs_of(known)
         names, run = np.unique(runs, return_inverse=True)
         slot = replace(ANY, wavenumber=2 * math.pi / self._wavelength)
@@ -144,7 +168,9 @@ class ComplexGP(ClosedForm):
             kernel = self._choose_two_lengths(few.places, few.target)
             kernel = kernel or choose_waves((few,), len(names))[0]
         factors, ((_, solution),) = fit_run_factors((rows,), [kernel.gram(places)], len(names))
-        prior = Prior(replace(kernel, amplitude=max(float(solution.values.abs().square().mean()), TINY)))
+        prior = Prior(
+            replace(kernel, amplitude=max(float(solution.values.abs().square().mean()), TINY))
+        )
         self.posterior = Exact.from_values(prior, places, solution.values, None, solution.factor)
         self.runs = RunFactors(names.astype(np.int64), factors)
         if len(names) > 1:
@@ -152,9 +178,11 @@ class ComplexGP(ClosedForm):
         return notes
 
     def _fit_by_neighbours(self, data: Measurements, known: np.ndarray) -> list[str]:
-        """Rows (n,) of one run, too many for one factor: their channels, and settings given neighbours.
+        """Rows (n,) of one run, too many for one factor: their channels,
+        and settings given neighbours.
 
-        A hundred nearest rows of one place, where a robot waited, tell of no other: its mean is taken once.
+        A hundred nearest rows of one place, where a robot waited, tell of no other:
+        its mean is taken once.
         """
         targets = take(data.target, known).reshape(len(known), -1)
         first, means, count = mean_at_places(data.moving[known], targets)
@@ -189,7 +217,9 @@ class ComplexGP(ClosedForm):
             for name, factor in zip(names, factors, strict=False)
         )
         more = f", and {len(names) - NAMED} more" if len(names) > NAMED else ""
-        return f"factors of runs, relative to run {names[np.bincount(run).argmax()]:g}: {listed}{more}"
+        return (
+            f"factors of runs, relative to run {names[np.bincount(run).argmax()]:g}: {listed}{more}"
+        )
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
@@ -197,7 +227,9 @@ class ComplexGP(ClosedForm):
         posterior = process.answer(query.places(self.fitted_site), dtype == torch.float64)
         share = posterior.variance / (1 + self.kernel.noise)
         mean = posterior.mean.to(dtype.to_complex()).reshape(-1, *self.shape)
-        prediction = Prediction(mean, (self.kernel.amplitude * share).to(dtype), share.to(dtype).clamp(0, 1))
+        prediction = Prediction(
+            mean, (self.kernel.amplitude * share).to(dtype), share.to(dtype).clamp(0, 1)
+        )
         return self.runs.apply_factors(prediction, query.run)
 
     def count_components(self) -> int:
@@ -213,18 +245,25 @@ def _mean_square(channels: np.ndarray) -> np.ndarray:
 def wave_kernels(wavelength: float) -> Iterator[Kernel]:
     """Yield candidates of an envelope's length, and for each of them of noise."""
     for length, noise in product(LENGTHS, NOISES):
-        yield Kernel((IsotropicWaves(length * wavelength, 1.0, 2 * math.pi / wavelength), WhiteNoise(noise)))
+        yield Kernel(
+            (IsotropicWaves(length * wavelength, 1.0, 2 * math.pi / wavelength), WhiteNoise(noise))
+        )
 
 
 def choose_waves(groups: tuple[Group, ...], runs: int) -> tuple[Kernel, Tensor]:
-    """Return the likeliest waves, of the first group's wavelength, and factors of runs, as measured."""
+    """Return the likeliest waves, of the first group's wavelength, and factors of runs,
+    as measured.
+    """
     trials: list[tuple[float, Kernel, Tensor]] = []
     candidates = wave_kernels(2 * math.pi / groups[0].slot.wavenumber)
     for _, kernels in groupby(candidates, lambda one: one.signals[0]):
         first, *others = kernels
         one = cast(IsotropicWaves, first.signals[0])
         waves = [replace(one, wavenumber=group.slot.wavenumber) for group in groups]
-        alike = [one.covariance(rows.places, rows.places) for one, rows in zip(waves, groups, strict=True)]
+        alike = [
+            one.covariance(rows.places, rows.places)
+            for one, rows in zip(waves, groups, strict=True)
+        ]
         for kernel in (first, *others):
             grams = [each + kernel.noise * torch.eye(len(each), dtype=each.dtype) for each in alike]
             factors, solutions = fit_run_factors(groups, grams, runs)

@@ -1,4 +1,5 @@
-"""Powers of noise that is correlated over the order of rows, by likelihood with all other terms held.
+"""Powers of noise that is correlated over the order of rows,
+by likelihood with all other terms held.
 
 They are found on a stretch of rows, since correlation over the order needs neighbours in it.
 """
@@ -46,7 +47,9 @@ def fit_drift(
         eye = torch.eye(len(group), dtype=torch.float64)
         pieces = signal[None], drift.correlations(group, group).to(torch.complex128)
         # No parameter of these terms changes the signal.
-        parts.append(BasisGroup.from_group(group, eye, pieces, torch.eye(1 + len(SHARES)).double()[:, 1:]))
+        parts.append(
+            BasisGroup.from_group(group, eye, pieces, torch.eye(1 + len(SHARES)).double()[:, 1:])
+        )
     white = torch.tensor([1.0, 0.0, 0.0, level], dtype=torch.float64)
     before = sum(solve_group(part, white).nll for part in parts)
     fitted, least = fit_terms(parts, (drift, noise), 0.0, STEPS)

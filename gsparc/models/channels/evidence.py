@@ -24,7 +24,8 @@ from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.density import TINY
 from gsparc.processes.left_out import left_out_residuals as left_out_rows
 
-WEAK = 1e-3  # pull of every parameter to where it started, which holds those that nothing depends on
+# Pull of every parameter to where it started, which holds those that nothing depends on
+WEAK = 1e-3
 STEPS = 30
 SETTLED = 1e-6  # relative change of the objective at which steps end
 
@@ -38,8 +39,10 @@ class BasisGroup:
     Attributes:
         group: whose, with targets of unit mean square.
         basis: (n, r) float64 of orthonormal columns.
-        pieces: (p, r, r) complex128 of each term of the signal, in the order of powers; the noise has none.
-        design: (P, Q), logarithms of own powers are its products with all parameters of signal and noise.
+        pieces: (p, r, r) complex128 of each term of the signal, in the order of powers; the noise
+            has none.
+        design: (P, Q), logarithms of own powers are its products with all parameters of signal and
+            noise.
         target: (r, D) complex128.
         rest: sum of squares outside the basis.
     """
@@ -52,7 +55,9 @@ class BasisGroup:
     rest: float
 
     @staticmethod
-    def from_group(group: Group, basis: Tensor, pieces: tuple[Tensor, ...], design: Tensor) -> BasisGroup:
+    def from_group(
+        group: Group, basis: Tensor, pieces: tuple[Tensor, ...], design: Tensor
+    ) -> BasisGroup:
         """Return it with the group's targets in the basis."""
         target = basis.T.to(torch.complex128) @ group.target
         rest = max(float(group.target.abs().square().sum() - target.abs().square().sum()), 0.0)
@@ -98,7 +103,8 @@ def normalise_power(group: Group) -> Group:
 def compress_groups(
     groups: tuple[Group, ...], prior: ChannelPrior, cache: Cache | None = None
 ) -> tuple[BasisGroup, ...]:
-    """Return signals of all groups; of one set of displacements and wavelength they share the basis.
+    """Return signals of all groups; of one set of displacements
+    and wavelength they share the basis.
 
     `cache` keeps matrices of places that further candidates and groups need again.
     """
@@ -108,7 +114,9 @@ def compress_groups(
     for group in groups:
         key = group.displacement_key, group.slot.wavenumber, prior.frame.envelope, noise
         alike = partial(prior[Isotropic].correlation, group, group)
-        basis = get_or_make(cache, key, partial(Basis.from_matrix, key, group.places, alike, noise, cache))
+        basis = get_or_make(
+            cache, key, partial(Basis.from_matrix, key, group.places, alike, noise, cache)
+        )
         pieces = tuple(term.unit_covariances_in_basis(group, basis) for term in prior.signals)
         design = torch.block_diag(*(term.design(group.slot) for term in learned_terms(prior)))
         parts.append(BasisGroup.from_group(group, basis.columns, pieces, design))
@@ -192,16 +200,23 @@ def fit_terms(
         return total, gradient.numpy()
 
     optimum = minimize(
-        cost_and_slopes, begin.numpy(), jac=True, method="L-BFGS-B", bounds=bounds,
+        cost_and_slopes,
+        begin.numpy(),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=bounds,
         options={"maxiter": steps, "ftol": SETTLED},
-    )  # fmt: skip
+    )
     found = torch.from_numpy(optimum.x)
-    fitted = tuple(term.with_values(values) for term, values in zip(terms, found.split(sizes), strict=True))
+    fitted = tuple(
+        term.with_values(values) for term, values in zip(terms, found.split(sizes), strict=True)
+    )
     return fitted, sum(solve_group(part, (part.design @ found).exp()).nll for part in parts)
 
 
 def left_out_errors(part: BasisGroup, power: Tensor, groupings: list[Grouping]) -> list[Tensor]:
-    """Return errors (n, D) of rows left out in groups, of each grouping (Rasmussen and Williams, 5.12).
+    """Return errors (n, D) of rows left out in groups,
+    of each grouping (Rasmussen and Williams, 5.12).
 
     Powers (P,) are its own.
     """

@@ -1,4 +1,6 @@
-"""Channels of one static end or several as a Gaussian process of waves, conditioned on measured rows."""
+"""Channels of one static end or several as a Gaussian process of waves,
+conditioned on measured rows.
+"""
 
 from __future__ import annotations
 
@@ -64,9 +66,11 @@ class GroupWeights:
 
     @cached_property
     def root(self) -> Tensor:
-        """(n, n), inverse of `lower`: real where that is, in single precision where variances allow it.
+        """(n, n), inverse of `lower`: real where that is,
+        in single precision where variances allow it.
 
-        A row's covariances c with all rows, its noise included, have c^H C^-1 c = C_ii: that tells the error.
+        A row's covariances c with all rows, its noise included, have c^H C^-1 c = C_ii:
+        that tells the error.
         """
         whole = self.given.factor.lower
         lower = whole.real.contiguous() if self.is_real else whole
@@ -79,7 +83,9 @@ class GroupWeights:
         return short if float(error) <= ROUNDED * self.noise else root
 
     def explained_variance(self, cross: Tensor) -> Tensor:
-        """Return the variance (m,) that the rows take away from places of covariances (m, n) with them."""
+        """Return the variance (m,) that the rows take away from places of covariances (m, n)
+        with them.
+        """
         cross = (cross.real if self.is_real else cross).to(self.root.dtype)
         return (cross.conj() @ self.root.T).abs().square().sum(1)
 
@@ -150,7 +156,9 @@ class ChannelField(ClosedForm):
         runs = np.unique(data.runs_of(self.rows))
         self._condition_groups(group_channels(data, self.rows, self.by_antenna), runs, None)
 
-    def _condition_groups(self, groups: tuple[Group, ...], runs: np.ndarray, factors: Tensor | None) -> None:
+    def _condition_groups(
+        self, groups: tuple[Group, ...], runs: np.ndarray, factors: Tensor | None
+    ) -> None:
         """Set the weights; factors of `runs` (R,), as measured, are estimated unless given."""
         prior = self.prior
         both = zip(prior.signal_covariances(groups), groups, strict=True)
@@ -159,7 +167,8 @@ class ChannelField(ClosedForm):
         self.runs = RunFactors(runs, factors)
         rest = prior.noise, prior.is_real
         self.weights = tuple(
-            GroupWeights(group, solution, max(solution.power, TINY), *rest) for group, solution in solutions
+            GroupWeights(group, solution, max(solution.power, TINY), *rest)
+            for group, solution in solutions
         )
         self.stations = {}
         for model in self.weights:
@@ -171,8 +180,8 @@ class ChannelField(ClosedForm):
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`.
 
-        Without stations those at the static places are asked, the first of several at one. Of one that no
-        row was learned of, what ends have in common answers (`SharedGains`).
+        Without stations those at the static places are asked, the first of several at one. Of one
+        that no row was learned of, what ends have in common answers (`SharedGains`).
         """
         # The longest group's covariance with a chunk is the largest matrix of an answer.
         longest = max(len(each.group) for each in self.require_fitted(self.weights or None))
@@ -191,8 +200,12 @@ class ChannelField(ClosedForm):
         )
         return self.runs.apply_factors(prediction, query.run)
 
-    def _predict_part(self, ends: Ends, dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Mean and images' share (B, A, K) of parts `dtype`, variance after and before learning (B,)."""
+    def _predict_part(
+        self, ends: Ends, dtype: torch.dtype
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Mean and images' share (B, A, K) of parts `dtype`,
+        variance after and before learning (B,).
+        """
         prior, images, size = self.prior, self.prior.find_term(Images), math.prod(self.channel)
         mean = torch.zeros(len(ends.moving), *self.channel, dtype=dtype.to_complex())
         # Without images it is not told, and needs no memory of its own.
@@ -200,7 +213,9 @@ class ChannelField(ClosedForm):
         after, before = (torch.zeros(len(ends.moving), dtype=torch.float64) for _ in range(2))
         exact = dtype == torch.float64
 
-        def add_slot(slot: Slot, rows: Tensor, values: Tensor, variance: Tensor, power: Tensor) -> None:
+        def add_slot(
+            slot: Slot, rows: Tensor, values: Tensor, variance: Tensor, power: Tensor
+        ) -> None:
             slot.write_entries(mean, rows, values)
             for total, part in ((after, variance), (before, power)):
                 # Variances are means over all A K entries, of which this slot has so many.
@@ -211,18 +226,31 @@ class ChannelField(ClosedForm):
             crosses = prior.end_covariances(slot_places, [model.group for model, _, _ in alike])
             for (model, here, _), at, cross in zip(alike, slot_places, crosses, strict=True):
                 if images is not None:
-                    at.slot.write_entries(share, here, model.given.mean(images.covariance(at, model.group)))
+                    at.slot.write_entries(
+                        share, here, model.given.mean(images.covariance(at, model.group))
+                    )
                 # In float64 slopes of variances are asked for, which a rounded root would spoil.
-                removed = model.given.explained_variance(cross) if exact else model.explained_variance(cross)
+                removed = (
+                    model.given.explained_variance(cross)
+                    if exact
+                    else model.explained_variance(cross)
+                )
                 whole = prior.variance(at) + prior.disturbance_variance
                 posterior_variance = model.scale * (whole - removed).clamp_min(0)
-                add_slot(at.slot, here, model.given.mean(cross), posterior_variance, model.scale * whole)
-        unheard = torch.tensor([one not in self.stations for one in ends.station.tolist()], dtype=torch.bool)
+                add_slot(
+                    at.slot, here, model.given.mean(cross), posterior_variance, model.scale * whole
+                )
+        unheard = torch.tensor(
+            [one not in self.stations for one in ends.station.tolist()], dtype=torch.bool
+        )
         for place in ends.still[unheard].detach().unique(dim=0):
             here = torch.nonzero(unheard & (ends.still == place).all(1)).flatten()
             if self.common is None:
-                raise ValueError("waves: one static end was learned from, which tells nothing of another")
-            for model in next(iter(self.stations.values())):  # what ends have in common, in its entries
+                raise ValueError(
+                    "waves: one static end was learned from, which tells nothing of another"
+                )
+            # What ends have in common, in its entries
+            for model in next(iter(self.stations.values())):
                 slot, outputs = model.group.slot, model.group.target.shape[1]
                 # Antennas of the new end stand about its place as those of the known one do.
                 middle = torch.from_numpy(self.site.every_station.position[slot.station])
@@ -233,7 +261,9 @@ class ChannelField(ClosedForm):
         return mean, share, after, before
 
     def _group_by_places(self, ends: Ends) -> list[list[tuple[GroupWeights, Tensor, Tensor]]]:
-        """Weights with the queries (m,) they answer and their places (m, 3), in lists of equal places."""
+        """Weights with the queries (m,) they answer and their places (m, 3),
+        in lists of equal places.
+        """
         alike: dict[tuple[Any, ...], list[tuple[GroupWeights, Tensor, Tensor]]] = {}
         for number in ends.station.unique().tolist():
             here = torch.nonzero(ends.station == number).flatten()
@@ -251,14 +281,19 @@ class ChannelField(ClosedForm):
         What rows have in common by their order alone is not predicted: no query has it.
         """
         mean = torch.zeros(len(self.rows), *self.channel, dtype=torch.complex64)
-        variance, entries = torch.zeros(len(self.rows)).double(), torch.zeros(len(self.rows)).double()
+        variance, entries = (
+            torch.zeros(len(self.rows)).double(),
+            torch.zeros(len(self.rows)).double(),
+        )
         for model in self.require_fitted(self.weights or None):
             group, outputs = model.group, model.group.target.shape[1]
             other = self.prior.disturbance(group).to(torch.complex128)
             residual, error = model.given.left_out_signal(other)
             assert error is not None
             predicted = group.target - residual
-            group.slot.write_entries(mean, group.rows, predicted * self.runs.factors[group.run][:, None])
+            group.slot.write_entries(
+                mean, group.rows, predicted * self.runs.factors[group.run][:, None]
+            )
             # Weighed by entries of the group, as the sum is divided by those of all groups.
             level = model.scale * outputs * self.runs.factors[group.run].abs().square()
             variance.index_add_(0, group.rows, error * level)
@@ -269,9 +304,12 @@ class ChannelField(ClosedForm):
         """See `Method.state`; factors are computed again by `restore`."""
         groups = [each.group for each in self.require_fitted(self.weights or None)]
         return {
-            "prior": self.prior.state(), "channel": list(self.channel), "rows": torch.from_numpy(self.rows),
-            "runs": to_plain(self.runs), "groups": [group.state(self.runs.factors) for group in groups],
-        }  # fmt: skip
+            "prior": self.prior.state(),
+            "channel": list(self.channel),
+            "rows": torch.from_numpy(self.rows),
+            "runs": to_plain(self.runs),
+            "groups": [group.state(self.runs.factors) for group in groups],
+        }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""

@@ -1,9 +1,9 @@
 """Which terms a field of channels has, and their powers, from training rows.
 
-The isotropic process comes first, chosen as `model=complex_gp` chooses. Every further term is kept where the
-marginal likelihood gains more than its parameters are worth (G. Schwarz, "Estimating the dimension of a
-model", Ann. Statist. 6 (1978)) and rows are predicted better without their neighbours: each alone, in 32
-cells of nearby places and in 8.
+The isotropic process comes first, chosen as `model=complex_gp` chooses. Every further term is kept
+where the marginal likelihood gains more than its parameters are worth (G. Schwarz, "Estimating the
+dimension of a model", Ann. Statist. 6 (1978)) and rows are predicted better without their
+neighbours: each alone, in 32 cells of nearby places and in 8.
 """
 
 from __future__ import annotations
@@ -52,7 +52,8 @@ COLUMNS = 8  # static ends, antennas or bands of tones that terms are decided on
 ENDS = 64  # of several static ends, those that powers are learned on in the end
 CONCENTRATION = 8.0  # of each direction, that of a von Mises-Fisher density
 SHRINKAGE = 0.5  # of directions' powers towards their mean, in rows of the inverse Gamma prior
-ALIGNED = 1_500  # rows that tell factors of runs: two degrees from those of 2,400, in a third of the time
+# Rows that tell factors of runs: two degrees from those of 2,400, in a third of the time
+ALIGNED = 1_500
 DEPTHS = (5, 3)  # cells of places are halved this often: 32 of them, and 8
 GAINS = (1.5, 6.0)  # wavelengths, candidates of the length over which a source's gain varies
 LEAST = 1e-3  # of all powers: sources below are dropped
@@ -60,7 +61,8 @@ SHARED = 0.3  # of the power, what directions have in common before they are lea
 NEW = 0.2  # of the isotropic field's power, where that of a new term starts
 SHORT = 8  # steps of a fit that compares lengths, or that is followed by another
 ROUGH_ENDS, ROUGH_ROWS = 12, 150  # that planes are looked for with, before all ends say which it is
-DENSE_ROWS, DENSE_COLUMNS = 300, 2  # learned on where places are so far apart that nothing can be compressed
+# Learned on where places are so far apart that nothing can be compressed
+DENSE_ROWS, DENSE_COLUMNS = 300, 2
 WEAKEST = 0.03  # of the diffuse field's power, a direction's beyond that of the weakest, to be kept
 BETTER = 0.995  # least ratio of left-out errors, after over before a term, at which it is kept
 NO_WORSE = 1.1  # largest of any one of them
@@ -77,7 +79,8 @@ class ChannelSettings:
         correlated: noise that is correlated over the order of rows.
         angles: directions of the diffuse field, of a half sphere where all places are in one plane.
         rows: measurements that powers are learned on at most; `Effort.term_rows` in `find_terms`.
-        tied: directions whose powers depend on the angle to the end as well, of a half sphere where flat.
+        tied: directions whose powers depend on the angle to the end as well, of a half sphere where
+            flat.
         narrow: concentration of each of these.
         knots: in that angle.
         mirrors: planes that several static ends share, at most; 0 for none.
@@ -100,9 +103,10 @@ class TermCandidate:
     """Terms with their powers, and how well they do.
 
     Attributes:
-        nll: negative log marginal likelihood [nats], the same rows for all candidates, plus what the
-            parameters must gain.
-        errors: squared errors, left out one by one and in the cells of `DEPTHS`, relative to the power.
+        nll: negative log marginal likelihood [nats], the same rows for all candidates, plus what
+            the parameters must gain.
+        errors: squared errors, left out one by one and in the cells of `DEPTHS`, relative to the
+            power.
     """
 
     prior: ChannelPrior
@@ -112,7 +116,9 @@ class TermCandidate:
     def beats(self, other: TermCandidate) -> bool:
         """Tell whether likelihood and left-out places prefer this one."""
         ratio = self.errors / other.errors
-        return self.nll < other.nll and bool(np.exp(np.log(ratio).mean()) < BETTER and ratio.max() < NO_WORSE)
+        return self.nll < other.nll and bool(
+            np.exp(np.log(ratio).mean()) < BETTER and ratio.max() < NO_WORSE
+        )
 
 
 def find_terms(
@@ -131,7 +137,9 @@ def find_terms(
     """
     start, factors, note = _fit_isotropic(data, rows, effort)
     every = group_channels(data, rows, True)
-    every = tuple(normalise_power(replace(g, target=g.target / factors[g.run][:, None])) for g in every)
+    every = tuple(
+        normalise_power(replace(g, target=g.target / factors[g.run][:, None])) for g in every
+    )
     most = effort.term_rows
     groups, cache = thin_groups(every, COLUMNS, most), Cache()
     if compress_groups(groups[:1], start, cache)[0].is_uncompressed:
@@ -151,12 +159,18 @@ def estimate_run_factors(data: Measurements, rows: np.ndarray, effort: Effort) -
     groups = thin_groups(group_channels(data, rows, True), COLUMNS, ALIGNED)
     both = zip(prior.signal_covariances(groups), groups, strict=True)
     runs = np.unique(data.runs_of(rows))
-    factors, _ = fit_run_factors(groups, [a + prior.disturbance(group) for a, group in both], len(runs))
+    factors, _ = fit_run_factors(
+        groups, [a + prior.disturbance(group) for a, group in both], len(runs)
+    )
     return RunFactors(runs, factors)
 
 
-def _fit_isotropic(data: Measurements, rows: np.ndarray, effort: Effort) -> tuple[ChannelPrior, Tensor, str]:
-    """Envelope and noise on the grid of `complex_gp`, the factors of runs, as measured, and a note."""
+def _fit_isotropic(
+    data: Measurements, rows: np.ndarray, effort: Effort
+) -> tuple[ChannelPrior, Tensor, str]:
+    """Envelope and noise on the grid of `complex_gp`, the factors of runs, as measured,
+    and a note.
+    """
     groups = group_channels(data, rows, False)
     looked = thin_groups(groups, COLUMNS, effort.chosen_on)
     runs = len(np.unique(data.runs_of(rows)))
@@ -218,11 +232,19 @@ class _Search:
         has_places = all(bool(torch.isfinite(group.slot.end).all()) for group in self.groups)
         direct = (has_places or not one_end) and wanted.direct
         if direct or (wanted.constant and one_end):
-            append_better(self._add_leakage_and_direct(steps[-1], direct), "leakage and direct wave")
-        if wanted.mirrors and steps[-1].prior.find_term(Direct) and count_static_ends(self.every) > 1:
+            append_better(
+                self._add_leakage_and_direct(steps[-1], direct), "leakage and direct wave"
+            )
+        if (
+            wanted.mirrors
+            and steps[-1].prior.find_term(Direct)
+            and count_static_ends(self.every) > 1
+        ):
             mirrored = self._add_mirrors(steps[-1])
             if mirrored is not None:
-                append_better(mirrored, f"mirror planes of all ends ({len(mirrored.prior[Images].planes)})")
+                append_better(
+                    mirrored, f"mirror planes of all ends ({len(mirrored.prior[Images].planes)})"
+                )
         if wanted.directions and one_end:
             append_better(self._add_directions(steps[-1]), "directions")
         if count_static_ends(self.every) > 1:
@@ -237,7 +259,8 @@ class _Search:
         ratio = after.errors / before.errors
         gain = (before.nll - after.nll) / sum(group.target.numel() for group in self.groups)
         notes.append(
-            f"waves: {name} {'kept' if keep else 'dropped'}: error times {ratio[0]:.3f} at left-out rows, "
+            f"waves: {name} {'kept' if keep else 'dropped'}: error times {ratio[0]:.3f} at "
+            "left-out rows, "
             f"{ratio[1]:.3f} and {ratio[2]:.3f} in small and large squares; "
             f"log likelihood {gain:+.3f} a channel"
         )
@@ -293,7 +316,9 @@ class _Search:
     def _add_mirrors(self, before: TermCandidate) -> TermCandidate | None:
         """With images in planes that all ends share; None where none is found."""
         prior = before.prior
-        rough = replace(self, groups=thin_groups(self.every, ROUGH_ENDS, ROUGH_ROWS))._compress(prior)
+        rough = replace(self, groups=thin_groups(self.every, ROUGH_ENDS, ROUGH_ROWS))._compress(
+            prior
+        )
         wide = replace(self, groups=thin_groups(self.every, ENDS, self.settings.rows))
         most = self.settings.mirrors
         planes = find_mirrors(rough, wide._compress(prior), prior, self.wavelength, most)
@@ -305,35 +330,49 @@ class _Search:
         heard = images.power.view(2, -1).sum(0) > LEAST * power.sum()
         if bool(heard.all()) or not bool(heard.any()):
             return mirrored
-        heard_images = replace(images, power=images.power[heard.repeat(2)], planes=images.planes[heard])
+        heard_images = replace(
+            images, power=images.power[heard.repeat(2)], planes=images.planes[heard]
+        )
         return self._refit(mirrored.prior.with_terms(heard_images))
 
     def _add_directions(self, before: TermCandidate) -> TermCandidate:
-        """With unequal powers of directions, which start equal; weak ones are told from none no longer."""
+        """With unequal powers of directions, which start equal;
+        weak ones are told from none no longer.
+        """
         prior = self._set_directions(before.prior, self.settings.angles, CONCENTRATION)
         prior, _ = fit_powers(self._compress(prior), prior, SHRINKAGE, 2 * SHORT)
         return self._refit(_drop_weak_directions(prior))
 
     def _refit_on_all_ends(self, steps: list[TermCandidate], known: bool, notes: list[str]) -> None:
-        """Offset and powers from all ends; directions' powers by their angles to ends, where that gains."""
+        """Offset and powers from all ends; directions' powers by their angles to ends,
+        where that gains.
+        """
         wide = replace(self, groups=thin_groups(self.every, ENDS, self.settings.rows))
         steps.append(wide._refit(steps[-1].prior))
         steps.append(wide._move_static_ends(steps[-1]))
         if known and self.settings.directions:
             setup = self.settings
-            tied = wide._refit(self._set_directions(steps[-1].prior, setup.tied, setup.narrow, setup.knots))
+            tied = wide._refit(
+                self._set_directions(steps[-1].prior, setup.tied, setup.narrow, setup.knots)
+            )
             steps.append(wide._choose(steps[-1], tied, "directions by angles to ends", notes))
 
     def _set_directions(
         self, prior: ChannelPrior, count: int, concentration: float, knots: int = 0
     ) -> ChannelPrior:
         """With so many directions in place of those there are, of equal powers and factors."""
-        group, isotropic, old = max(self.groups, key=len), prior[Isotropic], prior.find_term(Directions)
+        group, isotropic, old = (
+            max(self.groups, key=len),
+            prior[Isotropic],
+            prior.find_term(Directions),
+        )
         angles = spread_directions(group.places, group.slot.wavenumber, count)
         level = isotropic.power if old is None else isotropic.power + old.power.sum()
         power = ((1 - SHARED) * level / len(angles)).repeat(len(angles))
         towards = torch.zeros(knots, dtype=torch.float64)
-        fresh = Directions(prior.frame, power, angles=angles, concentration=concentration, towards=towards)
+        fresh = Directions(
+            prior.frame, power, angles=angles, concentration=concentration, towards=towards
+        )
         return prior.with_terms(replace(isotropic, power=SHARED * level), fresh)
 
     def _add_drift(self, before: TermCandidate, notes: list[str]) -> TermCandidate:
@@ -345,9 +384,15 @@ class _Search:
             for sums, at in zip(errors, (before.prior, prior), strict=True):
                 other = at.disturbance(group).to(torch.complex128)
                 gp = Conditioned.from_gram(signal + other, group.target)
-                residuals = [gp.left_out_signal(other, rows)[0] for rows in _left_out_groupings(group.places)]
+                residuals = [
+                    gp.left_out_signal(other, rows)[0] for rows in _left_out_groupings(group.places)
+                ]
                 sums += [float(error.abs().square().mean()) / len(groups) for error in residuals]
         worth = math.log(sum(2 * group.target.numel() for group in groups))  # of two powers
         after = TermCandidate(prior, worth - gain, errors[1])
         start = replace(before, nll=0.0, errors=errors[0])
-        return after if self._choose(start, after, "noise correlated over rows", notes) is after else before
+        return (
+            after
+            if self._choose(start, after, "noise correlated over rows", notes) is after
+            else before
+        )

@@ -1,9 +1,10 @@
-"""Correlations of wave fields over displacements, with complex values where waves prefer directions.
+"""Correlations of wave fields over displacements,
+with complex values where waves prefer directions.
 
 The diffuse field of a von Mises-Fisher density of directions with mean u and concentration c is
-`c / sinh(c) sinh(z) / z`, `z^2 = c^2 - (k d)^2 + 2 j c k u.d` (N. Ueno, S. Koyama and H. Saruwatari,
-"Directionally weighted wave field estimation exploiting prior information on source direction", IEEE Trans.
-Signal Process. 69 (2021)); without concentration it is sin(kd) / (kd).
+`c / sinh(c) sinh(z) / z`, `z^2 = c^2 - (k d)^2 + 2 j c k u.d` (N. Ueno, S. Koyama and H.
+Saruwatari, "Directionally weighted wave field estimation exploiting prior information on source
+direction", IEEE Trans. Signal Process. 69 (2021)); without concentration it is sin(kd) / (kd).
 """
 
 from __future__ import annotations
@@ -51,14 +52,24 @@ def directional_correlation(squared: Tensor, along: Tensor, concentration: float
         a, b = torch.where(real > 0, larger, smaller), torch.where(real > 0, smaller, larger)
         rising, falling = a.exp(), (-a).exp()
         x, y = (rising - falling).mul_(b.cos()), rising.add_(falling).mul_(b.sin())
-        share = size.clamp_min_(SMALL**2).reciprocal_().mul_(0.5 * concentration / math.sinh(concentration))
-        return torch.complex((x * a).addcmul_(y, b).mul_(share), y.mul_(a).sub_(x.mul_(b)).mul_(share))
+        share = (
+            size.clamp_min_(SMALL**2)
+            .reciprocal_()
+            .mul_(0.5 * concentration / math.sinh(concentration))
+        )
+        return torch.complex(
+            (x * a).addcmul_(y, b).mul_(share), y.mul_(a).sub_(x.mul_(b)).mul_(share)
+        )
 
 
-def isotropic_correlation(a: Tensor, b: Tensor, wavenumber: float, length: Tensor | float) -> Tensor:
-    """Return the correlation (..., n, m) float64 of waves from everywhere alike, in an envelope [m].
+def isotropic_correlation(
+    a: Tensor, b: Tensor, wavenumber: float, length: Tensor | float
+) -> Tensor:
+    """Return the correlation (..., n, m) float64 of waves from everywhere alike,
+    in an envelope [m].
 
-    Where both ends move, waves leave in all directions as they arrive from all: the product over the ends.
+    Where both ends move, waves leave in all directions as they arrive from all:
+    the product over the ends.
 
     Args:
         a, b: (..., n, 3) and (..., m, 3) [m] of one end, or (..., 6) of both.
@@ -67,7 +78,9 @@ def isotropic_correlation(a: Tensor, b: Tensor, wavenumber: float, length: Tenso
 
 
 def spherical_wave(places: Tensor, source: Tensor, wavenumber: float, reference: Tensor) -> Tensor:
-    """Return the wave `reference / r exp(-j k r)` (n,) complex128 at places (n, 3) of a source (3,) [m]."""
+    """Return the wave `reference / r exp(-j k r)` (n,) complex128 at places (n, 3)
+    of a source (3,) [m].
+    """
     away = ((places - source).square().sum(-1) + NEAR_M**2).sqrt()
     # The amplitude stops growing a quarter of a wavelength away, where no antenna is a point.
     level = reference / (away.square() + (math.pi / 2 / wavenumber) ** 2).sqrt()
@@ -83,7 +96,9 @@ def fibonacci_sphere(count: int) -> Tensor:
 
 
 def spread_directions(places: Tensor, wavenumber: float, count: int) -> Tensor:
-    """Return `count` directions (count, 3): of the sphere, or a half where places (n, 3) lie in a plane."""
+    """Return `count` directions (count, 3): of the sphere, or a half where places (n, 3)
+    lie in a plane.
+    """
     centred = places - places.mean(0)
     few = torch.eye(places.shape[1], dtype=torch.float64)
     axes = torch.linalg.svd(centred, full_matrices=False).Vh if len(places) > 2 else few

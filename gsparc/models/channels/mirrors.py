@@ -1,9 +1,11 @@
-"""Mirror planes that several static ends share, by the likelihood of their images at all ends together.
+"""Mirror planes that several static ends share,
+by the likelihood of their images at all ends together.
 
-A plane mirrors every end, each image with a complex gain of its own whose power all ends share: a wall that
-one antenna hardly shows is seen by many. Upright and level planes are looked at on a grid, the best are moved
-to where the likelihood is largest, and one by one kept while it rises by more than their numbers are worth
-(G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978)).
+A plane mirrors every end, each image with a complex gain of its own whose power all ends share: a
+wall that one antenna hardly shows is seen by many. Upright and level planes are looked at on a
+grid, the best are moved to where the likelihood is largest, and one by one kept while it rises by
+more than their numbers are worth (G. Schwarz, "Estimating the dimension
+of a model", Ann. Statist. 6 (1978)).
 """
 
 from __future__ import annotations
@@ -34,7 +36,8 @@ PROMISING = 2000  # planes that are looked at again after the first was found
 STARTS = 3  # planes that are moved to their best, of which the best is tried
 APART = 1.0  # wavelengths between the images of some end in two of them
 REFINED = 5  # halvings of the step
-LEAST = 0.1  # rise of the log likelihood per channel [nats]: fewer are not worth the time that images take
+# Rise of the log likelihood per channel [nats]: fewer are not worth the time that images take
+LEAST = 0.1
 PARAMETERS = 4  # of a plane: two angles, an offset and a power
 
 LOOKED_AT = 32  # planes that tell what is known of all of a grid
@@ -75,7 +78,10 @@ class _Searcher:
 
     def separate_planes(self, grid: Tensor, scores: Tensor) -> list[Tensor]:
         """Return the best planes whose images of the ends are apart."""
-        placed, near = Images.from_planes(self.frame, grid).mirror_ends(self.ends), APART * self.wavelength
+        placed, near = (
+            Images.from_planes(self.frame, grid).mirror_ends(self.ends),
+            APART * self.wavelength,
+        )
 
         def alike(one: int, other: int) -> bool:
             return bool((placed[:, one] - placed[:, other]).norm(dim=-1).max() < near)
@@ -83,7 +89,9 @@ class _Searcher:
         return [*grid[keep_apart(scores.argsort(descending=True).tolist(), alike, STARTS)]]
 
     def refine_plane(self, plane: Tensor, turn: float) -> tuple[Tensor, float, float]:
-        """Return a plane (4,) where its likelihood is largest, its level, and what it gains [nats]."""
+        """Return a plane (4,) where its likelihood is largest, its level,
+        and what it gains [nats].
+        """
         middle, shift = self.frame.middle, STEP * self.wavelength / 2
         normal, away = plane[:-1], plane[-1]
         across = torch.linalg.cross(normal, UP)
@@ -106,9 +114,12 @@ class _Searcher:
 
 
 def find_mirrors(
-    coarse: tuple[BasisGroup, ...], parts: tuple[BasisGroup, ...], prior: ChannelPrior,
-    wavelength: float, max_planes: int,
-) -> Tensor:  # fmt: skip
+    coarse: tuple[BasisGroup, ...],
+    parts: tuple[BasisGroup, ...],
+    prior: ChannelPrior,
+    wavelength: float,
+    max_planes: int,
+) -> Tensor:
     """Return planes (W, 4) float64, local; none where all together are not worth it.
 
     Args:
@@ -118,7 +129,9 @@ def find_mirrors(
         wavelength: [m].
         max_planes: planes.
     """
-    rough, probes = (tuple(Probe.from_group(part, prior) for part in each) for each in (coarse, parts))
+    rough, probes = (
+        tuple(Probe.from_group(part, prior) for part in each) for each in (coarse, parts)
+    )
     search = _Searcher(rough, probes, prior.frame, wavelength)
     numbers = sum(2 * probe.group.target.numel() for probe in probes)
     worth = math.log(numbers) / 2
@@ -129,7 +142,9 @@ def find_mirrors(
         if not len(search.planes):
             top = scores.topk(min(PROMISING, len(grid))).indices
             grid, scores = grid[top], scores[top]
-        moved = [search.refine_plane(start, turn / 2) for start in search.separate_planes(grid, scores)]
+        moved = [
+            search.refine_plane(start, turn / 2) for start in search.separate_planes(grid, scores)
+        ]
         plane, level, gain = max(moved, key=lambda m: m[2])
         if gain < PARAMETERS * worth:
             break
@@ -137,10 +152,16 @@ def find_mirrors(
     return search.planes if 2 * search.risen > LEAST * numbers else search.planes[:0]
 
 
-def planes_and_azimuth_step(probes: Probes, frame: Frame, wavelength: float) -> tuple[Tensor, float]:
-    """Return upright and level planes (m, 4) about places and ends, and the step of their azimuths [rad]."""
+def planes_and_azimuth_step(
+    probes: Probes, frame: Frame, wavelength: float
+) -> tuple[Tensor, float]:
+    """Return upright and level planes (m, 4) about places and ends,
+    and the step of their azimuths [rad].
+    """
     places = torch.cat([probe.group.places for probe in probes])
-    points = torch.cat([places, torch.stack([probe.group.slot.end for probe in probes]) + frame.offset])
+    points = torch.cat(
+        [places, torch.stack([probe.group.slot.end for probe in probes]) + frame.offset]
+    )
     extent = float(torch.linalg.vector_norm(places.amax(0) - places.amin(0)))
     # Of a half turn: walls, those across them and diagonal ones are all there.
     quarter = math.ceil(math.pi**2 / 2 * extent / wavelength / TURN_RAD)
@@ -151,15 +172,21 @@ def planes_and_azimuth_step(probes: Probes, frame: Frame, wavelength: float) -> 
     for normal in torch.cat([normals, UP[None]]):
         low, high = (points @ normal).aminmax()
         margin = max(MARGIN * float(high - low), LEAST_MARGIN_M)
-        number = min(max(int((float(high - low) + 2 * margin) / (STEP * wavelength)), 2), MOST_OFFSETS)
-        offsets = torch.linspace(float(low) - margin, float(high) + margin, number, dtype=torch.float64)
+        number = min(
+            max(int((float(high - low) + 2 * margin) / (STEP * wavelength)), 2), MOST_OFFSETS
+        )
+        offsets = torch.linspace(
+            float(low) - margin, float(high) + margin, number, dtype=torch.float64
+        )
         offsets = offsets[(offsets - frame.middle @ normal).abs() > STEP * wavelength]
         planes.append(torch.cat([normal.expand(len(offsets), -1), offsets[:, None]], 1))
     return torch.cat(planes), turn
 
 
 def _approximate_precision(probe: Probe, waves: Tensor) -> Tensor:
-    """`Probe.wave_precision` by that of a few: an isotropic field knows waves from everywhere alike."""
+    """`Probe.wave_precision` by that of a few:
+    an isotropic field knows waves from everywhere alike.
+    """
     size = waves.abs().square().sum(1)
     few = evenly_spaced(len(waves), LOOKED_AT)
     share = probe.wave_precision(waves[few]).sum() / size[few].sum().clamp_min(TINY)

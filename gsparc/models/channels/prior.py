@@ -34,7 +34,9 @@ class ChannelPrior(Stored):
         return found
 
     def with_terms(self, *terms: ChannelTerm) -> ChannelPrior:
-        """Return the prior with these in place of their kinds; those without powers are left out."""
+        """Return the prior with these in place of their kinds;
+        those without powers are left out.
+        """
         by_class = {type(term): term for term in (*self.terms, *terms)}
         # In the order of `KINDS`: parameters of terms stand one after the other in vectors.
         ordered = (by_class[one] for one in dict.fromkeys([*KINDS, *by_class]) if one in by_class)
@@ -76,13 +78,17 @@ class ChannelPrior(Stored):
         return torch.cat([term.power for term in self.terms if not term.is_signal]).sum()
 
     def end_covariances(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterator[Tensor]:
-        """Yield covariances (n, m) complex128 of several ends' signals, see `ChannelTerm.end_covariances`."""
+        """Yield covariances (n, m) complex128 of several ends' signals,
+        see `ChannelTerm.end_covariances`.
+        """
         for parts in zip(*(term.end_covariances(a, b) for term in self.signals), strict=True):
             # From the first part on: `0 + tensor` would copy a matrix for nothing.
             yield sum(parts[1:], parts[0]).to(torch.complex128)
 
     def signal_covariances(self, groups: Sequence[Group]) -> list[Tensor]:
-        """Return covariances (n, n) complex128 of groups' signals; what equal places share is made once."""
+        """Return covariances (n, n) complex128 of groups' signals;
+        what equal places share is made once.
+        """
         alike: dict[tuple[bytes, float], list[int]] = {}
         for number, group in enumerate(groups):
             alike.setdefault((group.displacement_key, group.slot.wavenumber), []).append(number)

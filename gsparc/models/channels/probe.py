@@ -1,4 +1,6 @@
-"""What one more wave of known shape would gain in likelihood, and where static ends really are by that."""
+"""What one more wave of known shape would gain in likelihood,
+and where static ends really are by that.
+"""
 
 from __future__ import annotations
 
@@ -48,7 +50,11 @@ class Probe:
     @staticmethod
     def from_group(part: BasisGroup, prior: ChannelPrior) -> Probe:
         """Factor a group's covariance with its own powers."""
-        at, basis, noise = solve_group(part, part.powers(prior)), part.basis.to(torch.complex128), prior.noise
+        at, basis, noise = (
+            solve_group(part, part.powers(prior)),
+            part.basis.to(torch.complex128),
+            prior.noise,
+        )
         alpha = basis @ at.given.weights + (part.group.target - basis @ part.target) / noise
         inverse = at.given.factor.inverse
         root = basis @ Factor.from_gram(inverse + 1e-12 * torch.eye(len(inverse))).lower
@@ -57,13 +63,17 @@ class Probe:
     def wave_precision(self, waves: Tensor) -> Tensor:
         """Return f^H C^-1 f (m,) float64 of waves (m, n)."""
         inside, basis, downdate = (
-            (waves.conj() @ each).abs().square().sum(1) for each in (self.root, self.basis, self.downdate)
+            (waves.conj() @ each).abs().square().sum(1)
+            for each in (self.root, self.basis, self.downdate)
         )
         outside = waves.abs().square().sum(1) - basis
         return (inside + outside.clamp_min(0) / self.noise - downdate).clamp_min(0)
 
-    def likelihood_gain(self, waves: Tensor, level: float, precision: Tensor | None = None) -> Tensor:
-        """Return log likelihood gains (m,) [nats] by each of waves (m, n) complex128 alone, of some power.
+    def likelihood_gain(
+        self, waves: Tensor, level: float, precision: Tensor | None = None
+    ) -> Tensor:
+        """Return log likelihood gains (m,) [nats] by each of waves (m, n) complex128 alone,
+        of some power.
 
         `precision` (m,) stands in for `known(waves)`.
         """
@@ -77,28 +87,38 @@ class Probe:
         dual = dual + (wave - self.basis @ (self.basis.mH @ wave)) / self.noise
         share = level / (1 + level * float((wave.conj() @ dual).real))
         alpha = self.alpha - share * dual[:, None] * (wave.conj() @ self.alpha)[None]
-        return replace(self, alpha=alpha, downdate=torch.cat([self.downdate, share**0.5 * dual[:, None]], 1))
+        return replace(
+            self, alpha=alpha, downdate=torch.cat([self.downdate, share**0.5 * dual[:, None]], 1)
+        )
 
 
 def likelihood_gains(
-    probes: Sequence[Probe], count: int, waves_of: Callable[[Probe, Tensor], Tensor], levels: Sequence[float],
+    probes: Sequence[Probe],
+    count: int,
+    waves_of: Callable[[Probe, Tensor], Tensor],
+    levels: Sequence[float],
     wave_precision: Callable[[Probe, Tensor], Tensor] = Probe.wave_precision,
-) -> Tensor:  # fmt: skip
-    """Return log likelihood gains (count, levels) of all groups; `waves_of` (m, n) are of numbers (m,)."""
+) -> Tensor:
+    """Return log likelihood gains (count, levels) of all groups; `waves_of` (m, n)
+    are of numbers (m,).
+    """
     total = torch.zeros(count, len(levels), dtype=torch.float64)
     for probe in probes:
         for chunk in torch.arange(count).split(max(ENTRIES // len(probe.group), 1)):
             raise_if_cancelled()
             each = waves_of(probe, chunk)
             size = wave_precision(probe, each)
-            total[chunk] += torch.stack([probe.likelihood_gain(each, level, size) for level in levels], 1)
+            total[chunk] += torch.stack(
+                [probe.likelihood_gain(each, level, size) for level in levels], 1
+            )
     return total
 
 
 def find_static_offset(
     parts: tuple[BasisGroup, ...], prior: ChannelPrior, wavelength: float
 ) -> Tensor | None:
-    """Return the likeliest offset (3,) float64 [m] on a grid that is refined, or None for none better.
+    """Return the likeliest offset (3,) float64 [m] on a grid that is refined,
+    or None for none better.
 
     Beside the direct wave all terms are held as they are, its varying gain left out.
     """
@@ -108,7 +128,10 @@ def find_static_offset(
 
     def log_posterior_gain(offsets: Tensor) -> Tensor:
         def direct_waves(probe: Probe, chunk: Tensor) -> Tensor:
-            moved = (replace(direct, frame=replace(direct.frame, offset=offset)) for offset in offsets[chunk])
+            moved = (
+                replace(direct, frame=replace(direct.frame, offset=offset))
+                for offset in offsets[chunk]
+            )
             return torch.cat([at.waves(probe.group) for at in moved])
 
         likely = -0.5 * (offsets / (REACH * wavelength)).square().sum(1)

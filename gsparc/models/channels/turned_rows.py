@@ -1,8 +1,9 @@
 """What stands beside the process of channels whose rows were turned to their neighbours.
 
-Errors of such channels are counted after a phase (and delay) of the row's own is taken out. The mean of a
-process, taken before, is too weak for that, the more the farther rows are: coherent sums of what is not
-coherent fade. And turning rows of one neighbourhood to each other asks less than turning all rows.
+Errors of such channels are counted after a phase (and delay) of the row's own is taken out. The
+mean of a process, taken before, is too weak for that, the more the farther rows are: coherent sums
+of what is not coherent fade. And turning rows of one neighbourhood to each other asks less
+than turning all rows.
 """
 
 from __future__ import annotations
@@ -29,7 +30,9 @@ TRIED = 1_000  # rows that tell how far neighbours are off
 
 
 class FullPowerGP(ComplexGP):
-    """The process, its mean at the power that is expected once a phase of the row's own is taken out."""
+    """The process, its mean at the power that is expected once a phase
+    of the row's own is taken out.
+    """
 
     name = "full_power_gp"
 
@@ -39,7 +42,9 @@ class FullPowerGP(ComplexGP):
         assert prediction.variance is not None
         power = prediction.mean.abs().square().flatten(1).mean(1).clamp_min(TINY_POWER)
         level = (1 + COHERENT * prediction.variance / power).sqrt()
-        return replace(prediction, mean=prediction.mean * level.view(-1, *[1] * (prediction.mean.dim() - 1)))
+        return replace(
+            prediction, mean=prediction.mean * level.view(-1, *[1] * (prediction.mean.dim() - 1))
+        )
 
 
 class TurnedNeighbours(InverseDistance, ClosedForm):
@@ -57,7 +62,10 @@ class TurnedNeighbours(InverseDistance, ClosedForm):
             sample_rows = covering_rows(positions, TRIED, 0)
             mean, spread = self._turn_nearest(positions[sample_rows], skip=1)
             turned = (
-                mean * align_factors(mean, targets[sample_rows], self._tones, self._unknown_factor)[:, None]
+                mean
+                * align_factors(mean, targets[sample_rows], self._tones, self._unknown_factor)[
+                    :, None
+                ]
             )
             missed = (np.abs(turned - targets[sample_rows]) ** 2).mean()
             self.scale = float(missed / max(spread.mean(), TINY_POWER))
@@ -75,7 +83,9 @@ class TurnedNeighbours(InverseDistance, ClosedForm):
         return "phase" if self.fitted_site.unknown_factor == "phase" else "phase+delay"
 
     def _turn_nearest(self, queries: np.ndarray, skip: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        """Means (q, A, K) of the nearest rows but the first `skip`, and what these differ by (q,)."""
+        """Means (q, A, K) of the nearest rows but the first `skip`,
+        and what these differ by (q,).
+        """
         means, spread = np.empty((len(queries), *self.shape), np.complex128), np.empty(len(queries))
         count = min(self.neighbours, len(self.positions) - skip)
         for part in row_blocks(means):
@@ -86,7 +96,9 @@ class TurnedNeighbours(InverseDistance, ClosedForm):
             mean = near[:, 0]
             for _ in range(ROUNDS):
                 onto = np.repeat(mean[:, None], count, 1).reshape(-1, *self.shape)
-                turns = align_factors(near.reshape(-1, *self.shape), onto, self._tones, self._unknown_factor)
+                turns = align_factors(
+                    near.reshape(-1, *self.shape), onto, self._tones, self._unknown_factor
+                )
                 near = near * turns.reshape(len(mean), count, 1, len(self._tones))
                 mean = (weight * near).sum(1)
             means[part] = mean

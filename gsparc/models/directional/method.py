@@ -1,8 +1,10 @@
-"""`model=directional_gp`: sources triangulated from directions of arrival, channels by one regression.
+"""`model=directional_gp`: sources triangulated from directions of arrival,
+channels by one regression.
 
-Rays of several receivers intersect at images of the transmitter, and the receivers with a ray to an image are
-those that see it. With positions and visibility known a channel is linear in the sources' gains: what this
-search proposes, and refines by phases of channels, `SightedSources` conditions on the rows.
+Rays of several receivers intersect at images of the transmitter, and the receivers with a ray to an
+image are those that see it. With positions and visibility known a channel is linear in the sources'
+gains: what this search proposes, and refines by phases of channels,
+`SightedSources` conditions on the rows.
 """
 
 from __future__ import annotations
@@ -19,36 +21,53 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.closed_form import LeftOutRows, Moments, from_containers, to_containers
 from gsparc.models.directional.position_refine import PositionRefinement, UncertainPositions
-from gsparc.models.directional.posterior import CONSTANTS, LENGTHS_M, NOISES, GainKernel, SightedSources
+from gsparc.models.directional.posterior import (
+    CONSTANTS,
+    LENGTHS_M,
+    NOISES,
+    GainKernel,
+    SightedSources,
+)
 from gsparc.models.directional.triangulation import Rays, triangulate
 from gsparc.models.directional.visibility import RayErrorRates, VisibilityGP, entries_to_flip
-from gsparc.models.image_sources.frame import SourceFrame, SourcePaths, SourcesInFrame, require_static_phase
+from gsparc.models.image_sources.frame import (
+    SourceFrame,
+    SourcePaths,
+    SourcesInFrame,
+    require_static_phase,
+)
 from gsparc.models.image_sources.rows import LEAST_ROWS, rows_of_measurements
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.physics.waves import point_wave, wave_over_band
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.stopwatch import Stopwatch
 
-MIN_SEEN = 2  # receivers with a ray to a source; of more than `SearchSettings.max_sources` those seen by most
+# Receivers with a ray to a source; of more than `SearchSettings.max_sources` those seen by most
+MIN_SEEN = 2
 MAX_RECEIVERS = 1000  # subsampled beyond: the cost of intersections grows with their square
 REFINEMENT_ROWS = 400  # rows used for position refinement
 REFINEMENT_KERNEL = GainKernel(CONSTANTS[1], LENGTHS_M[1], NOISES[1])  # meanwhile
-VISIBILITY_UPDATES, REFIT_EVERY = 9, 3  # rounds, each of which changes one entry per receiver at most
+# Rounds, each of which changes one entry per receiver at most
+VISIBILITY_UPDATES, REFIT_EVERY = 9, 3
 
 
 class DirectionalGP(SourcesInFrame):
-    """Gaussian process on channels of a moving receiver with measured directions; queries need none.
+    """Gaussian process on channels of a moving receiver with measured directions;
+    queries need none.
 
     Args:
         rows: largest number of receivers times tones in the regression.
         seed: of the subsample.
-        visibility: whether receivers see the sources that their rays point at; else every one sees all.
+        visibility: whether receivers see the sources that their rays point at; else every one sees
+            all.
     """
 
     name = "directional_gp"
     posterior: SightedSources
 
-    def __init__(self, rows: int = SearchSettings.rows, seed: int = 0, visibility: bool = True) -> None:
+    def __init__(
+        self, rows: int = SearchSettings.rows, seed: int = 0, visibility: bool = True
+    ) -> None:
         if rows < LEAST_ROWS:
             raise ValueError(f"directional_gp: rows must be at least {LEAST_ROWS}, got {rows}")
         self.row_limit, self.seed, self.visibility = rows, seed, visibility
@@ -58,7 +77,8 @@ class DirectionalGP(SourcesInFrame):
         """Learn from `train` and `val`.
 
         Raises:
-            ValueError: no channels of a moving receiver, no directions, or rays that do not intersect.
+            ValueError: no channels of a moving receiver, no directions, or rays that do not
+                intersect.
         """
         started = Stopwatch()
         require_static_phase(data.site, self.name)
@@ -66,7 +86,9 @@ class DirectionalGP(SourcesInFrame):
             raise ValueError("directional_gp: needs directions of arrival; this dataset has none")
         rows = fold.learned()
         if len(rows) > MAX_RECEIVERS:
-            rows = np.sort(np.random.default_rng(self.seed).choice(rows, MAX_RECEIVERS, replace=False))
+            rows = np.sort(
+                np.random.default_rng(self.seed).choice(rows, MAX_RECEIVERS, replace=False)
+            )
         places = data.rx_position[rows].astype(np.float64)
         rays = Rays.from_receivers(
             places, [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in rows]
@@ -75,12 +97,16 @@ class DirectionalGP(SourcesInFrame):
         seen = torch.from_numpy(clusters.seen_points(rays))
         sources = torch.nonzero(seen.sum(0) >= MIN_SEEN).flatten()
         if not len(sources):
-            raise ValueError("directional_gp: the directions of arrival do not intersect at any source")
+            raise ValueError(
+                "directional_gp: the directions of arrival do not intersect at any source"
+            )
         order = seen[:, sources].sum(0).argsort(descending=True, stable=True)
         sources = sources[order[: SearchSettings.max_sources]]
         everything = rows_of_measurements(data, rows, self.row_limit, self.seed)
         self.frame = SourceFrame.from_rows(data.site, data.target.shape[1], everything)
-        points, covariance = (torch.from_numpy(v)[sources] for v in (clusters.points, clusters.covariance))
+        points, covariance = (
+            torch.from_numpy(v)[sources] for v in (clusters.points, clusters.covariance)
+        )
         at = {int(row): k for k, row in enumerate(rows)}
         seen = seen[:, sources] if self.visibility else torch.ones_like(seen[:, sources])
         self.posterior = SightedSources(
@@ -100,7 +126,8 @@ class DirectionalGP(SourcesInFrame):
             changed = f"{pairs} pairs of receiver and source seen or hidden otherwise by channels; "
         self.posterior.precompute()
         note = (
-            f"directional_gp: {self.count_components()} sources where directions cross, direction error "
+            f"directional_gp: {self.count_components()} sources where directions cross, "
+            "direction error "
             f"{math.degrees(clusters.error):.2g} degrees; {changed}"
             f"{self.posterior.kernel.constant:.1%} of the gains' variance alike at all places"
         )
@@ -125,7 +152,8 @@ class DirectionalGP(SourcesInFrame):
         self.posterior = replace(self.posterior, power=few.power, kernel=few.kernel)
 
     def _update_visibility(self) -> int:
-        """Update visibility by the channels (see `entries_to_flip`); returns how many entries changed.
+        """Update visibility by the channels (see `entries_to_flip`);
+        returns how many entries changed.
 
         Only with one row per receiver: more of them determine the gains of their own receiver.
         """
@@ -138,7 +166,10 @@ class DirectionalGP(SourcesInFrame):
             if turn % REFIT_EVERY == REFIT_EVERY - 1:
                 self._refit_powers_and_kernel()
             now = self.posterior
-            one = now.mean_gains(now.arrival_at_rows(probability)) * now.unobstructed_waves[:, :, None]
+            one = (
+                now.mean_gains(now.arrival_at_rows(probability))
+                * now.unobstructed_waves[:, :, None]
+            )
             seen, odds = visibility.seen.float(), rates.log_odds_seen(rays, probability)
             flip = entries_to_flip(seen[rows], odds[rows], *now.conditioned.left_out(), one)
             if not bool(flip.any()):
@@ -156,7 +187,10 @@ class DirectionalGP(SourcesInFrame):
 
     def points_and_amplitudes(self) -> Found:
         """Return places [m], local, and amplitudes of the sources, to start a search from."""
-        return self.posterior.positions.points + self._fitted_frame().middle, self.posterior.power.sqrt()
+        return (
+            self.posterior.positions.points + self._fitted_frame().middle,
+            self.posterior.power.sqrt(),
+        )
 
     # ---- answers ----
     def _predict_normalised(self, places: Tensor, tones: Tensor, float64: bool) -> Moments:
@@ -176,7 +210,9 @@ class DirectionalGP(SourcesInFrame):
 
     def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """Return receivers, each predicted from all others; its own visibility is left out, too."""
-        return self._fitted_frame().to_left_out_rows(self.posterior.rows, self.posterior.predict_left_out())
+        return self._fitted_frame().to_left_out_rows(
+            self.posterior.rows, self.posterior.predict_left_out()
+        )
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""

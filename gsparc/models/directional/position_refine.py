@@ -1,15 +1,16 @@
-"""Uncertain positions of triangulated sources, refined to a fraction of a wavelength by phases of channels.
+"""Uncertain positions of triangulated sources,
+refined to a fraction of a wavelength by phases of channels.
 
-A source at an uncertain position has an unknown relative phase at receivers far apart. Averaged over a
-position of covariance S, signals received in directions u and u' have the covariance of a known position
-times
+A source at an uncertain position has an unknown relative phase at receivers far apart. Averaged
+over a position of covariance S, signals received in directions u and u' have the covariance of a
+known position times
 
     exp(-|L^T (v - v')|^2 / 2),   v = 2 pi f u / c,   S = L L^T .
 
-Sources are refined one after the other under the likelihood in which all others keep their current position
-uncertainty: many positions are drawn from the triangulation's posterior, the best
-are refined by Gauss-Newton steps, and a source is resolved where one optimum is clearly the best. One with
-several similar optima stays uncertain until others are resolved.
+Sources are refined one after the other under the likelihood in which all others keep their current
+position uncertainty: many positions are drawn from the triangulation's posterior, the best
+are refined by Gauss-Newton steps, and a source is resolved where one optimum is clearly the best.
+One with several similar optima stays uncertain until others are resolved.
 """
 
 from __future__ import annotations
@@ -64,7 +65,9 @@ class UncertainPositions:
         jitter = torch.full_like(self.points, JITTER_M2).diag_embed()
         return Factor.from_gram(self.covariance + jitter, "raise").lower
 
-    def phase_vectors(self, places: Tensor, frequency: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+    def phase_vectors(
+        self, places: Tensor, frequency: Tensor, dtype: torch.dtype = torch.float32
+    ) -> Tensor:
         """Return (K, n, 3) [rad], `L^T v` for places (n, 3) [m] and frequencies (n,) or () [Hz]."""
         slope = wave_vectors(self.points, places, frequency)
         return (slope @ self.covariance_factors).to(dtype)
@@ -76,12 +79,16 @@ class UncertainPositions:
     def incoherent(self, places: Tensor, frequency: Tensor) -> Tensor:
         """Return indices of the sources that are not coherent over these places."""
         phase_vectors = self.phase_vectors(places, frequency)
-        spread = (phase_vectors - phase_vectors.mean(1, keepdim=True)).square().sum(-1).amax(1).sqrt()
+        spread = (
+            (phase_vectors - phase_vectors.mean(1, keepdim=True)).square().sum(-1).amax(1).sqrt()
+        )
         return torch.nonzero(spread > SHARP_RAD).flatten()
 
 
 def wave_vectors(points: Tensor, places: Tensor, frequency: Tensor) -> Tensor:
-    """Return gradients (K, n, 3) float64 [rad/m] of received phases by sources' positions, up to a sign."""
+    """Return gradients (K, n, 3) float64 [rad/m] of received phases by sources' positions,
+    up to a sign.
+    """
     hertz = torch.as_tensor(frequency, dtype=torch.float64).reshape(-1, 1)
     return normalize(points[:, None] - places[None], dim=-1) * (2 * math.pi / LIGHT * hertz)
 
@@ -118,7 +125,9 @@ class PositionRefinement:
         uncertain = self.prior.incoherent(self.rows.position, self.rows.frequency)
         if not len(uncertain):
             return self.current  # directions were exact: nothing to refine
-        self.terms = torch.stack([self._source_covariance(k) for k in range(len(self.prior.points))])
+        self.terms = torch.stack(
+            [self._source_covariance(k) for k in range(len(self.prior.points))]
+        )
         mean_power = float(self.terms.diagonal(dim1=1, dim2=2).real.sum(0).mean())
         self.power = torch.full((len(self.terms),), 1 / max(mean_power, TINY))
         self.resolved = torch.zeros(len(self.terms), dtype=torch.bool)
@@ -138,7 +147,11 @@ class PositionRefinement:
         one = self.current.select(torch.tensor([k]))
         wave = spherical_waves(self.rows, one.points)[:, 0] * self.visible[:, k]
         phase_vectors = one.phase_vectors(self.rows.position, self.rows.frequency)
-        return wave[:, None] * wave.conj() * (self.correlation * coherence(phase_vectors, phase_vectors)[0])
+        return (
+            wave[:, None]
+            * wave.conj()
+            * (self.correlation * coherence(phase_vectors, phase_vectors)[0])
+        )
 
     def sum_source_covariances(self, without: int | None = None) -> Tensor:
         """Return the covariance (n, n) of the rows by all sources but one."""
@@ -154,30 +167,43 @@ class PositionRefinement:
         """
         outputs = self.rows.target.shape[1]
         for _ in range(POWER_UPDATES):
-            solution = condition_with_noise(self.sum_source_covariances(), self.noise, self.rows.target)
+            solution = condition_with_noise(
+                self.sum_source_covariances(), self.noise, self.rows.target
+            )
             explained = (solution.weights.conj() * (self.terms @ solution.weights)).real.sum((1, 2))
             due = outputs * (solution.factor.inverse.conj() * self.terms).real.sum((1, 2))
-            self.power = self.power * (explained / due.clamp_min(TINY)).clamp(1 / MAX_RATIO, MAX_RATIO)
-            self.power = self.power.clamp_max(MAX_POWER * float(self.power.median())).clamp_min(TINY)
+            self.power = self.power * (explained / due.clamp_min(TINY)).clamp(
+                1 / MAX_RATIO, MAX_RATIO
+            )
+            self.power = self.power.clamp_max(MAX_POWER * float(self.power.median())).clamp_min(
+                TINY
+            )
             residual = float(solution.weights.abs().square().sum())
             ratio = residual / (outputs * float(solution.factor.inverse.diagonal().real.sum()))
             self.noise = max(self.noise * min(max(ratio, 1 / MAX_RATIO), MAX_RATIO), MIN_NOISE)
         return solution.nll
 
     def _refine_source(self, k: int) -> None:
-        """Position and covariance of source k given its rays, the channels and all other sources."""
+        """Position and covariance of source k given its rays,
+        the channels and all other sources.
+        """
         conditional = ConditionalLikelihood(self, k)
         if self.resolved[k]:
             places = self.current.points[k][None]
         else:
-            places = conditional.select_separated(self._draw_positions(k), CELL / 2 * self.wavelength)
+            places = conditional.select_separated(
+                self._draw_positions(k), CELL / 2 * self.wavelength
+            )
         places, spreads = conditional.refine(places)
         log_posterior = conditional.log_posterior(places) + 0.5 * torch.linalg.slogdet(spreads)[1]
         best = int(log_posterior.argmax())
         offset = places - places[best]
         same = ((offset @ torch.linalg.inv(spreads[best])) * offset).sum(1) < SAME_SIGMAS**2
         same |= offset.norm(dim=1) < CELL / 2 * self.wavelength
-        if 1 / (1 + float((log_posterior[~same] - log_posterior[best]).exp().sum())) < MIN_PROBABILITY:
+        if (
+            1 / (1 + float((log_posterior[~same] - log_posterior[best]).exp().sum()))
+            < MIN_PROBABILITY
+        ):
             return
         points, covariance = self.current.points.clone(), self.current.covariance.clone()
         points[k], covariance[k], self.resolved[k] = places[best], spreads[best], True
@@ -207,7 +233,9 @@ class ConditionalLikelihood:
 
     def __init__(self, refinement: PositionRefinement, k: int) -> None:
         rows, prior = refinement.rows, refinement.prior
-        solution = condition_with_noise(refinement.sum_source_covariances(k), refinement.noise, rows.target)
+        solution = condition_with_noise(
+            refinement.sum_source_covariances(k), refinement.noise, rows.target
+        )
         in_view = torch.nonzero(refinement.visible[:, k] > 0).flatten()
         self.rows, self.alpha = rows.select_rows(in_view), solution.weights[in_view]
         self.inverse = solution.factor.inverse[in_view[:, None], in_view]
@@ -224,13 +252,17 @@ class ConditionalLikelihood:
         return (self.power * matched / scale - self.alpha.shape[1] * scale.log()).double() - rays
 
     def select_separated(self, points: Tensor, distance: float) -> Tensor:
-        """Return the best `REFINED` of positions (m, 3), at least `distance` [m] from each other."""
+        """Return the best `REFINED` of positions (m, 3),
+        at least `distance` [m] from each other.
+        """
         order = self.log_posterior(points).argsort(descending=True).tolist()
         near = torch.cdist(points, points) < distance
         return points[keep_apart(order, lambda i, j: bool(near[i, j]), REFINED)]
 
     def refine(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Return positions (m, 3) after Gauss-Newton steps at the best gain, and covariances (m, 3, 3)."""
+        """Return positions (m, 3) after Gauss-Newton steps at the best gain,
+        and covariances (m, 3, 3).
+        """
         best, step_scale = self.log_posterior(points), torch.ones(len(points), dtype=torch.float64)
         for _ in range(STEPS):
             step, _ = self._steps_and_covariances(points)
@@ -243,15 +275,21 @@ class ConditionalLikelihood:
         return points, self._steps_and_covariances(points)[1]
 
     def _steps_and_covariances(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Gauss-Newton steps (m, 3) at positions (m, 3), and covariances (m, 3, 3) by Fisher information."""
+        """Gauss-Newton steps (m, 3) at positions (m, 3), and covariances (m, 3, 3)
+        by Fisher information.
+        """
         waves = spherical_waves(self.rows, points)  # (n, m)
         whitened = self.inverse @ waves
         gain_precision = (waves.conj() * whitened).real.sum(0) + 1 / self.power
         gain = (waves.mH @ self.alpha) / gain_precision[:, None]  # (m, R)
-        phase_vectors = wave_vectors(points, self.rows.position, self.rows.frequency).float()  # (m, n, 3)
+        # (m, n, 3)
+        phase_vectors = wave_vectors(points, self.rows.position, self.rows.frequency).float()
         slope = waves.T[:, :, None] * phase_vectors * -1j
         along = torch.einsum("nm,mnc->mc", whitened.conj(), slope)
-        visible = self.inverse @ slope - whitened.T[:, :, None] * (along / gain_precision[:, None])[:, None]
+        visible = (
+            self.inverse @ slope
+            - whitened.T[:, :, None] * (along / gain_precision[:, None])[:, None]
+        )
         power = gain.abs().square().sum(1)[:, None, None]
         fisher = 2 * (power * (slope.mH @ visible).real).double()
         residual = self.alpha - whitened.T[:, :, None] * gain[:, None]  # K^-1 (y - a g), (m, n, R)

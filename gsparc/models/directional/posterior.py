@@ -2,10 +2,11 @@
 
     h(x, f) = sum_k m_k(x) g_k(x) exp(-j 2 pi f r_k / c) / r_k + noise,   m_k(x) in {0, 1}
 
-with m known at the receivers and a probability elsewhere. The gains are circular Gaussian processes as in
-`image_sources.gp_likelihood`, nearly constant over places. All share one correlation over places, so that the
-covariance of n rows is one product of waves however many sources there are, and a query's correlations are
-those of one kernel; what is uncertain of a source's place multiplies its own part (`coherence`).
+with m known at the receivers and a probability elsewhere. The gains are circular Gaussian processes
+as in `image_sources.gp_likelihood`, nearly constant over places. All share one correlation over
+places, so that the covariance of n rows is one product of waves however many sources there are, and
+a query's correlations are those of one kernel;
+what is uncertain of a source's place multiplies its own part (`coherence`).
 """
 
 from __future__ import annotations
@@ -49,7 +50,9 @@ class GainKernel:
     length: float
     noise: float
 
-    def correlation(self, first: Tensor, second: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+    def correlation(
+        self, first: Tensor, second: Tensor, dtype: torch.dtype = torch.float32
+    ) -> Tensor:
         """Return the correlation (n, m) of places (n, 3) and (m, 3) float64 [m]."""
         squared = (distances(first, second) / self.length).square()
         return (self.constant + (1 - self.constant) * matern32_of_squares(squared)).to(dtype)
@@ -118,13 +121,16 @@ class SightedSources:
     @cached_property
     def phase_vectors(self) -> Tensor:
         """(K', n, 3) of uncertain sources, see `UncertainPositions.phase_vectors`."""
-        return self.positions.select(self.incoherent).phase_vectors(self.rows.position, self.rows.frequency)
+        return self.positions.select(self.incoherent).phase_vectors(
+            self.rows.position, self.rows.frequency
+        )
 
     @cached_property
     def conditioned(self) -> Conditioned:
         """The rows given their covariance, which is factored in float64."""
         exact = to_double(replace(self))
-        one_by_one = (coherence(one, one) for one in exact.phase_vectors)  # of all sources: gigabytes
+        # Of all sources: gigabytes
+        one_by_one = (coherence(one, one) for one in exact.phase_vectors)
         covariance = exact._cross_covariance(exact.waves, one_by_one, exact.power)
         covariance *= exact._gain_correlation(self.kernel)
         return condition_with_noise(covariance, self.kernel.noise, exact.rows.target).in_float32
@@ -141,16 +147,23 @@ class SightedSources:
         return to_double(self.precompute())
 
     def precompute(self) -> SightedSources:
-        """Return itself, with what all queries need; what the first makes might be for inference only."""
+        """Return itself, with what all queries need;
+        what the first makes might be for inference only.
+        """
         assert len(self.dual_weights) == len(self.rows)
         return self
 
     def fit_powers_and_kernel(self) -> SightedSources:
-        """Return powers by expectation maximisation and the kernel by likelihood on a grid, in turn."""
+        """Return powers by expectation maximisation and the kernel by likelihood on a grid,
+        in turn.
+        """
         mean_power = float(self.waves.abs().square().sum(1).mean())
         # Equal powers to begin with, which add up to the rows' unit power.
         power, kernel = torch.full((self.waves.shape[1],), 1 / max(mean_power, TINY)), self.kernel
-        coherent, correlation = (self._coherence(), {each: self._gain_correlation(each) for each in KERNELS})
+        coherent, correlation = (
+            self._coherence(),
+            {each: self._gain_correlation(each) for each in KERNELS},
+        )
         for _ in range(ROUNDS):
             covariance = self._cross_covariance(self.waves, coherent, power)
             fits = {
@@ -158,26 +171,41 @@ class SightedSources:
                 for each, shared in correlation.items()
             }
             kernel, conditioned = min(fits.items(), key=lambda one: one[1].nll)
-            # E |g_k|^2 of the constant part, over outputs (Rasmussen and Williams, eq. 2.25 and 2.26)
+            # E |g_k|^2 of the constant part, over outputs (Rasmussen
+            # and Williams, eq. 2.25 and 2.26)
             prior = power * kernel.constant
             mean = prior[:, None] * (self.waves.mH @ conditioned.weights)
             information = (conditioned.factor.root @ self.waves).abs().square().sum(0)
-            power = (mean.abs().square().mean(1) + prior - prior.square() * information).clamp_min(TINY)
+            power = (mean.abs().square().mean(1) + prior - prior.square() * information).clamp_min(
+                TINY
+            )
         return replace(self, power=power, kernel=kernel)
 
-    def arrival_at(self, places: Tensor, frequency: Tensor, probability: Tensor | None = None) -> Arrival:
-        """Return geometry of places (m, 3) [m], frequencies (m,) or () [Hz]; probability (m, K) if known."""
+    def arrival_at(
+        self, places: Tensor, frequency: Tensor, probability: Tensor | None = None
+    ) -> Arrival:
+        """Return geometry of places (m, 3) [m], frequencies (m,) or () [Hz]; probability (m, K)
+        if known.
+        """
         dtype = self.power.dtype
-        probability = self.visibility.probability_seen(places) if probability is None else probability
+        probability = (
+            self.visibility.probability_seen(places) if probability is None else probability
+        )
         retained = torch.zeros(0, len(places), len(self.rows), dtype=dtype)
         if len(self.incoherent):
             several = self.positions.select(self.incoherent)
-            retained = coherence(several.phase_vectors(places, frequency, dtype), self.phase_vectors)
+            retained = coherence(
+                several.phase_vectors(places, frequency, dtype), self.phase_vectors
+            )
         correlation = self.kernel.correlation(places, self.rows.position, dtype)
-        return Arrival(ranges(places, self.positions.points), probability.to(dtype), correlation, retained)
+        return Arrival(
+            ranges(places, self.positions.points), probability.to(dtype), correlation, retained
+        )
 
     def arrival_at_rows(self, probability: Tensor) -> Arrival:
-        """Return the rows' own geometry, with the probability (receivers, K) that each sees each source."""
+        """Return the rows' own geometry, with the probability (receivers, K)
+        that each sees each source.
+        """
         return self.arrival_at(self.rows.position, self.rows.frequency, probability[self.observer])
 
     def mean_gains(self, at: Arrival) -> Tensor:
@@ -186,15 +214,21 @@ class SightedSources:
         gain = (at.correlation @ weights.flatten(1)).unflatten(1, weights.shape[1:])
         if len(self.incoherent):
             retained = at.retained * at.correlation
-            gain[:, self.incoherent] = torch.einsum("kmn,nkrc->mkrc", retained, weights[:, self.incoherent])
+            gain[:, self.incoherent] = torch.einsum(
+                "kmn,nkrc->mkrc", retained, weights[:, self.incoherent]
+            )
         return torch.view_as_complex(gain)
 
     def error_and_power(self, at: Arrival, carrier_hz: float) -> tuple[Tensor, Tensor]:
-        """Return the expected squared error and expected power (m,); of gains, noise and visibility."""
+        """Return the expected squared error and expected power (m,); of gains,
+        noise and visibility.
+        """
         probability, noise = at.probability, self.kernel.noise
         arriving = point_wave(at.away, carrier_hz, self.power.dtype)
         powers = arriving.abs().square() * self.power
-        cross = self._cross_covariance(arriving * probability, at.retained, self.power) * at.correlation
+        cross = (
+            self._cross_covariance(arriving * probability, at.retained, self.power) * at.correlation
+        )
         gains = (powers * probability.square()).sum(1) - self.conditioned.explained_variance(cross)
         # Variance p (1 - p) of a source that is seen or not, times its power.
         of_visibility = (powers * probability * (1 - probability)).sum(1)
@@ -209,7 +243,8 @@ class SightedSources:
         groups = rows_of_groups(self.observer.numpy())
         residual, _ = self.conditioned.left_out(groups)
         for group in groups:
-            # Weights without rows S are `K^-1 y - (K^-1)_:S (K^-1_SS)^-1 (K^-1 y)_S`: no other factor.
+            # Weights without rows S are `K^-1 y - (K^-1)_:S (K^-1_SS)^-1 (K^-1 y)_S`:
+            # no other factor.
             predicted[group] -= cross[group] @ (inverse[:, group] @ residual[group])
         return predicted
 
@@ -227,11 +262,14 @@ class SightedSources:
         total = (waves * exact) @ self.waves.mH
         if not len(uncertain):
             return total
-        # In real numbers, with one buffer: products of complex columns would each take three of all rows.
+        # In real numbers, with one buffer: products of complex columns would each take three of all
+        # rows.
         real, imag = total.real.contiguous(), total.imag.contiguous()
         buffer = torch.empty_like(real)
         for k, coherent in zip(uncertain.tolist(), retained, strict=True):
-            query, other = (torch.view_as_real(one[:, k].contiguous()) for one in (power * waves, self.waves))
+            query, other = (
+                torch.view_as_real(one[:, k].contiguous()) for one in (power * waves, self.waves)
+            )
             real.addcmul_(torch.mm(query, other.T, out=buffer), coherent)
             turned = torch.stack([query[:, 1], -query[:, 0]], 1)
             imag.addcmul_(torch.mm(turned, other.T, out=buffer), coherent)

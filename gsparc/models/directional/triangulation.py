@@ -1,10 +1,12 @@
-"""Triangulate sources from noisy directions of arrival: positions, covariances and the rays of each.
+"""Triangulate sources from noisy directions of arrival: positions,
+covariances and the rays of each.
 
-Each ray is a direction of arrival with an unknown error, N(0, sigma^2) about each of two axes, from one of K
-points, or an outlier of uniform direction. Points are found one after the other as in matching pursuit: pairs
-of rays propose them, all rays score them, and a Bayesian evidence (likelihood ratio against outliers times
-the Occam factor of the position: D. J. C. MacKay 2003, chapter 28) accepts them. Expectation maximisation
-over all points and rays then estimates responsibilities and sigma.
+Each ray is a direction of arrival with an unknown error, N(0, sigma^2) about each of two axes, from
+one of K points, or an outlier of uniform direction. Points are found one after the other as in
+matching pursuit: pairs of rays propose them, all rays score them, and a Bayesian evidence
+(likelihood ratio against outliers times the Occam factor of the position: D. J. C. MacKay 2003,
+chapter 28) accepts them. Expectation maximisation over all points
+and rays then estimates responsibilities and sigma.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ import numpy as np
 
 from gsparc.physics.rays import closest_ranges_and_gap
 
-MIN_ERROR, MAX_ERROR = 1e-4, 0.12  # [rad], of a direction: rounding in files; no position information
+# [rad], of a direction: rounding in files; no position information
+MIN_ERROR, MAX_ERROR = 1e-4, 0.12
 ERRORS = tuple(np.geomspace(MIN_ERROR, MAX_ERROR, 7))  # [rad], tried on the first point
 REACH_M = 40.0  # [m], largest distance of an image from the receivers' middle
 MIN_EVIDENCE = 6.0  # [nats], of an accepted point
@@ -65,10 +68,16 @@ class Rays:
         return Rays(self.places, self.direction[mask], self.owner[mask])
 
     def squared_error(self, points: np.ndarray) -> np.ndarray:
-        """Return squared angles (K, N) [rad^2] by which the rays miss points (K, 3), as squared chords."""
-        ahead = points @ self.direction.T - np.einsum("nc,nc->n", self.places[self.owner], self.direction)
+        """Return squared angles (K, N) [rad^2] by which the rays miss points (K, 3),
+        as squared chords.
+        """
+        ahead = points @ self.direction.T - np.einsum(
+            "nc,nc->n", self.places[self.owner], self.direction
+        )
         away = np.linalg.norm(points[:, None] - self.places[None], axis=-1)
-        return np.maximum(2 - 2 * ahead / np.maximum(away, np.finfo(float).tiny)[:, self.owner], 0.0)
+        return np.maximum(
+            2 - 2 * ahead / np.maximum(away, np.finfo(float).tiny)[:, self.owner], 0.0
+        )
 
 
 @dataclass(frozen=True)
@@ -116,7 +125,9 @@ def triangulate(rays: Rays, seed: int = 0) -> RayClusters:
 
 
 def fit_by_em(rays: Rays, points: np.ndarray, error: float) -> RayClusters:
-    """Run expectation maximisation over points and rays, without duplicates and points of weak evidence."""
+    """Run expectation maximisation over points and rays,
+    without duplicates and points of weak evidence.
+    """
     while True:
         responsibility = np.zeros((0, len(rays)))
         covariance = _step_points(rays, points[:0], responsibility, error)[1]
@@ -151,8 +162,12 @@ def _log_ratio(squared_error: np.ndarray, error: float) -> np.ndarray:
     return math.log(2 / error**2) - squared_error / (2 * error**2)
 
 
-def _responsibility(squared_error: np.ndarray, error: float, rate: np.ndarray | float = 1.0) -> np.ndarray:
-    """Probability (K, N) that rays come from points with `rate` times as many rays as there are outliers."""
+def _responsibility(
+    squared_error: np.ndarray, error: float, rate: np.ndarray | float = 1.0
+) -> np.ndarray:
+    """Probability (K, N) that rays come from points with `rate` times as many rays
+    as there are outliers.
+    """
     gain = _log_ratio(squared_error, error) + np.log(rate)
     top = np.maximum(gain.max(0), 0)
     weight = np.exp(gain - top)
@@ -160,7 +175,9 @@ def _responsibility(squared_error: np.ndarray, error: float, rate: np.ndarray | 
 
 
 def _evidence(responsibility: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Log likelihood that the rays lose without each point (K,), plus its log Occam factor [nats]."""
+    """Log likelihood that the rays lose without each point (K,),
+    plus its log Occam factor [nats].
+    """
     space = math.log(4 / 3 * math.pi * REACH_M**3)
     place = np.minimum(0.5 * np.linalg.slogdet(2 * math.pi * covariance)[1] - space, 0.0)
     return place - np.log1p(-np.minimum(responsibility, 1 - 1e-12)).sum(1)
@@ -217,10 +234,14 @@ def _refine_point(rays: Rays, point: np.ndarray, error: float) -> tuple[np.ndarr
     for _ in range(STEPS):
         responsibility = _responsibility(rays.squared_error(points), error)
         points, covariance = _step_points(rays, points, responsibility, error)
-    return points[0], float(_evidence(_responsibility(rays.squared_error(points), error), covariance)[0])
+    return points[0], float(
+        _evidence(_responsibility(rays.squared_error(points), error), covariance)[0]
+    )
 
 
-def _find_points(rays: Rays, mask: np.ndarray, error: float, rng: np.random.Generator) -> list[np.ndarray]:
+def _find_points(
+    rays: Rays, mask: np.ndarray, error: float, rng: np.random.Generator
+) -> list[np.ndarray]:
     """New points of the mask rays."""
     rest = rays.select_rays(mask)
     proposed = _midpoints(rest, error, rng, PAIRS, CANDIDATES)
@@ -230,7 +251,9 @@ def _find_points(rays: Rays, mask: np.ndarray, error: float, rng: np.random.Gene
     score, points, failed = gain.sum(1), [], 0
     while failed < MAX_FAILURES and score.max() > MIN_EVIDENCE:
         top = int(score.argmax())
-        near = rest.select_rays(rest.squared_error(proposed[top : top + 1])[0] < (GATE_SIGMAS * error) ** 2)
+        near = rest.select_rays(
+            rest.squared_error(proposed[top : top + 1])[0] < (GATE_SIGMAS * error) ** 2
+        )
         point, evidence = _refine_point(near, proposed[top], error)
         assigned = gain[top] > 0
         if evidence >= MIN_EVIDENCE:
@@ -244,7 +267,9 @@ def _find_points(rays: Rays, mask: np.ndarray, error: float, rng: np.random.Gene
     return points
 
 
-def _midpoints(rays: Rays, error: float, rng: np.random.Generator, pairs: int, limit: int) -> np.ndarray:
+def _midpoints(
+    rays: Rays, error: float, rng: np.random.Generator, pairs: int, limit: int
+) -> np.ndarray:
     """Midpoints (m, 3) of rays of two receivers that pass each other within their errors."""
     order = np.argsort(rays.owner, kind="stable")
     owners, starts = np.unique(rays.owner[order], return_index=True)

@@ -1,9 +1,9 @@
 """Visibility of sources, known at receivers by their directions of arrival and predicted elsewhere.
 
-Rays may be missing or spurious: each receiver's leave-one-out residual of the channels is compared with one
-source more or less. The prior odds that it sees a source come from its own ray, the rates of missed and
-spurious rays, and the leave-one-out visibility of its neighbours; the rates are estimated anew from the
-result.
+Rays may be missing or spurious: each receiver's leave-one-out residual of the channels is compared
+with one source more or less. The prior odds that it sees a source come from its own ray, the rates
+of missed and spurious rays, and the leave-one-out visibility of its neighbours; the rates are
+estimated anew from the result.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ MIN_PROBABILITY = 0.02  # bound of the neighbours' probabilities
 class VisibilityGP:
     """One Gaussian process over places per source, on labels 0 and 1.
 
-    Least-squares classification (Rasmussen and Williams 2006, section 6.5); length and noise minimise the
-    leave-one-out error.
+    Least-squares classification (Rasmussen and Williams 2006, section 6.5); length and noise
+    minimise the leave-one-out error.
 
     Attributes:
         places: (n, 3) float64 [m], receivers.
@@ -84,9 +84,13 @@ class VisibilityGP:
 
     @cached_property
     def _lengths_and_weights(self) -> tuple[Tensor, Tensor]:
-        """Lengths (L, 1) [m] that occur, and the weights (L n, K), zero but for those of a source's own."""
+        """Lengths (L, 1) [m] that occur, and the weights (L n, K),
+        zero but for those of a source's own.
+        """
         lengths = self.length.unique()[:, None]
-        return lengths, torch.where(lengths[:, None] == self.length, self.weights, 0.0).flatten(0, 1)
+        return lengths, torch.where(lengths[:, None] == self.length, self.weights, 0.0).flatten(
+            0, 1
+        )
 
 
 @dataclass(frozen=True)
@@ -103,22 +107,32 @@ class RayErrorRates:
 
     @staticmethod
     def from_rays(rays: Tensor) -> RayErrorRates:
-        """Return initial rates from rays (n, K), as if all receivers saw the source with most rays."""
-        return RayErrorRates(min(max(1 - float(rays.mean(0).max()), MIN_RATE), MAX_MISSED), SPURIOUS)
+        """Return initial rates from rays (n, K),
+        as if all receivers saw the source with most rays.
+        """
+        return RayErrorRates(
+            min(max(1 - float(rays.mean(0).max()), MIN_RATE), MAX_MISSED), SPURIOUS
+        )
 
     @staticmethod
     def from_visibility(rays: Tensor, seen: Tensor) -> RayErrorRates:
         """Estimate from rays and visibility, both (n, K) of zeros and ones."""
         missed = float((seen * (1 - rays)).sum() / seen.sum().clamp_min(1))
         spurious = float(((1 - seen) * rays).sum() / (1 - seen).sum().clamp_min(1))
-        return RayErrorRates(*(min(max(rate, MIN_RATE), 1 - MIN_RATE) for rate in (missed, spurious)))
+        return RayErrorRates(
+            *(min(max(rate, MIN_RATE), 1 - MIN_RATE) for rate in (missed, spurious))
+        )
 
     def log_odds_seen(self, rays: Tensor, probability: Tensor) -> Tensor:
         """Log odds (n, K) that a source is seen, by rays and the neighbours' probability (n, K)."""
         probability = (probability / (1 - self.missed)).clamp(MIN_PROBABILITY, 1 - MIN_PROBABILITY)
         detected = math.log((1 - self.missed) / self.spurious)
         undetected = math.log(self.missed / (1 - self.spurious))
-        return torch.where(rays > 0, detected, undetected) + probability.log() - (1 - probability).log()
+        return (
+            torch.where(rays > 0, detected, undetected)
+            + probability.log()
+            - (1 - probability).log()
+        )
 
 
 def entries_to_flip(

@@ -1,10 +1,12 @@
-"""Find the source that would explain most of the residual: back-projection over a box, then gradient ascent.
+"""Find the source that would explain most of the residual: back-projection over a box,
+then gradient ascent.
 
 The gain in log likelihood of a source at p, its amplitude free, grows with the matched filter
 
     score(p) = |a(p)^H K^-1 y|^2 / (a(p)^H K^-1 a(p))
 
-summed over outputs; K is the covariance of the sources found so far, so that the residual need not be formed.
+summed over outputs; K is the covariance of the sources found so far,
+so that the residual need not be formed.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ from gsparc.physics.waves import LIGHT, NEAR_M
 from gsparc.processes.worker import raise_if_cancelled
 
 BLOCK = 1024  # candidates at a time, so that a block stays in cache
-CANDIDATES, EXACT, POLISHED = 150_000, 1_500, 40  # points drawn in the box, scored exactly, moved by ascent
+# Points drawn in the box, scored exactly, moved by ascent
+CANDIDATES, EXACT, POLISHED = 150_000, 1_500, 40
 STEPS, STEP_M = 25, 0.02  # of the ascent
 
 
@@ -41,11 +44,14 @@ def gains_and_amplitudes(posterior: GainPosterior, candidates: Tensor) -> tuple[
     matched = (waves.mH @ conditioned.weights).abs().square().sum(1)
     power = (conditioned.factor.root @ waves).abs().square().sum(0)
     gained = matched / power
-    return gained / conditioned.weights.shape[1], (gained / power / conditioned.weights.shape[1]).sqrt()
+    return gained / conditioned.weights.shape[1], (
+        gained / power / conditioned.weights.shape[1]
+    ).sqrt()
 
 
 def rough_gains(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
-    """Return `|a^H alpha|^2 / |a|^2` (m,), ranges in float32: good to a thousandth of a cycle in a building.
+    """Return `|a^H alpha|^2 / |a|^2` (m,), ranges in float32:
+    good to a thousandth of a cycle in a building.
 
     Candidates are (m, 3), or (E, m, 3) as in `likelihood_gain`.
     """
@@ -78,10 +84,15 @@ def rough_gains(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
 
 
 def find_sources_in_box(
-    posterior: GainPosterior, box: Tensor, min_distance: float, limit: int, generator: torch.Generator,
+    posterior: GainPosterior,
+    box: Tensor,
+    min_distance: float,
+    limit: int,
+    generator: torch.Generator,
     images: ImagesOfAntennas,
-) -> list[tuple[Tensor, Tensor, Tensor]]:  # fmt: skip
-    """Return the best `limit` new sources in a box (2, 3) float64 [m], at least `min_distance` [m] apart.
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Return the best `limit` new sources in a box (2, 3) float64 [m],
+    at least `min_distance` [m] apart.
 
     Each is its place (3,) float64 [m], score () and amplitude (), the best first.
     `images` gives the images of the static end's antennas, as `likelihood_gain` takes them.
@@ -90,7 +101,9 @@ def find_sources_in_box(
     candidates = draw_in_box(low, high, CANDIDATES, generator)
     rough = rough_gains(posterior.rows, images(candidates), posterior.conditioned.weights)
     candidates = candidates[rough.topk(min(EXACT, len(rough))).indices]
-    exact = torch.cat([gains_and_amplitudes(posterior, images(part))[0] for part in candidates.split(BLOCK)])
+    exact = torch.cat(
+        [gains_and_amplitudes(posterior, images(part))[0] for part in candidates.split(BLOCK)]
+    )
     best = candidates[exact.topk(min(POLISHED, len(exact))).indices]
     polished = best.clone().requires_grad_()
     optimizer = torch.optim.Adam([polished], betas=BETAS)
@@ -107,14 +120,21 @@ def find_sources_in_box(
 
 
 def select_separated(
-    position: Tensor, scores: Tensor, min_distance: float, limit: int, threshold: float = 0.0,
+    position: Tensor,
+    scores: Tensor,
+    min_distance: float,
+    limit: int,
+    threshold: float = 0.0,
     known: Tensor | None = None,
-) -> list[int]:  # fmt: skip
-    """Return indices of the best scores (n,) of at least `threshold`, `min_distance` [m] apart by positions.
+) -> list[int]:
+    """Return indices of the best scores (n,) of at least `threshold`,
+    `min_distance` [m] apart by positions.
 
     Also from those that are `known` (K, 3).
     """
     if known is not None:
         scores = scores * (torch.cdist(position, known).amin(1) > min_distance)
     order = (i for i in scores.argsort(descending=True).tolist() if scores[i] >= threshold)
-    return keep_apart(order, lambda i, j: bool((position[i] - position[j]).norm() <= min_distance), limit)
+    return keep_apart(
+        order, lambda i, j: bool((position[i] - position[j]).norm() <= min_distance), limit
+    )

@@ -1,9 +1,11 @@
-"""Complex factors of antennas: cables and converters give each of an array a gain and a phase of its own.
+"""Complex factors of antennas: cables and converters give each of an array a gain
+and a phase of its own.
 
-They are the same at all places, so that aligned rows `u_e y` follow the process of calibrated antennas; the
-factors of largest likelihood are found as those of runs are (`best_run_factors`), first against the direct
-path alone, then against all sources found. They are used where they gain more than their number costs:
-G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978).
+They are the same at all places, so that aligned rows `u_e y` follow the process of calibrated
+antennas; the factors of largest likelihood are found as those of runs are (`best_run_factors`),
+first against the direct path alone, then against all sources found. They are used where they gain
+more than their number costs: G. Schwarz, "Estimating the dimension of a model", Ann. Statist.
+6 (1978).
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ def direct_path_scene(rows: Rows, static: Tensor, noise_floor: float) -> SourceS
 
 
 def find_element_factors(rows: Rows, scene: SourceScene) -> Tensor | None:
-    """Return factors (E,) complex64 for channels of each antenna, the first 1; None: nothing gained.
+    """Return factors (E,) complex64 for channels of each antenna, the first 1; None:
+    nothing gained.
 
     Args:
         rows: of a static array of E antennas, one output; those without a row are multiplied by 1.

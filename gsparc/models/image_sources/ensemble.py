@@ -26,7 +26,8 @@ log = logging.getLogger(__name__)
 
 IN_VAIN = 0.9  # of the power left out: two such searches, and no others begin
 QUADRATURE = 0.4  # initial `SourceScene.quadrature`
-CONVERGED_ERROR = 0.004  # leave-one-out error of two searches below which no third is started: 24 dB
+# leave-one-out error of two searches below which no third is started: 24 dB
+CONVERGED_ERROR = 0.004
 ROUNDS_SHARE = 0.9  # of a search's effort, after which no round adds sources
 Look = Callable[[Rows, SourceScene], None]  # of a search, with phases
 COMPACT_M = 0.5  # [m], extent of a static array up to which clutter occludes its antennas alike
@@ -48,13 +49,18 @@ class Member:
 
 
 def run_searches(
-    row_sets: list[Rows], transmitter: Tensor, settings: SearchSettings, noise_floor: float,
-    effort: Effort, look: Look | None = None, start: Found | None = None,
-) -> list[Member]:  # fmt: skip
+    row_sets: list[Rows],
+    transmitter: Tensor,
+    settings: SearchSettings,
+    noise_floor: float,
+    effort: Effort,
+    look: Look | None = None,
+    start: Found | None = None,
+) -> list[Member]:
     """Run one search per set of rows, best first; at least one.
 
-    The first two that have reached the noise floor are the last: searches of higher numbers do not start, or
-    end without a result, whichever of them is finished first.
+    The first two that have reached the noise floor are the last: searches of higher numbers do not
+    start, or end without a result, whichever of them is finished first.
 
     Args:
         row_sets: rows of each search, unit mean power, about the middle of the scene.
@@ -79,7 +85,8 @@ def run_searches(
     def is_unwanted(number: int) -> bool:
         """Tell whether those before it are all that is wanted."""
         before = [errors[one] for one in takewhile(errors.__contains__, range(number))]
-        in_vain = sum(error > IN_VAIN for error in before) >= 2  # as where each row has its own phase
+        # As where each row has its own phase
+        in_vain = sum(error > IN_VAIN for error in before) >= 2
         return stopped.is_set() or in_vain or reached_noise_floor(before, noise_floor)
 
     def run_search(number: int) -> Member:
@@ -93,7 +100,9 @@ def run_searches(
 
         search = Search(rows, transmitter, settings, number, look_then_has_ended, start)
         scene = estimate_phases(rows, search.run(), QUADRATURE, noise_floor)
-        scene = refine_scene(rows, learn_visibility(rows, scene, KernelVisibility()), POLISHING_STEPS)
+        scene = refine_scene(
+            rows, learn_visibility(rows, scene, KernelVisibility()), POLISHING_STEPS
+        )
         if look is not None and number == 0:
             look(rows, scene)
         error = left_out_nmse(rows, scene)
@@ -114,8 +123,12 @@ def run_searches(
         scene = member.scene
         log.info(
             "search %d of %d: %d sources over %d planes, error %.3f",
-            number + 1, len(row_sets), len(scene.sequences), len(scene.planes), member.left_out,
-        )  # fmt: skip
+            number + 1,
+            len(row_sets),
+            len(scene.sequences),
+            len(scene.planes),
+            member.left_out,
+        )
         errors[number] = member.left_out
         return member
 
@@ -126,7 +139,11 @@ def run_searches(
     try:
         running = [pool.submit(run_unless_unwanted, number) for number in range(len(row_sets))]
         wait(running, return_when=FIRST_EXCEPTION)
-        members = [m for number, one in enumerate(running) if (m := one.result()) and not is_unwanted(number)]
+        members = [
+            m
+            for number, one in enumerate(running)
+            if (m := one.result()) and not is_unwanted(number)
+        ]
     finally:
         stopped.set()
         pool.shutdown(cancel_futures=True)  # waits for the step of each search

@@ -34,7 +34,8 @@ class SourceFrame:
         antennas: A, outputs of a measurement.
         middle: (3,) float64 [m], local; origin of the fit.
         scale: stored target = scale * normalised target.
-        carrier_hz: amplitude goes with wavelength, so targets are multiplied by f / carrier first [Hz].
+        carrier_hz: amplitude goes with wavelength, so targets are multiplied by f / carrier first
+            [Hz].
     """
 
     site: Site
@@ -102,7 +103,8 @@ class SourcesInFrame(ClosedForm):
 
     Attributes:
         frame: of the fit.
-        factors: (A,) complex64, what each antenna's channels were multiplied by before the fit; (1,) of all.
+        factors: (A,) complex64, what each antenna's channels were multiplied by before the fit;
+            (1,) of all.
     """
 
     frame: SourceFrame
@@ -110,7 +112,8 @@ class SourcesInFrame(ClosedForm):
 
     @abstractmethod
     def _predict_normalised(self, places: Tensor, tones: Tensor, float64: bool) -> Moments:
-        """Means (m, R, F) at places (m, 3 or 6) [m] and tones (F,) [Hz], variance and prior (m,); in float64?
+        """Means (m, R, F) at places (m, 3 or 6) [m] and tones (F,) [Hz], variance and prior (m,);
+        in float64?
 
         Normalised; the prior is the power that is expected without any rows.
         """
@@ -122,13 +125,15 @@ class SourcesInFrame(ClosedForm):
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`.
 
-        The variance is of gains, noise, visibility and between searches; the confidence is the explained
-        share of the expected power.
+        The variance is of gains, noise, visibility and between searches; the confidence is the
+        explained share of the expected power.
         """
         frame = self._fitted_frame()
         places, count = frame.places_and_count(query)
         tones = torch.from_numpy(frame.site.tones())
-        mean, variance, prior = self._predict_normalised(places, tones, query.tx.dtype == torch.float64)
+        mean, variance, prior = self._predict_normalised(
+            places, tones, query.tx.dtype == torch.float64
+        )
         mean = mean * ((frame.carrier_hz / tones).float() * frame.scale)
         # Targets were multiplied by the antennas' factors before the fit.
         mean = mean.reshape(count, frame.antennas, len(tones)) / self.factors[:, None]
@@ -138,12 +143,13 @@ class SourcesInFrame(ClosedForm):
         return Prediction(mean, variance * frame.scale**2, (variance / prior).clamp(0, 1), mean)
 
     def paths(self, query: Query) -> QueryPaths:
-        """Return the paths that `predict` sums, one per source, which several searches may have found.
+        """Return the paths that `predict` sums, one per source,
+        which several searches may have found.
 
         Returns:
-            Gains (B, A, N) complex64 at the carrier, in stored units; delays (B, A, N) float64 [s]; unit
-            vectors (B, N, 3) float64 from the middle of the moving end's antennas to where a path comes from;
-            the carrier [Hz].
+            Gains (B, A, N) complex64 at the carrier, in stored units; delays (B, A, N) float64 [s];
+            unit vectors (B, N, 3) float64 from the middle of the moving end's antennas to where a
+            path comes from; the carrier [Hz].
         """
         frame = self._fitted_frame()
         places, count = frame.places_and_count(query)
@@ -159,7 +165,9 @@ class SourcesInFrame(ClosedForm):
 
 
 def merge_equal_paths(paths: QueryPaths) -> QueryPaths:
-    """Return paths whose sources are half a wavelength apart: gains of nearer ones add up in the first."""
+    """Return paths whose sources are half a wavelength apart:
+    gains of nearer ones add up in the first.
+    """
     gain, delay, unit, carrier_hz = paths
     if not len(gain):
         return paths
@@ -172,15 +180,23 @@ def merge_equal_paths(paths: QueryPaths) -> QueryPaths:
 
 
 def require_static_phase(site: Site, name: str) -> None:
-    """Raise a `ValueError` in a method's name for data that sources with carrier phase cannot explain."""
+    """Raise a `ValueError` in a method's name for data that sources
+    with carrier phase cannot explain.
+    """
     if not site.target.is_complex:
-        raise ValueError(f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp")
+        raise ValueError(
+            f"{name}: needs complex channels (csi), {site.name} has {site.kind}; take model=gp"
+        )
     if site.static_position is None:
-        raise ValueError(f"{name}: {site.name} lacks its static place: give it, or take model=complex_gp")
+        raise ValueError(
+            f"{name}: {site.name} lacks its static place: give it, or take model=complex_gp"
+        )
 
 
 def require_fixed_rotation(data: Measurements) -> None:
-    """Raise a `ValueError` where a static receiver of several antennas turns between measurements."""
+    """Raise a `ValueError` where a static receiver
+    of several antennas turns between measurements.
+    """
     antennas = data.target.shape[1]
     if static_array(data.site, antennas) is None:
         return
@@ -188,6 +204,7 @@ def require_fixed_rotation(data: Measurements) -> None:
     if turned.any():
         row = int(np.flatnonzero(turned)[0])
         raise ValueError(
-            f"{data.site.name}: row {row}: the static receiver of {antennas} antennas is turned otherwise "
+            f"{data.site.name}: row {row}: the static receiver of {antennas} antennas is turned "
+            "otherwise "
             "than in row 0; give the rows of each rotation as a file of their own"
         )

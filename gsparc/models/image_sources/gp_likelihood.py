@@ -1,18 +1,22 @@
-"""The image-source Gaussian process: likelihood of measured rows given a scene, and posterior of its gains.
+"""The image-source Gaussian process: likelihood of measured rows given a scene,
+and posterior of its gains.
 
-    h(x, f) = sum_k g_k(x) exp(-j 2 pi f r_k / c) / r_k + noise,   g_k ~ GP(0, s_k^2 visibility_k(x, x'))
+    h(x, f) = sum_k g_k(x) exp(-j 2 pi f r_k / c) / r_k + noise,
+    g_k ~ GP(0, s_k^2 visibility_k(x, x'))
 
-so two rows have covariance `sum_k s_k^2 a_k a_k'* C_k + noise`, with regression as in C. E. Rasmussen
-and C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006), chapters 2 and 5.
+so two rows have covariance `sum_k s_k^2 a_k a_k'* C_k + noise`, with regression as in C. E.
+Rasmussen and C. K. I. Williams, "Gaussian Processes for Machine Learning" (2006), chapters 2 and 5.
 
-Once the sources are known, gains have phases: the phase of a reflection is the same at all places; what
-varies is the visible share of a source. So `g_k(x) = exp(j phi_k) (u_k(x) + j v_k(x))` with real Gaussian
-processes u_k and v_k, and nearly all the variance in u_k: a share `quadrature / 2` is in v_k (1 / 2 would be
-the circular process above). In real and imaginary parts, n complex rows are 2 n real numbers of covariance
+Once the sources are known, gains have phases: the phase of a reflection is the same at all places;
+what varies is the visible share of a source. So `g_k(x) = exp(j phi_k) (u_k(x) + j v_k(x))` with
+real Gaussian processes u_k and v_k, and nearly all the variance in u_k: a share `quadrature / 2` is
+in v_k (1 / 2 would be the circular process above). In real and imaginary parts, n complex rows are
+2 n real numbers of covariance
     sum_k s_k^2 C_k * [(1 - quadrature / 2) p p^T + quadrature / 2 q q^T] + noise / 2
 
-with p = (Re w_k, Im w_k), q = (-Im w_k, Re w_k), w_k = a_k exp(j phi_k). It halves what must be learned of
-each source's visibility; the phases must be known first, so the search itself stays circular.
+with p = (Re w_k, Im w_k), q = (-Im w_k, Re w_k), w_k = a_k exp(j phi_k). It halves what must be
+learned of each source's visibility; the phases must be known first,
+so the search itself stays circular.
 """
 
 from __future__ import annotations
@@ -30,7 +34,9 @@ from gsparc.processes.conditioned import Conditioned
 
 
 def condition_with_noise(covariance: Tensor, noise: float, target: Tensor) -> Conditioned:
-    """Return targets (n, R) given a covariance to whose diagonal noise and jitter are added in place."""
+    """Return targets (n, R) given a covariance to whose diagonal noise
+    and jitter are added in place.
+    """
     # Rounding grows with the diagonal, which sources near the places raise far above 1.
     level = max(1.0, float(covariance.diagonal().real.mean()))
     covariance.diagonal().add_(noise + JITTER * level)
@@ -38,7 +44,9 @@ def condition_with_noise(covariance: Tensor, noise: float, target: Tensor) -> Co
 
 
 class CircularGains:
-    """Covariance of n rows by sources whose gains have any phase, to which sources are added one by one."""
+    """Covariance of n rows by sources whose gains have any phase,
+    to which sources are added one by one.
+    """
 
     def __init__(self, rows: Rows) -> None:
         self.target, n = rows.target, len(rows)
@@ -58,12 +66,16 @@ class CircularGains:
         self._imag.addcmul_(correlation, turned @ pair.T)
 
     def add_noise_and_condition(self, noise: Tensor | float) -> Conditioned:
-        """Add noise of this variance to `matrix`, for good, and return the rows' targets given it."""
+        """Add noise of this variance to `matrix`, for good,
+        and return the rows' targets given it.
+        """
         self._real.diagonal().add_(noise)
         return Conditioned.from_gram(self.matrix, self.target)
 
     def grad_waves(self, slope: Tensor, scaled: Tensor, correlation: Tensor) -> Tensor:
-        """Return slopes (n, K) of the negative log likelihood by waves (n, K), `2 (G * C_k) s_k a_k`."""
+        """Return slopes (n, K) of the negative log likelihood by waves (n, K),
+        `2 (G * C_k) s_k a_k`.
+        """
         real, imag = slope.real.contiguous(), slope.imag.contiguous()
         slopes = torch.empty_like(scaled)
         for k, one in enumerate(correlation):
@@ -110,7 +122,9 @@ class PhasedGains(CircularGains):
         self._sum.addcmul_(product.view_as(self._sum), correlation[None, :, None, :])
 
     def add_noise_and_condition(self, noise: Tensor | float) -> Conditioned:
-        """Add half of the noise to either part of `matrix`, for good; return the (2 n,) targets given it."""
+        """Add half of the noise to either part of `matrix`, for good; return the (2 n,)
+        targets given it.
+        """
         self.matrix.diagonal().add_(noise / 2)
         return Conditioned.from_gram(self.matrix, stack_real_imag(self.target)[0])
 
@@ -119,7 +133,9 @@ class PhasedGains(CircularGains):
         n, slopes = len(scaled), torch.empty_like(scaled)
         blocks = slope.view(2, n, 2, n)
         for k, one in enumerate(correlation):
-            pair = torch.stack(stack_real_imag(scaled[:, k]), 1) * quadrature_variances(self.quadrature)
+            pair = torch.stack(stack_real_imag(scaled[:, k]), 1) * quadrature_variances(
+                self.quadrature
+            )
             by = (blocks * one[None, :, None, :]).view(2 * n, 2 * n) @ pair
             # p = (Re, Im) and q = (-Im, Re): the derivatives by Re and Im collect both
             slopes[:, k] = torch.complex(by[:n, 0] + by[n:, 1], by[n:, 0] - by[:n, 1])
@@ -141,14 +157,18 @@ class PhasedGains(CircularGains):
 
 
 class GainPosterior:
-    """Posterior of a scene's gains given rows, circular or of fixed phases (`SourceScene.phase`)."""
+    """Posterior of a scene's gains given rows,
+    circular or of fixed phases (`SourceScene.phase`).
+    """
 
     def __init__(self, rows: Rows, scene: SourceScene) -> None:
         self.rows, self.scene = rows, scene
 
     @cached_property
     def in_float64(self) -> GainPosterior:
-        """The same in float64: rows 30 dB above their noise lose three digits where they are factored."""
+        """The same in float64: rows 30 dB above their noise lose three digits
+        where they are factored.
+        """
         _ = self.scene.unfolding, self.scene.obstacles  # which are doubled with the scene
         return to_double(GainPosterior(self.rows, self.scene))
 
@@ -175,7 +195,9 @@ class GainPosterior:
     @cached_property
     def conditioned(self) -> Conditioned:
         """The rows' targets given their covariance."""
-        noise = self.scene.log_amplitude.new_tensor(self.scene.log_noise).exp() + self.scene.noise_floor
+        noise = (
+            self.scene.log_amplitude.new_tensor(self.scene.log_noise).exp() + self.scene.noise_floor
+        )
         return self.source_gram.add_noise_and_condition(noise)
 
     @property
@@ -227,10 +249,14 @@ class GainPosterior:
         return self.rows.target - torch.complex(error[:n], error[n:])
 
 
-def estimate_phases(rows: Rows, scene: SourceScene, quadrature: float, noise_floor: float) -> SourceScene:
+def estimate_phases(
+    rows: Rows, scene: SourceScene, quadrature: float, noise_floor: float
+) -> SourceScene:
     """Return the scene with phases of mean gains under the circular process, and a noise floor."""
     posterior = GainPosterior(rows, replace(scene, noise_floor=JITTER))
     # The mean gain but for its power and constant share, which are positive and do not turn it.
     gain = (posterior.waves.mH @ posterior.conditioned.weights).sum(1)
     one = rows.target.shape[1] == 1
-    return replace(scene, phase=gain.angle(), quadrature=quadrature if one else 1.0, noise_floor=noise_floor)
+    return replace(
+        scene, phase=gain.angle(), quadrature=quadrature if one else 1.0, noise_floor=noise_floor
+    )

@@ -56,16 +56,19 @@ log = logging.getLogger(__name__)
 ALIGNMENT_SOURCES = (8, 20)  # sources of the searches that phase offsets are estimated against
 ALIGNMENT_ROUNDS = 3  # estimates of offsets and gains in turn, after each search
 LOOKED_AT = 200  # rows of the group that a search leaves out, after each round
-ALONE = 3.0  # times the effort of a search beside others: here nothing else answers where it ends early
+# Times the effort of a search beside others: here nothing else answers where it ends early
+ALONE = 3.0
 
 
 class ImageSourceGP(SourcesInFrame):
     """Image-source Gaussian process; one end stands still, both may have antennas of known places.
 
     Args:
-        searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed: see `SearchSettings`.
+        searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed: see
+            `SearchSettings`.
 
-    Constant complex factors of a static array's antennas are estimated where the likelihood wants them.
+    Constant complex factors of a static array's antennas are estimated
+    where the likelihood wants them.
 
     Attributes:
         start: places [m], local, and amplitudes of sources that each search starts from, or None.
@@ -81,11 +84,17 @@ class ImageSourceGP(SourcesInFrame):
     start: Found | None = None
 
     def __init__(
-        self, searches: int = SearchSettings.searches, search_rows: int = SearchSettings.search_rows,
-        rows: int = SearchSettings.rows, margin: float = SearchSettings.margin,
-        max_sources: int = SearchSettings.max_sources, order: int = SearchSettings.order,
-        offsets: Snapshot = "none", clutter: bool = True, seed: int = 0,
-    ) -> None:  # fmt: skip
+        self,
+        searches: int = SearchSettings.searches,
+        search_rows: int = SearchSettings.search_rows,
+        rows: int = SearchSettings.rows,
+        margin: float = SearchSettings.margin,
+        max_sources: int = SearchSettings.max_sources,
+        order: int = SearchSettings.order,
+        offsets: Snapshot = "none",
+        clutter: bool = True,
+        seed: int = 0,
+    ) -> None:
         self.settings = SearchSettings(
             searches, search_rows, rows, margin, max_sources, order, offsets, clutter, seed
         )
@@ -114,15 +123,19 @@ class ImageSourceGP(SourcesInFrame):
         self.factors = torch.ones(antennas, dtype=torch.complex64)
         calibrated = static_array(data.site, antennas) is not None and settings.offsets == "none"
         if calibrated:
-            # Against the direct wave first, as a search needs aligned antennas; again against what it found.
+            # Against the direct wave first, as a search needs aligned antennas;
+            # again against what it found.
             start = self._draw_search_rows(data, seen, 0)
             data = self._calibrate_antennas(
-                data, start, direct_path_scene(start, self._transmitter_in_frame(), self.noise_floor)
+                data,
+                start,
+                direct_path_scene(start, self._transmitter_in_frame(), self.noise_floor),
             )
         if settings.offsets != "none":
             data = self._align_offsets(data, seen, effort)
             notes.append(
-                f"{self.name}: {settings.offsets} offset of every snapshot estimated; predictions have none"
+                f"{self.name}: {settings.offsets} offset of every snapshot estimated; "
+                "predictions have none"
             )
         row_sets = self._draw_row_sets(data, seen)
         look = None
@@ -130,7 +143,9 @@ class ImageSourceGP(SourcesInFrame):
             # Search 0 is the one looked at, and it leaves out the first group (`_kept`).
             group = self._groups[0][:: -(-len(self._groups[0]) // LOOKED_AT)]
             look = partial(self._log_look, context.race, group, data.batch(group), [])
-        warm_start = None if self.start is None else (self.start[0] - self.frame.middle, self.start[1])
+        warm_start = (
+            None if self.start is None else (self.start[0] - self.frame.middle, self.start[1])
+        )
         members = self._run_searches(row_sets, settings, effort, look, warm_start)
         if calibrated:
             again = self._calibrate_antennas(data, row_sets[members[0].number], members[0].scene)
@@ -159,22 +174,31 @@ class ImageSourceGP(SourcesInFrame):
         """What was found, and what ended the search."""
         scene = self.members[0].scene
         counts = ", ".join(str(len(member.scene.sequences)) for member in self.members)
-        agree = ensemble.reached_noise_floor([member.left_out for member in members], self.noise_floor)
+        agree = ensemble.reached_noise_floor(
+            [member.left_out for member in members], self.noise_floor
+        )
         ended = "two agree up to noise, which is enough" if agree else "as many as effort= asks for"
         boxes, patches = len(scene.clutter.boxes), len(scene.clutter.patches)
-        notes = [f"{len(members)} of {self.settings.searches} searches ({ended}) found {counts} sources"]
+        notes = [
+            f"{len(members)} of {self.settings.searches} searches ({ended}) found {counts} sources"
+        ]
         if boxes or patches:
             notes.append(f"clutter: {boxes} occluding boxes, {patches} finite mirrors")
         if (self.factors != 1).any():
             turned = (self.factors / self.factors[0]).angle().rad2deg().abs().max()
             notes.append(
-                f"factors of the {len(self.factors)} antennas estimated, phases up to {turned:.0f} degrees "
+                f"factors of the {len(self.factors)} antennas estimated, phases up to "
+                f"{turned:.0f} degrees "
                 "from the first's"
             )
         return [f"{self.name}: {note}" for note in notes]
 
-    def _calibrate_antennas(self, data: Measurements, rows: Rows, scene: SourceScene) -> Measurements:
-        """Targets times the antennas' factors, which are kept; unchanged when they gain too little."""
+    def _calibrate_antennas(
+        self, data: Measurements, rows: Rows, scene: SourceScene
+    ) -> Measurements:
+        """Targets times the antennas' factors, which are kept;
+        unchanged when they gain too little.
+        """
         factors = find_element_factors(rows, scene)
         if factors is None:
             return data
@@ -182,35 +206,57 @@ class ImageSourceGP(SourcesInFrame):
         return replace(data, target=data.target * factors.numpy()[:, None])
 
     def _run_searches(
-        self, row_sets: list[Rows], settings: SearchSettings, effort: Effort,
-        look: Look | None = None, start: Found | None = None,
-    ) -> list[Member]:  # fmt: skip
+        self,
+        row_sets: list[Rows],
+        settings: SearchSettings,
+        effort: Effort,
+        look: Look | None = None,
+        start: Found | None = None,
+    ) -> list[Member]:
         """What `run_searches` finds about the static end, best first."""
         still, floor = self._transmitter_in_frame(), self.noise_floor
         return ensemble.run_searches(row_sets, still, settings, floor, effort, look, start)
 
     def _log_look(
-        self, race: Race, group: np.ndarray, batch: Batch, errors: list[float], rows: Rows, scene: SourceScene
+        self,
+        race: Race,
+        group: np.ndarray,
+        batch: Batch,
+        errors: list[float],
+        rows: Rows,
+        scene: SourceScene,
     ) -> None:
-        """Look at a search's scene by a batch of rows `group` (n,) that it left out; `FellBehind` ends it."""
+        """Look at a search's scene by a batch of rows `group` (n,) that it left out;
+        `FellBehind` ends it.
+        """
         # On a copy: `predict` reads the method's own processes, which are not found yet.
         mean = copy.copy(self)._set_members(rows, [Member(scene, 1.0)]).predict(batch).mean
         # Predictions are in stored units, the batch's targets already times the factors.
         missed = mean - batch.target / self.factors[:, None]
-        errors.append(race.check_candidate(f"{len(scene.sequences)} sources", group, missed, errors))
+        errors.append(
+            race.check_candidate(f"{len(scene.sequences)} sources", group, missed, errors)
+        )
 
-    def _draw(self, data: Measurements, rows: np.ndarray, limit: int | None = None, number: int = 0) -> Rows:
+    def _draw(
+        self, data: Measurements, rows: np.ndarray, limit: int | None = None, number: int = 0
+    ) -> Rows:
         """Some rows in the frame, drawn with the seed of a search by its number."""
         limit = self.settings.rows if limit is None else limit
-        return self.frame.normalise(rows_of_measurements(data, rows, limit, self.settings.seed + number))
+        return self.frame.normalise(
+            rows_of_measurements(data, rows, limit, self.settings.seed + number)
+        )
 
     def _draw_search_rows(self, data: Measurements, known: np.ndarray, number: int) -> Rows:
         """Rows of a search by its number."""
-        return self._draw(data, self._rows_of_search(known, number), self.settings.search_rows, number)
+        return self._draw(
+            data, self._rows_of_search(known, number), self.settings.search_rows, number
+        )
 
     def _draw_row_sets(self, data: Measurements, known: np.ndarray) -> list[Rows]:
         """Rows of each search."""
-        return [self._draw_search_rows(data, known, number) for number in range(self.settings.searches)]
+        return [
+            self._draw_search_rows(data, known, number) for number in range(self.settings.searches)
+        ]
 
     def _rows_of_search(self, known: np.ndarray, number: int) -> np.ndarray:
         """What a search by its number learns from: all but the group whose turn it is."""
@@ -220,14 +266,18 @@ class ImageSourceGP(SourcesInFrame):
     def _predict_left_out(
         self, data: Measurements, known: np.ndarray, members: list[Member], limit: int
     ) -> LeftOutRows | None:
-        """Rows of every group predicted by the searches that left it out, from at most `limit` others."""
+        """Rows of every group predicted by the searches that left it out,
+        from at most `limit` others.
+        """
         rows, means = [], []
         for turn, group in enumerate(self._groups):
             if mine := [one for one in members if one.number % len(self._groups) == turn]:
                 # As many rows as the process that answers has: fewer would err more than it does.
                 others = self._draw(data, self._rows_of_search(known, turn), limit)
                 rows.append(group)
-                means.append(copy.copy(self)._set_members(others, mine).predict(data.batch(group)).mean)
+                means.append(
+                    copy.copy(self)._set_members(others, mine).predict(data.batch(group)).mean
+                )
         if not rows:
             return None
         mean = torch.cat(means)
@@ -235,14 +285,18 @@ class ImageSourceGP(SourcesInFrame):
 
     def _transmitter_in_frame(self) -> Tensor:
         assert self.site is not None and self.site.static_position is not None
-        return torch.from_numpy(np.asarray(self.site.static_position, np.float64)) - self.frame.middle
+        return (
+            torch.from_numpy(np.asarray(self.site.static_position, np.float64)) - self.frame.middle
+        )
 
     def _align_offsets(self, data: Measurements, known: np.ndarray, effort: Effort) -> Measurements:
         """Estimate offsets against the line of sight, then against more and more sources."""
         direct = SourceScene.from_static_end(self._transmitter_in_frame(), torch.zeros(1))
         aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.frame.antennas))
         for sources in ALIGNMENT_SOURCES:
-            few = replace(self.settings, max_sources=sources, final_steps=POLISHING_STEPS, clutter=False)
+            few = replace(
+                self.settings, max_sources=sources, final_steps=POLISHING_STEPS, clutter=False
+            )
             rows = self._draw_search_rows(aligned, known, 0)
             scene = self._run_searches([rows], few, effort)[0].scene
             for _ in range(ALIGNMENT_ROUNDS):
@@ -253,9 +307,14 @@ class ImageSourceGP(SourcesInFrame):
     def _remove_offsets(
         self, data: Measurements, known: np.ndarray, scene: SourceScene, gains: Tensor
     ) -> Measurements:
-        """Targets of the known rows without their offsets against a scene's sources of constant gains."""
+        """Targets of the known rows without their offsets against a scene's sources
+        of constant gains.
+        """
         frequency = data.site.tones()
-        places, turned = measured_places(data, known), image_rotations(scene.planes, scene.sequences)
+        places, turned = (
+            measured_places(data, known),
+            image_rotations(scene.planes, scene.sequences),
+        )
         away = ranges_at(places.flatten(0, 1), scene.sources + self.frame.middle, turned)
         waves = wave_over_band(away, torch.from_numpy(frequency))
         # Antennas of known places share the gains; those of unknown ones each have their own.
@@ -263,16 +322,24 @@ class ImageSourceGP(SourcesInFrame):
             gains = gains[:, :1]
         summed = torch.einsum("mkf,kr->mrf", waves, gains.to(waves.dtype))
         predicted = summed.reshape(len(known), -1, len(frequency)).numpy()
-        measured = data.target[known] if data.mask is None else np.where(data.mask, data.target, 0)[known]
+        measured = (
+            data.target[known] if data.mask is None else np.where(data.mask, data.target, 0)[known]
+        )
         free: UnknownFactor = "phase" if self.settings.offsets == "phase" else "phase+delay"
         target = data.target.copy()
-        target[known] *= align_factors(measured, predicted, frequency, free)[:, None].astype(target.dtype)
+        target[known] *= align_factors(measured, predicted, frequency, free)[:, None].astype(
+            target.dtype
+        )
         return replace(data, target=target)
 
     def _predict_normalised(self, places: Tensor, tones: Tensor, float64: bool) -> Moments:
         """See `SourcesInFrame`; the variance is the posterior's plus that of the ensemble."""
-        stack, variance, prior = (self.query.in_float64 if float64 else self.query).predict(places, tones)
-        parts = [(share, one, variance) for share, one in zip(self.weights.tolist(), stack, strict=True)]
+        stack, variance, prior = (self.query.in_float64 if float64 else self.query).predict(
+            places, tones
+        )
+        parts = [
+            (share, one, variance) for share, one in zip(self.weights.tolist(), stack, strict=True)
+        ]
         return Moments(*mixture_moments(parts), prior)
 
     def _normalised_paths(self, places: Tensor) -> SourcePaths:
@@ -296,7 +363,9 @@ class ImageSourceGP(SourcesInFrame):
 
     @torch.no_grad()
     def reduce(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
-        """See `Method.reduce`: `searches` of largest weight, no variance; no source can be spared."""
+        """See `Method.reduce`: `searches` of largest weight, no variance;
+        no source can be spared.
+        """
         twin = copy.copy(self)
         count = min(int(settings.get("searches", len(self.members))), len(self.members))
         chosen = self.weights.topk(count).indices.sort().values
@@ -328,7 +397,11 @@ class ImageSourceGP(SourcesInFrame):
     @property
     def terms(self) -> tuple[str, ...]:
         """Carrier phase, and visibility where it is modelled."""
-        return ("phase", "visibility") if any(len(one.scene.clutter) for one in self.members) else ("phase",)
+        return (
+            ("phase", "visibility")
+            if any(len(one.scene.clutter) for one in self.members)
+            else ("phase",)
+        )
 
     def objects(self) -> SiteObjects:
         """Return planes and boxes of the heaviest search."""

@@ -1,4 +1,6 @@
-"""Maximise the marginal likelihood over planes, amplitudes, noise, phases, and the visibility kernel."""
+"""Maximise the marginal likelihood over planes, amplitudes, noise, phases,
+and the visibility kernel.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import BETAS, KernelVisibility, SourceScene
 from gsparc.processes.worker import out_of_steps
 
-# Steps between evaluations of the visibility kernel: sources move millimetres, it varies over decimetres.
+# Steps between evaluations of the visibility kernel: sources move millimetres,
+# it varies over decimetres.
 REFRESH = 16
 ROUND_STEPS, POLISHING_STEPS = 12, 20  # after a change of some sources, and of all
 VISIBILITY_STEPS = 10  # of `learn_visibility`
@@ -27,8 +30,11 @@ SPREAD = 0.5  # prior standard deviation of a visibility kernel's logarithms and
 Cost = Callable[[SourceScene], Tensor]  # negative log prior [nats] of a scene
 
 
-def refine_scene(rows: Rows, scene: SourceScene, steps: int, cost: Cost | None = None) -> SourceScene:
-    """Return the best scene of `steps` of Adam (D. P. Kingma and J. Ba, ICLR 2015), or until `out_of_steps`.
+def refine_scene(
+    rows: Rows, scene: SourceScene, steps: int, cost: Cost | None = None
+) -> SourceScene:
+    """Return the best scene of `steps` of Adam (D. P. Kingma and J. Ba, ICLR 2015),
+    or until `out_of_steps`.
 
     Args:
         rows: measurements.
@@ -49,7 +55,8 @@ def refine_scene(rows: Rows, scene: SourceScene, steps: int, cost: Cost | None =
                 group["lr"] *= DECAY
         if step % REFRESH == 0:
             seen = (
-                scene.visibility.correlation(rows.places, one) for one in _scene_at(scene, values).sources
+                scene.visibility.correlation(rows.places, one)
+                for one in _scene_at(scene, values).sources
             )
             correlation = torch.stack([*seen])
         value, gradient = _cost_and_gradient(rows, scene, values, correlation, cost)
@@ -64,16 +71,26 @@ def refine_scene(rows: Rows, scene: SourceScene, steps: int, cost: Cost | None =
 
 
 def _scene_at(scene: SourceScene, values: list[Tensor]) -> SourceScene:
-    """The scene of other transmitter, normals, offsets, log amplitudes, log noise and phases, if any."""
+    """The scene of other transmitter, normals, offsets, log amplitudes, log noise and phases,
+    if any.
+    """
     transmitter, normal, offset, log_amplitude, log_noise, *phase = values
     return replace(
-        scene, transmitter=transmitter, planes=torch.cat([normal, offset], 1), log_amplitude=log_amplitude,
-        log_noise=log_noise.item(), phase=phase[0] if phase else None,
-    )  # fmt: skip
+        scene,
+        transmitter=transmitter,
+        planes=torch.cat([normal, offset], 1),
+        log_amplitude=log_amplitude,
+        log_noise=log_noise.item(),
+        phase=phase[0] if phase else None,
+    )
 
 
 def _cost_and_gradient(
-    rows: Rows, scene: SourceScene, values: list[Tensor], correlation: Tensor, cost: Cost | None = None
+    rows: Rows,
+    scene: SourceScene,
+    values: list[Tensor],
+    correlation: Tensor,
+    cost: Cost | None = None,
 ) -> tuple[float, list[Tensor]]:
     """Negative log likelihood and prior, and derivatives by the values: `d nll = trace(G dK)`."""
     leaves = [v.detach().requires_grad_() for v in values]
@@ -100,10 +117,11 @@ def _cost_and_gradient(
 def learn_visibility(
     rows: Rows, scene: SourceScene, centre: KernelVisibility, steps: int = VISIBILITY_STEPS
 ) -> SourceScene:
-    """Fit the visibility kernel by likelihood until `out_of_steps`, with a log-normal prior about `centre`.
+    """Fit the visibility kernel by likelihood until `out_of_steps`,
+    with a log-normal prior about `centre`.
 
-    Without the prior the lengths collapse to explain the power of sources not found yet. Of gains with phases
-    `quadrature` is learned as well, unless it is 1: its prior is about the present one.
+    Without the prior the lengths collapse to explain the power of sources not found yet. Of gains
+    with phases `quadrature` is learned as well, unless it is 1: its prior is about the present one.
 
     Args:
         rows: a few hundred are enough.
@@ -111,13 +129,17 @@ def learn_visibility(
         centre: of the prior.
         steps: of Adam.
     """
-    shares, least, wide = ((), 0.02, 1.0) if scene.phase is None else ((scene.quadrature,), 0.005, 2**0.5)
+    shares, least, wide = (
+        ((), 0.02, 1.0) if scene.phase is None else ((scene.quadrature,), 0.005, 2**0.5)
+    )
     about, value = (kernel.to_parameters(least, *shares) for kernel in (centre, scene.visibility))
     width = SPREAD * torch.tensor([1.0, 1.0, 1.0, 2.0])[: len(value)] * wide
     optimizer = torch.optim.Adam([value.requires_grad_()], lr=0.1, betas=BETAS)
 
     def current_scene() -> SourceScene:
-        trial = replace(scene, visibility=KernelVisibility.from_parameters(value.detach()).to_floats())
+        trial = replace(
+            scene, visibility=KernelVisibility.from_parameters(value.detach()).to_floats()
+        )
         if scene.quadrature == 1:
             return trial
         return replace(trial, quadrature=float(torch.sigmoid(value.detach()[-1])))

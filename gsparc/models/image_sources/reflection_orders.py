@@ -16,21 +16,32 @@ from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.refine import ROUND_STEPS, refine_scene
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import SourceScene
-from gsparc.physics.mirror_planes import Reflections, all_sequences, bisector, hesse_form, images, reflect
+from gsparc.physics.mirror_planes import (
+    Reflections,
+    all_sequences,
+    bisector,
+    hesse_form,
+    images,
+    reflect,
+)
 from gsparc.processes.worker import out_of_steps
 
-LENGTH_PENALTY_M = 0.02  # [m] per reflection: of two sequences at the same position the shorter is preferred
+# [m] per reflection: of two sequences at the same position the shorter is preferred
+LENGTH_PENALTY_M = 0.02
 MIN_IMAGE_SHIFT_M = 0.2  # [m], half the least distance of a source from its mirror image
 ALLOWANCE = 10.0  # nats that may be lost with a plane
 ORDER = 3  # largest number of reflections of a source
-WALL_TOLERANCE, LEAST_M = 0.03, 0.02  # of a source's distance from the transmitter, plus [m], to an image
+# Of a source's distance from the transmitter, plus [m], to an image
+WALL_TOLERANCE, LEAST_M = 0.03, 0.02
 NEAR_SEQUENCE_M = 0.06  # [m], to that in perpendicular ones, plus 1 % of the distance
 MOST_WALLS = 10
 MANY_PLANES = 9  # beyond, third-order sequences are too many to try
 
 
 def drop_planes(rows: Rows, scene: SourceScene, tolerance: float) -> SourceScene:
-    """Try to remove planes until `out_of_steps`: sequences become the nearest over others [tolerance: m]."""
+    """Try to remove planes until `out_of_steps`:
+    sequences become the nearest over others [tolerance: m].
+    """
     index = 0
     while index < len(scene.planes) and not out_of_steps():
         shorter = _remove_plane(scene, index, tolerance)
@@ -55,7 +66,8 @@ def _remove_plane(scene: SourceScene, index: int, tolerance: float) -> SourceSce
     distance = _penalised_distances(scene, candidates, scene.sources[users])
     nearest = distance.argmin(1).tolist()
     strength = (
-        scene.log_amplitude[users] - (scene.sources[users] - scene.transmitter).norm(dim=1).clamp_min(1).log()
+        scene.log_amplitude[users]
+        - (scene.sources[users] - scene.transmitter).norm(dim=1).clamp_min(1).log()
     )
     if distance[int(strength.argmax())].min() > tolerance:
         return None
@@ -69,7 +81,9 @@ def _remove_plane(scene: SourceScene, index: int, tolerance: float) -> SourceSce
     return replace(scene, sequences=tuple(sequences)).select_sources(sorted(numbers))
 
 
-def _penalised_distances(scene: SourceScene, sequences: list[Reflections], places: Tensor) -> Tensor:
+def _penalised_distances(
+    scene: SourceScene, sequences: list[Reflections], places: Tensor
+) -> Tensor:
     """Distances (places, sequences) [m], plus a penalty on the order."""
     position = images(scene.transmitter, scene.planes, sequences)
     order = torch.tensor([len(sequence) for sequence in sequences])
@@ -77,7 +91,9 @@ def _penalised_distances(scene: SourceScene, sequences: list[Reflections], place
 
 
 def find_walls(sources: Tensor) -> Tensor | None:
-    """Return walls: planes (P, 4) that mirror many of the sources (K, 3) into one another, or None."""
+    """Return walls: planes (P, 4) that mirror many of the sources (K, 3) into one another,
+    or None.
+    """
     count = len(sources)
     tolerance = _wall_tolerance(sources)
     first, second = torch.triu_indices(count, count, 1)
@@ -86,7 +102,8 @@ def find_walls(sources: Tensor) -> Tensor | None:
     if len(planes) == 0:
         return None
     mirrored = reflect(sources[:, None], planes[None])  # (K, P, 3)
-    distance = torch.cdist(mirrored.flatten(0, 1), sources).unflatten(0, mirrored.shape[:2])  # (K, P, K)
+    # (K, P, K)
+    distance = torch.cdist(mirrored.flatten(0, 1), sources).unflatten(0, mirrored.shape[:2])
     allowed = torch.maximum(tolerance[:, None], tolerance[None])[:, None]
     agreement = torch.exp(-((2 * distance / allowed) ** 2)) * (distance < allowed)
     moved = (mirrored - sources[:, None]).norm(dim=-1) > 2 * MIN_IMAGE_SHIFT_M
@@ -96,7 +113,9 @@ def find_walls(sources: Tensor) -> Tensor | None:
     while len(chosen) < MOST_WALLS and support.max() >= 1.7:
         best = int(support.argmax())
         chosen.append(planes[best])
-        alike = (mirrored - mirrored[:, best : best + 1]).norm(dim=-1).mean(0) < 2 * tolerance.mean()
+        alike = (mirrored - mirrored[:, best : best + 1]).norm(dim=-1).mean(
+            0
+        ) < 2 * tolerance.mean()
         support = support.masked_fill(alike, -1.0)
     return torch.stack(chosen) if chosen else None
 
@@ -107,11 +126,12 @@ def _wall_tolerance(sources: Tensor) -> Tensor:
 
 
 def find_orthogonal_walls(scene: SourceScene) -> Tensor | None:
-    """Return the fewest planes (P, 4) of three perpendicular normals that explain most of a scene's sources.
+    """Return the fewest planes (P, 4) of three perpendicular normals that explain most
+    of a scene's sources.
 
-    Rooms are mostly boxes: two perpendicular walls give the third normal, and a pair of sources that differ
-    along one normal only gives a plane. None when no two planes are perpendicular. The sequences of the
-    scene's sources may be wrong.
+    Rooms are mostly boxes: two perpendicular walls give the third normal, and a pair of sources
+    that differ along one normal only gives a plane. None when no two planes are perpendicular. The
+    sequences of the scene's sources may be wrong.
     """
     triad = _wall_axes(scene)
     if triad is None:
@@ -144,7 +164,9 @@ def _wall_axes(scene: SourceScene) -> Tensor | None:
     """Three perpendicular unit vectors (3, 3), two of them normals of the planes used most."""
     used = [sum(i in sequence for sequence in scene.sequences) for i in range(len(scene.planes))]
     normals, _ = hesse_form(scene.planes)
-    pairs = [(i, j) for i in range(len(used)) for j in range(i) if (normals[i] @ normals[j]).abs() < 0.02]
+    pairs = [
+        (i, j) for i in range(len(used)) for j in range(i) if (normals[i] @ normals[j]).abs() < 0.02
+    ]
     if not pairs:
         return None
     i, j = max(pairs, key=lambda pair: used[pair[0]] + used[pair[1]])
@@ -165,7 +187,9 @@ def _count_explained(scene: SourceScene, planes: Tensor, tolerance: Tensor) -> f
 
 
 def reassign_to_walls(scene: SourceScene, walls: Tensor) -> SourceScene:
-    """Return new sequences over `walls` for all sources; one without a sequence gets a plane of its own."""
+    """Return new sequences over `walls` for all sources;
+    one without a sequence gets a plane of its own.
+    """
     sources = scene.sources
     tolerance = 2.5 * _wall_tolerance(sources)
     base = replace(scene, planes=walls)
@@ -185,18 +209,25 @@ def reassign_to_walls(scene: SourceScene, walls: Tensor) -> SourceScene:
             sequences.append((len(planes) - 1,))
             ids.append(i)
     explained = replace(
-        scene, planes=torch.stack(planes), sequences=tuple(sequences), log_amplitude=scene.log_amplitude[ids]
+        scene,
+        planes=torch.stack(planes),
+        sequences=tuple(sequences),
+        log_amplitude=scene.log_amplitude[ids],
     )
     return explained.select_sources(list(range(len(ids))))
 
 
 def prune_sources(rows: Rows, scene: SourceScene, min_gain: float) -> SourceScene:
-    """Drop sources that gain under `min_gain` nats, twice with a plane of their own, or `out_of_steps`."""
+    """Drop sources that gain under `min_gain` nats, twice with a plane of their own,
+    or `out_of_steps`.
+    """
     posterior, ids = GainPosterior(rows, scene), list(range(len(scene.sequences)))
     for i in sorted(ids[1:], key=lambda i: float(scene.log_amplitude[i])):
         if out_of_steps():
             break
-        sole_user = any(sum(index in scene.sequences[j] for j in ids) == 1 for index in scene.sequences[i])
+        sole_user = any(
+            sum(index in scene.sequences[j] for j in ids) == 1 for index in scene.sequences[i]
+        )
         loss = posterior.nll_without_source(ids.index(i)) - posterior.nll
         if loss < (2 * min_gain if sole_user else min_gain):
             ids.remove(i)

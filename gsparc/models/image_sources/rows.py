@@ -1,7 +1,8 @@
 """Measured channels as rows of one regression: a place, a frequency and what was measured there.
 
-To a receiver all sources are fixed points: a mirror image of the static end, or a small object, whose leg to
-the static end is the same for every receiver and folds into the complex gain. They differ when it moves.
+To a receiver all sources are fixed points: a mirror image of the static end, or a small object,
+whose leg to the static end is the same for every receiver and folds into the complex gain.
+They differ when it moves.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ class Rows:
         frequency: (n,) float64 [Hz].
         target: (n, R) complex64; R outputs share sources and visibility but not gains.
         receiver: (n,) int64, which measurement a row belongs to.
-        array: (E, 3) float64 [m], antennas of the static end from its position, site axes; None for one.
+        array: (E, 3) float64 [m], antennas of the static end from its position, site axes; None for
+            one.
         element: (n,) int64, which of these a row was measured with; None without `array`.
     """
 
@@ -62,9 +64,11 @@ class Rows:
 
 
 def static_array(site: Site, antennas: int) -> np.ndarray | None:
-    """Return antennas (E, 3) float64 [m] of a static receiver from its position, site axes; None for one.
+    """Return antennas (E, 3) float64 [m] of a static receiver from its position, site axes;
+    None for one.
 
-    By reciprocity the moving transmitter receives from each of them; those of unknown places are outputs.
+    By reciprocity the moving transmitter receives from each of them;
+    those of unknown places are outputs.
     """
     if site.static_end != "rx" or site.array is None or antennas == 1:
         return None
@@ -73,17 +77,21 @@ def static_array(site: Site, antennas: int) -> np.ndarray | None:
 
 
 def antenna_positions(site: Site, position: Tensor, rotation: Tensor, antennas: int) -> Tensor:
-    """Return places (S, E, 3) [m] of antennas at positions (S, 3); E = 1 where the geometry is unknown.
+    """Return places (S, E, 3) [m] of antennas at positions (S, 3);
+    E = 1 where the geometry is unknown.
 
     Rotations (S, 3, 3), or one (1, 3, 3) for all; differentiable.
     """
     if site.array is None or antennas == 1:
         return position[:, None]
-    return position[:, None] + torch.einsum("sij,ej->sei", rotation, torch.as_tensor(site.array).double())
+    return position[:, None] + torch.einsum(
+        "sij,ej->sei", rotation, torch.as_tensor(site.array).double()
+    )
 
 
 def channel_places(site: Site, antennas: int, position: Tensor, rotation: Tensor) -> Tensor:
-    """Return where antennas' channels are measured (`Rows.places`): (S, E, 3) or (S, E, 6) float64 [m].
+    """Return where antennas' channels are measured (`Rows.places`): (S, E, 3) or (S, E, 6)
+    float64 [m].
 
     Args:
         site: where.
@@ -104,9 +112,9 @@ def channel_places(site: Site, antennas: int, position: Tensor, rotation: Tensor
 def rows_of_measurements(data: Measurements, index: np.ndarray, limit: int, seed: int) -> Rows:
     """Return at most `limit` rows from the given measurements.
 
-    Every measurement gives as many antennas of known places as the limit allows, drawn at random, and each
-    of these the same number of tones, a comb over the band with a random start, so that together they cover
-    it. When one row each exceeds the limit, measurements are subsampled.
+    Every measurement gives as many antennas of known places as the limit allows, drawn at random,
+    and each of these the same number of tones, a comb over the band with a random start, so that
+    together they cover it. When one row each exceeds the limit, measurements are subsampled.
 
     Args:
         data: kind csi; a transmitter that moves is, by reciprocity, a moving receiver.
@@ -130,7 +138,8 @@ def rows_of_measurements(data: Measurements, index: np.ndarray, limit: int, seed
         values = data.target[row].astype(np.complex64)  # (A, K)
         measured = np.ones((antennas, tones), bool) if data.mask is None else data.mask[row]
         for e in few_rows.draw_rows(per, most, rng) if most < per else range(per):
-            # Antennas of unknown places are outputs of one row, so that a tone must be measured at all.
+            # Antennas of unknown places are outputs of one row,
+            # so that a tone must be measured at all.
             bins = np.flatnonzero(measured[e] if per > 1 else measured.all(0))
             count = min(wanted, len(bins))
             if count == 0:
@@ -140,19 +149,24 @@ def rows_of_measurements(data: Measurements, index: np.ndarray, limit: int, seed
             at, target = np.repeat(first_end(place[e, None]), count, 0), values[e, comb][:, None]
             target = target if per > 1 else values[:, comb].T
             parts.append((at, frequency[comb], target, np.full(count, row), np.full(count, e)))
-    *columns, element = (torch.from_numpy(np.concatenate(column)) for column in zip(*parts, strict=True))
+    *columns, element = (
+        torch.from_numpy(np.concatenate(column)) for column in zip(*parts, strict=True)
+    )
     rows = Rows(*columns)
     return rows if array is None else replace(rows, array=torch.from_numpy(array), element=element)
 
 
 def measured_places(data: Measurements, index: np.ndarray) -> Tensor:
     """Return `channel_places` of measurements (S,)."""
-    position, rotation = (torch.from_numpy(of[index]).double() for of in (data.moving, data.rx_rotation))
+    position, rotation = (
+        torch.from_numpy(of[index]).double() for of in (data.moving, data.rx_rotation)
+    )
     return channel_places(data.site, data.target.shape[1], position, rotation)
 
 
 def ranges_at(places: Tensor, sources: Tensor, rotations: Tensor) -> Tensor:
-    """Return ranges (m, K) float64 [m] from places (m, 3), or of images of antennas from places (m, 6).
+    """Return ranges (m, K) float64 [m] from places (m, 3),
+    or of images of antennas from places (m, 6).
 
     Args:
         places: see `Rows.places`.
@@ -161,6 +175,7 @@ def ranges_at(places: Tensor, sources: Tensor, rotations: Tensor) -> Tensor:
     """
     position = first_end(places)
     if places.shape[1] > position.shape[1]:
-        # A mirror turns the array with its middle: offsets of antennas are mirrored about the image.
+        # A mirror turns the array with its middle:
+        # offsets of antennas are mirrored about the image.
         sources = sources + torch.einsum("kij,mj->mki", rotations, places[:, position.shape[1] :])
     return ranges(position, sources)

@@ -29,7 +29,8 @@ ROUNDED = 1e-3  # of a squared length, largest rounding error of a squared dista
 class KernelVisibility:
     """`c + (1 - c) Matern-3/2(direction, place)`: a constant gain plus one that varies smoothly.
 
-    Sources do not occlude each other: each has its own gain process, and all share the kernel's parameters.
+    Sources do not occlude each other: each has its own gain process,
+    and all share the kernel's parameters.
 
     Attributes:
         constant: share of the gain's variance that is the same everywhere.
@@ -41,10 +42,13 @@ class KernelVisibility:
     angle: float | Tensor = 0.5
     length: float | Tensor = 2.0
 
-    def correlation(self, places: Tensor, source: Tensor, dtype: torch.dtype = torch.float32) -> Tensor:
+    def correlation(
+        self, places: Tensor, source: Tensor, dtype: torch.dtype = torch.float32
+    ) -> Tensor:
         """Return (n, n) in [0, 1] of the gains of a source (3,) [m] at places (n, 3) float64 [m].
 
-        By reciprocity gains also vary over places of the static end, the last three of (n, 6) numbers.
+        By reciprocity gains also vary over places of the static end, the last three of (n, 6)
+        numbers.
         """
         squared = _squared_distances(unit_vectors(first_end(places), source, dtype)) / self.angle**2
         if not _needs_float64(places, float(torch.as_tensor(self.length).detach())):
@@ -54,11 +58,15 @@ class KernelVisibility:
 
     @staticmethod
     def from_parameters(value: Tensor) -> KernelVisibility:
-        """Make it from the logit of `constant` and the logarithms of both lengths; differentiable."""
+        """Make it from the logit of `constant` and the logarithms of both lengths;
+        differentiable.
+        """
         return KernelVisibility(torch.sigmoid(value[0]), value[1].exp(), value[2].exp())
 
     def to_parameters(self, min_share: float, *shares: float) -> Tensor:
-        """Return what `from_parameters` reads, then logits of more `shares`; all are at least `min_share`."""
+        """Return what `from_parameters` reads, then logits of more `shares`;
+        all are at least `min_share`.
+        """
         # A logit has no value at 0 and 1, and hardly a slope near them.
         clipped = [min(max(float(share), min_share), 0.995) for share in (self.constant, *shares)]
         first, *rest = (math.log(share / (1 - share)) for share in clipped)
@@ -83,8 +91,8 @@ class SourceScene:
         visibility: kernel of all sources' gains, beside the occlusion by clutter.
         clutter: occluding boxes and finite mirrors.
         phase: (K,) float32 [rad] of gains of constant phase; None: gains are circular.
-        quadrature: in (0, 1], twice the share of a gain's variance in quadrature to its phase; 1 with several
-            outputs, which have no common phase.
+        quadrature: in (0, 1], twice the share of a gain's variance in quadrature to its phase; 1
+            with several outputs, which have no common phase.
         noise_floor: known variance of the noise, beside what is estimated, in the same units.
     """
 
@@ -100,7 +108,9 @@ class SourceScene:
     noise_floor: float = JITTER
 
     @staticmethod
-    def from_static_end(transmitter: Tensor, log_amplitude: Tensor, log_noise: float = 0.0) -> SourceScene:
+    def from_static_end(
+        transmitter: Tensor, log_amplitude: Tensor, log_noise: float = 0.0
+    ) -> SourceScene:
         """Return the static end (3,) [m] alone, of log amplitude (1,)."""
         return SourceScene(transmitter, NO_PLANES, ((),), log_amplitude, log_noise)
 
@@ -131,17 +141,23 @@ class SourceScene:
         return torch.polar(torch.ones_like(self.phase), self.phase)
 
     def visible_share(self, places: Tensor) -> Tensor:
-        """Return shares (n, K), or (1, 1), of sources that clutter lets through to places (n, 3) [m]."""
+        """Return shares (n, K), or (1, 1), of sources that clutter lets through to places (n, 3)
+        [m].
+        """
         if not len(self.clutter):
             return torch.ones(1, 1)
         return self.obstacles.visible_share(self.unfolding.paths(places)).T
 
     def images(self, rows: Rows) -> Tensor:
-        """Return images (K, 3) float64 [m] of the static end, or (E, K, 3) of each of its antennas."""
+        """Return images (K, 3) float64 [m] of the static end, or (E, K, 3)
+        of each of its antennas.
+        """
         return images(rows.static_ends(self.transmitter), self.planes, self.sequences)
 
     def unobstructed_waves(self, rows: Rows) -> Tensor:
-        """Return waves (n, K) complex64 of sources at every row, turned by phases, without clutter."""
+        """Return waves (n, K) complex64 of sources at every row, turned by phases,
+        without clutter.
+        """
         waves = spherical_waves(rows, self.images(rows))
         return waves if self.phase is None else waves * self.phase_factors
 
@@ -151,9 +167,17 @@ class SourceScene:
         return waves if self.phase is None else waves * self.phase_factors
 
     def longer_sequences(self, order: int) -> list[Reflections]:
-        """Return other sequences over the planes: up to `order` with one more at the end, and all pairs."""
+        """Return other sequences over the planes: up to `order` with one more at the end,
+        and all pairs.
+        """
         indices = range(len(self.planes))
-        more = [(*w, i) for w in self.sequences if len(w) < order for i in indices if not w or w[-1] != i]
+        more = [
+            (*w, i)
+            for w in self.sequences
+            if len(w) < order
+            for i in indices
+            if not w or w[-1] != i
+        ]
         sequences = set(self.sequences)
         return [w for w in dict.fromkeys(more + all_sequences([*indices], 2)) if w not in sequences]
 
@@ -164,7 +188,9 @@ class SourceScene:
     def add_sequences(
         self, sequences: list[Reflections], amplitude: Tensor, phase: Tensor | None = None
     ) -> SourceScene:
-        """Return more sources, with amplitudes (k,), and phases (k,) [rad] where gains have them."""
+        """Return more sources, with amplitudes (k,), and phases (k,)
+        [rad] where gains have them.
+        """
         log_amplitude = torch.cat([self.log_amplitude, amplitude.log().float()])
         if phase is not None and self.phase is not None:
             phase = torch.cat([self.phase, phase])
@@ -201,11 +227,15 @@ def spherical_waves(rows: Rows, sources: Tensor) -> Tensor:
         if sources.dim() == 2:
             raise ValueError("rows of several static antennas need the images of each, (E, K, 3)")
         sources = sources.index_select(0, rows.element)  # (n, K, 3)
-    return point_wave(ranges(rows.position, sources), rows.frequency[:, None], rows.target.real.dtype)
+    return point_wave(
+        ranges(rows.position, sources), rows.frequency[:, None], rows.target.real.dtype
+    )
 
 
 def direct_amplitude(rows: Rows, transmitter: Tensor) -> Tensor:
-    """Return the amplitude () of the direct wave of the static end (3,) [m] if it were all there is."""
+    """Return the amplitude () of the direct wave of the static end (3,)
+    [m] if it were all there is.
+    """
     waves = spherical_waves(rows, rows.static_ends(transmitter)[..., None, :])
     return (waves.mH @ rows.target).abs().mean() / waves.abs().square().sum()
 

@@ -1,4 +1,6 @@
-"""Search for image sources: greedy, over reflections in known planes first, over free space second."""
+"""Search for image sources: greedy, over reflections in known planes first,
+over free space second.
+"""
 
 from __future__ import annotations
 
@@ -39,11 +41,13 @@ log = logging.getLogger(__name__)
 
 NOISE = 0.1  # variance at the start, of unit signal power
 PARENTS = 4  # of a new source, tried in turn until one is found
-SEQUENCE_SCORE, FREE_SCORE = 8.0, 15.0  # least of a sequence over known planes, of a source with its own
+# Least of a sequence over known planes, of a source with its own
+SEQUENCE_SCORE, FREE_SCORE = 8.0, 15.0
 SEQUENCES_PER_ROUND, FREE_PER_ROUND = 4, 2  # new sources, at most
 PRUNE = 5.0  # least gain of a source kept [nats]
 Found = tuple[Tensor, Tensor]  # places and amplitudes of sources
-PATIENCE, PROGRESS = 3, SEQUENCE_SCORE  # rounds without a gain of a source's nats, that end the search
+# Rounds without a gain of a source's nats, that end the search
+PATIENCE, PROGRESS = 3, SEQUENCE_SCORE
 REARRANGED_EVERY = 3  # rounds between attempts at walls, and at the visibility's lengths
 LEARN_VISIBILITY_FROM = 12  # sources, from which on the visibility's lengths are learned
 
@@ -59,7 +63,8 @@ class SearchSettings(Checked):
         margin: of the search box around receivers and transmitter [m].
         max_sources: that end the search.
         order: largest reflection order of a source.
-        offsets: unknown offsets of every snapshot, to be estimated: `none`, `phase` or `phase_timing`.
+        offsets: unknown offsets of every snapshot, to be estimated: `none`, `phase` or
+            `phase_timing`.
         clutter: search for occluding boxes and finite mirrors, shared by all sources.
         seed: of everything random in the first search; the others count on.
         final_steps: of refinement at the end.
@@ -78,7 +83,8 @@ class SearchSettings(Checked):
 
 
 class Search:
-    """One search over one set of normalised rows (`Frame`); if `out_of_steps`, with what was found so far.
+    """One search over one set of normalised rows (`Frame`); if `out_of_steps`,
+    with what was found so far.
 
     Args:
         rows: a few hundred.
@@ -90,14 +96,21 @@ class Search:
     """
 
     def __init__(
-        self, rows: Rows, transmitter: Tensor, settings: SearchSettings, number: int,
-        after_round: Callable[[], bool], found: Found | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        rows: Rows,
+        transmitter: Tensor,
+        settings: SearchSettings,
+        number: int,
+        after_round: Callable[[], bool],
+        found: Found | None = None,
+    ) -> None:
         self.rows, self.settings, self.after_round = rows, settings, after_round
         self.generator = torch.Generator().manual_seed(settings.seed + number)
         self.wavelength = LIGHT / float(rows.frequency.mean())
         measured = torch.cat([rows.position, transmitter[None]])
-        self.box = torch.stack([measured.amin(0) - settings.margin, measured.amax(0) + settings.margin])
+        self.box = torch.stack(
+            [measured.amin(0) - settings.margin, measured.amax(0) + settings.margin]
+        )
         loudness = direct_amplitude(rows, transmitter).log().reshape(1)
         self.scene = SourceScene.from_static_end(transmitter, loudness, math.log(NOISE))
         if found is not None and settings.order:
@@ -131,8 +144,12 @@ class Search:
             nll = GainPosterior(self.rows, self.scene).nll
             log.debug(
                 "round %d: %d sources, %d planes, nll %.1f, %s",
-                number, len(self.scene.sequences), len(self.scene.planes), nll, self.scene.visibility,
-            )  # fmt: skip
+                number,
+                len(self.scene.sequences),
+                len(self.scene.planes),
+                nll,
+                self.scene.visibility,
+            )
             if len(self.scene.sequences) >= s.max_sources:
                 break
             stale, best = (0, nll) if nll < best - PROGRESS else (stale + 1, best)
@@ -157,7 +174,9 @@ class Search:
 
     def _learn_visibility(self, steps: int) -> None:
         if len(self.scene.sequences) >= LEARN_VISIBILITY_FROM:
-            few = self.rows.select_rows(torch.randperm(len(self.rows), generator=self.generator)[:400])
+            few = self.rows.select_rows(
+                torch.randperm(len(self.rows), generator=self.generator)[:400]
+            )
             self.scene = learn_visibility(few, self.scene, KernelVisibility(), steps)
 
     def _add_sequences(self, limit: int | None = None) -> int:
@@ -166,9 +185,13 @@ class Search:
         more = scene.replace_sequences(scene.longer_sequences(self.settings.order))
         if not more.sequences:
             return 0
-        scores, amplitude = gains_and_amplitudes(GainPosterior(self.rows, scene), more.images(self.rows))
+        scores, amplitude = gains_and_amplitudes(
+            GainPosterior(self.rows, scene), more.images(self.rows)
+        )
         spacing = 0.5 * self.wavelength
-        chosen = select_separated(more.sources, scores, spacing, limit, SEQUENCE_SCORE, scene.sources)
+        chosen = select_separated(
+            more.sources, scores, spacing, limit, SEQUENCE_SCORE, scene.sources
+        )
         if chosen:
             self.scene = scene.add_sequences([more.sequences[i] for i in chosen], amplitude[chosen])
         return len(chosen)
@@ -176,16 +199,21 @@ class Search:
     def _add_free_sources(self) -> int:
         """Add the best sources anywhere in the box, each with a plane of its own; returns how many.
 
-        Images of several antennas are turned as their parent's are: with an array, parents are tried in turn.
+        Images of several antennas are turned as their parent's are: with an array,
+        parents are tried in turn.
         """
         posterior = GainPosterior(self.rows, self.scene)
-        parents: list[Reflections | None] = [None] if self.rows.array is None else [*self._strong_parents()]
+        parents: list[Reflections | None] = (
+            [None] if self.rows.array is None else [*self._strong_parents()]
+        )
         for number, parent in enumerate(parents):
             if number and out_of_steps():
                 break
             spread = partial(self._antenna_images, parent)
             spacing = 0.5 * self.wavelength
-            found = find_sources_in_box(posterior, self.box, spacing, FREE_PER_ROUND, self.generator, spread)
+            found = find_sources_in_box(
+                posterior, self.box, spacing, FREE_PER_ROUND, self.generator, spread
+            )
             found = [source for source in found if source[1] >= FREE_SCORE]
             for position, _, amplitude in found:
                 sequence, plane = self._best_parent_and_plane(position, posterior)
@@ -199,16 +227,24 @@ class Search:
 
     def _reflectable(self, scene: SourceScene) -> list[int]:
         """Sources that may be reflected once more."""
-        return [i for i, sequence in enumerate(scene.sequences) if len(sequence) < self.settings.order]
+        return [
+            i for i, sequence in enumerate(scene.sequences) if len(sequence) < self.settings.order
+        ]
 
     def _strong_parents(self) -> list[Reflections]:
-        """The static end, then the sequences of the loudest sources that may be reflected once more."""
+        """The static end, then the sequences of the loudest sources
+        that may be reflected once more.
+        """
         loudness = self.scene.log_amplitude
-        louder = sorted((i for i in self._reflectable(self.scene) if i), key=lambda i: -float(loudness[i]))
+        louder = sorted(
+            (i for i in self._reflectable(self.scene) if i), key=lambda i: -float(loudness[i])
+        )
         return [self.scene.sequences[i] for i in (0, *louder[: PARENTS - 1])]
 
     def _antenna_images(self, parent: Reflections | None, points: Tensor) -> Tensor:
-        """Images (E, m, 3) of the antennas when a parent, reflected once more, is at points (m, 3)."""
+        """Images (E, m, 3) of the antennas when a parent, reflected once more,
+        is at points (m, 3).
+        """
         if parent is None:
             return points
         scene = self.scene.replace_sequences((parent,))
@@ -217,12 +253,16 @@ class Search:
     def _best_parent_and_plane(
         self, position: Tensor, posterior: GainPosterior
     ) -> tuple[Reflections, Tensor]:
-        """Parent of a new source: its bisector with it, as a mirror, explains most of the residual."""
+        """Parent of a new source: its bisector with it, as a mirror,
+        explains most of the residual.
+        """
         scene, able = posterior.scene, self._reflectable(posterior.scene)
         planes = bisector(scene.sources[able], position)
         mirrored = reflect(scene.sources[None], planes[:, None])  # (parents, K, 3)
         flat = mirrored.flatten(0, 1)
-        candidates = reflect(scene.images(self.rows)[..., None, :, :], planes[:, None]).flatten(-3, -2)
+        candidates = reflect(scene.images(self.rows)[..., None, :, :], planes[:, None]).flatten(
+            -3, -2
+        )
         sources = torch.cat([scene.sources, position[None]])
         new = torch.cdist(flat, sources).amin(1) > 0.5 * self.wavelength
         scores = gains_and_amplitudes(posterior, candidates)[0].reshape(mirrored.shape[:2])
@@ -234,7 +274,9 @@ class Search:
         return scene.sequences[able[best]], planes[best]
 
     def _try_paired_walls(self) -> None:
-        """Find walls among all pairs of sources, reassign sources to them if the likelihood allows."""
+        """Find walls among all pairs of sources,
+        reassign sources to them if the likelihood allows.
+        """
         if len(self.scene.sequences) < 6:
             return
         self._try_walls(orders.find_walls(self.scene.sources))

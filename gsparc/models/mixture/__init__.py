@@ -1,1 +1,3 @@
-"""Several predictors of one site as one: solutions, processes, and their weights from held-out rows."""
+"""Several predictors of one site as one: solutions, processes,
+and their weights from held-out rows.
+"""

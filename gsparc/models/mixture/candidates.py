@@ -56,11 +56,15 @@ def make_powers(init: InitSettings, clutter: bool, context: FitContext) -> Close
 
 
 def make_joint_powers(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
-    """Return powers of several stations in one process; without `clutter` they share their law alone."""
+    """Return powers of several stations in one process;
+    without `clutter` they share their law alone.
+    """
     return JointPowerField(clutter and init.name != "diffuse", context.seed, context.terms)
 
 
-def make_bearings(init: InitSettings, clutter: bool, context: FitContext, **more: Any) -> ClosedForm:
+def make_bearings(
+    init: InitSettings, clutter: bool, context: FitContext, **more: Any
+) -> ClosedForm:
     """Return sources where bearings cross; `more` is of `MovingArrayField`."""
     search = replace(BearingSearchSettings(), sources=init.max_sources)
     return MovingArrayField(search, seed=context.seed, **more)

@@ -27,7 +27,9 @@ class LearnsTogether(MethodFactory):
     own_terms = OwnTerms()
 
     def learns_jointly(self, site: Site) -> bool:
-        """Tell whether stations share a field: of powers, or channels of a known carrier with phases."""
+        """Tell whether stations share a field: of powers,
+        or channels of a known carrier with phases.
+        """
         waves = site.has_waves and not site.paired
         return (waves and site.phase_reference != "neighbours") or site.target.is_level
 
@@ -37,14 +39,19 @@ class LearnsTogether(MethodFactory):
         if own.terms:
             return "model.terms are of one station's model"
         unaimed = own.prior is not None and find_sectors(data) is None
-        return "model.prior is of one station's model, or of a network with azimuths" if unaimed else None
+        return (
+            ("model.prior is of one station's model, or of a network with azimuths")
+            if unaimed
+            else None
+        )
 
     def choose_stations(
         self, data: Measurements, fold: Fold, context: FitContext
     ) -> tuple[Literal["each", "together"], str]:
         """See `Method.choose_stations`.
 
-        Channels share waves and where their stations really stand, powers a law that few rows of one tell.
+        Channels share waves and where their stations really stand,
+        powers a law that few rows of one tell.
         """
         if (why := self.why_each(data)) is not None:
             return "each", why
@@ -55,8 +62,12 @@ class LearnsTogether(MethodFactory):
         if data.site.target.is_complex:
             return "together", "channels at all stations share waves and the frame of places"
         if find_sectors(data) is not None:
-            return "together", "sectors of a network share a law, a pattern and the shadowing of their sites"
-        if not np.isin(data.stations_of(fold.test), data.stations_of(fold.train)).any() and len(fold.test):
+            return "together", (
+                "sectors of a network share a law, a pattern and the shadowing of their sites"
+            )
+        if not np.isin(data.stations_of(fold.test), data.stations_of(fold.train)).any() and len(
+            fold.test
+        ):
             return (
                 "together",
                 "no station of the test rows was heard: what stations share answers for them",

@@ -26,14 +26,21 @@ log = logging.getLogger(__name__)
 GROUPS = 3  # of training rows, that solutions are weighed by
 OPEN_ENDED = ("sources", "bearings", "scene")  # candidates that take what effort they are given
 SEARCHES = ("sources",)  # of them, those that race
-NEAR = 0.1  # share of the energy that another solution misses, below which few searches are enough beside it
+# Share of the energy that another solution misses, below which few searches are enough beside it
+NEAR = 0.1
 BESIDE = 2  # searches then, of the usual effort
 
 
 def fit_candidates(
-    parts: Mapping[str, Candidate], init: InitSettings, effects: EffectSettings, data: Measurements,
-    fold: Fold, context: FitContext, watch: Stopwatch, cut: InnerFolds | None,
-) -> tuple[dict[str, ClosedForm], dict[str, FitReport]]:  # fmt: skip
+    parts: Mapping[str, Candidate],
+    init: InitSettings,
+    effects: EffectSettings,
+    data: Measurements,
+    fold: Fold,
+    context: FitContext,
+    watch: Stopwatch,
+    cut: InnerFolds | None,
+) -> tuple[dict[str, ClosedForm], dict[str, FitReport]]:
     """Fit candidates; return them, and what each cost.
 
     Where they are several, training rows are cut into groups as the test was cut, and each solution

@@ -16,7 +16,8 @@ from gsparc.models.powers.own_terms import OwnTerms, to_terms
 from gsparc.models.terms import array_obstacle, phase_obstacle
 from gsparc.training.context import FitContext, FitReport
 
-PROCESS_ROWS = 1_000  # of a moving array, up to which sources may be worth less than the plain process
+# Of a moving array, up to which sources may be worth less than the plain process
+PROCESS_ROWS = 1_000
 
 
 def _candidates(*names: str) -> dict[str, Candidate]:
@@ -33,7 +34,9 @@ class ImageSources(Mixture):
         searched = ("sources", "rays") if data.directions is not None else ("sources",)
         placed = (str(self.init.name),) if self.init.name in CANDIDATES else searched
         # Offsets are known to sources alone.
-        return _candidates(*placed, *["diffuse"] * (self.init.snapshot == "none" and self.adds_process))
+        return _candidates(
+            *placed, *["diffuse"] * (self.init.snapshot == "none" and self.adds_process)
+        )
 
     def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""
@@ -41,7 +44,9 @@ class ImageSources(Mixture):
 
 
 class Channels(Mixture):
-    """Leakage, a direct wave and waves from all around; where rows were turned to each other, a process."""
+    """Leakage, a direct wave and waves from all around; where rows were turned to each other,
+    a process.
+    """
 
     name = "channels"
 
@@ -53,7 +58,11 @@ class Channels(Mixture):
 
     def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""
-        return None if data.site.target.is_complex else f"the target is {data.site.kind}, not channels"
+        return (
+            None
+            if data.site.target.is_complex
+            else (f"the target is {data.site.kind}, not channels")
+        )
 
 
 class Powers(Mixture):
@@ -92,11 +101,17 @@ class Powers(Mixture):
         """See `Mixture`."""
         if data.site.several and (why := self.why_each(data)) is not None:
             return f"{why}; say stations=each"
-        return None if data.site.target.is_level else f"the target is {data.site.kind}, not received powers"
+        return (
+            None
+            if data.site.target.is_level
+            else (f"the target is {data.site.kind}, not received powers")
+        )
 
 
 class Bearings(Mixture):
-    """Sources where bearings of a moving array cross, with processes of powers, beside the plain process."""
+    """Sources where bearings of a moving array cross, with processes of powers,
+    beside the plain process.
+    """
 
     name = "bearings"
 

@@ -47,9 +47,11 @@ PARTS = {"power": "a trend over distance", "residual": "a Gaussian process of th
 
 
 class Mixture(LearnsTogether, ClosedForm):
-    """The weighed mean of solutions whose weights follow from the rows: no single one need be the right one.
+    """The weighed mean of solutions whose weights follow from the rows:
+    no single one need be the right one.
 
-    Initialisers find them, held-out groups weigh them. Subclasses say what is solved for which kind of site.
+    Initialisers find them, held-out groups weigh them.
+    Subclasses say what is solved for which kind of site.
 
     Args:
         effects: switches of terms, of which `visibility` and `residual` are heeded.
@@ -61,17 +63,22 @@ class Mixture(LearnsTogether, ClosedForm):
     has_gaussians = resumable = True
 
     def __init__(
-        self, effects: EffectSettings = EffectSettings(), position_std: float | None = None,
-        init: InitSettings | None = None, residual_alone: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        effects: EffectSettings = EffectSettings(),
+        position_std: float | None = None,
+        init: InitSettings | None = None,
+        residual_alone: bool = False,
+    ) -> None:
         check_arguments(locals(), position_std=or_null(number(0)), residual_alone=switch())
         self.switches, self.init = effects, init or InitSettings()
         self.position_std, self.residual_alone = position_std, residual_alone
-        self.runs = RunFactors.identity()  # of channels, learned in the phase and level of the largest run
+        # Of channels, learned in the phase and level of the largest run
+        self.runs = RunFactors.identity()
         self.members: list[ClosedForm] = []
         self.weights: tuple[float, ...] = ()  # (M,) of the mean, of sum 1
         self.started = ""  # names of members
-        self.explained: float | None = None  # share of the variance of validation rows, by Gaussians
+        # Share of the variance of validation rows, by Gaussians
+        self.explained: float | None = None
         self.init_s: float | None = None
 
     @abstractmethod
@@ -90,10 +97,12 @@ class Mixture(LearnsTogether, ClosedForm):
     # -- learning ----------------------------------------------------------------------------------
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Initialise, weigh, and solve for all rows; where places have errors, again where they rather are.
+        """Initialise, weigh, and solve for all rows; where places have errors,
+        again where they rather are.
 
         Raises:
-            ValueError: these measurements are of another kind, or the only initialiser cannot solve this.
+            ValueError: these measurements are of another kind, or the only initialiser cannot solve
+                this.
         """
         self.site, self.runs = data.site, RunFactors.identity()
         if (why := self.why_not(data)) is not None:
@@ -102,13 +111,16 @@ class Mixture(LearnsTogether, ClosedForm):
         named = self.init.name in ("auto", "diffuse", *parts)
         if not named:  # an initialiser of another kind of site
             log.warning(
-                "init=%s has no effect here: what is tried is %s", self.init.name, " and ".join(parts)
+                "init=%s has no effect here: what is tried is %s",
+                self.init.name,
+                " and ".join(parts),
             )
         name = "diffuse" if self.residual_alone else self.init.name if named else "auto"
         init = replace(self.init, name=name)
         if "scene" in parts:
             read_walls(self.init.file)  # its errors come before anything is computed
-        # Places are refined by slopes of predictions: of one end that moves, with phases that rows share.
+        # Places are refined by slopes of predictions: of one end that moves,
+        # with phases that rows share.
         site, phases = data.site, data.site.phase_reference != "neighbours"
         heeds = not (site.target.is_image or site.paired) and phases
         fit_rows = fold.learned()
@@ -117,9 +129,14 @@ class Mixture(LearnsTogether, ClosedForm):
         return self._solve(parts, init, data, fold, context)
 
     def _fit_twice(
-        self, parts: Mapping[str, Candidate], init: InitSettings, data: Measurements, fold: Fold,
-        context: FitContext, std: np.ndarray,
-    ) -> FitReport:  # fmt: skip
+        self,
+        parts: Mapping[str, Candidate],
+        init: InitSettings,
+        data: Measurements,
+        fold: Fold,
+        context: FitContext,
+        std: np.ndarray,
+    ) -> FitReport:
         """First where rows were measured, then where they rather were."""
         watch = Stopwatch()
         # Files of the folder are of the second pass, which an interrupted run goes on with.
@@ -136,9 +153,13 @@ class Mixture(LearnsTogether, ClosedForm):
         return replace(report, seconds=spent + report.seconds, notes=notes, cost=cost)
 
     def _solve(
-        self, parts: Mapping[str, Candidate], init: InitSettings, data: Measurements, fold: Fold,
+        self,
+        parts: Mapping[str, Candidate],
+        init: InitSettings,
+        data: Measurements,
+        fold: Fold,
         context: FitContext,
-    ) -> FitReport:  # fmt: skip
+    ) -> FitReport:
         """Fit candidates, weigh several by rows held out, and condition them on all rows.
 
         Channels of several runs are learned in the phase and level of one.
@@ -152,11 +173,16 @@ class Mixture(LearnsTogether, ClosedForm):
         self.runs = _estimate_run_factors(data, fit_rows, context)
         data = self.runs.remove_factors(data)
         stages = {"factors of runs": watch.seconds} if len(self.runs) > 1 else {}
-        cut = cut_folds(data, fold, context.split, fit_candidates.GROUPS, context.seed) if several else None
+        cut = (
+            cut_folds(data, fold, context.split, fit_candidates.GROUPS, context.seed)
+            if several
+            else None
+        )
         found, reports = fit_candidates.fit_candidates(
             parts, init, self.switches, data, fold, context, watch, cut
         )
-        # Searches have errors of their own, and of few squares nothing is sure: a mixture need not be.
+        # Searches have errors of their own, and of few squares nothing is sure:
+        # a mixture need not be.
         sure = 0.0 if set(found).intersection((*fit_candidates.SEARCHES, "neighbours")) else 1.0
         chosen = weigh_members(found, data, fold.val, cut, sure)
         self.members, self.weights = [found[name] for name in chosen], tuple(chosen.values())
@@ -171,12 +197,18 @@ class Mixture(LearnsTogether, ClosedForm):
         # Not below 0: searches of a resumed run count what they took before.
         stages["weighing"] = max(self.init_s - sum(stages.values()), 0.0)
         stages["final weights"] = seconds - self.init_s
-        unused = {name: spent for name, spent in stages.items() if name in reports and name not in chosen}
+        unused = {
+            name: spent for name, spent in stages.items() if name in reports and name not in chosen
+        }
         notes = [note for name in chosen for note in reports[name].notes]
         return FitReport(seconds, tuple(notes)).with_cost(Cost(stages, unused))
 
-    def _explained_share(self, data: Measurements, fold: Fold, is_conditioned: bool) -> float | None:
-        """What Gaussians explain of validation rows; conditions on training rows, unless apart already."""
+    def _explained_share(
+        self, data: Measurements, fold: Fold, is_conditioned: bool
+    ) -> float | None:
+        """What Gaussians explain of validation rows; conditions on training rows,
+        unless apart already.
+        """
         if not (len(fold.val) and self.count_gaussians):
             return None
         if not is_conditioned:
@@ -200,11 +232,16 @@ class Mixture(LearnsTogether, ClosedForm):
         """See `HasMembers`; their weights keep their ratios."""
         chosen = [number for number, one in enumerate(self.members) if one in kept]
         names, weights = self.started.split("+"), np.array(self.weights)[chosen]
-        self.members, self.started = [self.members[i] for i in chosen], "+".join(names[i] for i in chosen)
+        self.members, self.started = (
+            [self.members[i] for i in chosen],
+            "+".join(names[i] for i in chosen),
+        )
         self.weights = tuple((weights / weights.sum()).tolist())
 
     def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
-        """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""
+        """See `Reconditions`; of fields whose parameters are few,
+        such as those of powers without fringes.
+        """
         if self.member is None or not self.member.forgets:
             return None
         # Deep, as members are conditioned in place and those of this method must stay as they are.
@@ -217,7 +254,9 @@ class Mixture(LearnsTogether, ClosedForm):
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; what members disagree about is added to their variances."""
         self.require_fitted(self.members or None)
-        prediction = Prediction.joined([self._mix_predictions(part) for part in query.split(QUERY_CHUNK)])
+        prediction = Prediction.joined(
+            [self._mix_predictions(part) for part in query.split(QUERY_CHUNK)]
+        )
         return self.runs.apply_factors(prediction, query.run)
 
     def _mix_predictions(self, query: Query) -> Prediction:
@@ -238,8 +277,13 @@ class Mixture(LearnsTogether, ClosedForm):
         """Return the mean of all; what they disagree about is part of its variance."""
         result = [member.left_out(rows) for member in self.members]
         if len({one.mean.shape for one in result}) > 1:
-            raise ValueError(f"{self.name}: of several tones or antennas one is kept of rows left out")
-        parts = [(weight, one.mean, one.variance) for weight, one in zip(self.weights, result, strict=True)]
+            raise ValueError(
+                f"{self.name}: of several tones or antennas one is kept of rows left out"
+            )
+        parts = [
+            (weight, one.mean, one.variance)
+            for weight, one in zip(self.weights, result, strict=True)
+        ]
         return LeftOutRows(result[0].rows, *mixture_moments(parts))
 
     def process(self) -> PowerProcess | None:
@@ -247,19 +291,26 @@ class Mixture(LearnsTogether, ClosedForm):
         return self.member.process() if isinstance(self.member, HasProcess) else None
 
     def paths(self, query: Query) -> QueryPaths:
-        """See `HasPaths`; of solutions that are made of paths each source once, by their weights in the mean.
+        """See `HasPaths`; of solutions that are made of paths each source once,
+        by their weights in the mean.
 
         What other solutions and the residual add to channels is in no path.
         """
-        members = [(weight, one) for weight, one in self.weighted_members() if isinstance(one, HasPaths)]
+        members = [
+            (weight, one) for weight, one in self.weighted_members() if isinstance(one, HasPaths)
+        ]
         if not members:
             raise ValueError("its channels are not made of paths")
-        gains, delays, units, carriers = zip(*(method.paths(query) for _, method in members), strict=True)
-        gain = torch.cat([weight * part for (weight, _), part in zip(members, gains, strict=True)], dim=2)
+        gains, delays, units, carriers = zip(
+            *(method.paths(query) for _, method in members), strict=True
+        )
+        gain = torch.cat(
+            [weight * part for (weight, _), part in zip(members, gains, strict=True)], dim=2
+        )
         delay, unit, carrier = torch.cat(delays, dim=2), torch.cat(units, dim=1), carriers[0]
         return merge_equal_paths(QueryPaths(gain, delay, unit, carrier))
 
-    # -- what it is made of --------------------------------------------------------------------------
+    # -- what it is made of ------------------------------------------------------------------------
 
     @property
     def member(self) -> ClosedForm | None:
@@ -278,7 +329,11 @@ class Mixture(LearnsTogether, ClosedForm):
     @property
     def label(self) -> str:
         """The name, and how many nearest rows tell of a place where not all do."""
-        return self.name if self.member is None else self.member.label.replace(self.member.name, self.name, 1)
+        return (
+            self.name
+            if self.member is None
+            else self.member.label.replace(self.member.name, self.name, 1)
+        )
 
     @property
     def terms(self) -> tuple[str, ...]:
@@ -308,18 +363,24 @@ class Mixture(LearnsTogether, ClosedForm):
     def facts(self) -> dict[str, float | int | str | None]:
         """See `Method.facts`."""
         return super().facts() | {
-            "model/init": self.started, "model/variance_explained": self.explained,
-            "model/steps": 0, "model/steps_taken": 0, "time/init_s": self.init_s,
-        }  # fmt: skip
+            "model/init": self.started,
+            "model/variance_explained": self.explained,
+            "model/steps": 0,
+            "model/steps_taken": 0,
+            "time/init_s": self.init_s,
+        }
 
     # -- storing -----------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
         return {
-            "members": [method_state(member) for member in self.members], "weights": list(self.weights),
-            "started": self.started, "explained": self.explained, "runs": self.runs.state(),
-        }  # fmt: skip
+            "members": [method_state(member) for member in self.members],
+            "weights": list(self.weights),
+            "started": self.started,
+            "explained": self.explained,
+            "runs": self.runs.state(),
+        }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
@@ -334,5 +395,7 @@ def _estimate_run_factors(data: Measurements, known: np.ndarray, context: FitCon
         return RunFactors.identity()
     # Validation rows too: candidates are weighed by them in the phase of the same run.
     result = estimate_run_factors(data, known, context.counts)
-    log.info("channels of %d runs: the factor of each was estimated by waves of all runs", len(result))
+    log.info(
+        "channels of %d runs: the factor of each was estimated by waves of all runs", len(result)
+    )
     return result

@@ -1,1 +1,3 @@
-"""Spectra of a moving array: triangulated sources, their powers over places, and a residual process."""
+"""Spectra of a moving array: triangulated sources, their powers over places,
+and a residual process.
+"""

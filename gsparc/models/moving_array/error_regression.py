@@ -1,8 +1,9 @@
-"""Expected errors of images over the receivers' places, from the leave-one-out errors of training rows.
+"""Expected errors of images over the receivers' places,
+from the leave-one-out errors of training rows.
 
-The posterior variance of a process on images depends on the sampling density alone; errors do not: they are
-large at shadow boundaries and where paths interfere. Far from all rows nothing is known: the error is that of
-an image drawn at random.
+The posterior variance of a process on images depends on the sampling density alone; errors do not:
+they are large at shadow boundaries and where paths interfere. Far from all rows nothing is known:
+the error is that of an image drawn at random.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ LEAST_M = 1e-6  # [m], of rows that are at one place
 
 
 def image_features(image: Tensor, added: Tensor) -> Tensor:
-    """Return features (n, 3) of predicted images: log brightness, log of what is added, largest pixel.
+    """Return features (n, 3) of predicted images: log brightness, log of what is added,
+    largest pixel.
 
     Args:
         image: (n, H, W), the prediction.
@@ -45,8 +47,8 @@ class ImageErrors(Stored):
         near: (n, k) rows nearest to each of the n training rows, itself first.
         precision: (n, k, k) float64, inverse of these rows' correlations with noise.
         errors: (n,) logarithms of leave-one-out relative errors.
-        regression: on five columns: the neighbours' error, the logarithm of the residual's variance given the
-            neighbours, and `image_features`.
+        regression: on five columns: the neighbours' error, the logarithm of the residual's variance
+            given the neighbours, and `image_features`.
         kernel: of the residual.
         farthest: largest distance of a learned place to its nearest other [m].
         reach: correlation length of the sources' powers [m].
@@ -62,11 +64,14 @@ class ImageErrors(Stored):
     reach: float
     prior: float
 
-    def unknown_and_variance(self, far: Tensor, features: Tensor, power: Tensor) -> tuple[Tensor, Tensor]:
+    def unknown_and_variance(
+        self, far: Tensor, features: Tensor, power: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Return what is unknown (m,) in [0, 1], and the mean square error per pixel (m,), float32.
 
         An image is known to its relative error with weight c and not at all with weight 1 - c, the
-        correlation c of a source's power over what the nearest row is farther than the largest gap of rows.
+        correlation c of a source's power over what the nearest row is farther
+        than the largest gap of rows.
 
         Args:
             far: (m, n) [m] from the training rows.
@@ -75,7 +80,9 @@ class ImageErrors(Stored):
         """
         error, nearest = self.error_and_nearest(far, features)
         correlation = matern32((nearest - self.farthest).clamp_min(0), self.reach)
-        variance = correlation * (error * power).clamp_max(self.prior) + (1 - correlation) * self.prior
+        variance = (
+            correlation * (error * power).clamp_max(self.prior) + (1 - correlation) * self.prior
+        )
         return 1 - correlation / (1 + error), variance
 
     def error_and_nearest(self, far: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
@@ -92,9 +99,15 @@ class ImageErrors(Stored):
 
 
 def fit_errors(
-    places: np.ndarray, relative_error: Tensor, features: Tensor, kernel: Kernel, reach: float, prior: float
+    places: np.ndarray,
+    relative_error: Tensor,
+    features: Tensor,
+    kernel: Kernel,
+    reach: float,
+    prior: float,
 ) -> ImageErrors:
-    """Fit leave-one-out errors |e|^2 / |h|^2 (n,) and features (n, 3) at places (n, 3) [m]; n at least 2.
+    """Fit leave-one-out errors |e|^2 / |h|^2 (n,) and features (n, 3) at places (n, 3) [m];
+    n at least 2.
 
     `kernel`, `reach` and `prior` are `ImageErrors`'s.
     """
@@ -102,16 +115,27 @@ def fit_errors(
     rows = torch.from_numpy(rows_with_nearest(places, np.arange(len(places)), NEIGHBOURS))
     others, near, positions = rows[:, 1:], rows[:, :NEIGHBOURS], torch.from_numpy(places)
     distance = (positions[others] - positions[:, None]).norm(dim=2).float()
-    columns = _columns(kernel, distance, _precision(kernel, positions[others]), errors[others], features)
+    columns = _columns(
+        kernel, distance, _precision(kernel, positions[others]), errors[others], features
+    )
     regression = RelativeErrorRegression.from_rows(columns, relative_error)
-    precision, farthest = (_precision(kernel, positions[near]), max(float(distance[:, 0].max()), LEAST_M))
+    precision, farthest = (
+        _precision(kernel, positions[near]),
+        max(float(distance[:, 0].max()), LEAST_M),
+    )
     return ImageErrors(near, precision, errors, regression, kernel, farthest, reach, prior)
 
 
-def _columns(kernel: Kernel, distance: Tensor, precision: Tensor, errors: Tensor, features: Tensor) -> Tensor:
-    """Columns (m, 5) of the regression from k neighbours: (m, k) distances [m], (m, k, k), (m, k) errors."""
+def _columns(
+    kernel: Kernel, distance: Tensor, precision: Tensor, errors: Tensor, features: Tensor
+) -> Tensor:
+    """Columns (m, 5) of the regression from k neighbours: (m, k) distances [m], (m, k, k), (m, k)
+    errors.
+    """
     variance = _posterior_variance(kernel, distance, precision).log().to(distance.dtype)
-    return torch.cat([torch.stack([_average_neighbours(distance, errors), variance], 1), features], 1)
+    return torch.cat(
+        [torch.stack([_average_neighbours(distance, errors), variance], 1), features], 1
+    )
 
 
 def _precision(kernel: Kernel, places: Tensor) -> Tensor:
@@ -121,13 +145,17 @@ def _precision(kernel: Kernel, places: Tensor) -> Tensor:
 
 
 def _posterior_variance(kernel: Kernel, distance: Tensor, precision: Tensor) -> Tensor:
-    """Posterior variance (m,) float64 over the amplitude at a `distance` (m, k) [m] from k neighbours.
+    """Posterior variance (m,) float64 over the amplitude at a `distance` (m, k)
+    [m] from k neighbours.
 
-    The nearest rows screen off the others (Stein 2002), whose Cholesky factor would be most of a query.
+    The nearest rows screen off the others (Stein 2002),
+    whose Cholesky factor would be most of a query.
     """
     cross = kernel.correlation(distance.double())[:, None]
     prior = 1 + kernel.noise
-    return (prior - (cross @ precision @ cross.mT)[:, 0, 0]).clamp(max(kernel.noise, LEAST_NOISE), prior)
+    return (prior - (cross @ precision @ cross.mT)[:, 0, 0]).clamp(
+        max(kernel.noise, LEAST_NOISE), prior
+    )
 
 
 def _average_neighbours(distance: Tensor, values: Tensor) -> Tensor:

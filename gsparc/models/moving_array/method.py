@@ -1,7 +1,8 @@
-"""`model=moving_array`: sources, their powers as smooth trends, a Gaussian process on residual spectra.
+"""`model=moving_array`: sources, their powers as smooth trends,
+a Gaussian process on residual spectra.
 
-The trend moves directions of arrival with the receiver, which interpolating images cannot; the residual
-goes to a Gaussian process on images.
+The trend moves directions of arrival with the receiver, which interpolating images cannot; the
+residual goes to a Gaussian process on images.
 """
 
 from __future__ import annotations
@@ -64,7 +65,8 @@ class Spectra:
 
 
 class MovingArrayField(Differentiable, ClosedForm):
-    """Triangulated sources seen through the receiver's array, and a Gaussian process on the residual images.
+    """Triangulated sources seen through the receiver's array,
+    and a Gaussian process on the residual images.
 
     Args:
         search: how sources are found.
@@ -81,9 +83,14 @@ class MovingArrayField(Differentiable, ClosedForm):
     found: PowerTrend  # sources and their powers
 
     def __init__(
-        self, search: SearchSettings = SearchSettings(), trend: TrendSettings = TrendSettings(),
-        rest_rows: int = 1500, components: int = 512, seed: int = 0, name: str = "moving_array",
-    ) -> None:  # fmt: skip
+        self,
+        search: SearchSettings = SearchSettings(),
+        trend: TrendSettings = TrendSettings(),
+        rest_rows: int = 1500,
+        components: int = 512,
+        seed: int = 0,
+        name: str = "moving_array",
+    ) -> None:
         super().__init__()
         if rest_rows < 3:
             raise ValueError(f"{name}: model.rest_rows={rest_rows}: expected at least 3")
@@ -96,7 +103,8 @@ class MovingArrayField(Differentiable, ClosedForm):
         """Find sources, fit their powers and the residual.
 
         Raises:
-            ValueError: not spectra of a moving receiver with a declared array that keeps its orientation.
+            ValueError: not spectra of a moving receiver with a declared array that keeps its
+                orientation.
         """
         problem = site_problem(data)
         if problem is not None:
@@ -127,24 +135,34 @@ class MovingArrayField(Differentiable, ClosedForm):
         spectra = self._make_spectra(positions, targets)
         sources = self._find_sources(spectra)
         power = self._fit_powers(spectra, sources)
-        modelled = self._fit_trend(spectra, sources, power, self._choose_kernel(spectra, sources, power))
+        modelled = self._fit_trend(
+            spectra, sources, power, self._choose_kernel(spectra, sources, power)
+        )
         rows = _spread_rows(len(positions), self.rest_rows)
-        misfit, kernel = error_and_likeliest_kernel(positions[rows], spectra.values[rows] - modelled[rows])
+        misfit, kernel = error_and_likeliest_kernel(
+            positions[rows], spectra.values[rows] - modelled[rows]
+        )
         self._fit_residual(spectra, modelled, kernel, targets)
         error, count = misfit / targets[0].size, self.count_components()
         note = f"{self.name}: {count} sources, leave-one-out error {error:.4g}"
-        fitted = f"length {kernel.length:.3g} m and noise {kernel.noise:.3g}, chosen on {len(rows)} rows"
+        fitted = (
+            f"length {kernel.length:.3g} m and noise {kernel.noise:.3g}, chosen on {len(rows)} rows"
+        )
         return (note, f"{self.name}: residual of {fitted}, {len(self.residual.axes)} components")
 
     @torch.no_grad()
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """Solve powers, trends, residual and errors anew, with the sources and kernels of the fit."""
+        """Solve powers, trends, residual and errors anew,
+        with the sources and kernels of the fit.
+        """
         self.rows = rows = heard_rows(data, rows)
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         targets, self.seen = training_targets(data, rows), len(rows)
         spectra, one = self._make_spectra(data.moving[rows], targets), self.found
-        modelled = self._fit_trend(spectra, one.sources, self._fit_powers(spectra, one.sources), one.kernel)
+        modelled = self._fit_trend(
+            spectra, one.sources, self._fit_powers(spectra, one.sources), one.kernel
+        )
         self._fit_residual(spectra, modelled, self.residual.kernel, targets)
 
     def _find_pixel_exponent(self, targets: np.ndarray) -> int:
@@ -153,7 +171,9 @@ class MovingArrayField(Differentiable, ClosedForm):
         Raises:
             ValueError: neither is a spectrum of the declared array.
         """
-        exponent, rest = pixel_exponent(self.lags(), self._to_images(targets[_spread_rows(len(targets), 16)]))
+        exponent, rest = pixel_exponent(
+            self.lags(), self._to_images(targets[_spread_rows(len(targets), 16)])
+        )
         if rest > MAX_UNEXPLAINED:
             raise ValueError(
                 f"{self.name}: the declared array cannot have measured these spectra "
@@ -162,7 +182,10 @@ class MovingArrayField(Differentiable, ClosedForm):
         return exponent
 
     def _make_spectra(self, places: np.ndarray, targets: np.ndarray) -> Spectra:
-        both = [(self.lags().to_lags(b**self.exponent), self.basis.project(b)) for b in self._blocks(targets)]
+        both = [
+            (self.lags().to_lags(b**self.exponent), self.basis.project(b))
+            for b in self._blocks(targets)
+        ]
         lags, values = (torch.cat(part) for part in zip(*both, strict=True))
         return Spectra(places, lags, values)
 
@@ -173,19 +196,35 @@ class MovingArrayField(Differentiable, ClosedForm):
         still = self.site.static_position
         first = None if still is None else torch.from_numpy(np.asarray(still)).float()
         return find_sources(
-            few.lags, few.receivers, first, self.rotation(), self.lags(), self.site.grid,
-            replace(self.search, steps=self._steps), self.seed,
-        )  # fmt: skip
+            few.lags,
+            few.receivers,
+            first,
+            self.rotation(),
+            self.lags(),
+            self.site.grid,
+            replace(self.search, steps=self._steps),
+            self.seed,
+        )
 
     def _fit_powers(self, spectra: Spectra, sources: Tensor) -> np.ndarray:
         """Powers (n, K) float64 that explain each row best."""
         array = self.receiving_array()
-        return torch.cat([
-            nonnegative_powers(part, array.atoms(sources, places), self.search.ridge)
-            for part, places in zip(spectra.lags.split(BLOCK), spectra.receivers.split(BLOCK), strict=True)
-        ]).double().numpy()  # fmt: skip
+        return (
+            torch.cat(
+                [
+                    nonnegative_powers(part, array.atoms(sources, places), self.search.ridge)
+                    for part, places in zip(
+                        spectra.lags.split(BLOCK), spectra.receivers.split(BLOCK), strict=True
+                    )
+                ]
+            )
+            .double()
+            .numpy()
+        )
 
-    def _fit_trend(self, spectra: Spectra, sources: Tensor, power: np.ndarray, kernel: Kernel) -> Tensor:
+    def _fit_trend(
+        self, spectra: Spectra, sources: Tensor, power: np.ndarray, kernel: Kernel
+    ) -> Tensor:
         """Fit the trend of powers (n, K); its left-out images (n, R)."""
         self.found, trend_power = fit_trend(sources, kernel, spectra.places, power)
         return self._render_coefficients(spectra, sources, torch.from_numpy(trend_power).float())
@@ -193,25 +232,36 @@ class MovingArrayField(Differentiable, ClosedForm):
     def _render_coefficients(self, spectra: Spectra, sources: Tensor, power: Tensor) -> Tensor:
         """Images (n, R) of sources of powers (n, K)."""
         array = self.receiving_array()
-        return torch.cat([
-            self.basis.project(array.render(sources, places, part))
-            for places, part in zip(spectra.receivers.split(BLOCK), power.split(BLOCK), strict=True)
-        ])  # fmt: skip
+        return torch.cat(
+            [
+                self.basis.project(array.render(sources, places, part))
+                for places, part in zip(
+                    spectra.receivers.split(BLOCK), power.split(BLOCK), strict=True
+                )
+            ]
+        )
 
     def _choose_kernel(self, spectra: Spectra, sources: Tensor, power: np.ndarray) -> Kernel:
         """Kernel of a trend, by leave-one-out error."""
         rows = _spread_rows(len(spectra.places), self.trend.rows)
         # Lengths are shares of the site's diagonal, of 1 m where all rows are at one place.
-        some, diagonal = spectra.subset(rows), float(np.linalg.norm(np.ptp(spectra.places, axis=0))) or 1.0
+        some, diagonal = (
+            spectra.subset(rows),
+            float(np.linalg.norm(np.ptp(spectra.places, axis=0))) or 1.0,
+        )
         errors = {}
         for length in self.trend.lengths:
             kernel = Kernel.from_length(length * diagonal, self.trend.noise)
-            trend_power = torch.from_numpy(fit_trend(sources, kernel, some.places, power[rows])[1]).float()
+            trend_power = torch.from_numpy(
+                fit_trend(sources, kernel, some.places, power[rows])[1]
+            ).float()
             missed = some.values - self._render_coefficients(some, sources, trend_power)
             errors[kernel] = error_and_likeliest_kernel(some.places, missed)[0]
         return min(errors, key=lambda kernel: errors[kernel])
 
-    def _fit_residual(self, spectra: Spectra, modelled: Tensor, kernel: Kernel, targets: np.ndarray) -> None:
+    def _fit_residual(
+        self, spectra: Spectra, modelled: Tensor, kernel: Kernel, targets: np.ndarray
+    ) -> None:
         """The process on what left-out trends (n, R) miss, and the error model of the sum."""
         self.positions, missed = spectra.places, spectra.values - modelled
         self.residual, added = fit_residual(kernel, spectra.places, missed, self.components)
@@ -227,7 +277,11 @@ class MovingArrayField(Differentiable, ClosedForm):
             errors.append(error)
             features.append(image_features(images, energy[part]))
         # Two images drawn at random differ by twice the variance.
-        prior = 2 * float((spectra.values - spectra.values.mean(0)).square().mean(0).sum()) / targets[0].size
+        prior = (
+            2
+            * float((spectra.values - spectra.values.mean(0)).square().mean(0).sum())
+            / targets[0].size
+        )
         reach = self.found.kernel.length
         self.errors = fit_errors(
             spectra.places, torch.cat(relative), torch.cat(features), kernel, reach, prior
@@ -237,7 +291,9 @@ class MovingArrayField(Differentiable, ClosedForm):
     def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """See `ClosedForm`; images."""
         if not len(self.rows):
-            raise ValueError(f"{self.name}: condition it first, a stored one has no rows to leave out")
+            raise ValueError(
+                f"{self.name}: condition it first, a stored one has no rows to leave out"
+            )
         mean = torch.cat([self.basis.images(part).clamp_(0, 1) for part in self._left.split(BLOCK)])
         return LeftOutRows(self.rows, mean, self._left_error)
 
@@ -260,7 +316,9 @@ class MovingArrayField(Differentiable, ClosedForm):
         """Return answers with all that was found, made once."""
         if self._query is None:
             places = torch.from_numpy(self.positions)
-            self._query = ImageRenderer(self.receiving_array(), self.basis, self.found, self.residual, places)
+            self._query = ImageRenderer(
+                self.receiving_array(), self.basis, self.found, self.residual, places
+            )
         return self._query
 
     def count_components(self) -> int:

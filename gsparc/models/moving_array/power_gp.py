@@ -1,4 +1,6 @@
-"""Powers of sources over the receiver's position: one Gaussian process per source, one kernel for all."""
+"""Powers of sources over the receiver's position: one Gaussian process per source,
+one kernel for all.
+"""
 
 from __future__ import annotations
 
@@ -47,12 +49,18 @@ class PowerTrend(Stored):
     weights: Tensor
 
     def powers(self, distance: Tensor) -> Tensor:
-        """Return powers (m, K) of sources at places `distance` (m, n) [m] from training receivers."""
+        """Return powers (m, K) of sources at places `distance` (m, n)
+        [m] from training receivers.
+        """
         return torch.addmm(self.level, self.kernel.correlation(distance), self.weights)
 
 
-def solve_and_leave_out(kernel: Kernel, places: np.ndarray, values: Tensor) -> tuple[Tensor, Tensor]:
-    """Return weights (n, K) of centred values (n, K) at places (n, 3) [m], and left-out residuals (n, K)."""
+def solve_and_leave_out(
+    kernel: Kernel, places: np.ndarray, values: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return weights (n, K) of centred values (n, K) at places (n, 3) [m],
+    and left-out residuals (n, K).
+    """
     posterior = Exact.from_values(Prior(kernel), torch.from_numpy(places), values)
     return posterior.weights, posterior.left_out_residuals().residual
 
@@ -60,9 +68,14 @@ def solve_and_leave_out(kernel: Kernel, places: np.ndarray, values: Tensor) -> t
 def fit_trend(
     sources: Tensor, kernel: Kernel, places: np.ndarray, power: np.ndarray
 ) -> tuple[PowerTrend, np.ndarray]:
-    """Return the trend of powers (n, K) at places (n, 3), and its leave-one-out predictions (n, K)."""
+    """Return the trend of powers (n, K) at places (n, 3),
+    and its leave-one-out predictions (n, K).
+    """
     level = power.mean(0)
     weights, residual = solve_and_leave_out(kernel, places, torch.from_numpy(power - level))
-    # in the order that a checkpoint keeps: in another one sums differ, and roots of small pixels by more
-    trend = PowerTrend(sources, kernel, torch.from_numpy(level).float(), weights.float().contiguous())
+    # in the order that a checkpoint keeps: in another one sums differ,
+    # and roots of small pixels by more
+    trend = PowerTrend(
+        sources, kernel, torch.from_numpy(level).float(), weights.float().contiguous()
+    )
     return trend, power - residual.numpy()

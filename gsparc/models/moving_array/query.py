@@ -38,7 +38,9 @@ class ReceivingArray:
         stride: between the pixels that are rendered.
     """
 
-    def __init__(self, space: SpectrumLags, rotation: Tensor, exponent: int, stride: int = 1) -> None:
+    def __init__(
+        self, space: SpectrumLags, rotation: Tensor, exponent: int, stride: int = 1
+    ) -> None:
         self.space, self.rotation, self.exponent = space, rotation, exponent
         self._pixels = space.pixels if stride == 1 else space.pixels.subsample_pixels(stride)
 
@@ -83,9 +85,13 @@ class ImageRenderer:
     """
 
     def __init__(
-        self, array: ReceivingArray, basis: Separable, trend: PowerTrend, residual: Residual,
+        self,
+        array: ReceivingArray,
+        basis: Separable,
+        trend: PowerTrend,
+        residual: Residual,
         places: Tensor,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._array, self._basis, self._trend, self._residual = array, basis, trend, residual
         # From the middle of the site float32 resolves micrometres.
         self._middle = places.mean(0)
@@ -98,7 +104,9 @@ class ImageRenderer:
         explained = self._array.render(self._trend.sources, receivers, self._trend.powers(far))
         added = self._residual.coefficients(far)
         # In place into fresh images: another copy would be as large as the answer.
-        return ImageAnswers(explained, self._basis.images(added).add_(explained), added.square().sum(1), far)
+        return ImageAnswers(
+            explained, self._basis.images(added).add_(explained), added.square().sum(1), far
+        )
 
     @cached_property
     def in_float64(self) -> ImageRenderer:
@@ -106,7 +114,9 @@ class ImageRenderer:
         return to_double(self)
 
 
-def reduce_moving_array(method: MovingArrayField, settings: Settings, measured: dict[str, Tensor]) -> Method:
+def reduce_moving_array(
+    method: MovingArrayField, settings: Settings, measured: dict[str, Tensor]
+) -> Method:
     """Return the mean with the strongest components of the residual (`keep`).
 
     On fewer pixels (`stride`) and without its variance.
@@ -139,7 +149,9 @@ class ReducedMean(View):
         basis = inner.basis if stride == 1 else inner.basis.subsample_pixels(stride)
         residual = inner.residual.keep_axes(count)
         places = torch.from_numpy(inner.positions)
-        self._query = ImageRenderer(inner.receiving_array(stride), basis, inner.found, residual, places)
+        self._query = ImageRenderer(
+            inner.receiving_array(stride), basis, inner.found, residual, places
+        )
         self._count = count
 
     @torch.no_grad()

@@ -1,7 +1,7 @@
 """What sources leave of spectra (interference, shadow edges): a Gaussian process on images.
 
-Universal kriging (Matheron 1969) with the process of `baselines.gp`; images are numbers of a basis that
-they share (`gsparc.physics.separable`).
+Universal kriging (Matheron 1969) with the process of `baselines.gp`; images are numbers of a basis
+that they share (`gsparc.physics.separable`).
 """
 
 from __future__ import annotations
@@ -39,19 +39,27 @@ class Residual(Stored):
     weights: Tensor
 
     def coefficients(self, distance: Tensor) -> Tensor:
-        """Return coefficients (m, R) of images at places `distance` (m, n) [m] from training receivers."""
+        """Return coefficients (m, R) of images at places `distance` (m, n)
+        [m] from training receivers.
+        """
         return torch.addmm(self.mean, self.kernel.correlation(distance) @ self.weights, self.axes)
 
     def keep_axes(self, count: int) -> Residual:
         """Return the process with the `count` axes that most is predicted along."""
-        return Residual(self.kernel, self.mean, self.axes[:count], self.weights[:, :count].contiguous())
+        return Residual(
+            self.kernel, self.mean, self.axes[:count], self.weights[:, :count].contiguous()
+        )
 
 
-def fit_residual(kernel: Kernel, places: np.ndarray, values: Tensor, limit: int) -> tuple[Residual, Tensor]:
-    """Return the process on coefficients (n, R) at places (n, 3) [m], and its left-out predictions (n, R).
+def fit_residual(
+    kernel: Kernel, places: np.ndarray, values: Tensor, limit: int
+) -> tuple[Residual, Tensor]:
+    """Return the process on coefficients (n, R) at places (n, 3) [m],
+    and its left-out predictions (n, R).
 
-    Axes are those of the left-out predictions, fewer than those of the rows: a row's own details are on the
-    latter, but in no prediction. What a prediction lacks of its axes adds about its energy to the error.
+    Axes are those of the left-out predictions, fewer than those of the rows: a row's own details
+    are on the latter, but in no prediction. What a prediction lacks
+    of its axes adds about its energy to the error.
     """
     mean = values.mean(0)
     if limit == 0:
@@ -71,7 +79,9 @@ def fit_residual(kernel: Kernel, places: np.ndarray, values: Tensor, limit: int)
 
 
 def error_and_likeliest_kernel(places: np.ndarray, values: Tensor) -> tuple[float, Kernel]:
-    """Return the left-out squared error of images (n, R) under the likeliest kernel, and that kernel."""
+    """Return the left-out squared error of images (n, R) under the likeliest kernel,
+    and that kernel.
+    """
     mean = values.mean(0)
     centred = (values - mean).double().numpy()
     scores = centred @ energies_and_axes(centred, KERNEL_COMPONENTS)[1].T
@@ -82,7 +92,9 @@ def error_and_likeliest_kernel(places: np.ndarray, values: Tensor) -> tuple[floa
 
 
 def energies_and_axes(values: np.ndarray, limit: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return at most `limit` principal axes (C, R) of values (n, R), energies (C,) along them, falling."""
+    """Return at most `limit` principal axes (C, R) of values (n, R), energies (C,) along them,
+    falling.
+    """
     n, r = values.shape
     gram = values @ values.T if n <= r else values.T @ values
     keep = min(limit, n, r)

@@ -1,4 +1,6 @@
-"""Triangulate sources from the spectra of many receivers: greedy search on the residual, then refinement."""
+"""Triangulate sources from the spectra of many receivers: greedy search on the residual,
+then refinement.
+"""
 
 from __future__ import annotations
 
@@ -62,8 +64,8 @@ def bearings(sources: Tensor, receivers: Tensor, rotation: Tensor) -> Tensor:
 def nonnegative_powers(lags: Tensor, atoms: Tensor, ridge: float) -> Tensor:
     """Return the power (n, K), none negative, of each source at each receiver.
 
-    Ridge regression of lags (n, Q) on atoms (n, K, Q) within the positive cone, by coordinate descent from
-    the clipped free solution (Franc, Hlavac and Navara 2005).
+    Ridge regression of lags (n, Q) on atoms (n, K, Q) within the positive cone, by coordinate
+    descent from the clipped free solution (Franc, Hlavac and Navara 2005).
     """
     gram = atoms @ atoms.mT
     gram.diagonal(dim1=-2, dim2=-1).add_(ridge)
@@ -86,9 +88,15 @@ def sum_lags(power: Tensor, atoms: Tensor) -> Tensor:
 
 
 def find_sources(
-    lags: Tensor, receivers: Tensor, first: Tensor | None, rotation: Tensor, space: SpectrumLags,
-    grid: SphereGrid, settings: SearchSettings, seed: int,
-) -> Tensor:  # fmt: skip
+    lags: Tensor,
+    receivers: Tensor,
+    first: Tensor | None,
+    rotation: Tensor,
+    space: SpectrumLags,
+    grid: SphereGrid,
+    settings: SearchSettings,
+    seed: int,
+) -> Tensor:
     """Return positions (K, 3) float32 [m] of sources.
 
     Args:
@@ -146,10 +154,16 @@ def find_sources(
 
 
 def _best_separated(
-    candidates: Tensor, images: Tensor, receivers: Tensor, rotation: Tensor, grid: SphereGrid,
+    candidates: Tensor,
+    images: Tensor,
+    receivers: Tensor,
+    rotation: Tensor,
+    grid: SphereGrid,
     settings: SearchSettings,
-) -> Tensor:  # fmt: skip
-    """Candidates of the largest amplitude (n, P) in their direction over all receivers, no near doubles."""
+) -> Tensor:
+    """Candidates of the largest amplitude (n, P) in their direction over all receivers,
+    no near doubles.
+    """
     score = torch.zeros(len(candidates))
     for image, receiver in zip(images, receivers, strict=True):
         pixel, inside = _pixels_and_inside(bearings(candidates, receiver[None], rotation)[0], grid)
@@ -159,9 +173,10 @@ def _best_separated(
     some = receivers[:: max(1, len(receivers) // COMPARED)][:COMPARED]
     seen = bearings(ranked, some, rotation).transpose(0, 1).reshape(len(ranked), -1)
     chosen = keep_apart(
-        range(len(ranked)), lambda i, j: float((seen[i] - seen[j]).abs().mean()) <= settings.apart,
+        range(len(ranked)),
+        lambda i, j: float((seen[i] - seen[j]).abs().mean()) <= settings.apart,
         settings.per_round,
-    )  # fmt: skip
+    )
     return ranked[chosen]
 
 
@@ -178,12 +193,15 @@ def _pixels_and_inside(directions: Tensor, grid: SphereGrid) -> tuple[Tensor, Te
     return (row.clamp(0, grid.height - 1) * grid.width + column.clamp(0, grid.width - 1)), inside
 
 
-MAX_UNEXPLAINED = 0.02  # share of energy outside the array's lags, above which it measured no such spectrum
+# Share of energy outside the array's lags, above which it measured no such spectrum
+MAX_UNEXPLAINED = 0.02
 
 
 def site_problem(data: Measurements) -> str | None:
     """Return why sources cannot be triangulated from these measurements; None when they can."""
-    otherwise = "bearings need a moving receiver, here the transmitter moves (model=array is for that)"
+    otherwise = (
+        "bearings need a moving receiver, here the transmitter moves (model=array is for that)"
+    )
     problem = array_obstacle(data.site, "tx", otherwise)
     if problem is not None:
         return problem

@@ -1,8 +1,8 @@
 """`model=calibrated_raytracer`: the geometry is known, the materials are learned.
 
-A ray tracer that is told where everything stands, and learns from the measurements what it is made of
-(`gsparc.simulate.calibration`), with one gain of both ends. Nothing is interpolated: where it traces no
-path, it predicts the median of the training rows where it traces none.
+A ray tracer that is told where everything stands, and learns from the measurements what it is made
+of (`gsparc.simulate.calibration`), with one gain of both ends. Nothing is interpolated: where it
+traces no path, it predicts the median of the training rows where it traces none.
 """
 
 from __future__ import annotations
@@ -92,7 +92,8 @@ class CalibratedRayTracer(Checked, Method):
         """Trace the training rows, and learn materials and gain from their powers.
 
         Raises:
-            ValueError: other data than `problem` allows, no known scene, or paths to fewer than 2 rows.
+            ValueError: other data than `problem` allows, no known scene, or paths to fewer than 2
+                rows.
             SimulatorMissing: Sionna is not installed.
         """
         fault = self.why_not(data)
@@ -119,10 +120,14 @@ class CalibratedRayTracer(Checked, Method):
         reached = traced > 0
         # Gain and scale of the residuals are learned at least: two unknowns.
         if reached.sum() < 2:
-            raise ValueError(f"{self.name}: paths reach {reached.sum()} training rows; is this the scene?")
+            raise ValueError(
+                f"{self.name}: paths reach {reached.sum()} training rows; is this the scene?"
+            )
         self.learned = calibrate(replay, start, traced, measured, self.steps)
         # Without paths in training, what is weakest there is the best guess of what lies deeper.
-        self._silent_db = float(np.median(measured[~reached]) if not reached.all() else measured.min())
+        self._silent_db = float(
+            np.median(measured[~reached]) if not reached.all() else measured.min()
+        )
         # Powers tell a gain in decibels; channels need its phase too.
         if data.site.target.is_complex:
             self._factor = self._best_factor(data, rows)
@@ -134,9 +139,14 @@ class CalibratedRayTracer(Checked, Method):
             f"{name} {one.permittivity:.3g} and {one.conductivity:.2g} S/m"
             for name, one in self.learned.materials.items()
         )
-        notes = [f"permittivity and conductivity of {materials}; residuals {self.learned.scale_db:.2g} dB"]
+        notes = [
+            f"permittivity and conductivity of {materials}; residuals "
+            f"{self.learned.scale_db:.2g} dB"
+        ]
         if dark:
-            notes.append(f"{dark} training rows have no path; such places get {self._silent_db:.4g} dB")
+            notes.append(
+                f"{dark} training rows have no path; such places get {self._silent_db:.4g} dB"
+            )
         return tuple(f"{self.name}: {note}" for note in notes)
 
     def _best_factor(self, data: Measurements, rows: np.ndarray) -> complex:
@@ -150,7 +160,9 @@ class CalibratedRayTracer(Checked, Method):
         site, learned = self.fitted_site, self.require_fitted(self.learned)
         paths = self._trace(query.places(site).detach().numpy())
         if site.target.is_complex:
-            return Prediction(torch.from_numpy((self._channels(paths) * self._factor).astype(np.complex64)))
+            return Prediction(
+                torch.from_numpy((self._channels(paths) * self._factor).astype(np.complex64))
+            )
         power = paths.received_power()
         # No path is -inf dB, which the silent level replaces.
         with np.errstate(divide="ignore"):
@@ -169,9 +181,12 @@ class CalibratedRayTracer(Checked, Method):
     def _effects(self) -> Effects:
         # Diffuse scattering has parameters of its own, which nothing here learns.
         return Effects(
-            diffraction=self.diffraction, edge_diffraction=False, diffuse=False, polarisation=False,
+            diffraction=self.diffraction,
+            edge_diffraction=False,
+            diffuse=False,
+            polarisation=False,
             depth=self.depth,
-        )  # fmt: skip
+        )
 
     def _loaded_tracer(self) -> RayTracer:
         """The scene under what was learned, loaded when it is first asked."""
@@ -179,7 +194,9 @@ class CalibratedRayTracer(Checked, Method):
             assert self.site is not None and self.site.static_position is not None
             scene = from_config(json.loads(self._scene_json))
             place = self.site.static_position + self.site.origin
-            self._tracer = load_tracer(scene, Sampling(self.samples, self.batch), place, self.site.name)
+            self._tracer = load_tracer(
+                scene, Sampling(self.samples, self.batch), place, self.site.name
+            )
             if self.learned is not None:
                 apply_materials(self._tracer, self.learned.materials)
         return self._tracer
@@ -188,9 +205,11 @@ class CalibratedRayTracer(Checked, Method):
         """Return the scene's settings, the materials, the gain."""
         assert self.learned is not None
         return {
-            "scene": self._scene_json, "learned": asdict(self.learned), "silent_db": self._silent_db,
+            "scene": self._scene_json,
+            "learned": asdict(self.learned),
+            "silent_db": self._silent_db,
             "factor": [self._factor.real, self._factor.imag],
-        }  # fmt: skip
+        }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`; the scene is loaded with the first prediction."""
@@ -204,7 +223,9 @@ class CalibratedRayTracer(Checked, Method):
 def _measured_decibels(data: Measurements, rows: np.ndarray) -> np.ndarray:
     """Powers (n,) of `rows` in decibels of stored units; of channels the mean over tones."""
     power = data.site.target.power(data.target[rows]).reshape(len(rows), -1)
-    measured = np.ones(power.shape, bool) if data.mask is None else data.mask[rows].reshape(power.shape)
+    measured = (
+        np.ones(power.shape, bool) if data.mask is None else data.mask[rows].reshape(power.shape)
+    )
     # A row without any measured tone has power 0, not 0 / 0.
     power = (power * measured).sum(axis=1) / np.maximum(measured.sum(axis=1), 1)
     return finite_decibels(power)

@@ -1,7 +1,8 @@
-"""A network in the style of FIRE: a variational autoencoder from one antenna's uplink to its downlink.
+"""A network in the style of FIRE: a variational autoencoder
+from one antenna's uplink to its downlink.
 
-After Liu et al., "FIRE: Enabling reciprocity for FDD MIMO systems", MobiCom 2021: the code represents the
-paths, and the decoder evaluates them in the other band. Sizes and training are ours.
+After Liu et al., "FIRE: Enabling reciprocity for FDD MIMO systems", MobiCom 2021: the code
+represents the paths, and the decoder evaluates them in the other band. Sizes and training are ours.
 """
 
 from __future__ import annotations
@@ -33,10 +34,14 @@ class Coder(Network):
         self.antennas = torch.from_numpy(np.asarray(scene.site.antennas))
         self.weight, self.code = settings.divergence, settings.code
         # Of every number of the code a mean and the logarithm of its variance.
-        self.encoder = perceptron(2 * len(scene.site.uplink_hz), 2 * self.code, settings.hidden, 2, nn.GELU)
+        self.encoder = perceptron(
+            2 * len(scene.site.uplink_hz), 2 * self.code, settings.hidden, 2, nn.GELU
+        )
         self.decoder = perceptron(self.code, 2 * scene.shape[1], settings.hidden, 2, nn.GELU)
 
-    def downlink_and_divergence(self, uplink: Tensor, noise: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    def downlink_and_divergence(
+        self, uplink: Tensor, noise: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Return the downlink (B, K) and the code's divergence from a standard normal (B,)."""
         middle, log_variance = self.encoder(torch.view_as_real(uplink).flatten(1)).chunk(2, dim=1)
         code = middle if noise is None else middle + noise * (log_variance / 2).exp()
@@ -53,16 +58,21 @@ class Coder(Network):
         return downlink.view(*uplink.shape[:2], -1) * scale
 
     def unit_uplink_and_level(self, uplink: Tensor) -> tuple[Tensor, Tensor]:
-        """Return uplinks (B, A, L) of antennas that answer, at unit power, and their level (B, 1, 1)."""
+        """Return uplinks (B, A, L) of antennas that answer, at unit power,
+        and their level (B, 1, 1).
+        """
         # Both bands lose alike along the path: the uplink's level carries over to the downlink.
         scale = root_mean_power(uplink)[:, None, None]
         return uplink[:, self.antennas] / scale, scale
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return the mean squared error () of unit channels, and the code's divergence by its weight."""
+        """Return the mean squared error () of unit channels,
+        and the code's divergence by its weight.
+        """
         assert batch.uplink is not None
         uplink, scale = self.unit_uplink_and_level(batch.uplink)
-        # As many antennas of snapshots as there are snapshots, whatever the array: steps cost alike.
+        # As many antennas of snapshots as there are snapshots, whatever the array:
+        # steps cost alike.
         pick = torch.randint(uplink.shape[0] * uplink.shape[1], (len(uplink),), generator=generator)
         # Snapshots have arbitrary phase: rotating both ends augments the data.
         angle = 2 * math.pi * torch.rand(len(uplink), 1, generator=generator)

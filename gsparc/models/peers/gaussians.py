@@ -1,4 +1,6 @@
-"""Gaussians of a peer: their start, what changes them, how they are rendered, what they are for a picture."""
+"""Gaussians of a peer: their start, what changes them, how they are rendered,
+what they are for a picture.
+"""
 
 from __future__ import annotations
 
@@ -18,10 +20,14 @@ from gsparc.models.peers.trained import KnownSite, Network, TrainedPeer, percept
 from gsparc.ops import Cutoff, Pose, SphereGrid, rasterize
 
 SHIFT = 0.1  # [m], of directions [rad], that a place moves by per unit of the network's output
-MOST_STRETCH = 3.0  # of a log scale, a factor of 20 either way: exp of what a network says has no bound
+# Of a log scale, a factor of 20 either way: exp of what a network says has no bound
+MOST_STRETCH = 3.0
 GEOMETRY_RATES = {  # learning rates of a `GaussianField` called `field`
-    "field.means": 2e-3, "field.log_scales": 5e-3, "field.quats": 1e-3, "field.opacity_logits": 1e-2,
-}  # fmt: skip
+    "field.means": 2e-3,
+    "field.log_scales": 5e-3,
+    "field.quats": 1e-3,
+    "field.opacity_logits": 1e-2,
+}
 
 
 class GaussianPeer(TrainedPeer):
@@ -84,16 +90,21 @@ def initial_gaussians(scene: KnownSite, count: int) -> GaussianField:
 
 
 def rendering_options(scene: KnownSite) -> tuple[SphereGrid, dict[str, Any]]:
-    """Return grid and cut-off: spectra bring their grid; channels see the sphere, cut off relatively."""
+    """Return grid and cut-off: spectra bring their grid; channels see the sphere,
+    cut off relatively.
+    """
     grid = scene.site.grid or SphereGrid.full_sphere(FULL_SPHERE_ROWS, 2 * FULL_SPHERE_ROWS)
     least = RasterSettings().relative_cutoff
     return grid, {} if scene.site.target.is_image else {"cutoff": Cutoff(least, relative=True)}
 
 
 def render_each(
-    geometry: tuple[Tensor, Tensor, Tensor, Tensor], features: Tensor, pose: Pose, grid: SphereGrid,
+    geometry: tuple[Tensor, Tensor, Tensor, Tensor],
+    features: Tensor,
+    pose: Pose,
+    grid: SphereGrid,
     **options: Any,
-) -> Tensor:  # fmt: skip
+) -> Tensor:
     """Return images of samples with different Gaussians each, one plan per sample.
 
     Args:
@@ -119,14 +130,21 @@ class Deformation(nn.Module):
         places: (2, 3) [m], box that the Gaussians start in.
         queries: (2, 3) [m], box of the moving end.
         outputs: numbers per Gaussian.
-        settings: `width` and `depth` of the network, `octaves` of the Fourier features of both inputs.
+        settings: `width` and `depth` of the network, `octaves` of the Fourier features of both
+            inputs.
     """
 
-    def __init__(self, places: Tensor, queries: Tensor, outputs: int, settings: DeformedPeer) -> None:
+    def __init__(
+        self, places: Tensor, queries: Tensor, outputs: int, settings: DeformedPeer
+    ) -> None:
         super().__init__()
         width, encoding = settings.width, EncodingSettings("fourier", settings.octaves)
-        self.place, self.query = PositionEncoding(encoding, places), PositionEncoding(encoding, queries)
-        # The first layer is linear: its two halves are added instead of writing every pair of inputs out.
+        self.place, self.query = (
+            PositionEncoding(encoding, places),
+            PositionEncoding(encoding, queries),
+        )
+        # The first layer is linear: its two halves are added instead
+        # of writing every pair of inputs out.
         self.by_place = nn.Linear(self.place.width, width)
         self.by_query = nn.Linear(self.query.width, width)
         self.rest = perceptron(width, outputs, width, settings.depth - 1)

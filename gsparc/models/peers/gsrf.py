@@ -1,17 +1,20 @@
 """GSRF: complex-valued Gaussians whose radiance is a Fourier-Legendre series of direction.
 
-K. Yang, G. Dong, S. Ji, W. Du, M. Srivastava, "GSRF: Complex-Valued 3D Gaussian Splatting for Efficient
-Radio-Frequency Data Synthesis", NeurIPS 2025. Its forerunner RFSPM (K. Yang et al., "Scalable 3D Gaussian
-Splatting-Based RF Signal Spatial Propagation Modeling", 2025) had a network per Gaussian instead.
+K. Yang, G. Dong, S. Ji, W. Du, M. Srivastava, "GSRF: Complex-Valued 3D Gaussian Splatting for
+Efficient Radio-Frequency Data Synthesis", NeurIPS 2025. Its forerunner RFSPM (K. Yang et al.,
+"Scalable 3D Gaussian Splatting-Based RF Signal Spatial Propagation Modeling", 2025)
+had a network per Gaussian instead.
 
-Kept: complex radiance without any network, front-to-back compositing, magnitude of the complex sum, a loss of
-absolute errors, SSIM and the frequency domain. Left out: the phase of the transmittance (ours attenuates
-without a phase; radiances absorb it), adaptive density control, associated Legendre functions (ours are
-products of polynomials and a Fourier series), orthographic splatting onto a sphere of rays (our footprints
-lie on the tangent plane), spectra rendered about the transmitter (ours are about the receiver).
+Kept: complex radiance without any network, front-to-back compositing, magnitude of the complex sum,
+a loss of absolute errors, SSIM and the frequency domain. Left out: the phase of the transmittance
+(ours attenuates without a phase; radiances absorb it), adaptive density control, associated
+Legendre functions (ours are products of polynomials and a Fourier series), orthographic splatting
+onto a sphere of rays (our footprints lie on the tangent plane), spectra rendered about the
+transmitter (ours are about the receiver).
 
-Channels are an extension of ours: the distance to every Gaussian turns and fades its wave, and each has a
-response per antenna and tone. The published task, an uplink channel at a latent position, is another.
+Channels are an extension of ours: the distance to every Gaussian turns and fades its wave, and each
+has a response per antenna and tone. The published task, an uplink channel at a latent position,
+is another.
 """
 
 from __future__ import annotations
@@ -42,12 +45,16 @@ class ComplexGaussians(GaussianNetwork):
 
     def __init__(self, scene: KnownSite, settings: GSRF) -> None:
         # Of what the base counts.
-        super().__init__(scene, settings.count, settings.ssim_weight / (1 - settings.fourier_weight))
+        super().__init__(
+            scene, settings.count, settings.ssim_weight / (1 - settings.fourier_weight)
+        )
         count, self.degree, self.order = settings.count, settings.degree, settings.order
         self.fourier_weight = settings.fourier_weight
         self.field = initial_gaussians(scene, count)
         self.grid, self.options = rendering_options(scene)
-        self.coefficients = nn.Parameter(0.02 * torch.randn(count, count_terms(self.degree, self.order), 2))
+        self.coefficients = nn.Parameter(
+            0.02 * torch.randn(count, count_terms(self.degree, self.order), 2)
+        )
         with torch.no_grad():
             # The constant term: Gaussians begin by radiating alike to all sides.
             self.coefficients[:, 0, 0] += 0.3
@@ -76,18 +83,28 @@ class ComplexGaussians(GaussianNetwork):
         """Return spectra (B, H, W) or channels (B, A, K)."""
         sent, geometry, rx = self.radiance_towards(query), self.field.geometry(), query.rx
         if self.response is not None:
-            seen = mean_weights(make_plan(*geometry, rx, self.grid, **self.options), *geometry).share
+            seen = mean_weights(
+                make_plan(*geometry, rx, self.grid, **self.options), *geometry
+            ).share
             arriving = seen * torch.view_as_complex(sent.contiguous())
             return torch.einsum("bn,nak->bak", arriving, torch.view_as_complex(self.response))
-        return smooth_root(rasterize(*geometry, sent, rx, self.grid, **self.options).image.square().sum(1))
+        return smooth_root(
+            rasterize(*geometry, sent, rx, self.grid, **self.options).image.square().sum(1)
+        )
 
     def emit(self, query: Query) -> Tensor:
         """See `GaussianNetwork`; of channels the root mean square over antennas and tones."""
         sent = self.radiance_towards(query)[0].norm(dim=1)
-        return sent if self.response is None else sent * self.response.square().sum(-1).mean((1, 2)).sqrt()
+        return (
+            sent
+            if self.response is None
+            else sent * self.response.square().sum(-1).mean((1, 2)).sqrt()
+        )
 
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
-        """Return the base's, and for spectra the mean squared distance of the two-dimensional transforms."""
+        """Return the base's, and for spectra the mean squared distance
+        of the two-dimensional transforms.
+        """
         seen = self(batch)
         plain = task_loss(seen, batch, self.losses, self.scene.site.target).mean()
         # A transform mixes all pixels, those that were not measured among them.
@@ -121,7 +138,8 @@ class GSRF(GaussianPeer):
     Args:
         count: Gaussians.
         degree, order: largest Legendre degree and Fourier order of the radiance.
-        ssim_weight, fourier_weight: shares of SSIM and of the frequency domain in the loss (spectra).
+        ssim_weight, fourier_weight: shares of SSIM and of the frequency domain in the loss
+            (spectra).
         others: see `TrainedPeer`.
     """
 
@@ -145,8 +163,8 @@ def count_terms(degree: int, order: int) -> int:
 def fourier_legendre(directions: Tensor, degree: int, order: int) -> Tensor:
     """Return P_l(cos theta) times 1, cos(m phi), sin(m phi): unit vectors (..., 3) -> (..., terms).
 
-    With complex coefficients these span the same functions as P_l(cos theta) exp(j m phi), |m| <= `order`,
-    l <= `degree`; theta is measured from z.
+    With complex coefficients these span the same functions as P_l(cos theta) exp(j m phi), |m| <=
+    `order`, l <= `degree`; theta is measured from z.
     """
     x, y, z = directions.unbind(-1)
     legendre = [torch.ones_like(z), z]
@@ -156,5 +174,7 @@ def fourier_legendre(directions: Tensor, degree: int, order: int) -> Tensor:
     waves = [torch.ones_like(azimuth)]
     for m in range(1, order + 1):
         waves += [torch.cos(m * azimuth), torch.sin(m * azimuth)]
-    series = torch.stack(legendre[: degree + 1], -1).unsqueeze(-1) * torch.stack(waves, -1).unsqueeze(-2)
+    series = torch.stack(legendre[: degree + 1], -1).unsqueeze(-1) * torch.stack(
+        waves, -1
+    ).unsqueeze(-2)
     return series.flatten(-2)

@@ -1,14 +1,14 @@
 """NeRF2: two networks, marched along a ray per pixel.
 
-X. Zhao, Z. An, Q. Pan, L. Yang, "NeRF2: Neural Radio-Frequency Radiance Fields", MobiCom 2023; sizes and
-march also by the authors' program.
+X. Zhao, Z. An, Q. Pan, L. Yang, "NeRF2: Neural Radio-Frequency Radiance Fields", MobiCom 2023;
+sizes and march also by the authors' program.
 
-Kept: an attenuation network (place -> attenuation, turn of the phase and a feature) whose input is given
-again half-way, a signal network of two layers (feature, direction, transmitter -> amplitude and phase),
-phases bounded to a turn, 1/d, no factor of opacity, the coherent sum along every ray, the magnitude of it,
-squared error on rays drawn at random. Left out: the branches for RSSI and MIMO channels, weight decay,
-octaves that begin at 2 pi metres (ours begin at the extent of the scene). The published sizes are
-`paper=nerf2`: minutes an image on a CPU.
+Kept: an attenuation network (place -> attenuation, turn of the phase and a feature) whose input is
+given again half-way, a signal network of two layers (feature, direction, transmitter -> amplitude
+and phase), phases bounded to a turn, 1/d, no factor of opacity, the coherent sum along every ray,
+the magnitude of it, squared error on rays drawn at random. Left out: the branches for RSSI and MIMO
+channels, weight decay, octaves that begin at 2 pi metres (ours begin at the extent of the scene).
+The published sizes are `paper=nerf2`: minutes an image on a CPU.
 """
 
 from __future__ import annotations
@@ -24,7 +24,14 @@ from torch import Tensor, nn
 from gsparc.data.query import Batch, Query
 from gsparc.data.target import Kind
 from gsparc.field.encoding import EncodingSettings, PositionEncoding
-from gsparc.models.peers.trained import DIRECTIONS, KnownSite, Network, TrainedPeer, perceptron, smooth_root
+from gsparc.models.peers.trained import (
+    DIRECTIONS,
+    KnownSite,
+    Network,
+    TrainedPeer,
+    perceptron,
+    smooth_root,
+)
 from gsparc.ops import Pose
 
 REFERENCE = 0.025  # [m] at which a signal has unit gain: 1/d without its constant
@@ -46,9 +53,13 @@ class MarchedField(Network):
         octaves, width, half = settings.octaves, settings.width, settings.depth // 2
         self.place = PositionEncoding(EncodingSettings("fourier", octaves), around)
         self.query = PositionEncoding(EncodingSettings("fourier", octaves), scene.box)
-        self.heading = PositionEncoding(EncodingSettings("fourier", settings.view_octaves), DIRECTIONS)
+        self.heading = PositionEncoding(
+            EncodingSettings("fourier", settings.view_octaves), DIRECTIONS
+        )
         self.early = perceptron(self.place.width, width, width, half)
-        self.late = perceptron(self.place.width + width, 2 + width, width, settings.depth - half - 1)
+        self.late = perceptron(
+            self.place.width + width, 2 + width, width, settings.depth - half - 1
+        )
         # The first layer is linear: what all samples of a ray share is added, not repeated.
         self.by_feature = nn.Linear(width, width)
         self.by_ray = nn.Linear(self.heading.width + self.query.width, width)
@@ -56,7 +67,9 @@ class MarchedField(Network):
         self.register_buffer("directions", scene.site.grid.directions(torch.float32).flatten(0, -2))
 
     def march(self, origin: Tensor, heading: Tensor, query: Tensor) -> Tensor:
-        """Return magnitudes (R,) seen from origin (R, 3) [m] along unit vectors (R, 3); query (R, 3) [m]."""
+        """Return magnitudes (R,) seen from origin (R, 3) [m] along unit vectors (R, 3);
+        query (R, 3) [m].
+        """
         step = self.far / self.samples
         depth = step * torch.arange(self.samples)
         places = origin[:, None] + depth[:, None] * heading[:, None]
@@ -65,7 +78,10 @@ class MarchedField(Network):
         shared = self.by_ray(torch.cat([self.heading(heading), self.query(query)], -1))
         signal = self.signal((self.by_feature(out[..., 2:]) + shared[:, None]).relu())
         raw = torch.stack([out[..., :2], signal])  # of attenuation and signal: size and phase
-        size, phase = nn.functional.leaky_relu(raw[..., 0]).abs(), 2 * math.pi * torch.sigmoid(raw[..., 1])
+        size, phase = (
+            nn.functional.leaky_relu(raw[..., 0]).abs(),
+            2 * math.pi * torch.sigmoid(raw[..., 1]),
+        )
         thick, turn = step * size[0], step * phase[0]
         gain = (thick - thick.cumsum(1)).exp() * size[1] * REFERENCE / (depth + step)
         wave = torch.polar(gain, turn.cumsum(1) - turn + phase[1])
@@ -87,12 +103,16 @@ class MarchedField(Network):
         rx, pixels = query.rx, torch.arange(len(self.directions))
         moving = self.scene.site.moving(query.tx, rx)
         parts = []
-        for sample, some in product(range(len(query)), pixels.split(max(POINTS // self.samples, 1))):
+        for sample, some in product(
+            range(len(query)), pixels.split(max(POINTS // self.samples, 1))
+        ):
             which = torch.full_like(some, sample)
             parts.append(self.march(*self._origins_and_directions(rx, which, some), moving[which]))
         return torch.cat(parts).view(len(query), *self.scene.shape)
 
-    def _origins_and_directions(self, rx: Pose, sample: Tensor, pixel: Tensor) -> tuple[Tensor, Tensor]:
+    def _origins_and_directions(
+        self, rx: Pose, sample: Tensor, pixel: Tensor
+    ) -> tuple[Tensor, Tensor]:
         """Origins and world directions (R, 3) of the pixels of samples."""
         local = self.directions[pixel]
         if not rx.batched:
@@ -105,10 +125,12 @@ class NeRF2(TrainedPeer):
     """Spectra.
 
     Args:
-        width, depth: of the attenuation network; the signal network's two layers have `width` and half of it.
+        width, depth: of the attenuation network; the signal network's two layers have `width` and
+            half of it.
         samples: points per ray.
         rays: pixels drawn per step, spread over the batch.
-        octaves, view_octaves: of the Fourier features of places and transmitters, and of directions.
+        octaves, view_octaves: of the Fourier features of places and transmitters, and of
+            directions.
         far_m: where rays end [m]; None: one and a half times the extent of the scene.
         others: see `TrainedPeer`.
     """

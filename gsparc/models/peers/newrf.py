@@ -1,15 +1,16 @@
 """NeWRF: rays along the directions of arrival only, marched for virtual transmitters.
 
-H. Lu, C. Vattheuer, B. Mirzasoleiman, O. Abari, "NeWRF: A Deep Learning Framework for Wireless Radiation
-Field Reconstruction and Channel Prediction", ICML 2024.
+H. Lu, C. Vattheuer, B. Mirzasoleiman, O. Abari, "NeWRF: A Deep Learning Framework for Wireless
+Radiation Field Reconstruction and Channel Prediction", ICML 2024.
 
-Kept: training rays along measured directions of arrival, a network of place and direction that says where on
-the ray a virtual transmitter stands and what it sends, amplitude 1/d and the carrier's phase over the marched
-distance; at a query the directions are *searched* (rays of training receivers are triangulated, the nearest
-receivers vote which of the virtual transmitters are seen). Left out: the network that predicts how many paths
-a query has (what at least half of the neighbours see is taken); a density per metre (ours is an opacity per
-sample, since half of the samples lie within 10 cm of where the intersection found something, in place of
-hierarchical resampling), four octaves of directions (two), further rays, noise on directions.
+Kept: training rays along measured directions of arrival, a network of place and direction that says
+where on the ray a virtual transmitter stands and what it sends, amplitude 1/d and the carrier's
+phase over the marched distance; at a query the directions are *searched* (rays of training
+receivers are triangulated, the nearest receivers vote which of the virtual transmitters are seen).
+Left out: the network that predicts how many paths a query has (what at least half of the neighbours
+see is taken); a density per metre (ours is an opacity per sample, since half of the samples lie
+within 10 cm of where the intersection found something, in place of hierarchical resampling), four
+octaves of directions (two), further rays, noise on directions.
 """
 
 from __future__ import annotations
@@ -43,7 +44,10 @@ class DirectedRays(Network):
         super().__init__(scene, len(precomputed["virtual"]))
         assert scene.site.wavelength is not None
         self.precomputed = precomputed
-        self.samples, self.neighbours = settings.samples, min(settings.neighbours, len(precomputed["places"]))
+        self.samples, self.neighbours = (
+            settings.samples,
+            min(settings.neighbours, len(precomputed["places"])),
+        )
         self.wavenumber = 2 * math.pi / scene.site.wavelength
         reach = (precomputed["virtual"][:, None] - precomputed["places"][None]).norm(dim=-1)
         self.far = float(torch.quantile(reach[precomputed["votes"].T > 0], 0.99)) + AROUND
@@ -54,10 +58,11 @@ class DirectedRays(Network):
         self.network = perceptron(inputs, 3, settings.width, settings.depth)
 
     def transmitters_and_likely(self, places: Tensor, skip_self: bool) -> tuple[Tensor, Tensor]:
-        """Return virtual transmitters (B, P, 3) [m] likely seen from places (B, 3), and which are (B, P).
+        """Return virtual transmitters (B, P, 3) [m] likely seen from places (B, 3),
+        and which are (B, P).
 
-        At least half of the nearest training receivers see them. Training receivers (`skip_self`) see what
-        they were measured to see.
+        At least half of the nearest training receivers see them. Training receivers (`skip_self`)
+        see what they were measured to see.
         """
         distance = torch.cdist(places, self.precomputed["places"])
         near = distance.topk(1 if skip_self else self.neighbours, largest=False).indices
@@ -65,14 +70,20 @@ class DirectedRays(Network):
         best = share.topk(max(int((share >= 0.5).sum(1).max()), 1), dim=1)
         return self.precomputed["virtual"][best.indices], best.values >= 0.5
 
-    def march(self, places: Tensor, goals: Tensor, likely: Tensor, rng: torch.Generator | None) -> Tensor:
-        """Return channels (B,) of rays from places (B, 3) to goals (B, P, 3) [m], those likely (B, P)."""
+    def march(
+        self, places: Tensor, goals: Tensor, likely: Tensor, rng: torch.Generator | None
+    ) -> Tensor:
+        """Return channels (B,) of rays from places (B, 3) to goals (B, P, 3) [m],
+        those likely (B, P).
+        """
         towards = goals - places[:, None]
         distance = towards.norm(dim=-1, keepdim=True).clamp_min(NEAR)
         heading = towards / distance
         half = self.samples // 2
         shape = (*heading.shape[:2], half)
-        jitter = torch.full((2, *shape), 0.5) if rng is None else torch.rand((2, *shape), generator=rng)
+        jitter = (
+            torch.full((2, *shape), 0.5) if rng is None else torch.rand((2, *shape), generator=rng)
+        )
         steps = torch.arange(half)
         coarse = NEAR + (self.far - NEAR) * (steps + jitter[0]) / half
         fine = (distance - AROUND + 2 * AROUND * (steps + jitter[1]) / half).clamp_min(NEAR / 2)
@@ -96,7 +107,9 @@ class DirectedRays(Network):
     def loss(self, batch: Batch, generator: torch.Generator) -> Tensor:
         """Return the mean squared error along measured directions."""
         places = torch.atleast_2d(batch.rx.position)
-        seen = self.march(places, *self.transmitters_and_likely(places, True), generator).view(-1, 1, 1)
+        seen = self.march(places, *self.transmitters_and_likely(places, True), generator).view(
+            -1, 1, 1
+        )
         return (seen - batch.target).abs().square().mean()
 
 
@@ -125,13 +138,15 @@ class NeWRF(TrainedPeer):
         """Return virtual transmitters, and which of them every training receiver sees.
 
         Raises:
-            ValueError: no directions, no carrier, more than one antenna or tone, or a moving transmitter.
+            ValueError: no directions, no carrier, more than one antenna or tone, or a moving
+                transmitter.
         """
         if data.directions is None:
             raise ValueError(f"{self.name}: needs directions of arrival; this dataset has none")
         if data.site.wavelength is None or data.site.static_end != "tx" or data.target[0].size != 1:
             raise ValueError(
-                f"{self.name}: needs a moving receiver with one antenna, one tone and a known carrier"
+                f"{self.name}: needs a moving receiver with one antenna, one tone and a known "
+                "carrier"
             )
         places = data.rx_position[rows].astype(np.float64)
         towards = [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in rows]

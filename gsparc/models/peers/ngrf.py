@@ -1,13 +1,14 @@
 """nGRF: channels as a direct complex sum over Gaussians, with no image in between.
 
-M. Umer, M. A. Mohsin, A. Bilal, J. M. Cioffi, "Neural Gaussian Radio Fields for Channel Estimation", 2025.
+M. Umer, M. A. Mohsin, A. Bilal, J. M. Cioffi,
+"Neural Gaussian Radio Fields for Channel Estimation", 2025.
 
 Kept: Gaussians in space as radiators with complex responses, summed as waves without occlusion:
-h = sum_i g_i exp(-j k r_i) / r_i, r_i softened by the Gaussian's extent. Left out: the network that gives
-the responses (ours are free numbers; a network that also knew the query would fit every training sample and
-predict none), adaptive density control, polarised antenna patterns (one learned response per antenna).
-Written from the published description; the authors' attributes may differ. Spectra, which the paper does not
-predict, are what a declared static array makes of the same waves.
+h = sum_i g_i exp(-j k r_i) / r_i, r_i softened by the Gaussian's extent. Left out: the network that
+gives the responses (ours are free numbers; a network that also knew the query would fit every
+training sample and predict none), adaptive density control, polarised antenna patterns (one learned
+response per antenna). Written from the published description; the authors' attributes may differ.
+Spectra, which the paper does not predict, are what a declared static array makes of the same waves.
 """
 
 from __future__ import annotations
@@ -37,16 +38,25 @@ class Radiators(Network):
 
     def __init__(self, scene: KnownSite, settings: NGRF) -> None:
         super().__init__(scene, settings.count)
-        site, count, name, spectrum = scene.site, self.count, settings.name, scene.site.target.is_image
+        site, count, name, spectrum = (
+            scene.site,
+            self.count,
+            settings.name,
+            scene.site.target.is_image,
+        )
         if site.subcarriers_hz is None and site.carrier_hz is None:
-            raise ValueError(f"{name}: the dataset declares no frequency, waves have no phase without")
+            raise ValueError(
+                f"{name}: the dataset declares no frequency, waves have no phase without"
+            )
         if spectrum and (site.array is None or scene.receiver is None):
             raise ValueError(f"{name}: spectra need a static receiver with a declared array")
         antennas, tones = (len(site.array), 1) if spectrum else scene.shape  # type: ignore[arg-type]
         low, high = scene.box[0] - MARGIN, scene.box[1] + MARGIN
         means = low + (high - low) * torch.rand(count, len(low))
         if site.static_end == "tx" and site.static_position is not None:
-            means[0] = torch.from_numpy(site.static_position) + TRANSMITTER_SPREAD * torch.randn_like(low)
+            means[0] = torch.from_numpy(
+                site.static_position
+            ) + TRANSMITTER_SPREAD * torch.randn_like(low)
         self.means = nn.Parameter(means)
         self.log_extents = nn.Parameter(torch.full((count,), math.log(0.05)))
         self.gains = nn.Parameter(torch.randn(count, 2) * scene.reach / math.sqrt(2 * count))

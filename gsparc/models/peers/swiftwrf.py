@@ -1,13 +1,15 @@
-"""SwiftWRF: planar Gaussians on the spectrum itself, deformed by a small network, summed in any order.
+"""SwiftWRF: planar Gaussians on the spectrum itself, deformed by a small network,
+summed in any order.
 
-M. Liu, C. Zhang, Q. Yang, Y. Cao, Y. Xu, Y. Xu, S. Sun, M. Dai, Y. Guan, "Deformable 2D Gaussian Splatting
-for Efficient Wireless Radiance Field Rendering" (SwiftWRF), 2025.
+M. Liu, C. Zhang, Q. Yang, Y. Cao, Y. Xu, Y. Xu, S. Sun, M. Dai, Y. Guan, "Deformable 2D Gaussian
+Splatting for Efficient Wireless Radiance Field Rendering" (SwiftWRF), 2025.
 
-Kept: two-dimensional Gaussians without depth, a plain sum instead of compositing, one small network from
-(Gaussian, position of the moving end) to changes of centre, shape and strength. Left out: the two stages with
-annealed smoothing, the residual scheme between groups of spectra, complex signals in two channels. The
-Gaussians lie on the unit sphere around the receiver rather than in the image plane, so that the seam in
-azimuth closes; the plain sum is our compositing in the limit of vanishing opacity, without occlusion.
+Kept: two-dimensional Gaussians without depth, a plain sum instead of compositing, one small network
+from (Gaussian, position of the moving end) to changes of centre, shape and strength. Left out: the
+two stages with annealed smoothing, the residual scheme between groups of spectra, complex signals
+in two channels. The Gaussians lie on the unit sphere around the receiver rather than in the image
+plane, so that the seam in azimuth closes; the plain sum is our compositing in the limit of
+vanishing opacity, without occlusion.
 """
 
 from __future__ import annotations
@@ -76,7 +78,8 @@ class PlanarGaussians(GaussianNetwork):
         quats = turn_about_normal(self.frames, angle)
         opacities = widths.new_full((batch, len(self.base)), THIN)
         geometry = (directions, quats, torch.cat([widths, flat], -1), opacities)
-        # The rasterizer multiplies by the opacity again: what is left is the plain sum of strengths.
+        # The rasterizer multiplies by the opacity again:
+        # what is left is the plain sum of strengths.
         strength = (self.strengths.unsqueeze(-1) + light) / THIN
         here = torch.zeros_like(self.base[0])
         image = render_each(
@@ -85,14 +88,17 @@ class PlanarGaussians(GaussianNetwork):
         return image.squeeze(1)
 
     def _changes_at(self, query: Query) -> tuple[Tensor, ...]:
-        return self.deformation(self.base, self.scene.site.moving(query.tx, query.rx)).split(CHANGES, -1)
+        return self.deformation(self.base, self.scene.site.moving(query.tx, query.rx)).split(
+            CHANGES, -1
+        )
 
     def emit(self, query: Query) -> Tensor:
         """See `GaussianNetwork`."""
         return self.strengths + self._changes_at(query)[-1][0, :, 0]
 
     def to_cloud(self, strengths: Tensor) -> GaussianCloud:
-        """Return them a metre from the receiver, not yet moved; opacities are strengths: nothing is hidden.
+        """Return them a metre from the receiver, not yet moved; opacities are strengths:
+        nothing is hidden.
 
         Raises:
             ValueError: the receiver moves: they are directions, and lie nowhere.
@@ -101,16 +107,21 @@ class PlanarGaussians(GaussianNetwork):
         if receiver is None:
             raise ValueError("Gaussians of directions around a receiver that moves lie nowhere")
         towards = self.base + (self.centres.unsqueeze(-2) @ self.axes).squeeze(-2)
-        means = receiver.position + towards / towards.norm(dim=-1, keepdim=True) @ receiver.rotation.mT
+        means = (
+            receiver.position + towards / towards.norm(dim=-1, keepdim=True) @ receiver.rotation.mT
+        )
         turned = turn_about_normal(self.frames, self.angles[None, :, None] / 2)[0].numpy()
         rotation = Rotation.from_matrix(receiver.rotation.numpy())
         quats = rotation * Rotation.from_quat(turned, scalar_first=True)
         widths = self.log_widths.exp().double().numpy()
         return GaussianCloud(
-            means.double().numpy(), np.column_stack([widths, np.full(len(widths), FLAT)]),
-            quats.as_quat(scalar_first=True), strengths.double().clamp(0, 1).numpy(),
-            strengths.double().numpy(), "emission of a Gaussian",
-        )  # fmt: skip
+            means.double().numpy(),
+            np.column_stack([widths, np.full(len(widths), FLAT)]),
+            quats.as_quat(scalar_first=True),
+            strengths.double().clamp(0, 1).numpy(),
+            strengths.double().numpy(),
+            "emission of a Gaussian",
+        )
 
 
 @dataclass(eq=False, kw_only=True)
@@ -126,7 +137,9 @@ class SwiftWRF(DeformedPeer):
 
 
 def sphere_lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:
-    """Return `count` even directions (N, 3) over the grid's part of a sphere, and tangents (N, 2, 3)."""
+    """Return `count` even directions (N, 3) over the grid's part of a sphere,
+    and tangents (N, 2, 3).
+    """
     low = grid.first_elevation - grid.elevation_step / 2
     high = grid.first_elevation + (grid.height - 0.5) * grid.elevation_step
     step = torch.arange(count) + 0.5
@@ -143,13 +156,19 @@ def sphere_lattice(grid: SphereGrid, count: int) -> tuple[Tensor, Tensor]:
 
 
 def frame_quaternions(axes: Tensor, normal: Tensor) -> Tensor:
-    """Return rotations (N, 4) w x y z whose columns are two tangents (N, 2, 3) and the normal (N, 3)."""
+    """Return rotations (N, 4) w x y z whose columns are two tangents (N, 2, 3)
+    and the normal (N, 3).
+    """
     columns = torch.cat([axes, normal.unsqueeze(1)], 1).mT
-    return torch.from_numpy(Rotation.from_matrix(columns.numpy()).as_quat(scalar_first=True)).float()
+    return torch.from_numpy(
+        Rotation.from_matrix(columns.numpy()).as_quat(scalar_first=True)
+    ).float()
 
 
 def turn_about_normal(frame: Tensor, half: Tensor) -> Tensor:
-    """Return frames (N, 4) turned about their own third axis by twice `half` (B, N, 1) [rad]: (B, N, 4)."""
+    """Return frames (N, 4) turned about their own third axis by twice `half` (B, N, 1) [rad]:
+    (B, N, 4).
+    """
     w, x, y, z = frame.unsqueeze(-1).unbind(-2)
     c, s = half.cos(), half.sin()
     return torch.cat([w * c - z * s, x * c + y * s, y * c - x * s, z * c + w * s], -1)

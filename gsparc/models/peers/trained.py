@@ -16,7 +16,12 @@ from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.data.target import Kind
-from gsparc.field.gradient_stage import interruptible, make_trainer, read_trainer_result, requested_steps
+from gsparc.field.gradient_stage import (
+    interruptible,
+    make_trainer,
+    read_trainer_result,
+    requested_steps,
+)
 from gsparc.field.losses import LossSettings, task_loss
 from gsparc.field.module import NetworkModule
 from gsparc.field.optimizer import OptimizerSettings
@@ -59,7 +64,9 @@ class KnownSite:
     def reach(self) -> float:
         """Extent of the scene [m]: from the static end to the far side of the box."""
         still, (low, high) = self.site.static_position, self.box
-        distance = 0.0 if still is None else float((torch.from_numpy(still) - (low + high) / 2).norm())
+        distance = (
+            0.0 if still is None else float((torch.from_numpy(still) - (low + high) / 2).norm())
+        )
         return max(distance + float((high - low).norm()) / 2, 1.0)
 
 
@@ -103,10 +110,12 @@ def smooth_root(power: Tensor) -> Tensor:
 
 @dataclass(eq=False, kw_only=True)
 class TrainedPeer(Method):
-    """Learns from `fold.train` and `fold.val` together in counted steps; nothing is chosen on `val`.
+    """Learns from `fold.train` and `fold.val` together in counted steps;
+    nothing is chosen on `val`.
 
     Args:
-        learn_val: false: validation rows are not learned from, but watched, and their figures logged.
+        learn_val: false: validation rows are not learned from, but watched, and their figures
+            logged.
         max_steps: of the learning-rate schedule. None takes `usual_steps`, times the effort.
         batch_size: samples per step.
         rate: Adam's learning rate where `rates` names no other.
@@ -119,7 +128,8 @@ class TrainedPeer(Method):
     takes_effort: ClassVar[bool] = True  # type: ignore[misc]
     threads_pay: ClassVar[bool] = True  # type: ignore[misc]
     is_yardstick: ClassVar[bool] = True  # type: ignore[misc]
-    usual_steps: ClassVar[dict[Kind, int]]  # a minute of one core at its usual batches (docs/table.md)
+    # A minute of one core at its usual batches (docs/table.md)
+    usual_steps: ClassVar[dict[Kind, int]]
     makes: ClassVar[type[Any]]  # a `Network` of a scene and these settings
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name
     name: str
@@ -151,21 +161,30 @@ class TrainedPeer(Method):
         return f"{self._count_steps(kind, effort, step_count)} steps of {self.batch_size} samples"
 
     def precompute(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
-        """Return tensors computed from the training rows (n,) before training; stored with the weights."""
+        """Return tensors computed from the training rows (n,) before training;
+        stored with the weights.
+        """
         return {}
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
         """Train to the end of the schedule; steps of the Trainer win over the model's.
 
         Raises:
-            ValueError: a kind of data the method does not serve, no rows, or a run of others to resume.
+            ValueError: a kind of data the method does not serve, no rows, or a run of others to
+                resume.
             RuntimeError: the loss became NaN or infinite.
         """
         kinds, kind = tuple(self.usual_steps), data.site.kind
-        split = replace(fold, train=np.r_[fold.train, fold.val], val=fold.val[:0]) if self.learn_val else fold
+        split = (
+            replace(fold, train=np.r_[fold.train, fold.val], val=fold.val[:0])
+            if self.learn_val
+            else fold
+        )
         rows = np.sort(split.train)
         if kind not in kinds:
-            raise ValueError(f"{self.name}: predicts {' and '.join(kinds)}; this dataset holds {kind}")
+            raise ValueError(
+                f"{self.name}: predicts {' and '.join(kinds)}; this dataset holds {kind}"
+            )
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         origin = Origin.from_fit(data, fold, context)
@@ -179,7 +198,9 @@ class TrainedPeer(Method):
             origin.require_same(read_interrupted(context.resume))
         module = self.module(self._count_steps(kind, context.counts, step_count), context.run_dir)
         files = GsparcCheckpointIO(self, context.config_yaml, origin.to_extra())
-        trainer, batches = make_trainer(module, data, replace(split, train=rows), context, files, watch)
+        trainer, batches = make_trainer(
+            module, data, replace(split, train=rows), context, files, watch
+        )
         with interruptible(trainer, batches):
             trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
         result = read_trainer_result(trainer, watch)
@@ -195,7 +216,9 @@ class TrainedPeer(Method):
         return NetworkModule(network, network.scene.site, rates, steps, run_dir, self._rate_group)
 
     def _rate_group(self, name: str) -> tuple[str, float]:
-        kind = max((prefix for prefix in self.rates if name.startswith(prefix)), key=len, default="other")
+        kind = max(
+            (prefix for prefix in self.rates if name.startswith(prefix)), key=len, default="other"
+        )
         return kind, self.rates.get(kind, self.rate)
 
     def fitted(self) -> Network:
@@ -216,7 +239,11 @@ class TrainedPeer(Method):
     def state(self) -> dict[str, Any]:
         """Return weights, and what the network is built from."""
         network = self.fitted()
-        scene = {"shape": list(network.scene.shape), "box": network.scene.box, "found": self.precomputed}
+        scene = {
+            "shape": list(network.scene.shape),
+            "box": network.scene.box,
+            "found": self.precomputed,
+        }
         return {**scene, "network": network.state_dict(), "steps": self.steps}
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:

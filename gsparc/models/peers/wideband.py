@@ -1,11 +1,14 @@
-"""Frequency-embedded 3D Gaussians: a network of a Gaussian's place, the query and the carrier changes them.
+"""Frequency-embedded 3D Gaussians: a network of a Gaussian's place,
+the query and the carrier changes them.
 
-Z. Li, L. Yang, Y. Bian, H. Pan, Y. Fu, Y. Wang, Z. Chen, Y.-C. Chen, G. Xue, "Wideband RF Radiance Field
-Modeling Using Frequency-embedded 3D Gaussian Splatting", NeurIPS 2025; the authors' program (XFreq-GS).
+Z. Li, L. Yang, Y. Bian, H. Pan, Y. Fu, Y. Wang, Z. Chen, Y.-C. Chen, G. Xue, "Wideband RF Radiance
+Field Modeling Using Frequency-embedded 3D Gaussian Splatting", NeurIPS 2025;
+the authors' program (XFreq-GS).
 
-Kept: complex signals of a harmonic series over directions; one network that scales amplitude, attenuation and
-size, turns the phase, and scales and shifts the series' constant, pulled towards no change; L1 and SSIM; one
-model of all carriers. Left out: codes of single Gaussians, adaptive density control.
+Kept: complex signals of a harmonic series over directions; one network that scales amplitude,
+attenuation and size, turns the phase, and scales and shifts the series' constant, pulled towards no
+change; L1 and SSIM; one model of all carriers. Left out: codes of single Gaussians,
+adaptive density control.
 """
 
 from __future__ import annotations
@@ -73,14 +76,20 @@ class FrequencyEmbedded(GaussianNetwork):
         amplitude, phase, opacity, size = self._attributes(query, changes)
         count = len(query)
         geometry = (
-            self.field.means.expand(count, -1, -1), self.field.quats.expand(count, -1, -1),
-            self.field.log_scales.exp() * size.sqrt(), opacity,
-        )  # fmt: skip
+            self.field.means.expand(count, -1, -1),
+            self.field.quats.expand(count, -1, -1),
+            self.field.log_scales.exp() * size.sqrt(),
+            opacity,
+        )
         signal = torch.stack([amplitude * phase.cos(), amplitude * phase.sin()], dim=-1)
-        return smooth_root(render_each(geometry, signal, query.rx, self.grid, **self.options).square().sum(1))
+        return smooth_root(
+            render_each(geometry, signal, query.rx, self.grid, **self.options).square().sum(1)
+        )
 
     def _changes_at(self, query: Query) -> tuple[Tensor, ...]:
-        station = torch.zeros(len(query), dtype=torch.long) if query.station is None else query.station
+        station = (
+            torch.zeros(len(query), dtype=torch.long) if query.station is None else query.station
+        )
         moving = self.scene.site.moving(query.tx, query.rx)
         return self.deformation(
             self.field.means, torch.cat([moving, self.tuned[station, None]], dim=1)
@@ -90,7 +99,9 @@ class FrequencyEmbedded(GaussianNetwork):
         """Amplitude, phase and opacity (B, N), factor of the squared size (B, N, 1)."""
         amplitude, phase, attenuation, size, scale, shift = changes
         towards = self.scene.site.moving(query.tx, query.rx)[:, None] - self.field.means
-        series = fourier_legendre(nn.functional.normalize(towards, dim=-1), self.degree, self.degree)
+        series = fourier_legendre(
+            nn.functional.normalize(towards, dim=-1), self.degree, self.degree
+        )
         whole = torch.einsum("bnk,nkc->bnc", series, self.series)
         constant = self.series[:, 0]
         raw = 0.5 + whole + MOST_CHANGE[1] * scale.tanh() * constant + MOST_CHANGE[2] * shift.tanh()

@@ -1,12 +1,13 @@
 """WRF-GS+: 3D Gaussians that a network deforms for every position of the transmitter.
 
-C. Wen, J. Tong, Y. Hu, Z. Lin, J. Zhang, "Neural Representation for Wireless Radiation Field Reconstruction:
-A 3D Gaussian Splatting Approach" (WRF-GS and WRF-GS+), 2025.
+C. Wen, J. Tong, Y. Hu, Z. Lin, J. Zhang, "Neural Representation for Wireless Radiation Field
+Reconstruction: A 3D Gaussian Splatting Approach" (WRF-GS and WRF-GS+), 2025.
 
-Kept: a static part (the Gaussians) and a dynamic part (a network of a Gaussian's place and the query) that
-moves, turns, stretches, fades and re-lights them (the authors' program neither moves nor fades them); one
-projection per query; L1 and SSIM. Left out: adaptive density control, complex signals in two channels, first
-Gaussians 20 m wide about the origin (ours start around the receiver).
+Kept: a static part (the Gaussians) and a dynamic part (a network of a Gaussian's place and the
+query) that moves, turns, stretches, fades and re-lights them (the authors' program neither moves
+nor fades them); one projection per query; L1 and SSIM. Left out: adaptive density control, complex
+signals in two channels, first Gaussians 20 m wide about the origin (ours start around the
+receiver).
 """
 
 from __future__ import annotations
@@ -52,9 +53,11 @@ class DeformedGaussians(GaussianNetwork):
         place, turn, stretch, fade, light = self._changes_at(query)
         stretch = stretch.clamp(-MOST_STRETCH, MOST_STRETCH)
         geometry = (
-            field.means + SHIFT * place, field.quats + turn, (field.log_scales + stretch).exp(),
+            field.means + SHIFT * place,
+            field.quats + turn,
+            (field.log_scales + stretch).exp(),
             torch.sigmoid(field.opacity_logits + fade.squeeze(-1)),
-        )  # fmt: skip
+        )
         signal = torch.sigmoid(self.signals.unsqueeze(-1) + light)
         return render_each(geometry, signal, query.rx, self.grid, **self.options).squeeze(1)
 

@@ -1,9 +1,9 @@
 """The field of received powers: what the path loses in known walls, and a process of the rest.
 
-In decibels: a constant or a distance law, uncertain; a loss for each known wall on the straight path between
-the ends; one or two Matern-3/2 of place; noise. Of many rows the mean of such processes is taken, by what
-squares left out say. Where a wavelength is sampled powers interfere: there coherent waves stand beside one
-process.
+In decibels: a constant or a distance law, uncertain; a loss for each known wall on the straight
+path between the ends; one or two Matern-3/2 of place; noise. Of many rows the mean of such
+processes is taken, by what squares left out say. Where a wavelength is sampled powers interfere:
+there coherent waves stand beside one process.
 """
 
 from __future__ import annotations
@@ -26,7 +26,12 @@ from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.known.images import walls_in_frame
 from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, fit_fringes, resolves_wavelength
-from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, describe_weights, subtract_means
+from gsparc.models.powers.own_terms import (
+    UserTerm,
+    add_terms_to_trend,
+    describe_weights,
+    subtract_means,
+)
 from gsparc.models.powers.prior_map import PriorMap
 from gsparc.models.powers.settings import (
     LAW_NEEDS,
@@ -58,7 +63,8 @@ class PowerField(ClosedForm):
     Args:
         waves: whether coherent ones are sought where neighbours are closer than half a wavelength.
         seed: of rows and waves that are drawn.
-        walls: that are known, in the coordinates of the measurements; no waves are sought beside them.
+        walls: that are known, in the coordinates of the measurements; no waves are sought beside
+            them.
         terms: further columns of the mean, in the coordinates of the measurements.
     """
 
@@ -67,14 +73,18 @@ class PowerField(ClosedForm):
     priors: tuple[tuple[float, Prior], ...]  # with shares of the mean, the largest first
 
     def __init__(
-        self, waves: bool = True, seed: int = 0, walls: SceneWalls | None = None,
+        self,
+        waves: bool = True,
+        seed: int = 0,
+        walls: SceneWalls | None = None,
         terms: tuple[Columns, ...] = (),
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.waves, self.seed, self.walls, self.own_terms = waves, seed, walls, terms
         self.fringes: Fringes | None = None  # of coherent waves, beside the process
         self.powers: PowerProcess | None = None
         self.known = np.zeros(0, np.int64)
-        self.at = np.zeros(0, np.int64)  # places of the process that known rows are of, where rows share them
+        # Places of the process that known rows are of, where rows share them
+        self.at = np.zeros(0, np.int64)
         self.decibels = np.zeros(0)
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -87,19 +97,25 @@ class PowerField(ClosedForm):
         if not len(rows):
             raise ValueError("a process of powers needs at least one row")
         self.site, self.fringes = data.site, None
-        notes = (*self._choose_priors(data, rows, context.counts), *self._judge_maps(power_rows(data, rows)))
+        notes = (
+            *self._choose_priors(data, rows, context.counts),
+            *self._judge_maps(power_rows(data, rows)),
+        )
         self.condition(data, rows)
         user_terms = tuple(one for one in self.trend.more if isinstance(one, UserTerm))
         if user_terms and self.powers is not None and isinstance(self.powers.posterior, Exact):
             notes = (*describe_weights(self.powers.posterior, user_terms), *notes)
         return FitReport(watch.seconds, notes)
 
-    def _choose_priors(self, data: Measurements, rows: np.ndarray, effort: Effort) -> tuple[str, ...]:
+    def _choose_priors(
+        self, data: Measurements, rows: np.ndarray, effort: Effort
+    ) -> tuple[str, ...]:
         """Set the priors and waves; what must be said of them."""
         seen, site, chosen_on = power_rows(data, rows), data.site, effort.chosen_on
         # Checked once: a query has no time for it, nor has `torch.func`.
         terms = tuple(
-            UserTerm.from_site(t, site).centre(torch.from_numpy(seen.places)) for t in self.own_terms
+            UserTerm.from_site(t, site).centre(torch.from_numpy(seen.places))
+            for t in self.own_terms
         )
         if self.walls is not None:
             walls = walls_in_frame(self.walls, site.origin, site.static_position)
@@ -107,7 +123,9 @@ class PowerField(ClosedForm):
             has_law = int((~seen.silent).sum()) >= LAW_NEEDS
             rest = subtract_means(seen, terms)
             law, notes = fit_site_law(rest, site) if has_law else (None, ())
-            trend = add_terms_to_trend(rest, replace(trend_about_rows(rest, law), more=(walls,)), terms)
+            trend = add_terms_to_trend(
+                rest, replace(trend_about_rows(rest, law), more=(walls,)), terms
+            )
             best = choose_candidate(seen, [MeanLaw(trend, 0.0, ())], self.seed, chosen_on)
             self.priors = ((1.0, best.prior),)
             about = "a distance law" if has_law else f"a constant, with fewer than {LAW_NEEDS} rows"
@@ -116,12 +134,21 @@ class PowerField(ClosedForm):
         found, remarks = candidate_priors(seen, site, self.seed, chosen_on, terms), list[str]()
         self.priors = ((1.0, found[0].prior),)
         # A level that silent rows are below is no power that waves could be fitted to.
-        if self.waves and not seen.silent.any() and resolves_wavelength(seen.places, site.wavelength):
+        if (
+            self.waves
+            and not seen.silent.any()
+            and resolves_wavelength(seen.places, site.wavelength)
+        ):
             # `Fringes.rows` is searched by bisection, and must ascend.
             order = np.argsort(rows)
             assert site.wavelength is not None
             self.fringes, note = fit_fringes(
-                seen.subset(order), rows[order], found[0].prior, site.wavelength, self.seed, effort.fringes
+                seen.subset(order),
+                rows[order],
+                found[0].prior,
+                site.wavelength,
+                self.seed,
+                effort.fringes,
             )
             remarks.append(note)
             if self.fringes is not None:  # their share was learned beside this process
@@ -129,7 +156,8 @@ class PowerField(ClosedForm):
         self.priors, notes = mix_candidates(seen, found, self.seed, chosen_on)
         own = tuple(term for term in terms if not isinstance(term.term, PriorMap))
         if len(own) < len(terms) and not self._used_maps():
-            # Kernels were sought beside the map's: a map that is left out leaves what there is without it.
+            # Kernels were sought beside the map's: a map that is left out leaves what there is
+            # without it.
             found = candidate_priors(seen, site, self.seed, chosen_on, own)
             self.priors, notes = mix_candidates(seen, found, self.seed, chosen_on)
         return (*notes, *remarks)
@@ -141,7 +169,9 @@ class PowerField(ClosedForm):
         return [term for term in own if isinstance(term, PriorMap)]
 
     def _judge_maps(self, rows: PowerRows) -> list[Caution]:
-        """What must be said of maps from before: that one is left out, and what may be wrong with it."""
+        """What must be said of maps from before: that one is left out,
+        and what may be wrong with it.
+        """
         heard = rows.heard_rows
         used, cautions = self._used_maps(), list[Caution]()
         for term in self.own_terms:
@@ -159,14 +189,18 @@ class PowerField(ClosedForm):
     @property
     def label(self) -> str:
         """The name, and how many nearest rows tell of a place where not all do."""
-        return approximation_label(self.name, None if self.powers is None else self.powers.posterior)
+        return approximation_label(
+            self.name, None if self.powers is None else self.powers.posterior
+        )
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
         return None if self.powers is None else self.powers.with_exact_posterior()
 
     def count_components(self) -> int:
-        """See `ClosedForm.count_gaussians`; coherent waves count as Gaussians of no extent, far away."""
+        """See `ClosedForm.count_gaussians`; coherent waves count as Gaussians of no extent,
+        far away.
+        """
         return 0 if self.fringes is None else len(self.fringes.weights)
 
     @property
@@ -177,13 +211,21 @@ class PowerField(ClosedForm):
     @property
     def terms(self) -> tuple[str, ...]:
         """`power` where walls are known, `phase` where coherent waves are, `residual` always."""
-        named = {"power": bool(self.trend.more), "phase": self.fringes is not None, "residual": True}
+        named = {
+            "power": bool(self.trend.more),
+            "phase": self.fringes is not None,
+            "residual": True,
+        }
         return tuple(name for name, there in named.items() if there)
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
-        """See `ClosedForm`; what rows say where nothing was heard is that powers are below a level."""
+        """See `ClosedForm`; what rows say where nothing was heard is
+        that powers are below a level.
+        """
         seen = power_rows(data, rows)
-        each = [(share, condition_on_powers(seen, prior, self.seed)[0]) for share, prior in self.priors]
+        each = [
+            (share, condition_on_powers(seen, prior, self.seed)[0]) for share, prior in self.priors
+        ]
         self.powers = replace(each[0][1], others=tuple(each[1:]))
         loud = seen.subset(np.flatnonzero(~seen.silent))
         self.known, self.decibels = rows[~seen.silent], loud.decibels
@@ -246,12 +288,18 @@ class PowerField(ClosedForm):
         self.site, self.seed = site, int(state["seed"])
         parts = (from_plain(state[name]) for name in ("priors", "process", "fringes"))
         self.priors, self.powers, self.fringes = parts
-        self.known, self.decibels, self.at = (state[name].numpy() for name in ("known", "decibels", "at"))
+        self.known, self.decibels, self.at = (
+            state[name].numpy() for name in ("known", "decibels", "at")
+        )
 
     def _decibel_moments(self, process: PowerProcess, places: Tensor) -> tuple[Tensor, ...]:
-        """Mean [dB], variance [dB^2], unknown share, and what coherent waves explain [dB], (b,) each."""
+        """Mean [dB], variance [dB^2], unknown share, and what coherent waves explain [dB], (b,)
+        each.
+        """
         mean, spread, share = process.answer(places)
         if self.fringes is None:
             return mean, spread, share, mean
-        mean, factor = self.fringes.blend_solutions(mean, places, process.posterior.nearest_distance(places))
+        mean, factor = self.fringes.blend_solutions(
+            mean, places, process.posterior.nearest_distance(places)
+        )
         return mean, spread * factor, share, self.fringes.solution_powers(places).mean(1)

@@ -1,10 +1,12 @@
-"""Powers of coherent waves where a wavelength is sampled, averaged over solutions and with a process.
+"""Powers of coherent waves where a wavelength is sampled,
+averaged over solutions and with a process.
 
-One solution predicts badly, as phases are ambiguous; the mean of many in decibels predicts well, and half of
-that and half of the process better (bagging: L. Breiman, Mach. Learn. 24 (1996)). Each solution is blind to
-one fold of places, so that rows are predicted by solutions that never saw their surroundings; a few rows
-drawn evenly are kept from all solutions and tell how they do between rows. What share the solutions get is a
-matter of both, by least squares (stacking: D. H. Wolpert, Neural Networks 5 (1992)).
+One solution predicts badly, as phases are ambiguous; the mean of many in decibels predicts well,
+and half of that and half of the process better (bagging: L. Breiman, Mach. Learn. 24 (1996)). Each
+solution is blind to one fold of places, so that rows are predicted by solutions that never saw
+their surroundings; a few rows drawn evenly are kept from all solutions and tell how they do between
+rows. What share the solutions get is a matter of both,
+by least squares (stacking: D. H. Wolpert, Neural Networks 5 (1992)).
 """
 
 from __future__ import annotations
@@ -98,8 +100,11 @@ class Fringes(Stored):
         field = torch.complex(phase.cos(), phase.sin()) @ self._mixture_weights
         return self.level + to_decibels(field.real.square() + field.imag.square() + FLOOR)
 
-    def blend_solutions(self, decibels: Tensor, places: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
-        """Return a process's means (n,) [dB] shared with the solutions, and factors (n,) of its variance.
+    def blend_solutions(
+        self, decibels: Tensor, places: Tensor, distance: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Return a process's means (n,) [dB] shared with the solutions, and factors (n,)
+        of its variance.
 
         Args:
             decibels: (n,) of the process.
@@ -111,19 +116,25 @@ class Fringes(Stored):
     def blend_blind_solutions(
         self, decibels: Tensor, places: Tensor, distance: Tensor, rows: np.ndarray
     ) -> tuple[Tensor, Tensor]:
-        """Return the same at rows (n,) by those solutions that never saw them or their surroundings."""
+        """Return the same at rows (n,) by those solutions that never saw them
+        or their surroundings.
+        """
         at = np.clip(np.searchsorted(self.rows, rows), 0, len(self.rows) - 1)
         fold = np.where(self.rows[at] == rows, self.fold[at], -1)
         mean = _held_out_mean(self.solution_powers(places).numpy(), fold, self.blind)
         return self._means_and_factors(decibels, torch.from_numpy(mean), distance)
 
-    def _means_and_factors(self, decibels: Tensor, mean: Tensor, distance: Tensor) -> tuple[Tensor, Tensor]:
+    def _means_and_factors(
+        self, decibels: Tensor, mean: Tensor, distance: Tensor
+    ) -> tuple[Tensor, Tensor]:
         share, factor = self.blend.share_and_inflation(distance, self.wavelength)
         return decibels + share * (mean - decibels), factor
 
 
 def resolves_wavelength(places: np.ndarray, wavelength: float | None) -> bool:
-    """Tell whether places (n, 3) are closer than half a wavelength to their neighbours, most of them."""
+    """Tell whether places (n, 3) are closer than half a wavelength to their neighbours,
+    most of them.
+    """
     if wavelength is None or has_both_ends(places):
         return False
     return 0 < neighbour_distance(places) < wavelength / 2
@@ -152,7 +163,13 @@ def fit_fringes(
         fold[part] = k
     fold[order[:probes]] = -1
     index = np.sort(order[: probes + count])
-    every, rows, numbers, group, fold = rows, rows.subset(index), numbers[index], squares[index], fold[index]
+    every, rows, numbers, group, fold = (
+        rows,
+        rows.subset(index),
+        numbers[index],
+        squares[index],
+        fold[index],
+    )
     level = float(to_decibels(from_decibels(rows.decibels).mean()))
     basis = make_basis(rows.places[fold >= 0], wavelength)
     columns = basis.columns(rows.places)
@@ -163,7 +180,8 @@ def fit_fringes(
     )
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
-    gain = 0.0  # mean of the squared errors at places left out, of the process less those of both [dB^2]
+    # Mean of the squared errors at places left out, of the process less those of both [dB^2]
+    gain = 0.0
     while len(weights) < most:
         # A solution of every fold a round: all rows have as many that are blind to them.
         for k in range(FOLDS):
@@ -172,18 +190,27 @@ def fit_fringes(
         blind = np.arange(len(weights)) % FOLDS
         powers = level + field_db(columns @ np.stack(weights, 1))
         blend, gain = _fit_blend(rows, group, fold, powers, blind, error, distance)
-        fringes = Fringes(basis, np.stack(weights, 1), blind, numbers, fold, level, wavelength, blend)
+        fringes = Fringes(
+            basis, np.stack(weights, 1), blind, numbers, fold, level, wavelength, blend
+        )
         if len(weights) >= TRIED and gain <= 0:
             break
     if fringes is None or gain <= 0:
-        return None, f"no fringes: {len(weights)} coherent solutions predict places left out no better{tail}"
+        return None, (
+            f"no fringes: {len(weights)} coherent solutions predict places left out no better{tail}"
+        )
     share = " and ".join(f"{value:.0%}" for value in fringes.blend.share)
-    note = f"fringes of {columns.shape[1]} coherent waves, {len(weights)} solutions, with {share} of the mean"
+    note = (
+        f"fringes of {columns.shape[1]} coherent waves, {len(weights)} solutions, with "
+        f"{share} of the mean"
+    )
     return fringes, f"{note} between rows and a block away, the process the rest{tail}"
 
 
 def _held_out_mean(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
-    """Means (n,) of powers (n, S) over the solutions blind to each row's fold; over all where that is -1."""
+    """Means (n,) of powers (n, S) over the solutions blind to each row's fold;
+    over all where that is -1.
+    """
     counts = _blind_solutions(fold, blind)
     return (powers * counts).sum(1) / counts.sum(1)
 
@@ -193,7 +220,9 @@ def _blind_solutions(fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
 
 
 def _excess_variance(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) -> np.ndarray:
-    """Squared error (n,) that the mean of blind solutions has beyond that of as many as there are."""
+    """Squared error (n,) that the mean of blind solutions has beyond that of
+    as many as there are.
+    """
     counts = _blind_solutions(fold, blind)
     number, every = counts.sum(1), len(blind)
     mean = (powers * counts).sum(1) / number
@@ -205,7 +234,8 @@ def _excess_variance(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) ->
 def _errors_and_distances(
     rows: PowerRows, parts: list[np.ndarray], prior: Prior, seed: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Errors (n,) of a process at rows of each part without that part, and distances (n,) to the rest [m].
+    """Errors (n,) of a process at rows of each part without that part, and distances (n,)
+    to the rest [m].
 
     Of all rows, as it will answer: at some of them alone it would seem worse than it is.
     """
@@ -216,7 +246,9 @@ def _errors_and_distances(
     for part in parts:
         fit = np.setdiff1d(at, at[part]) if big else np.setdiff1d(np.arange(len(rows.places)), part)
         posterior: Posterior = (
-            full.subset(fit, seed) if big else condition_on_powers(rows.subset(fit), prior, seed)[0].posterior
+            full.subset(fit, seed)
+            if big
+            else condition_on_powers(rows.subset(fit), prior, seed)[0].posterior
         )
         places = torch.from_numpy(rows.places[part])
         error[part] = posterior.mean_at(places)[:, 0].numpy() - rows.decibels[part]
@@ -225,10 +257,17 @@ def _errors_and_distances(
 
 
 def _fit_blend(
-    rows: PowerRows, group: np.ndarray, fold: np.ndarray, powers: np.ndarray, blind: np.ndarray,
-    error: np.ndarray, distance: np.ndarray,
-) -> tuple[Blend, float]:  # fmt: skip
-    """How to share predictions with a process of errors (n,), and what that gains at places left out."""
+    rows: PowerRows,
+    group: np.ndarray,
+    fold: np.ndarray,
+    powers: np.ndarray,
+    blind: np.ndarray,
+    error: np.ndarray,
+    distance: np.ndarray,
+) -> tuple[Blend, float]:
+    """How to share predictions with a process of errors (n,),
+    and what that gains at places left out.
+    """
     probes = fold < 0
     errors = np.stack([error, _held_out_mean(powers, fold, blind) - rows.decibels], 1)
     gram = errors[:, :, None] * errors[:, None]

@@ -13,7 +13,8 @@ SPREAD = 0.25  # deviation of a prior on what share of a mean a prediction has
 
 
 def number_squares(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
-    """Return the number (n,) int64 of the square of floor that each of places (n, 3), or (n, 6), lies in.
+    """Return the number (n,) int64 of the square of floor that each of places (n, 3), or (n, 6),
+    lies in.
 
     Along the longer side of the places' box there are `sides` squares.
     """
@@ -23,7 +24,9 @@ def number_squares(places: np.ndarray, sides: int = SIDES) -> np.ndarray:
 
 
 def split_groups(group: np.ndarray, count: int, seed: int) -> list[np.ndarray]:
-    """Return `count` parts of rows (n,), none empty unless there are fewer groups; groups stay whole."""
+    """Return `count` parts of rows (n,), none empty unless there are fewer groups;
+    groups stay whole.
+    """
     names = np.random.default_rng(seed).permutation(int(group.max()) + 1)
     parts = [np.flatnonzero(np.isin(group, names[k::count])) for k in range(count)]
     return [part for part in parts if len(part)]

@@ -29,20 +29,25 @@ LARGEST = 1e4  # of a column [deviations]: squares of larger ones hide the noise
 
 
 def to_terms(terms: Any) -> tuple[Columns, ...]:
-    """Return terms (`model.terms`) as a tuple, one alone as of one; `ValueError` for what is none."""
+    """Return terms (`model.terms`) as a tuple, one alone as of one;
+    `ValueError` for what is none.
+    """
     result = tuple(terms) if isinstance(terms, Sequence) else (terms,)
     for one in result:
         if not isinstance(one, Columns):
             raise ValueError(f"model.terms: {one!r} is not a gsparc.processes.term.Columns")
         if type(one).__module__ == MAIN:
             advice = "a saved model opens only where it is defined; move it to a file"
-            log.warning("model.terms: %s is of a notebook or script: %s", type(one).__name__, advice)
+            log.warning(
+                "model.terms: %s is of a notebook or script: %s", type(one).__name__, advice
+            )
     return result
 
 
 @dataclass(frozen=True)
 class OwnTerms:
-    """What a user says of one station's powers before any row; each attribute is a setting of `model`.
+    """What a user says of one station's powers before any row;
+    each attribute is a setting of `model`.
 
     Attributes:
         terms: further columns of the mean.
@@ -63,12 +68,16 @@ class OwnTerms:
         if self.prior is None:
             return self.terms
         if data.site.paired:
-            log.warning("model.prior has no effect here: a map is about one end that moves, and both do")
+            log.warning(
+                "model.prior has no effect here: a map is about one end that moves, and both do"
+            )
             return self.terms
         if data.site.several:
             return (*self.terms, NetworkMaps.from_file(self.prior, data))
         (station,), still = data.site.every_station.shown, data.site.every_station.position[0]
-        station = data.site.name.rpartition(OF_STATION)[2] if OF_STATION in data.site.name else station
+        station = (
+            data.site.name.rpartition(OF_STATION)[2] if OF_STATION in data.site.name else station
+        )
         levels = read_prior_levels(self.prior, data, station)
         return (*self.terms, PriorMap.from_levels(*levels, still + data.site.origin))
 
@@ -105,7 +114,9 @@ class UserTerm(Columns):
         return mean, deviation / self.unit
 
     def columns(self, places: Tensor) -> Tensor:
-        """See `Columns`; of places of the moving end (n, 3), or of both (n, 6), in local coordinates."""
+        """See `Columns`; of places of the moving end (n, 3), or of both (n, 6),
+        in local coordinates.
+        """
         return self.weight_prior[1] * (self._user_columns(places) - self.middle)
 
     def mean(self, places: Tensor) -> Tensor:
@@ -141,9 +152,13 @@ class UserTerm(Columns):
         if wrong := int((~result.isfinite()).any(1).sum()):
             unknown = not has_both_ends(places) and self.still is None
             why = ", but the place of the end that stands is not given" if unknown else ""
-            raise ValueError(f"{gave}, NaN or infinite in {wrong} rows; finite numbers are needed{why}")
+            raise ValueError(
+                f"{gave}, NaN or infinite in {wrong} rows; finite numbers are needed{why}"
+            )
         if (most := float(result.abs().max())) * (1.0 if prior is None else prior[1]) > LARGEST:
-            raise ValueError(f"{gave} of up to {most:.2g}; divide them until most are between 0.1 and 10")
+            raise ValueError(
+                f"{gave} of up to {most:.2g}; divide them until most are between 0.1 and 10"
+            )
         return replace(self, middle=result.mean(0))
 
 
@@ -154,7 +169,9 @@ def subtract_means(rows: PowerRows, terms: Sequence[UserTerm]) -> PowerRows:
 
 
 def add_terms_to_trend(rows: PowerRows, trend: Trend, terms: tuple[UserTerm, ...]) -> Trend:
-    """Return a trend of rows less the terms' means, with the terms, in units of what it leaves of rows."""
+    """Return a trend of rows less the terms' means, with the terms,
+    in units of what it leaves of rows.
+    """
     heard = rows.heard_rows
     residual = heard.decibels - trend.mean(torch.from_numpy(heard.places)).numpy()
     unit = float(residual.std()) or 1.0
@@ -163,7 +180,9 @@ def add_terms_to_trend(rows: PowerRows, trend: Trend, terms: tuple[UserTerm, ...
 
 def set_term_unit(trend: Trend, deviation: float) -> Trend:
     """Return a trend whose users' terms are relative to a process of this deviation [dB]."""
-    terms = (replace(one, unit=deviation) if isinstance(one, UserTerm) else one for one in trend.more)
+    terms = (
+        replace(one, unit=deviation) if isinstance(one, UserTerm) else one for one in trend.more
+    )
     return replace(trend, more=tuple(terms)) if trend.more else trend
 
 
@@ -194,7 +213,9 @@ def describe_weights(posterior: Exact, terms: tuple[UserTerm, ...]) -> list[Lear
     weights, scale = (columns.T @ posterior.weights)[:, 0], posterior.prior.kernel.amplitude
     # Of weights of unit variance, times the amplitude: 1 - C^T K^-1 C.
     std = (scale * (1 - posterior.factor.whiten(columns).square().sum(0)).clamp_min(0)).sqrt()
-    numbers = torch.stack([weights, std, torch.zeros_like(std), torch.full_like(std, scale**0.5)]).numpy()
+    numbers = torch.stack(
+        [weights, std, torch.zeros_like(std), torch.full_like(std, scale**0.5)]
+    ).numpy()
     sizes = [one.columns(at[:1]).shape[1] for one in terms]
     parts = np.split(numbers[:, -sum(sizes) :], np.cumsum(sizes)[:-1], 1)
     classes = [type(one.term).__name__ for one in terms]
@@ -203,16 +224,19 @@ def describe_weights(posterior: Exact, terms: tuple[UserTerm, ...]) -> list[Lear
     counted = zip(classes, order, strict=True)
     names = [f"{name} {n}" if classes.count(name) > 1 else name for name, n in counted]
     return [
-        LearnedWeights.from_numbers(name, one.weight_prior[1] * part + [[one.weight_prior[0]], [0]] * 2)
+        LearnedWeights.from_numbers(
+            name, one.weight_prior[1] * part + [[one.weight_prior[0]], [0]] * 2
+        )
         for name, one, part in zip(names, terms, parts, strict=True)
     ]
 
 
 def pool_station_weights(notes: Sequence[str]) -> dict[str, str]:
-    """Return, for what stations say of each term, one sentence: all of them together, and how they differ.
+    """Return, for what stations say of each term, one sentence: all of them together,
+    and how they differ.
 
-    Rows of stations are independent given the weight (random effects: R. DerSimonian, N. Laird, Controlled
-    Clinical Trials 7 (1986)).
+    Rows of stations are independent given the weight (random effects: R. DerSimonian, N. Laird,
+    Controlled Clinical Trials 7 (1986)).
     """
     found, result = [note for note in notes if isinstance(note, LearnedWeights)], dict[str, str]()
     for key in {(one.name, one.numbers.shape): None for one in found}:
@@ -225,13 +249,25 @@ def pool_station_weights(notes: Sequence[str]) -> dict[str, str]:
         prior_precision, total = wide[0] ** -2.0, precision.sum(0)
         centre = (precision * estimates).sum(0) / total
         excess = (precision * (estimates - centre) ** 2).sum(0) - (len(same) - 1)
-        between = np.sqrt(np.maximum(excess / np.maximum(total - (precision**2).sum(0) / total, TINY), 0.0))
+        between = np.sqrt(
+            np.maximum(excess / np.maximum(total - (precision**2).sum(0) / total, TINY), 0.0)
+        )
         precision = 1 / (1 / precision + between**2)
         both = prior_precision + precision.sum(0)
-        mean, error = (prior_precision * before[0] + (precision * estimates).sum(0)) / both, both**-0.5
-        rest = f" (of {len(same)} stations, which differ by {', '.join(f'{b:.2g}' for b in between)}"
+        mean, error = (
+            (prior_precision * before[0] + (precision * estimates).sum(0)) / both,
+            both**-0.5,
+        )
+        rest = (
+            f" (of {len(same)} stations, which differ by {', '.join(f'{b:.2g}' for b in between)}"
+        )
         if len(same) >= POOLED_FROM and len(mean) == 1:
-            rest += f"; prior_db=[{mean[0]:.3g}, {np.hypot(error, between)[0]:.2g}] tells each of the others"
+            rest += (
+                f"; prior_db=[{mean[0]:.3g}, {np.hypot(error, between)[0]:.2g}] tells each "
+                "of the others"
+            )
         one = np.stack([mean, error, before[0], wide[0]])
-        result |= dict.fromkeys(same, LearnedWeights.from_numbers(key[0], one, f"{rest})" * (len(same) > 1)))
+        result |= dict.fromkeys(
+            same, LearnedWeights.from_numbers(key[0], one, f"{rest})" * (len(same) > 1))
+        )
     return result

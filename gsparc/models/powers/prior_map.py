@@ -1,8 +1,9 @@
-"""A map from before any row (`model.prior`): of a planning tool, a ray tracer, or last year's model.
+"""A map from before any row (`model.prior`): of a planning tool, a ray tracer,
+or last year's model.
 
-Levels are a share of the map's, which is about 1 before any row, a constant, and a process of what the map
-lacks. Laws without the map stand beside it, and the likelihood of rows left out says which is right
-(`candidate_priors` in `settings.py`).
+Levels are a share of the map's, which is about 1 before any row, a constant, and a process of what
+the map lacks. Laws without the map stand beside it, and the likelihood of rows left out says which
+is right (`candidate_priors` in `settings.py`).
 """
 
 from __future__ import annotations
@@ -31,7 +32,8 @@ if TYPE_CHECKING:
 SHARE = (1.0, 0.3)  # mean and deviation of the weight of a map's levels
 NEAR = 4  # points of the map that tell of a place
 CLOSE = 1e-3  # [m]
-SPACING, DRAWN = 0.9, 10_000  # share of points with a neighbour as near; that tell how near, and of the law
+# Share of points with a neighbour as near; that tell how near, and of the law
+SPACING, DRAWN = 0.9, 10_000
 AREA = (
     2.0,
     4.0,
@@ -44,7 +46,8 @@ ALONG = 0.9  # of a map's levels, less a law of distance, that lie below those a
 
 @dataclass(frozen=True)
 class PriorMap(Columns):
-    """Levels of a map, between its points the mean of the nearest, weighed by distances to the power -2.
+    """Levels of a map, between its points the mean of the nearest,
+    weighed by distances to the power -2.
 
     Outside the area of its points it is the law of distance that its own levels have.
 
@@ -64,13 +67,17 @@ class PriorMap(Columns):
 
     @classmethod
     def from_levels(cls, points: np.ndarray, level: np.ndarray, still: np.ndarray) -> Self:
-        """Return a map of levels (M,) [dB] at points (M, 2) [m]; the end that stands is at (3,) or NaN."""
+        """Return a map of levels (M,) [dB] at points (M, 2) [m]; the end that stands is at (3,)
+        or NaN.
+        """
         level = level - level.mean()
         part = slice(None, None, max(1, len(points) // DRAWN))
         about = (0.0, 0.0, 0.0, 0.0)
         if np.isfinite(still[:2]).all() and len(level[part]) > 2:
             decades = np.log10(np.linalg.norm(points[part] - still[:2], axis=1).clip(1.0))
-            slope, first = np.polynomial.Polynomial.fit(decades, level[part], 1).convert().coef[[1, 0]]
+            slope, first = (
+                np.polynomial.Polynomial.fit(decades, level[part], 1).convert().coef[[1, 0]]
+            )
             about = (*still[:2].tolist(), float(first), float(slope))
         known = torch.from_numpy(points.copy()), torch.from_numpy(level)
         return cls(*known, spacing=point_spacing(points), about=about)
@@ -90,7 +97,9 @@ class PriorMap(Columns):
         return (inside * level + (1 - inside) * outside)[:, None].to(places.dtype)
 
     def look_up(self, at: Tensor) -> tuple[Tensor, Tensor]:
-        """Return how far (n,) places (n, 2) [m] are within the map's area, 0 to 1, and levels (n,) [dB]."""
+        """Return how far (n,) places (n, 2) [m] are within the map's area, 0 to 1, and levels (n,)
+        [dB].
+        """
         near = self._tree.query(at.detach().numpy(), min(NEAR, len(self.points)))[1]
         near = torch.from_numpy(near.reshape(len(at), -1))
         squared = (self.points[near] - at[:, None]).square().sum(2) + CLOSE**2
@@ -99,10 +108,12 @@ class PriorMap(Columns):
         return inside.clamp(0.0, 1.0), (weight * self.level[near]).sum(1) / weight.sum(1)
 
     def explain_misfit(self, places: np.ndarray, decibels: np.ndarray) -> str:
-        """Say what is wrong with a map by levels (n,) [dB] at world places (n, D) [m]; empty: nothing.
+        """Say what is wrong with a map by levels (n,) [dB] at world places (n, D) [m]; empty:
+        nothing.
 
         >>> at = np.c_[np.arange(20.0), np.zeros(20)]
-        >>> PriorMap.from_levels(at, at[:, 0], np.full(3, np.nan)).explain_misfit(at, -50 - at[:, 0])[:45]
+        >>> levels = PriorMap.from_levels(at, at[:, 0], np.full(3, np.nan))
+        >>> levels.explain_misfit(at, -50 - at[:, 0])[:45]
         'model.prior: levels fall by 1 dB where those '
         """
         inside, level = self.look_up(torch.from_numpy(places[:, :2]))
@@ -115,18 +126,25 @@ class PriorMap(Columns):
         error = float(np.std(values - slope * spread * known)) / spread / math.sqrt(len(known) - 2)
         if slope + SURE * error < 0:
             advice = "path losses? write minus them, or scale -1 of the band"
-            return f"model.prior: levels fall by {-slope:.1g} dB where those of the map rise by 1: {advice}"
+            return (
+                f"model.prior: levels fall by {-slope:.1g} dB where those of the map rise by "
+                f"1: {advice}"
+            )
         low, high = slope - SURE * error, slope + SURE * error
         if low <= SLOPES[1] and high >= SLOPES[0]:
             return ""
         advice = "in another unit, or of another place?"
         if float(np.ptp(self.level)) < FLAT_DB:
             advice = "linear powers? write 10 log10 of them, or the unit of the band, such as mW"
-        return f"model.prior: levels rise by {slope:.1g} dB where those of the map rise by 1: {advice}"
+        return (
+            f"model.prior: levels rise by {slope:.1g} dB where those of the map rise by 1: {advice}"
+        )
 
 
 def point_spacing(points: np.ndarray) -> float:
-    """Return how near points (M, 2) lie [m]: most have a neighbour as near; infinity of one point."""
+    """Return how near points (M, 2) lie [m]: most have a neighbour as near;
+    infinity of one point.
+    """
     if len(points) < 2:
         return math.inf
     nearest = cKDTree(points).query(points[:: max(1, len(points) // DRAWN)], 2)[0][:, 1]
@@ -134,7 +152,9 @@ def point_spacing(points: np.ndarray) -> float:
 
 
 def usual_loss(way: Tensor) -> Tensor:
-    """Return what the law of distance of a network takes off before any row (n,) [dB], of ways (n, D) [m]."""
+    """Return what the law of distance of a network takes off before any row (n,) [dB],
+    of ways (n, D) [m].
+    """
     return 5 * SHARED[0] * way.square().sum(1).clamp_min(1.0).log10()
 
 
@@ -145,16 +165,20 @@ def describe_use(used: bool, cells: int) -> str:
     'the map from before is left out for 12 cells: rows are likelier without it'
     """
     how = "used" if used else "left out"
-    return f"the map from before is {how} for {cells} cells{'' if used else ': rows are likelier without it'}"
+    return (
+        f"the map from before is {how} for {cells} "
+        f"cells{'' if used else ': rows are likelier without it'}"
+    )
 
 
 @dataclass(frozen=True)
 class NetworkMaps(Columns):
-    """Maps of a network's stations as a mean, less the law of distance that a network has before any row.
+    """Maps of a network's stations as a mean,
+    less the law of distance that a network has before any row.
 
     Attributes:
-        maps: of stations that have one: number, whether it has the station's pattern, as that of a whole site
-            has none, and the map.
+        maps: of stations that have one: number, whether it has the station's pattern, as that of a
+            whole site has none, and the map.
         level: of them along beams, less which stations with and without a map are alike [dB].
     """
 
@@ -163,9 +187,13 @@ class NetworkMaps(Columns):
 
     @classmethod
     def from_file(cls, path: Files, data: Measurements) -> Self:
-        """Read the map of each station, or of its site; `DataError` where there is none, see there."""
+        """Read the map of each station, or of its site; `DataError` where there is none,
+        see there.
+        """
         found = list[tuple[int, bool, PriorMap]]()
-        for number, own, (world, levels) in read_prior_maps(path, data, data.site.every_station.shown):
+        for number, own, (world, levels) in read_prior_maps(
+            path, data, data.site.every_station.shown
+        ):
             points, level = map(torch.from_numpy, (world - data.site.origin[:2], levels))
             before = found[-1][2] if found else None
             # Squares of one raster are stored once.
@@ -177,18 +205,31 @@ class NetworkMaps(Columns):
         return cls(tuple(found))
 
     def explain_misfits(self, rows: StationRows, names: Sequence[str]) -> list[str]:
-        """Say what is wrong with maps of stations by rows of these, see `PriorMap.explain_misfit`."""
+        """Say what is wrong with maps of stations by rows of these,
+        see `PriorMap.explain_misfit`.
+        """
         heard = rows.side == 0
-        own = [(names[n], level, heard & (rows.station == n)) for n, is_own, level in self.maps if is_own]
-        faults = [(name, level.explain_misfit(rows.places[at], rows.decibels[at])) for name, level, at in own]
+        own = [
+            (names[n], level, heard & (rows.station == n))
+            for n, is_own, level in self.maps
+            if is_own
+        ]
+        faults = [
+            (name, level.explain_misfit(rows.places[at], rows.decibels[at]))
+            for name, level, at in own
+        ]
         return group_warnings([f"station {name}: {fault}" for name, fault in faults if fault])
 
     def put_under(self, network: Sectors, places: np.ndarray) -> Sectors:
-        """Return a network about these maps, whose stations at (T, 3) have no other pattern and power."""
+        """Return a network about these maps, whose stations at (T, 3)
+        have no other pattern and power.
+        """
         table, aimed = network.table.clone(), [number for number, own, _ in self.maps if own]
         table[aimed] = ROUND.double()
         still = torch.from_numpy(places[:, :2])
-        levels = [one.level + usual_loss(one.points - still[number]) for number, _, one in self.maps]
+        levels = [
+            one.level + usual_loss(one.points - still[number]) for number, _, one in self.maps
+        ]
         level = float(np.quantile(torch.cat(levels).numpy(), ALONG))
         return replace(network, table=table, more=(replace(self, level=level),))
 

@@ -1,8 +1,8 @@
 """Settings of a process of powers: its mean law, lengths and noise, from rows heard and silent.
 
-Left-out likelihood is of rows with neighbours. What a setting is worth in a gap it does not tell: there a
-mixture of processes, by the errors at squares of floor left out, is safer than the likeliest of them
-(stacking: D. H. Wolpert, Neural Networks 5 (1992)).
+Left-out likelihood is of rows with neighbours. What a setting is worth in a gap it does not tell:
+there a mixture of processes, by the errors at squares of floor left out, is safer than the
+likeliest of them (stacking: D. H. Wolpert, Neural Networks 5 (1992)).
 """
 
 from __future__ import annotations
@@ -21,7 +21,12 @@ from gsparc.models.baselines.distance_law import fit_site_law
 from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.member_weights import best_weights
 from gsparc.models.powers.groups import SIDES, number_squares
-from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, set_term_unit, subtract_means
+from gsparc.models.powers.own_terms import (
+    UserTerm,
+    add_terms_to_trend,
+    set_term_unit,
+    subtract_means,
+)
 from gsparc.models.powers.prior_map import PriorMap
 from gsparc.processes.censored import ConditionalGaussian
 from gsparc.processes.fit_kernel import LOOKS, fit_kernel_by_evidence, fit_kernel_by_left_out
@@ -37,7 +42,13 @@ from gsparc.processes.left_out import left_out_residuals, rows_of_groups
 from gsparc.processes.nearest import FEW, choose_kernel_by_nearest, condition_on_nearest
 from gsparc.processes.places import has_both_ends
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import MOST_ROWS, PowerProcess, PowerRows, condition_on_powers, trend_about_rows
+from gsparc.processes.powers import (
+    MOST_ROWS,
+    PowerProcess,
+    PowerRows,
+    condition_on_powers,
+    trend_about_rows,
+)
 from gsparc.processes.prior import Posterior, Prior
 from gsparc.processes.trend import Trend
 from gsparc.training.effort import Effort
@@ -59,7 +70,8 @@ TWO_LENGTHS_NEED, MIXED_FROM = 100, 20  # rows that were heard
 LEAST_SILL = 1e-2  # of the nugget: below it levels are all alike to kriging
 SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
-WIDE = ((0.03, 0.3), (0.03, 1.5))  # further pairs, of the median distance: the best one length may be short
+# Further pairs, of the median distance: the best one length may be short
+WIDE = ((0.03, 0.3), (0.03, 1.5))
 SPANS = (SIDES, SIDES // 2)  # squares along the longer side that are left out
 REFINED = 8  # looks at all rows after such at few
 EVIDENCE_LOOKS = 30
@@ -71,7 +83,8 @@ def process_and_notes(
 ) -> tuple[PowerProcess, tuple[str, ...]]:
     """Return a process of largest leave-one-out likelihood, and what must be said of it.
 
-    Where some rows were silent, settings are those of largest evidence as expectation propagation has it.
+    Where some rows were silent, settings are those of largest evidence
+    as expectation propagation has it.
 
     Args:
         rows: at least one.
@@ -94,7 +107,9 @@ class MeanLaw(NamedTuple):
 
 @dataclass(frozen=True)
 class KernelCandidate:
-    """A prior, its log likelihood less `cost` for fitted parameters, and what must be said of it."""
+    """A prior, its log likelihood less `cost` for fitted parameters,
+    and what must be said of it.
+    """
 
     score: float
     trend: Trend
@@ -117,7 +132,9 @@ class KernelCandidate:
     @property
     def has_map(self) -> bool:
         """Whether the mean has a share of a map from before."""
-        return any(isinstance(one, UserTerm) and isinstance(one.term, PriorMap) for one in self.trend.more)
+        return any(
+            isinstance(one, UserTerm) and isinstance(one.term, PriorMap) for one in self.trend.more
+        )
 
 
 def candidate_priors(
@@ -125,8 +142,9 @@ def candidate_priors(
 ) -> list[KernelCandidate]:
     """Return the likeliest settings of each mean law, the best first, kriging's, and one for gaps.
 
-    That for gaps is of kriging's shape; its length and noise suit squares left out as they do rows. Of few or
-    very many rows the best law alone. Each law has further `terms`, and stands there without a map, too.
+    That for gaps is of kriging's shape; its length and noise suit squares left out as they do rows.
+    Of few or very many rows the best law alone. Each law has further `terms`,
+    and stands there without a map, too.
     """
     sure = tuple(one for one in terms if not isinstance(one.term, PriorMap))
     trends = [
@@ -142,18 +160,25 @@ def candidate_priors(
         return sorted(found, key=lambda one: -one.score)
     found = [choose_candidate(rows, trends, seed, max_rows, MIXED_ON)]
     # Other laws have a kernel like it: a short walk from there, not one from anywhere.
-    others = [replace(found[0], **one._asdict()) for one in trends if one.trend is not found[0].trend]
+    others = [
+        replace(found[0], **one._asdict()) for one in trends if one.trend is not found[0].trend
+    ]
     found += [_refine_kernel(rows, one, seed, max_rows) for one in others]
     # One row of a place: levels that repeat there to the digit would speak for no noise.
     once = np.sort(np.unique(rows.places, axis=0, return_index=True)[1])
     few = rows.subset(once).draw_subset(MIXED_ON, seed)
     squares = [list(rows_of_groups(number_squares(few.places, sides))) for sides in SPANS]
-    gaps = [_fit_one_length(few, one.trend, 0.0, one.notes, ExponentialShadowing, squares) for one in found]
+    gaps = [
+        _fit_one_length(few, one.trend, 0.0, one.notes, ExponentialShadowing, squares)
+        for one in found
+    ]
     return [*found, *_kriged(rows, trends[0]), max(gaps, key=lambda one: one.score)]
 
 
 def _kriged(rows: PowerRows, mean: MeanLaw) -> list[KernelCandidate]:
-    """The settings of a variogram, which ordinary kriging has; none of many rows, or without a sill."""
+    """The settings of a variogram, which ordinary kriging has; none of many rows,
+    or without a sill.
+    """
     if len(rows.places) > CHOSEN_ON:  # there a third of the seconds, for nothing
         return []
     found = fit_variogram(rows.places, rows.decibels[:, None])
@@ -167,10 +192,12 @@ def _kriged(rows: PowerRows, mean: MeanLaw) -> list[KernelCandidate]:
 def mix_candidates(
     rows: PowerRows, candidates: list[KernelCandidate], seed: int, max_rows: int
 ) -> tuple[tuple[tuple[float, Prior], ...], tuple[str, ...]]:
-    """Return candidates with their shares in a mean, the largest first, and what must be said of them.
+    """Return candidates with their shares in a mean, the largest first,
+    and what must be said of them.
 
-    Shares have the least squared error at rows left out one by one and at squares of floor left out, both
-    relative to the best candidate's. A prior on equal shares would lose among rows (by 1 % on dense streets).
+    Shares have the least squared error at rows left out one by one and at squares of floor left
+    out, both relative to the best candidate's.
+    A prior on equal shares would lose among rows (by 1 % on dense streets).
     """
     if len(candidates) == 1:
         return ((1.0, candidates[0].prior),), (candidates[0].description, *candidates[0].notes)
@@ -178,10 +205,15 @@ def mix_candidates(
     posteriors = [condition_on_powers(part, one.prior, seed)[0].posterior for one in candidates]
     # Of all rows: drawn ones are farther apart than those that will answer.
     values = rows.measured_rows.means_at_places()
-    near = [condition_on_nearest(one.prior, values, seed, cover=FEW).left_out().mean for one in candidates]
+    near = [
+        condition_on_nearest(one.prior, values, seed, cover=FEW).left_out().mean
+        for one in candidates
+    ]
     gram = AMONG_ROWS * _relative_gram([(values.values - mean)[:, 0].numpy() for mean in near])
     for sides in SPANS:
-        gram += _relative_gram([_errors_without_squares(one, sides) for one in posteriors]) / len(SPANS)
+        gram += _relative_gram([_errors_without_squares(one, sides) for one in posteriors]) / len(
+            SPANS
+        )
     share = best_weights(gram)
     bare = np.flatnonzero([not one.has_map for one in candidates])
     if 0 < len(bare) < len(candidates):
@@ -190,7 +222,9 @@ def mix_candidates(
         # Both were chosen on these rows: what a map gains by chance is no gain elsewhere.
         if share @ gram @ share > (1 - MAP_PAYS) * (alone @ gram @ alone):
             share = alone
-    mixture = [(float(share[k]), candidates[k]) for k in np.argsort(-share, kind="stable") if share[k]]
+    mixture = [
+        (float(share[k]), candidates[k]) for k in np.argsort(-share, kind="stable") if share[k]
+    ]
     texts = [f"{weight:.0%} of {one.description}" for weight, one in mixture]
     notes = dict.fromkeys(note for _, one in mixture for note in one.notes)
     return tuple((weight, one.prior) for weight, one in mixture), (*texts, *notes)
@@ -203,7 +237,9 @@ def _relative_gram(errors: list[np.ndarray]) -> np.ndarray:
 
 
 def _errors_without_squares(posterior: Posterior, sides: int) -> np.ndarray:
-    """Errors (n,) [dB] of rows that were heard, each predicted without those of its square of floor."""
+    """Errors (n,) [dB] of rows that were heard,
+    each predicted without those of its square of floor.
+    """
     assert isinstance(posterior, Exact)
     group = rows_of_groups(number_squares(posterior.rows.numpy(), sides))
     residual, _ = left_out_residuals(posterior.factor.inverse, posterior.weights, group)
@@ -215,19 +251,26 @@ def choose_candidate(
 ) -> KernelCandidate:
     """Return the best of mean laws (each with its cost and notes), with its kernel.
 
-    `compared_on`: rows that laws and kernels are compared on, of `max_rows` that the kernel is chosen on.
+    `compared_on`: rows that laws and kernels are compared on,
+    of `max_rows` that the kernel is chosen on.
     """
     many = len(rows.places) > CHOSEN_ON and not rows.silent.any()
-    best = _choose_on_part(rows, trends, seed, min(max_rows, compared_on) if many else max_rows, compared_on)
+    best = _choose_on_part(
+        rows, trends, seed, min(max_rows, compared_on) if many else max_rows, compared_on
+    )
     return _refine_kernel(rows, best, seed, max_rows) if many else best
 
 
-def _refine_kernel(rows: PowerRows, best: KernelCandidate, seed: int, max_rows: int) -> KernelCandidate:
+def _refine_kernel(
+    rows: PowerRows, best: KernelCandidate, seed: int, max_rows: int
+) -> KernelCandidate:
     """The same mean with the kernel that rows, all heard, say near its own."""
-    if len(rows.places) <= CHOSEN_ON or not best.kernel.is_isotropic:  # none need, or can, be the nearest
+    # None need, or can, be the nearest
+    if len(rows.places) <= CHOSEN_ON or not best.kernel.is_isotropic:
         part = rows.draw_subset(min(max_rows, CHOSEN_ON), seed)
         return _search_kernel(part, best, [best.kernel], limit=REFINED)
-    kernel, how = choose_kernel_by_nearest(best.prior, rows.means_at_places(), seed)  # given these, all tell
+    # Given these, all tell
+    kernel, how = choose_kernel_by_nearest(best.prior, rows.means_at_places(), seed)
     return replace(best, kernel=kernel, notes=(*best.notes, f"then {how}"))
 
 
@@ -274,14 +317,19 @@ def _candidate_laws(rows: PowerRows, site: Site, mean: MeanName) -> list[MeanLaw
     law, notes = fit_site_law(rows, site)
     trend = trend_about_rows(rows, law)
     odds = LAW_ODDS if law.exponent >= LEAST_FALL else 0.0
-    by_distance = MeanLaw(trend, 4 if notes else 1 - odds, notes)  # its floor, and a place that was sought
+    # Its floor, and a place that was sought
+    by_distance = MeanLaw(trend, 4 if notes else 1 - odds, notes)
     return [by_distance] if mean == "distance" else [constant, by_distance]
 
 
 def _fit_one_length(
-    rows: PowerRows, trend: Trend, cost: float, notes: tuple[str, ...],
-    shape: type[Shadowing | ExponentialShadowing] = Shadowing, squares: Sequence[Sequence[Tensor]] = (),
-) -> KernelCandidate:  # fmt: skip
+    rows: PowerRows,
+    trend: Trend,
+    cost: float,
+    notes: tuple[str, ...],
+    shape: type[Shadowing | ExponentialShadowing] = Shadowing,
+    squares: Sequence[Sequence[Tensor]] = (),
+) -> KernelCandidate:
     view = rows.view(trend)
     scale = median_distance(view.apart)
     if len(view.values) < 3 or not view.values.any() or not view.apart.any():
@@ -305,14 +353,18 @@ def _search_kernel(
 
 
 def _two_length_starts(scale: float, kernel: Kernel) -> list[Kernel]:
-    """Two lengths to start from, near the best one and apart from it; `scale` is a median distance [m]."""
+    """Two lengths to start from, near the best one and apart from it;
+    `scale` is a median distance [m].
+    """
     fit, noise = kernel.length, kernel.noise
     near = [Kernel.from_lengths((fit * a, fit * b), (0.5, 0.5), noise) for a, b in SPLITS]
     return near + [Kernel.from_lengths((scale * a, scale * b), (0.3, 0.7), noise) for a, b in WIDE]
 
 
 def _end_starts(scale: float, kernel: Kernel) -> list[Kernel]:
-    """Shadows of the path and of each end, or gains of each place, where one was found for both together."""
+    """Shadows of the path and of each end, or gains of each place,
+    where one was found for both together.
+    """
     starts = []
     for length in (kernel.length, SHARES[0] * scale):
         ends = (EndShadowing(length), EndShadowing(length, other=True))
@@ -325,7 +377,10 @@ def _select_doubtful(rows: PowerRows, base: KernelCandidate) -> PowerRows:
     """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
     view = rows.view(base.trend, base.kernel)
     gram, values = base.kernel.amplitude * view.gram(base.kernel), view.values
-    silent, most = (torch.from_numpy(rows.silent), max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT))
+    silent, most = (
+        torch.from_numpy(rows.silent),
+        max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT),
+    )
     gaussian = ConditionalGaussian.from_gram(gram, values[:, 0], silent)
     doubt = torch.from_numpy(rows.side)[silent] * gaussian.z_score(values[silent, 0])
     used = ~rows.silent
@@ -334,6 +389,8 @@ def _select_doubtful(rows: PowerRows, base: KernelCandidate) -> PowerRows:
 
 
 def _fit_by_evidence(rows: PowerRows, base: KernelCandidate, limit: int) -> KernelCandidate:
-    """The same with settings of largest evidence, silent rows among the rest; without looks as they are."""
+    """The same with settings of largest evidence, silent rows among the rest;
+    without looks as they are.
+    """
     value, kernel = fit_kernel_by_evidence(base.kernel, [rows.view(base.trend, base.kernel)], limit)
     return replace(base, score=-value * len(rows.places) - base.cost, kernel=kernel)

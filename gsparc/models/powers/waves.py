@@ -1,8 +1,9 @@
-"""Plane waves from everywhere as a basis of coherent fields at measured places, and powers fitted by them.
+"""Plane waves from everywhere as a basis of coherent fields at measured places,
+and powers fitted by them.
 
-Powers alone leave phases unknown: a fit is one of many, found by damped least squares from a random start
-(Levenberg 1944, Marquardt 1963) on decibels, whose errors are Student's t (K. L. Lange et al., "Robust
-statistical modeling using the t distribution", JASA 84 (1989)).
+Powers alone leave phases unknown: a fit is one of many, found by damped least squares from a random
+start (Levenberg 1944, Marquardt 1963) on decibels, whose errors are Student's t (K. L. Lange et
+al., "Robust statistical modeling using the t distribution", JASA 84 (1989)).
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ SCALE_DB = 2.0  # of the errors at first
 LEAST_DB = 0.5
 ALIKE = 3.0  # rows that err together, as neighbours do: each counts a third
 FLOOR = 3e-4  # power that no interference takes away, of the mean power
-HIDDEN = (0.1, 0.03, 0.01, 0.003, 0.0)  # powers added to hide nulls at first, one stage after the other
+# Powers added to hide nulls at first, one stage after the other
+HIDDEN = (0.1, 0.03, 0.01, 0.003, 0.0)
 STEPS = 8  # of a stage, twice as many of the last
 DAMPED = 4.0  # factor of the damping after a step that was none
 TRIES, SETTLED = 4, 1e-4
@@ -71,8 +73,11 @@ def field_db(field: np.ndarray) -> np.ndarray:
     return to_decibels(np.abs(field) ** 2 + FLOOR)
 
 
-def fit_wave_weights(columns: np.ndarray, decibels: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Return complex weights (r,) of columns (n, r) whose powers are (n,) [dB about their mean power].
+def fit_wave_weights(
+    columns: np.ndarray, decibels: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Return complex weights (r,) of columns (n, r) whose powers are (n,)
+    [dB about their mean power].
 
     A weight's prior is complex normal of variance 1.
     """
@@ -108,13 +113,20 @@ class _Misfit:
 
     @classmethod
     def from_waves(
-        cls, columns: np.ndarray, decibels: np.ndarray, weights: np.ndarray, hidden: float, scale: float
+        cls,
+        columns: np.ndarray,
+        decibels: np.ndarray,
+        weights: np.ndarray,
+        hidden: float,
+        scale: float,
     ) -> _Misfit:
         field = columns @ weights
         power = np.abs(field) ** 2 + FLOOR + hidden
         error = to_decibels(power) - decibels
         value = 0.5 * (DEGREES + 1) * float(np.log1p(error**2 / (DEGREES * scale**2)).sum())
-        return cls(weights, field, power, error, value + ALIKE * float((np.abs(weights) ** 2).sum()))
+        return cls(
+            weights, field, power, error, value + ALIKE * float((np.abs(weights) ** 2).sum())
+        )
 
     def error_scale(self) -> float:
         """Return that of the errors [dB], by a few steps of expectation maximisation."""
@@ -126,9 +138,14 @@ class _Misfit:
 
 
 def _step_and_damping(
-    columns: np.ndarray, single: np.ndarray, decibels: np.ndarray, now: _Misfit, hidden: float,
-    scale: float, damping: float,
-) -> tuple[_Misfit, float] | None:  # fmt: skip
+    columns: np.ndarray,
+    single: np.ndarray,
+    decibels: np.ndarray,
+    now: _Misfit,
+    hidden: float,
+    scale: float,
+    damping: float,
+) -> tuple[_Misfit, float] | None:
     """A better place and the next damping; None where none was found."""
     count = columns.shape[1]
     # Single precision: a step need not be exact, its worth is judged in double.
@@ -149,7 +166,9 @@ def _step_and_damping(
             damping *= DAMPED
             continue
         by = -factor.solve(torch.from_numpy(right)[:, None])[:, 0].numpy()
-        new = _Misfit.from_waves(columns, decibels, now.weights + by[:count] + 1j * by[count:], hidden, scale)
+        new = _Misfit.from_waves(
+            columns, decibels, now.weights + by[:count] + 1j * by[count:], hidden, scale
+        )
         if new.value < now.value:
             return new, max(damping / 3, 1e-5)
         damping *= DAMPED

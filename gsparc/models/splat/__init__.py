@@ -1,1 +1,3 @@
-"""`LearnedField`: Gaussians that are rasterized, initialised in closed form and trained by gradient."""
+"""`LearnedField`: Gaussians that are rasterized,
+initialised in closed form and trained by gradient.
+"""

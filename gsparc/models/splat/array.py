@@ -1,4 +1,6 @@
-"""`model=array`: spectra that a static array measures, imaged from Gaussians by the array's response."""
+"""`model=array`: spectra that a static array measures,
+imaged from Gaussians by the array's response.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +16,8 @@ class ArrayField(LearnedField):
 
     Args:
         field: number and places of the Gaussians.
-        refit: learn from validation rows too (settings are chosen by cross-validation, not on them).
+        refit: learn from validation rows too (settings are chosen by cross-validation, not on
+            them).
         name: as it appears in tables.
     """
 
@@ -22,7 +25,10 @@ class ArrayField(LearnedField):
     takes_effort = takes_weights = resumable = False  # it is solved in closed form
 
     def __init__(
-        self, field: FieldSettings = FieldSettings(count=128), refit: bool = True, name: str = "array"
+        self,
+        field: FieldSettings = FieldSettings(count=128),
+        refit: bool = True,
+        name: str = "array",
     ) -> None:
         super().__init__(
             field=field,

@@ -18,8 +18,8 @@ class Choices:
     """What `auto` became; stored in checkpoints, so that a model reads back as it was trained.
 
     Attributes:
-        init: `sphere`, `uniform` or `grid`, with random weights; `images` or `vectors`, the sphere with
-            weights in closed form.
+        init: `sphere`, `uniform` or `grid`, with random weights; `images` or `vectors`, the sphere
+            with weights in closed form.
         encoding: `kind` of the emission's `EncodingSettings`.
         activation: as in `EmissionSettings`.
         init_bias: as in `EmissionSettings`.
@@ -36,11 +36,14 @@ class Choices:
         return self.init in ("images", "vectors")
 
 
-def resolve_auto(settings: ModelSettings, init: InitName, site: Site) -> tuple[Choices, tuple[str, ...]]:
-    """Return choices for a site, and lines on those left `auto`: "init=auto -> uniform: the receiver moves".
+def resolve_auto(
+    settings: ModelSettings, init: InitName, site: Site
+) -> tuple[Choices, tuple[str, ...]]:
+    """Return choices for a site, and lines on those left `auto`: "init=auto -> uniform:
+    the receiver moves".
 
-    A closed-form start needs spectra, a static receiver, a linear read-out and kernel features. Hidden units
-    need an encoding of few values, because each Gaussian has a network of its own.
+    A closed-form start needs spectra, a static receiver, a linear read-out and kernel features.
+    Hidden units need an encoding of few values, because each Gaussian has a network of its own.
 
     Raises:
         ValueError: a closed-form start that these settings or data do not allow.
@@ -62,7 +65,9 @@ def resolve_auto(settings: ModelSettings, init: InitName, site: Site) -> tuple[C
     possible = spectra and static and not emission.hidden and encoding == "kernel"
     fitted = "vectors" if through_array else "images"
     choice = fitted if possible else "sphere" if spectra and static else "uniform"
-    start = choose("init", init, choice, f"{why}, hidden={emission.hidden}, encoding.kind={encoding}")
+    start = choose(
+        "init", init, choice, f"{why}, hidden={emission.hidden}, encoding.kind={encoding}"
+    )
     if start in ("images", "vectors") and not (possible and start == fitted):
         needed = "spectra, a static receiver, model.emission.hidden=0 and encoding.kind=kernel"
         array = "with" if start == "vectors" else "without"
@@ -93,7 +98,10 @@ def apply_choices(settings: ModelSettings, choices: Choices) -> ModelSettings:
     replace = dataclasses.replace
     encoding = replace(settings.emission.encoding, kind=choices.encoding)
     emission = replace(
-        settings.emission, encoding=encoding, activation=choices.activation, init_bias=choices.init_bias
+        settings.emission,
+        encoding=encoding,
+        activation=choices.activation,
+        init_bias=choices.init_bias,
     )
     placement = choices.init if choices.init in ("uniform", "grid") else "sphere"
     return replace(settings, field=replace(settings.field, placement=placement), emission=emission)

@@ -1,4 +1,6 @@
-"""Lightning's checkpoints inside ours: one file that `gsparc.load` reads and `ckpt_path=` resumes from."""
+"""Lightning's checkpoints inside ours: one file that `gsparc.load` reads
+and `ckpt_path=` resumes from.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,8 @@ def read_interrupted(path: Path) -> checkpoint.StoredModel:
     """Return what an interrupted training left.
 
     Raises:
-        ValueError: when the file holds a finished model without a trainer's state, or one that is not finite.
+        ValueError: when the file holds a finished model without a trainer's state, or one that is
+            not finite.
     """
     stored = checkpoint.read(path)
     if "trainer" not in stored.extra:
@@ -30,7 +33,9 @@ def read_interrupted(path: Path) -> checkpoint.StoredModel:
     wrong = checkpoint.find_non_finite(trainer, "trainer")
     wrong = wrong or checkpoint.find_non_finite(callbacks, "trainer.callbacks", infinite=True)
     if wrong is not None:
-        raise checkpoint.CheckpointError(f"{path}: {wrong} is NaN or infinite; resume from an earlier file")
+        raise checkpoint.CheckpointError(
+            f"{path}: {wrong} is NaN or infinite; resume from an earlier file"
+        )
     return stored
 
 
@@ -46,7 +51,9 @@ class GsparcCheckpointIO(CheckpointIO):
     def __init__(self, method: Method, config_yaml: str, marks: Mapping[str, Any]) -> None:
         self.method, self.config_yaml, self.marks = method, config_yaml, dict(marks)
 
-    def save_checkpoint(self, trainer_state: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+    def save_checkpoint(
+        self, trainer_state: dict[str, Any], path: Any, storage_options: Any = None
+    ) -> None:
         """Write atomically; nowhere where a fit has no folder."""
         extra = {"trainer": trainer_state, **self.marks}
         if Path(path).parent != Path():

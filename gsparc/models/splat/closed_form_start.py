@@ -1,9 +1,10 @@
-"""A first field in closed form: project the training images on the footprints, regress over position.
+"""A first field in closed form: project the training images on the footprints,
+regress over position.
 
-Footprints are fixed, so an image is linear in the emissions, and an emission that is linear in the whitened
-kernel features is a Gaussian process of position: both fits are ridge least squares. Gradient training
-starts from there; from random weights it needs minutes to get as far and generalises worse (Adam's solution
-is not the one of least norm).
+Footprints are fixed, so an image is linear in the emissions, and an emission that is linear in the
+whitened kernel features is a Gaussian process of position: both fits are ridge least squares.
+Gradient training starts from there; from random weights it needs minutes to get as far and
+generalises worse (Adam's solution is not the one of least norm).
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.left_out import left_out_residuals
 
-IMAGE_RIDGE = 1e-4  # relative to the mean footprint energy; footprints overlap, so the projection is singular
+# Relative to the mean footprint energy; footprints overlap, so the projection is singular
+IMAGE_RIDGE = 1e-4
 CHUNK = 256  # images held as floats at a time
 KERNEL_ROWS = 1024  # leave-one-out factors a matrix of this size at every look
 COMPONENTS = 128
@@ -46,7 +48,9 @@ LEAST_NOISE = 1e-6  # of the kernel's variance
 def learn_prior(data: Measurements, rows: np.ndarray, anchors: int, seed: int) -> Smoothness:
     """Return smoothness and up to `anchors` positions (drawn by seed) from training rows (n,)."""
     chosen, kernel = _fit_kernel(data, rows, anchors, seed)
-    return Smoothness(torch.from_numpy(data.moving[chosen].astype(np.float32)), kernel.length, kernel.noise)
+    return Smoothness(
+        torch.from_numpy(data.moving[chosen].astype(np.float32)), kernel.length, kernel.noise
+    )
 
 
 @dataclass(frozen=True)
@@ -68,12 +72,18 @@ def learn_process(data: Measurements, rows: np.ndarray, anchors: int, seed: int)
     noise = max(kernel.noise, LEAST_NOISE)
     places = torch.from_numpy(data.moving[rows]).float().double()  # as queries come
     features = whitened_features(places, kernel.length, noise, "matern32", anchors)
-    prior = Smoothness(features.places.float(), kernel.length, noise, "matern32", features.whitening.float())
+    prior = Smoothness(
+        features.places.float(), kernel.length, noise, "matern32", features.whitening.float()
+    )
     return Process(prior, features)
 
 
-def _fit_kernel(data: Measurements, rows: np.ndarray, limit: int, seed: int) -> tuple[np.ndarray, Kernel]:
-    """At most so many of rows (n,), drawn by seed, and the kernel of largest likelihood for them."""
+def _fit_kernel(
+    data: Measurements, rows: np.ndarray, limit: int, seed: int
+) -> tuple[np.ndarray, Kernel]:
+    """At most so many of rows (n,), drawn by seed,
+    and the kernel of largest likelihood for them.
+    """
     draw = np.random.default_rng(seed)
     chosen = rows if len(rows) <= limit else np.sort(draw.choice(rows, limit, replace=False))
     looked_at = chosen[:: -(-len(chosen) // KERNEL_ROWS)]
@@ -104,7 +114,9 @@ class ImageEmissions:
     def render(self, outputs: Tensor) -> Tensor:
         """Return images (n, P) of other outputs (n, N) at the same places."""
         emission = outputs.float()
-        return (emission if self.attenuation is None else emission * self.attenuation) @ self.weights.mT
+        return (
+            emission if self.attenuation is None else emission * self.attenuation
+        ) @ self.weights.mT
 
 
 @torch.no_grad()
@@ -112,12 +124,14 @@ class ImageEmissions:
 def solve_emissions(
     model: GaussianModel, data: Measurements, rows: np.ndarray, receiver: Pose, process: Process
 ) -> LeftOut | None:
-    """Set the emission's last layer so that the model reproduces the training spectra as well as it can.
+    """Set the emission's last layer so that the model reproduces the training spectra
+    as well as it can.
 
     What the process leaves unknown becomes the model's error model.
 
     Args:
-        model: spectra, a static receiver, a linear read-out (`emission.hidden=0`) of the process's features.
+        model: spectra, a static receiver, a linear read-out (`emission.hidden=0`) of the process's
+            features.
         data: all measurements.
         rows: (n,) training rows.
         receiver: the static pose.
@@ -130,10 +144,15 @@ def solve_emissions(
         ValueError: the emission has hidden units.
     """
     if model.settings.emission.hidden:
-        raise ValueError("init=images solves a linear read-out: leave init=auto, or model.emission.hidden=0")
+        raise ValueError(
+            "init=images solves a linear read-out: leave init=auto, or model.emission.hidden=0"
+        )
     version = int(model.gaussians.version)
     weights = model.freeze(receiver).render(torch.eye(len(model.gaussians)), version).flatten(1).mT
-    parts = [_emissions(model, data, part, weights) for part in np.array_split(rows, -(-len(rows) // CHUNK))]
+    parts = [
+        _emissions(model, data, part, weights)
+        for part in np.array_split(rows, -(-len(rows) // CHUNK))
+    ]
     outputs = torch.cat([part.outputs for part in parts])
     mean = outputs.mean(0)
     readout = process.features.weigh @ (outputs - mean)
@@ -142,14 +161,18 @@ def solve_emissions(
     first = parts[0]
     chunk = rows[: len(first.outputs)]
     places = torch.from_numpy(data.moving[chunk]).float().double()
-    features = whitened_features(places, process.prior.length, process.prior.noise, "matern32", len(chunk))
+    features = whitened_features(
+        places, process.prior.length, process.prior.noise, "matern32", len(chunk)
+    )
     inverse = features.weigh.mT @ features.weigh
     if model.error is not None:
         model.error.set_error_law(*_error_law(first, inverse, process.prior.noise, mean))
     return _leave_out(first, inverse, data.moving[chunk], mean)
 
 
-def _emissions(model: GaussianModel, data: Measurements, rows: np.ndarray, weights: Tensor) -> ImageEmissions:
+def _emissions(
+    model: GaussianModel, data: Measurements, rows: np.ndarray, weights: Tensor
+) -> ImageEmissions:
     """Emissions (least squares) that show the images of rows (n,)."""
     gram = weights.mT @ weights
     ridge = IMAGE_RIDGE * gram.diagonal().mean() * torch.eye(len(gram))
@@ -164,8 +187,11 @@ def _emissions(model: GaussianModel, data: Measurements, rows: np.ndarray, weigh
     return ImageEmissions(weights, images, outputs.double(), attenuation)
 
 
-def _error_law(seen: ImageEmissions, inverse: Tensor, noise: float, mean: Tensor) -> tuple[float, float]:
-    """Level and power of the `ErrorModel`: errors of rows left out one by one, and of the mean alone.
+def _error_law(
+    seen: ImageEmissions, inverse: Tensor, noise: float, mean: Tensor
+) -> tuple[float, float]:
+    """Level and power of the `ErrorModel`: errors of rows left out one by one,
+    and of the mean alone.
 
     Rasmussen and Williams (2006), eq. 5.12.
     """
@@ -173,10 +199,14 @@ def _error_law(seen: ImageEmissions, inverse: Tensor, noise: float, mean: Tensor
     unknown = (variance - noise).clamp(0, 1)
     images = [seen.render(seen.outputs - residual), seen.render(mean.expand_as(seen.outputs))]
     error = torch.cat([(image - seen.images).square().mean(1) for image in images])
-    return fit_level_and_power(torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy())
+    return fit_level_and_power(
+        torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy()
+    )
 
 
-def _leave_out(seen: ImageEmissions, inverse: Tensor, places: np.ndarray, mean: Tensor) -> LeftOut | None:
+def _leave_out(
+    seen: ImageEmissions, inverse: Tensor, places: np.ndarray, mean: Tensor
+) -> LeftOut | None:
     """Rows at places (n, 3) [m] predicted without their neighbours, at gaps of some spacings."""
     count = len(places)
     if count < LEAST_HELD:
@@ -189,7 +219,9 @@ def _leave_out(seen: ImageEmissions, inverse: Tensor, places: np.ndarray, mean: 
     gaps = np.array(GAPS) * spacing
     about = (seen.outputs - mean).numpy()
     means, _ = means_and_variances(inverse.numpy(), about, distance, centres, gaps)
-    some = replace(seen, weights=seen.weights[pixels], images=seen.images[:, pixels]).subset(centres)
+    some = replace(seen, weights=seen.weights[pixels], images=seen.images[:, pixels]).subset(
+        centres
+    )
     predicted = [some.render(torch.from_numpy(at_gap) + mean).clamp(0, 1) for at_gap in means]
     images = seen.images[:, pixels].double().numpy()
     return LeftOut(places, images, centres, gaps, torch.stack(predicted).double().numpy())
@@ -210,6 +242,9 @@ def start_in_closed_form(task: InitTask) -> Start:
             solve_emissions, data=task.data, rows=task.rows, receiver=task.receiver, process=process
         )
         return Start(process.prior, solve)
-    kernel = "kernel" in (task.settings.emission.encoding.kind, task.settings.confidence.encoding.kind)
+    kernel = "kernel" in (
+        task.settings.emission.encoding.kind,
+        task.settings.confidence.encoding.kind,
+    )
     prior = learn_prior(task.data, task.rows, task.most_anchors, task.seed) if kernel else None
     return Start(prior)

@@ -1,4 +1,6 @@
-"""Gaussians that are rendered, averaged with a plain process: `array_process` and `image_process`."""
+"""Gaussians that are rendered, averaged with a plain process:
+`array_process` and `image_process`.
+"""
 
 from __future__ import annotations
 
@@ -35,13 +37,15 @@ from gsparc.training.cost import Cost
 log = logging.getLogger(__name__)
 # A mean with the process takes several times as long: it must gain 2 standard errors, and .1 dB.
 SURE, LEAST_GAIN = 2.0, 0.1 / RELATIVE_DB
-FEW_ROWS = 40  # fewer do not tell a weight from a half, where the two differ by less than twice the error
+# Fewer do not tell a weight from a half, where the two differ by less than twice the error
+FEW_ROWS = 40
 MOST_HELD = 1_000  # validation rows that the process is weighed on: memory
 BEYOND = 1e-3  # of the variance of targets, that an averaged process leaves out
 
 
 class ImageProcess(LearnedField):
-    """Gaussians that emit images, trained by rendering, and a plain process by its weight in the mean.
+    """Gaussians that emit images, trained by rendering,
+    and a plain process by its weight in the mean.
 
     Args:
         plain: whether a plain process may stand in, or be averaged in.
@@ -54,7 +58,8 @@ class ImageProcess(LearnedField):
         super().__init__(name=name, **field)
         self.plain = plain
         self.explained: float | None = None
-        self._average: tuple[GaussianProcess, float] | None = None  # a process and its weight in the mean
+        # A process and its weight in the mean
+        self._average: tuple[GaussianProcess, float] | None = None
 
     @property
     def effects(self) -> str:  # type: ignore[override]
@@ -67,7 +72,9 @@ class ImageProcess(LearnedField):
     # -- learning ----------------------------------------------------------------------------------
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Train by rendering, and weigh a process against what came of it; see `LearnedField.fit`."""
+        """Train by rendering, and weigh a process against what came of it;
+        see `LearnedField.fit`.
+        """
         self._average = None
         array = self.settings.response.array
         why = array_obstacle(data.site, "rx", "the receiver moves") if array else None
@@ -76,9 +83,11 @@ class ImageProcess(LearnedField):
         choices, _ = resolve_auto(self.settings, self.init.name, data.site)
         log.info(
             "training by rendering: %d Gaussians, terms %s, init=%s; configured callbacks: %s",
-            self.settings.field.count, self.effects, choices.init,
+            self.settings.field.count,
+            self.effects,
+            choices.init,
             ", ".join(type(callback).__name__ for callback in context.callbacks()) or "none",
-        )  # fmt: skip
+        )
         report = super().fit(data, fold, context)
         spent = dict(self.spent)
         if self._average is not None:
@@ -92,7 +101,11 @@ class ImageProcess(LearnedField):
         spent["weighing"] = max(report.seconds - sum(spent.values()), 0.0)
         log.info("%s: %s", self.name, self.description)
         # Steps that no look kept, or all of the field: paid for, and not in the answer.
-        unused = {} if self.steps else {name: s for name, s in spent.items() if name.startswith("gradient")}
+        unused = (
+            {}
+            if self.steps
+            else {name: s for name, s in spent.items() if name.startswith("gradient")}
+        )
         if self._is_process_alone:
             unused = {name: s for name, s in spent.items() if name != "averaged process"}
         return report.with_cost(Cost(spent, unused))
@@ -103,14 +116,19 @@ class ImageProcess(LearnedField):
         return self._average is not None and self._average[1] >= 1
 
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
-        """Weigh a process of the same rows by validation rows and, of spectra, training rows left out."""
+        """Weigh a process of the same rows by validation rows and, of spectra,
+        training rows left out.
+        """
         if not self.plain:
             return
-        process, left_out = GaussianProcess(), self._left_out  # a dozen validation rows decide by chance
+        # A dozen validation rows decide by chance
+        process, left_out = GaussianProcess(), self._left_out
         process.condition(data, fold.train)
         if not self.count_components() or (left_out is None and len(fold.val) < LEAST_HELD):
             few = f"{len(fold.val)} held-out rows do not tell whether Gaussians gain"
-            log.info("%s: a Gaussian process alone", few if self.count_components() else "no Gaussians")
+            log.info(
+                "%s: a Gaussian process alone", few if self.count_components() else "no Gaussians"
+            )
             self._average = process, 1.0
             return
         triples, val = [], fold.val[:: -(-len(fold.val) // MOST_HELD) or 1]
@@ -126,9 +144,12 @@ class ImageProcess(LearnedField):
         gram = relative_to_row(gram) if data.site.target.is_image else gram
         weight = float(choose_weights(gram, np.arange(len(gram)), SURE, LEAST_GAIN, FEW_ROWS)[1])
         log.info(
-            "%d held-out rows, %d training rows without their neighbours: weight of a Gaussian process %.2f",
-            len(val), 0 if left_out is None else len(left_out.centres), weight,
-        )  # fmt: skip
+            "%d held-out rows, %d training rows without their neighbours: weight of a Gaussian "
+            "process %.2f",
+            len(val),
+            0 if left_out is None else len(left_out.centres),
+            weight,
+        )
         self._average = (process, weight) if weight else None
 
     # -- answering ---------------------------------------------------------------------------------
@@ -140,8 +161,11 @@ class ImageProcess(LearnedField):
         field = super().predict(query)
         if self._average is None:
             return field
-        process, weight = self._average  # its variance is most of its cost, and the field has one of its own
-        return replace(field, mean=self.fitted_site.target.blend(field.mean, process.mean_at(query), weight))
+        # Its variance is most of its cost, and the field has one of its own
+        process, weight = self._average
+        return replace(
+            field, mean=self.fitted_site.target.blend(field.mean, process.mean_at(query), weight)
+        )
 
     def gradient_problem(self) -> str | None:
         """See `Method.gradient_problem`; a process alone has gradients."""
@@ -156,7 +180,9 @@ class ImageProcess(LearnedField):
         if self._average is None:
             return result
         process, weight = self._average
-        return average_with_process(result, process, partial(self.fitted_site.target.blend, weight=weight))
+        return average_with_process(
+            result, process, partial(self.fitted_site.target.blend, weight=weight)
+        )
 
     def count_components(self) -> int:
         """Return the number of Gaussians."""

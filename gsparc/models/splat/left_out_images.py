@@ -1,8 +1,9 @@
-"""Training images predicted without their neighbours, by whatever is linear in them, and by a plain process.
+"""Training images predicted without their neighbours, by whatever is linear in them,
+and by a plain process.
 
-Plain leave-one-out tests interpolation over the spacing of the samples only: here each sample is predicted
-without all others within a gap, for several gaps, so that rows can be chosen that are as far from what is
-left as queries will be.
+Plain leave-one-out tests interpolation over the spacing of the samples only: here each sample is
+predicted without all others within a gap, for several gaps, so that rows can be chosen that are as
+far from what is left as queries will be.
 """
 
 from __future__ import annotations
@@ -40,17 +41,23 @@ class LeftOut(Stored):
     predicted: np.ndarray
 
     def predict_by_process(self) -> np.ndarray:
-        """Return the same samples (g, c, P) as a Gaussian process on images predicts them from the rest."""
+        """Return the same samples (g, c, P) as a Gaussian process
+        on images predicts them from the rest.
+        """
         mean = self.images.mean(0)
         vectors, lengths, _ = np.linalg.svd(self.images - mean, full_matrices=False)
         # Left singular vectors times singular values are scores in an orthonormal basis.
         kernel = choose_left_out_kernel(self.positions, vectors * lengths, len(mean))
         inverse = Factor.from_gram(kernel.gram(torch.from_numpy(self.positions))).inverse.numpy()
         distance = cdist(self.positions, self.positions)
-        return mean + means_and_variances(inverse, self.images - mean, distance, self.centres, self.gaps)[0]
+        return (
+            mean
+            + means_and_variances(inverse, self.images - mean, distance, self.centres, self.gaps)[0]
+        )
 
     def beside_process(self, distance: float | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return predictions, those of a process, and targets (n, P) of samples that anything is left for.
+        """Return predictions, those of a process, and targets (n, P)
+        of samples that anything is left for.
 
         At the gap of `nearest_gap`.
         """
@@ -60,7 +67,8 @@ class LeftOut(Stored):
         return both[0][seen], both[1][seen], self.images[self.centres][seen]
 
     def nearest_gap(self, distance: float | None) -> int:
-        """Return the gap whose held-out samples are most nearly `distance` [m] from the rest, by medians.
+        """Return the gap whose held-out samples are most nearly `distance` [m] from the rest,
+        by medians.
 
         Args:
             distance: of rows held out of the fit to the nearest row in it; None: no gap at all.
@@ -77,7 +85,11 @@ class LeftOut(Stored):
 
 
 def means_and_variances(
-    inverse: np.ndarray, values: np.ndarray, distance: np.ndarray, centres: np.ndarray, gaps: np.ndarray
+    inverse: np.ndarray,
+    values: np.ndarray,
+    distance: np.ndarray,
+    centres: np.ndarray,
+    gaps: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean and variance of each sample given all others outside a gap around it.
 
@@ -103,11 +115,16 @@ def means_and_variances(
         # Rows with all others inside the gap have nothing to be predicted from: they stay NaN.
         some = np.flatnonzero(~near.all(1))
         result = left_out_around(precision, weighted, rows[some], torch.from_numpy(near[some]))
-        mean[g, some], variance[g, some] = values[centres[some]] - result[0].numpy(), result[1].numpy()
+        mean[g, some], variance[g, some] = (
+            values[centres[some]] - result[0].numpy(),
+            result[1].numpy(),
+        )
     return mean, variance
 
 
 def mean_log_error(error: np.ndarray) -> float:
-    """Return the mean over gaps and centres of the log of squared errors (g, c), NaN where there are none."""
+    """Return the mean over gaps and centres of the log of squared errors (g, c),
+    NaN where there are none.
+    """
     usable = ~np.isnan(error).all(1)
     return float(np.nanmean(np.log(error[usable] + LEAST), axis=1).mean()) if usable.any() else 0.0

@@ -53,7 +53,8 @@ log = logging.getLogger(__name__)
 
 THIRDS = 3  # of the rows: one is for validation where few were set apart
 LEAST_TOLD = 8  # validation rows: fewer say by chance which steps and which mixtures pay
-ENOUGH = 2  # times the antennas of an array: so many Gaussians give it any vector, and more the same
+# Times the antennas of an array: so many Gaussians give it any vector, and more the same
+ENOUGH = 2
 STEP_COUNTS = ("trainer.max_steps", "trainer.max_epochs")  # which ask for no step, too
 QUERY_CHUNK = 256  # bounds the memory of one prediction call
 
@@ -63,7 +64,8 @@ class Stage:
     """A part of a fit that begins with a fresh model, or goes on with one.
 
     Attributes:
-        name: `train`; `refit`: as many steps again on all rows; `final`: the start alone, on all rows.
+        name: `train`; `refit`: as many steps again on all rows; `final`: the start alone, on all
+            rows.
         fold: whose training rows it learns from.
         context: the fit's, with the stage's folder and the file that it resumes from.
         steps: of gradient, of its schedule.
@@ -93,10 +95,11 @@ class LearnedField(Method):
         name: as it appears in tables.
         init: where Gaussians come from; `auto` solves the emission in closed form where it can.
         refit: after validation, train again on training and validation rows together.
-        keep_best: end with the parameters of the best look at validation rows, the start among them.
-        steps: of gradient, where `trainer.max_steps` and `trainer.max_epochs` give none; `auto`: 60 after a
-            start in closed form, else 400, fewer where the first looks show no gain (`KeepBest`). 0 of
-            either is the start alone.
+        keep_best: end with the parameters of the best look at validation rows, the start among
+            them.
+        steps: of gradient, where `trainer.max_steps` and `trainer.max_epochs` give none; `auto`: 60
+            after a start in closed form, else 400, fewer where the first looks show no gain
+            (`KeepBest`). 0 of either is the start alone.
         guesses: settings the source of this configuration does not give, one line each.
     """
 
@@ -104,7 +107,8 @@ class LearnedField(Method):
     has_gaussians = True
     resumable = True  # every step's state is in `last.ckpt`
     takes_effort = takes_weights = True
-    _is_process_alone = False  # whether a process beside it has all the weight: another stage gains nothing
+    # Whether a process beside it has all the weight: another stage gains nothing
+    _is_process_alone = False
     _ended: tuple[str, ...] = ()
     # The float64 copy of a version of the model, for an array or not.
     _doubled: tuple[tuple[int, bool], tuple[GaussianModel, FrozenArray | None]] | None = None
@@ -126,7 +130,9 @@ class LearnedField(Method):
         steps: int | Literal["auto"] = "auto",
         guesses: Sequence[str] = (),
     ) -> None:
-        check_arguments(locals(), refit=switch(), keep_best=switch(), steps=or_word(whole(0), "auto"))
+        check_arguments(
+            locals(), refit=switch(), keep_best=switch(), steps=or_word(whole(0), "auto")
+        )
         self.settings = ModelSettings(field, emission, attenuation, raster, response, confidence)
         self.loss, self.rates, self.name = loss, optimizer, name
         self.init = replace(init or InitSettings(), snapshot=loss.snapshot)
@@ -139,16 +145,19 @@ class LearnedField(Method):
         self.site: Site | None = None
         self.choices: Choices | None = None
         self._ends: dict[str, Tensor] = {}
-        self._shape: tuple[int, int] | None = None  # (A, K); a file may not say where its antennas are
+        # (A, K); a file may not say where its antennas are
+        self._shape: tuple[int, int] | None = None
         self._prior: Smoothness | None = None
         self._paying: int | None = None  # position in the schedule after which steps did not pay
-        self.steps = self.steps_taken = 0  # of gradient: kept in the last stage, and taken in the first
+        # Of gradient: kept in the last stage, and taken in the first
+        self.steps = self.steps_taken = 0
         self.init_s: float | None = None  # of all initialisers; None of a model read back
         self._earlier_s = 0.0  # of training, by the stages so far [s]
         self.frozen: FrozenView | FrozenArray | None = None
         self.spent: dict[str, float] = {}  # of each stage of the last fit [s]
         self._left_out: LeftOut | None = None  # of the initialiser; not stored
-        self._apart: float | None = None  # validation rows from the nearest training row, median [m]
+        # Validation rows from the nearest training row, median [m]
+        self._apart: float | None = None
 
     # -- learning ----------------------------------------------------------------------------------
 
@@ -158,12 +167,13 @@ class LearnedField(Method):
         return super().settings_read() | {*steps}
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
-        """Train on `fold.train`; `fold.val` is watched, calibrates the confidence, and is then learned too.
+        """Train on `fold.train`; `fold.val` is watched, calibrates the confidence,
+        and is then learned too.
 
-        A start in closed form is step 0, with the same looks at validation rows as every later step. Where it
-        stays the best, it is solved again on all rows, and that is the result. Where steps are kept, a second
-        stage (`refit`) takes as many on training and validation rows together, because the baselines learn
-        from all of them, with the confidence of the first.
+        A start in closed form is step 0, with the same looks at validation rows as every later
+        step. Where it stays the best, it is solved again on all rows, and that is the result. Where
+        steps are kept, a second stage (`refit`) takes as many on training and validation rows
+        together, because the baselines learn from all of them, with the confidence of the first.
         """
         origin = Origin.from_fit(data, fold, context)
         stored_model = None if context.resume is None else read_interrupted(context.resume)
@@ -182,11 +192,16 @@ class LearnedField(Method):
                 module, data, stage.fold, stage.context, files, watch, self._stage_callbacks(stage)
             )
             with gradient_stage.interruptible(trainer, batches):
-                trainer.fit(module, datamodule=batches, ckpt_path=stage.context.resume, weights_only=True)
+                trainer.fit(
+                    module, datamodule=batches, ckpt_path=stage.context.resume, weights_only=True
+                )
             result = gradient_stage.read_trainer_result(trainer, watch)
             self._end_stage(stage, result, watch.seconds - began)
         self.frozen = self._doubled = None
-        what, count = f"final, {self.steps} of {self.steps_taken} steps kept", self.count_components()
+        what, count = (
+            (f"final, {self.steps} of {self.steps_taken} steps kept"),
+            self.count_components(),
+        )
         context.log_curve(watch.seconds, what, step=self.steps_taken, num_gaussians=count)
         return FitReport(watch.seconds, self._ended, cpu_s=watch.cpu_elsewhere)
 
@@ -207,7 +222,8 @@ class LearnedField(Method):
             return
         why = "the target is powers" if site.target.is_level else "both ends move"
         raise ValueError(
-            f"{self.name}: the paper's field is of spectra and channels between an end that stands and one "
+            f"{self.name}: the paper's field is of spectra and channels between an end that "
+            "stands and one "
             f"that moves; here {why}: take model=gsparc without paper="
         )
 
@@ -229,14 +245,20 @@ class LearnedField(Method):
             log.info("%s", reason)
         if data.site.target.is_complex and self.choices.activation == "sigmoid":
             log.warning(
-                "%s: a sigmoid is positive, so that real and imaginary parts of these channels cannot be "
-                "negative; model.emission.activation=signed_sigmoid is the smallest change that can be",
+                "%s: a sigmoid is positive, so that real and imaginary parts of these channels "
+                "cannot be "
+                "negative; model.emission.activation=signed_sigmoid is the smallest change that "
+                "can be",
                 self.name,
             )
         self._paying, self.init_s = extra.get("paying"), float(extra.get("init_s", 0.0))
-        self.steps_taken, self._earlier_s = int(extra.get("taken", 0)), float(extra.get("earlier_s", 0.0))
+        self.steps_taken, self._earlier_s = (
+            int(extra.get("taken", 0)),
+            float(extra.get("earlier_s", 0.0)),
+        )
         self.spent, self._apart = {}, _validation_distance(data, fold)
-        self._left_out = from_plain(extra.get("left_out"))  # an interrupted run's start is not repeated
+        # An interrupted run's start is not repeated
+        self._left_out = from_plain(extra.get("left_out"))
         self._ended = tuple(extra.get("ended", ()))
 
     def _plan_stages(
@@ -254,9 +276,11 @@ class LearnedField(Method):
         usual = context.counts.steps_after_solving if solved else context.counts.steps
         steps = usual if step_count is None else step_count
         log.info(
-            "steps=%s%d: a start %s", "auto -> " if step_count is None else "", steps,
+            "steps=%s%d: a start %s",
+            "auto -> " if step_count is None else "",
+            steps,
             "in closed form" if solved else f"from init={self.choices.init}",
-        )  # fmt: skip
+        )
         refits = resumed is not None and resumed.extra.get("stage") == "refit"
         if resumed is not None and refits:
             self.restore(data.site, resumed.state)
@@ -264,11 +288,14 @@ class LearnedField(Method):
             watching = not self.keep_best or len(watched.val) > 0 or not solved
             if steps and watching:
                 # Steps that somebody asks for are all taken.
-                yield Stage("train", watched, context, steps, PATIENCE if step_count is None else None)
+                yield Stage(
+                    "train", watched, context, steps, PATIENCE if step_count is None else None
+                )
             if solved and (few or not watching):
                 self._paying = 0  # by so few rows steps would be chosen by chance
             if solved and (self._paying == 0 or not steps):
-                # No step was surely better, or none was asked for: the start, solved again on all rows.
+                # No step was surely better, or none was asked for: the start,
+                # solved again on all rows.
                 self.steps, every = 0, _train_on_all(fold) if self.refit else fold
                 yield Stage("final", every, replace(context, resume=None), 0)
                 self._weigh_process(data, every)
@@ -279,12 +306,17 @@ class LearnedField(Method):
             self._weigh_process(data, watched)
         if self.refit and len(watched.val) and not self._is_process_alone:
             resume = context.resume if refits else None
-            yield Stage("refit", _train_on_all(watched), context.for_part("refit", resume=resume), steps)
+            yield Stage(
+                "refit", _train_on_all(watched), context.for_part("refit", resume=resume), steps
+            )
 
-    def _start_stage(self, stage: Stage, data: Measurements, watch: Stopwatch) -> GaussianModule | None:
+    def _start_stage(
+        self, stage: Stage, data: Measurements, watch: Stopwatch
+    ) -> GaussianModule | None:
         """Make a fresh model, or read one back; return what trains it, None where no step is taken.
 
-        `refit` keeps the confidence of the stage before: the rows that calibrated it are learned from now.
+        `refit` keeps the confidence of the stage before:
+        the rows that calibrated it are learned from now.
         """
         context, folder = stage.context, stage.context.run_dir
         L.seed_everything(context.seed, verbose=False)
@@ -295,11 +327,17 @@ class LearnedField(Method):
         elif context.resume is None:
             start = start_in_closed_form(
                 InitTask(
-                    apply_choices(self.settings, self.choices), self.choices.closed_form, data,
-                    stage.fold.train, self._static_receiver(), self._ends.get("tx_position"),
-                    context.seed, folder, watch,
+                    apply_choices(self.settings, self.choices),
+                    self.choices.closed_form,
+                    data,
+                    stage.fold.train,
+                    self._static_receiver(),
+                    self._ends.get("tx_position"),
+                    context.seed,
+                    folder,
+                    watch,
                 )
-            )  # fmt: skip
+            )
             self._prior = start.prior
             self.model = self._new_model(data.site)
             solved = None if start.solve is None else start.solve(self.model)
@@ -308,7 +346,10 @@ class LearnedField(Method):
             self.restore(data.site, checkpoint.read(context.resume).state)
         if stage.name == "refit":
             assert before is not None
-            self.fitted_model().confidence, self.fitted_model().error = before.confidence, before.error
+            self.fitted_model().confidence, self.fitted_model().error = (
+                before.confidence,
+                before.error,
+            )
             if before.confidence is not None:
                 before.confidence.requires_grad_(False)
         prepared = watch.seconds - started
@@ -327,12 +368,17 @@ class LearnedField(Method):
     def _extra(self, stage: Stage, watch: Stopwatch, origin: Origin) -> dict[str, Any]:
         """What `_begin_fit` reads of a run that is interrupted in a stage."""
         return {
-            "stage": stage.name, "earlier_s": self._earlier_s, "spent_s": watch.seconds,
+            "stage": stage.name,
+            "earlier_s": self._earlier_s,
+            "spent_s": watch.seconds,
             "spent_cpu_s": watch.cpu_seconds,
-            "ended": [*self._ended], "paying": self._paying, "init_s": self.init_s,
+            "ended": [*self._ended],
+            "paying": self._paying,
+            "init_s": self.init_s,
             "taken": self.steps_taken,
-            "left_out": to_plain(self._left_out), **origin.to_extra(),
-        }  # fmt: skip
+            "left_out": to_plain(self._left_out),
+            **origin.to_extra(),
+        }
 
     def _stage_callbacks(self, stage: Stage) -> list[L.Callback]:
         """Callbacks that say which steps are kept."""
@@ -340,7 +386,9 @@ class LearnedField(Method):
             return [KeepBest(stage.patience)] if self.keep_best else []
         return [] if self._paying is None else [StopAt(self._paying)]
 
-    def _end_stage(self, stage: Stage, result: gradient_stage.TrainerResult, seconds: float) -> None:
+    def _end_stage(
+        self, stage: Stage, result: gradient_stage.TrainerResult, seconds: float
+    ) -> None:
         """Note what the steps of a stage were worth."""
         self._earlier_s += seconds
         self.steps = result.taken if result.kept is None else result.kept
@@ -353,7 +401,9 @@ class LearnedField(Method):
         """A hook between the stages: what a process averaged with the field would gain."""
 
     def module(self, steps: int = 1, run_dir: Path = Path()) -> GaussianModule:
-        """Return what Lightning trains: the model, its loss and its rates, with schedules over `steps`."""
+        """Return what Lightning trains: the model, its loss and its rates,
+        with schedules over `steps`.
+        """
         solved = self.choices is not None and self.choices.closed_form
         rates = self.rates.after_closed_form(steps) if solved else self.rates
         return GaussianModule(self.fitted_model(), self.loss, rates, steps, run_dir)
@@ -362,7 +412,8 @@ class LearnedField(Method):
         """Take the weights of another model of this site; what is learned anew are these rows.
 
         Raises:
-            ValueError: it holds no Gaussian field, or one of other positions, directions or channels.
+            ValueError: it holds no Gaussian field, or one of other positions, directions or
+                channels.
         """
         stored = checkpoint.read(path)
         state = stored.state.get("inner", stored.state)
@@ -370,10 +421,13 @@ class LearnedField(Method):
             raise ValueError(f"init_from={path}: {stored.method} holds no Gaussian field")
         for name in ("kind", "grid", "static_end"):
             if getattr(site, name) != getattr(stored.site, name):
-                raise ValueError(f"init_from={path}: its {name} is another; take a model of the same {name}")
+                raise ValueError(
+                    f"init_from={path}: its {name} is another; take a model of the same {name}"
+                )
         if not np.allclose(site.origin, stored.site.origin, atol=1e-6):
             raise ValueError(
-                f"init_from={path}: its origin is {stored.site.origin} m, here it is {site.origin} m"
+                f"init_from={path}: its origin is {stored.site.origin} m, here it is "
+                f"{site.origin} m"
             )
         LearnedField.restore(self, site, {**state, "ends": self._ends, "shape": self._shape})
 
@@ -383,8 +437,13 @@ class LearnedField(Method):
 
     def _new_model(self, site: Site) -> GaussianModel:
         assert self.choices is not None
-        settings, transmitter = apply_choices(self.settings, self.choices), self._ends.get("tx_position")
-        return GaussianModel(settings, site, self._static_receiver(), transmitter, self._prior, self._shape)
+        settings, transmitter = (
+            apply_choices(self.settings, self.choices),
+            self._ends.get("tx_position"),
+        )
+        return GaussianModel(
+            settings, site, self._static_receiver(), transmitter, self._prior, self._shape
+        )
 
     @torch.no_grad()
     def _calibrate_errors(self, data: Measurements, fold: Fold) -> None:
@@ -392,13 +451,17 @@ class LearnedField(Method):
         model = self.fitted_model()
         rows = fold.val if len(fold.val) else fold.train
         if model.confidence is not None:
-            model.confidence.store_range(torch.from_numpy(np.asarray(data.moving[rows], dtype=np.float32)))
+            model.confidence.store_range(
+                torch.from_numpy(np.asarray(data.moving[rows], dtype=np.float32))
+            )
         if model.error is not None and len(fold.val) >= LEAST_HELD:
             batch = data.batch(fold.val)
             result = model(batch.tx, batch.rx)
             assert result.unknown is not None
             error = squared_error(result.mean.clamp(0, 1), batch, model.site.target)
-            model.error.set_error_law(*fit_level_and_power(result.unknown.numpy(), error.double().numpy()))
+            model.error.set_error_law(
+                *fit_level_and_power(result.unknown.numpy(), error.double().numpy())
+            )
 
     # -- answering ---------------------------------------------------------------------------------
 
@@ -417,7 +480,9 @@ class LearnedField(Method):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        return Prediction.joined([self._predict_at(part.tx, part.rx) for part in query.split(QUERY_CHUNK)])
+        return Prediction.joined(
+            [self._predict_at(part.tx, part.rx) for part in query.split(QUERY_CHUNK)]
+        )
 
     def _predict_at(self, tx: Tensor, rx: Pose) -> Prediction:
         if tx.dtype == torch.float64:
@@ -433,8 +498,13 @@ class LearnedField(Method):
 
     @torch.no_grad()
     def _in_float64(self, rx: Pose) -> tuple[GaussianModel, FrozenArray | None]:
-        """The model and what an array sees of it, in float64; images are rendered: these have gradients."""
-        model, seen = self.fitted_model(), self.frozen_at(rx) if self.settings.response.array else None
+        """The model and what an array sees of it, in float64; images are rendered:
+        these have gradients.
+        """
+        model, seen = (
+            self.fitted_model(),
+            self.frozen_at(rx) if self.settings.response.array else None,
+        )
         frozen = seen if isinstance(seen, FrozenArray) else None
         of = int(model.gaussians.version), frozen is None
         if self._doubled is None or self._doubled[0] != of:
@@ -452,14 +522,20 @@ class LearnedField(Method):
             return Prediction(mean, *model.error(result.unknown))
         if model.confidence is None:
             return Prediction(mean)
-        return Prediction(mean, unknown=1 - model.confidence.normalised_confidence(model.site.moving(tx, rx)))
+        return Prediction(
+            mean, unknown=1 - model.confidence.normalised_confidence(model.site.moving(tx, rx))
+        )
 
     def frozen_at(self, rx: Pose) -> FrozenView | FrozenArray | None:
-        """Return the matrix of the static receiver, made anew after an edit; None for any other pose."""
+        """Return the matrix of the static receiver, made anew after an edit;
+        None for any other pose.
+        """
         model, static = self.fitted_model(), self._static_receiver()
         if not model.site.target.is_image or static is None or rx.batched:
             return None
-        if not (torch.equal(rx.position, static.position) and torch.equal(rx.rotation, static.rotation)):
+        if not (
+            torch.equal(rx.position, static.position) and torch.equal(rx.rotation, static.rotation)
+        ):
             return None
         if self.frozen is None or self.frozen.version != int(model.gaussians.version):
             self.frozen = freeze_view(model, rx)
@@ -473,9 +549,11 @@ class LearnedField(Method):
         model, square = self.model, torch.zeros(self.count_components())
         for one in query.split(1):  # features of all would be gigabytes
             square += model.emissions(one.tx, one.rx)[0].square().sum(1)
-        return model.gaussians.to_cloud((square / max(len(query), 1)).sqrt(), "emission of a Gaussian")
+        return model.gaussians.to_cloud(
+            (square / max(len(query), 1)).sqrt(), "emission of a Gaussian"
+        )
 
-    # -- what it can do besides ----------------------------------------------------------------------
+    # -- what it can do besides --------------------------------------------------------------------
 
     reduction_settings = reduce.reduction_settings
     reduction_inputs = reduce.reduction_inputs
@@ -489,9 +567,13 @@ class LearnedField(Method):
         choices = None if self.choices is None else vars(self.choices)
         model = self.fitted_model().state_dict()
         return {
-            "choices": choices, "ends": self._ends, "prior": prior, "shape": self._shape, "model": model,
+            "choices": choices,
+            "ends": self._ends,
+            "prior": prior,
+            "shape": self._shape,
+            "model": model,
             "steps": (self.steps, self.steps_taken),
-        }  # fmt: skip
+        }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """Become the field whose `state()` this was."""
@@ -502,7 +584,9 @@ class LearnedField(Method):
         self._shape = None if state["shape"] is None else tuple(state["shape"])
         self._prior = None if state["prior"] is None else Smoothness(**state["prior"])
         self.model = self._new_model(site)
-        edit.resize_gaussians(self.model, self.model.gaussians, len(state["model"]["gaussians.ids"]))
+        edit.resize_gaussians(
+            self.model, self.model.gaussians, len(state["model"]["gaussians.ids"])
+        )
         self.model.load_state_dict(state["model"])
         self.frozen = self._doubled = None
 
@@ -517,14 +601,20 @@ class LearnedField(Method):
             return self.label
         hidden, count = self.settings.emission.hidden, len(self.model.gaussians)
         kind = "array process" if self.settings.response.array else "process of images"
-        text = f"networks of {hidden} hidden units in {count} Gaussians" if hidden else f"{count} Gaussians"
+        text = (
+            (f"networks of {hidden} hidden units in {count} Gaussians")
+            if hidden
+            else f"{count} Gaussians"
+        )
         text = f"{kind} through {text}" if self.choices.closed_form else text
         if self.choices.init == "vectors" and not self.steps and self.site is not None:
             enough = ENOUGH * len(self.site.array_geometry()[0])
             text += f" ({enough} or more give the same answers)" * (count >= enough)
         part = "all" if self.steps == self.steps_taken else self.steps or "none"
         return text + (
-            f", {self.steps_taken} gradient steps, {part} kept" if self.steps_taken else ", no gradient steps"
+            f", {self.steps_taken} gradient steps, {part} kept"
+            if self.steps_taken
+            else ", no gradient steps"
         )
 
     def facts(self) -> dict[str, float | int | str | None]:
@@ -533,11 +623,15 @@ class LearnedField(Method):
         if self.choices is not None:
             chosen = {"init": self.choices.init, "encoding": self.choices.encoding}
             chosen |= {"activation": self.choices.activation, "steps": str(self.steps_taken)}
-            facts |= {"model/choices": ", ".join(f"{name}={value}" for name, value in chosen.items())}
+            facts |= {
+                "model/choices": ", ".join(f"{name}={value}" for name, value in chosen.items())
+            }
             facts |= {"model/init": self.choices.init}
         return facts | {
-            "model/steps": self.steps, "model/steps_taken": self.steps_taken, "time/init_s": self.init_s,
-        }  # fmt: skip
+            "model/steps": self.steps,
+            "model/steps_taken": self.steps_taken,
+            "time/init_s": self.init_s,
+        }
 
 
 def _train_on_all(fold: Fold) -> Fold:
@@ -546,7 +640,9 @@ def _train_on_all(fold: Fold) -> Fold:
 
 
 def _hold_out_third(data: Measurements, fold: Fold, context: FitContext) -> Fold:
-    """With a third of the rows for validation, cut as the test is; all are learned from in the end."""
+    """With a third of the rows for validation, cut as the test is;
+    all are learned from in the end.
+    """
     fit_rows = np.sort(fold.learned())
     if len(fit_rows) < THIRDS * LEAST_HELD:
         return fold
@@ -555,7 +651,9 @@ def _hold_out_third(data: Measurements, fold: Fold, context: FitContext) -> Fold
 
 
 def _validation_distance(data: Measurements, fold: Fold) -> float | None:
-    """How far validation rows are from the nearest training row, median [m]; None where there are none."""
+    """How far validation rows are from the nearest training row, median [m];
+    None where there are none.
+    """
     if not len(fold.val):
         return None
     return float(np.median(cKDTree(data.moving[fold.train]).query(data.moving[fold.val])[0]))

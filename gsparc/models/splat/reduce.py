@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 def reduction_settings(method: LearnedField) -> tuple[str, ...]:
     """See `Method.reduce`.
 
-    Frozen through an array, Gaussians are one small matrix however many there are: what costs time are the
-    places that the features are told by, which `keep` is a share of, and pixels.
+    Frozen through an array, Gaussians are one small matrix however many there are: what costs time
+    are the places that the features are told by, which `keep` is a share of, and pixels.
     """
     model = method.fitted_model()
     if not model.settings.response.array:
@@ -37,7 +37,9 @@ def reduction_settings(method: LearnedField) -> tuple[str, ...]:
     return ("keep", "stride", "confidence") if model.tells_unknown else ("confidence",)
 
 
-def reduction_inputs(method: LearnedField, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
+def reduction_inputs(
+    method: LearnedField, data: Measurements, rows: np.ndarray
+) -> dict[str, Tensor]:
     """Return `receiver` (4, 3), a static one's position [m] above its rotation; else nothing."""
     if method.fitted_model().site.static_end != "rx":
         return {}
@@ -89,7 +91,9 @@ def _freeze_coarse(
     """
     view = method.frozen_at(Pose(receiver[0], receiver[1:]))
     response, grid = model.response, model.site.grid
-    assert isinstance(view, FrozenArray) and isinstance(response, ArrayResponse) and grid is not None
+    assert (
+        isinstance(view, FrozenArray) and isinstance(response, ArrayResponse) and grid is not None
+    )
     renderer = response.coarse_renderer(stride, coarsen_grid(grid, stride)) if stride > 1 else None
     return freeze_array(model, view.view, renderer), grid
 
@@ -98,8 +102,8 @@ def _freeze_coarse(
 def distil_features(model: GaussianModel, share: float) -> None:
     """Keep the `share` of the places behind the emission's features that lie farthest apart.
 
-    The emissions of the whole field at all its places, with their noise, are what the fewer features are
-    fitted to; what they cannot tell counts as unknown.
+    The emissions of the whole field at all its places, with their noise, are what the fewer
+    features are fitted to; what they cannot tell counts as unknown.
 
     Args:
         model: changed in place; its features tell the unknown share.
@@ -114,10 +118,13 @@ def distil_features(model: GaussianModel, share: float) -> None:
     chosen = pivoted_rows(places, length, 0.0, old.kernel, math.ceil(share * len(places)))
     features = place_features(places[chosen], places, length, noise, old.kernel)
     result = features.weigh @ (gram @ (old.whitening.double() @ weights))
-    prior = Smoothness(features.places.float(), length, noise, old.kernel, features.whitening.float())
+    prior = Smoothness(
+        features.places.float(), length, noise, old.kernel, features.whitening.float()
+    )
     few = PositionEncoding(old.settings, torch.as_tensor(model.site.query_box), prior)
     emission.encoding = few.to(old.anchors.device)
     emission.weight2 = torch.nn.Parameter(
-        result.float().view(-1, count, channels).permute(1, 0, 2).contiguous(), emission.weight2.requires_grad
+        result.float().view(-1, count, channels).permute(1, 0, 2).contiguous(),
+        emission.weight2.requires_grad,
     )
     model.gaussians.version += 1

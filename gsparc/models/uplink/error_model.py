@@ -1,4 +1,6 @@
-"""Features of a snapshot's sources that tell the error of a prediction, and the noise of a snapshot."""
+"""Features of a snapshot's sources that tell the error of a prediction,
+and the noise of a snapshot.
+"""
 
 from __future__ import annotations
 
@@ -33,10 +35,12 @@ class SearchedSnapshots:
     noise: Tensor
 
     def features(self, mean: Tensor, aperture: Aperture) -> Tensor:
-        """Return features (B, 10) of the error at an aperture with predicted channels `mean` (B, A, K).
+        """Return features (B, 10) of the error at an aperture
+        with predicted channels `mean` (B, A, K).
 
-        Noise, misfit, posterior variance, variance by delays alone (which saturates), cancellation, number
-        and delay spread of the sources, variance of their gains, fading depth at the aperture, and its size.
+        Noise, misfit, posterior variance, variance by delays alone (which saturates), cancellation,
+        number and delay spread of the sources, variance of their gains,
+        fading depth at the aperture, and its size.
         """
         sources = self.sources
         heard, strength = mean_power(self.uplink), sources.gain.abs().square()
@@ -67,9 +71,12 @@ def estimate_noise(uplink: Tensor, aperture: Aperture, window: tuple[float, floa
     count = len(aperture.tones)
     # Without a taper side lobes of strong paths would be taken for noise.
     taper = torch.hann_window(count + 2, periodic=False)[1:-1].to(uplink.real)
-    # Delays repeat after 1 turn per tone: the part of the period outside the window, .1 from its ends.
+    # Delays repeat after 1 turn per tone: the part of the period outside the window,
+    # .1 from its ends.
     outside = torch.linspace(window[1] + 0.1, window[0] + 0.9, count)
-    probe = torch.polar(torch.ones(count, len(outside)), 2 * math.pi * torch.outer(aperture.tones, outside))
+    probe = torch.polar(
+        torch.ones(count, len(outside)), 2 * math.pi * torch.outer(aperture.tones, outside)
+    )
     result = (uplink * taper) @ probe.to(uplink.dtype)
     # The median of an exponential power is log 2 of its mean, and is moved little by paths.
     return result.abs().square().flatten(1).median(1).values / math.log(2) / taper.square().sum()

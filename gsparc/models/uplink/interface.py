@@ -22,7 +22,11 @@ class SeparatesPaths(Protocol):
         """Return gains, delays and directions (B, N) of uplinks (B, U, L)."""
 
     def predict_from_uplink(
-        self, uplink: Tensor, frequency_hz: Tensor, noise: Tensor | None = None, antennas: slice = slice(None)
+        self,
+        uplink: Tensor,
+        frequency_hz: Tensor,
+        noise: Tensor | None = None,
+        antennas: slice = slice(None),
     ) -> Prediction:
         """Return channels (B, A, K) of some antennas at frequencies (K,) [Hz]."""
 
@@ -51,18 +55,22 @@ class UplinkMethod(Method):
         self.require_fitted(self.site)
         if query.uplink is None:
             raise ValueError(
-                f"{self.name}: reads a fresh uplink, and positions alone have none: uplink= is needed, or "
+                f"{self.name}: reads a fresh uplink, and positions alone have none: uplink= is "
+                "needed, or "
                 "take model=gp"
             )
         return query.uplink
 
     def select_antennas(self, uplink: Tensor) -> Tensor:
-        """Return those of uplinks (B, U, L) that are heard by the antennas that answer, (B, A, L)."""
+        """Return those of uplinks (B, U, L) that are heard by the antennas that answer,
+        (B, A, L).
+        """
         return uplink[:, torch.from_numpy(np.asarray(self.fitted_site.antennas))]
 
     def _require_uplink(self, data: Measurements) -> Site:
         if not data.site.target.is_complex or data.uplink is None or data.site.antennas is None:
             raise ValueError(
-                f"{self.name}: reads a fresh uplink, and {data.site.name} has none (dataset=argos does)"
+                f"{self.name}: reads a fresh uplink, and {data.site.name} has none "
+                "(dataset=argos does)"
             )
         return data.site

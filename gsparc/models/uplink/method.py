@@ -1,4 +1,6 @@
-"""`model=uplink`: plane-wave sources estimated in each uplink snapshot, extrapolated to the downlink."""
+"""`model=uplink`: plane-wave sources estimated in each uplink snapshot,
+extrapolated to the downlink.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,8 @@ from gsparc.training.stopwatch import Stopwatch
 
 CHUNK = 32  # snapshots searched together
 LEAKAGES = (1e-4, 3e-4, 1e-3)
-PIECES, PIECE_TONES = 4, 5  # of the downlink, one antenna each, added to the error model's training set
+# Of the downlink, one antenna each, added to the error model's training set
+PIECES, PIECE_TONES = 4, 5
 
 
 class UplinkField(UplinkMethod):
@@ -44,9 +47,12 @@ class UplinkField(UplinkMethod):
     name = "uplink"
 
     def __init__(
-        self, search: SearchSettings = SearchSettings(), teachers: int = 1200,
-        shrink: bool = True, seed: int | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        search: SearchSettings = SearchSettings(),
+        teachers: int = 1200,
+        shrink: bool = True,
+        seed: int | None = None,
+    ) -> None:
         if teachers < 50:
             raise ValueError(f"uplink: teachers={teachers}: expected at least 50 snapshots")
         self.settings, self.teachers = search, teachers
@@ -78,10 +84,11 @@ class UplinkField(UplinkMethod):
     def _features_and_errors(
         self, data: Measurements, rows: np.ndarray, rng: np.random.Generator, pieces: int
     ) -> tuple[Tensor, Tensor]:
-        """Features (n, S) and errors (n,), of the mean's power, of training snapshots, whole and in pieces.
+        """Features (n, S) and errors (n,), of the mean's power, of training snapshots,
+        whole and in pieces.
 
-        Pieces are one antenna and a few tones: narrow grids of one antenna fade deeper than the whole
-        downlink.
+        Pieces are one antenna and a few tones: narrow grids of one antenna fade deeper than the
+        whole downlink.
         """
         features, error = [], []
         whole = self._downlink
@@ -112,9 +119,15 @@ class UplinkField(UplinkMethod):
         return self._predict_at(self.query_uplinks(query), query.noise_variance, self._downlink)
 
     def predict_from_uplink(
-        self, uplink: Tensor, frequency_hz: Tensor, noise: Tensor | None = None, antennas: slice = slice(None)
+        self,
+        uplink: Tensor,
+        frequency_hz: Tensor,
+        noise: Tensor | None = None,
+        antennas: slice = slice(None),
     ) -> Prediction:
-        """Return the same at absolute frequencies (K,) [Hz] of one's own, and on some of the antennas."""
+        """Return the same at absolute frequencies (K,) [Hz] of one's own,
+        and on some of the antennas.
+        """
         tones = ((frequency_hz.double() - self._middle_hz) / self._spacing_hz).float()
         return self._predict_at(uplink, noise, Aperture(self._downlink.places[antennas], tones))
 
@@ -124,11 +137,13 @@ class UplinkField(UplinkMethod):
             result = self._search_snapshots(uplink, noise)
             mean = result.sources.channels(aperture)
             error = self.error_model.expected_error(result.features(mean, aperture))
-            # Before shrinking: what was not found is not in the mean, and shrinking does not take it away.
+            # Before shrinking: what was not found is not in the mean,
+            # and shrinking does not take it away.
             variance = error * mean_power(mean)
             if self.shrink:
                 mean = mean / (1 + error)[:, None, None]
-        mean, error, variance = (part.clone() for part in (mean, error, variance))  # ordinary tensors again
+        # Ordinary tensors again
+        mean, error, variance = (part.clone() for part in (mean, error, variance))
         return Prediction(mean, variance, error / (1 + error))
 
     def _search_snapshots(self, uplink: Tensor, noise: Tensor | None) -> SearchedSnapshots:
@@ -140,13 +155,22 @@ class UplinkField(UplinkMethod):
         straight = uplink * phasor(mean[:, None] * aperture.tones)[:, None]
         chunks = zip(straight.split(CHUNK), noise.split(CHUNK), strict=True)
         found, residuals = zip(*(self.search(*chunk) for chunk in chunks), strict=True)
-        sources = Sources(*map(torch.cat, zip(*(vars(part).values() for part in found), strict=True)))
+        sources = Sources(
+            *map(torch.cat, zip(*(vars(part).values() for part in found), strict=True))
+        )
         return SearchedSnapshots(
-            replace(sources, delay=sources.delay + mean[:, None]), torch.cat(residuals), uplink, noise
+            replace(sources, delay=sources.delay + mean[:, None]),
+            torch.cat(residuals),
+            uplink,
+            noise,
         )
 
     def _set_search(self, site: Site, settings: SearchSettings) -> None:
-        assert site.uplink_hz is not None and site.uplink_array is not None and site.antennas is not None
+        assert (
+            site.uplink_hz is not None
+            and site.uplink_array is not None
+            and site.antennas is not None
+        )
         assert site.subcarriers_hz is not None and site.carrier_hz is not None
         self._middle_hz = float(site.uplink_hz.mean())
         self._spacing_hz = float(np.diff(np.sort(site.uplink_hz)).min())
@@ -170,7 +194,9 @@ class UplinkField(UplinkMethod):
         self.site = site
         self._set_search(site, SearchSettings(**state["search"]))
         error_state = state["error_model"]
-        self.error_model = None if error_state is None else RelativeErrorRegression.read(error_state)
+        self.error_model = (
+            None if error_state is None else RelativeErrorRegression.read(error_state)
+        )
 
     def count_components(self) -> int:
         """Return the number of sources of a snapshot."""

@@ -1,8 +1,9 @@
-"""Sources of a snapshot by greedy search on a grid, each round followed by a joint refinement off it.
+"""Sources of a snapshot by greedy search on a grid,
+each round followed by a joint refinement off it.
 
-Newtonised matching pursuit (Mamandipoor, Ramasamy, Madhow 2016) with gains under a sparse Bayesian prior
-(Tipping 2001), refined by variable projection (Golub and Pereyra 1973): directions and delays take
-Gauss-Newton steps on what the best gains leave unexplained.
+Newtonised matching pursuit (Mamandipoor, Ramasamy, Madhow 2016) with gains under a sparse Bayesian
+prior (Tipping 2001), refined by variable projection (Golub and Pereyra 1973): directions and delays
+take Gauss-Newton steps on what the best gains leave unexplained.
 """
 
 from __future__ import annotations
@@ -17,20 +18,26 @@ from gsparc.models.uplink.interface import mean_power
 from gsparc.physics.plane_waves import Aperture, SourceColumns, antenna_responses, tone_responses
 from gsparc.processes.factor import Factor
 
-LEAST_SHARE = 1e-7  # of a snapshot's power, lower bound of a source's prior against division by zero
-UNEXPLAINED = 0.2  # of a round's residual that counts as noise: sources not found yet bias those found
-REACH = (0.03, 0.006)  # prior standard deviation of a step of cosines, and of delays: half a step of the grid
+# Of a snapshot's power, lower bound of a source's prior against division by zero
+LEAST_SHARE = 1e-7
+# Of a round's residual that counts as noise: sources not found yet bias those found
+UNEXPLAINED = 0.2
+# Prior standard deviation of a step of cosines, and of delays: half a step of the grid
+REACH = (0.03, 0.006)
 LARGEST = 2  # of these deviations, that a step may have
 
 
 def repeat_per_coordinate(gain: Tensor) -> Tensor:
-    """Return gains (B, N) once for each coordinate of their sources, (B, 3 N): two cosines and a delay."""
+    """Return gains (B, N) once for each coordinate of their sources, (B, 3 N):
+    two cosines and a delay.
+    """
     return gain.repeat(1, 3)
 
 
 @dataclass(frozen=True)
 class Sources:
-    """N sources of each of B snapshots, with the posterior of all of them together (Laplace's approximation).
+    """N sources of each of B snapshots, with the posterior of all
+    of them together (Laplace's approximation).
 
     Attributes:
         direction: (B, N, 2) cosines in the array's plane.
@@ -66,18 +73,25 @@ class Sources:
         return (over_antennas * self.gain[..., None]).transpose(1, 2) @ over_tones
 
     def error_variance(self, aperture: Aperture) -> Tensor:
-        """Return the expected squared error per entry (B,) of `response`, to first order in the places."""
+        """Return the expected squared error per entry (B,) of `response`,
+        to first order in the places.
+        """
         count = self.gain.shape[1]
         gram = SourceColumns.from_sources(self.direction, self.delay, aperture).gram()
-        gain_variance = (gram[:, :count, :count] * self.gain_covariance.transpose(1, 2)).sum((1, 2)).real
-        # Derivatives by directions and delays: of the gains, and of the steering vectors times the gains.
+        gain_variance = (
+            (gram[:, :count, :count] * self.gain_covariance.transpose(1, 2)).sum((1, 2)).real
+        )
+        # Derivatives by directions and delays: of the gains,
+        # and of the steering vectors times the gains.
         gains = repeat_per_coordinate(self.gain)
         slopes = gram[:, count:, count:] * gains[:, None] * gains.conj()[..., None]
         mixed = self.gain_slopes.mH @ (gram[:, :count, count:] * gains[:, None])
         from_gains = self.gain_slopes.mH @ (gram[:, :count, :count] @ self.gain_slopes)
         from_positions = (slopes + from_gains).real + 2 * mixed.real
         from_positions = (from_positions * self.position_covariance).sum((1, 2))
-        return (gain_variance + from_positions).clamp_min(0) / (len(aperture.places) * len(aperture.tones))
+        return (gain_variance + from_positions).clamp_min(0) / (
+            len(aperture.places) * len(aperture.tones)
+        )
 
 
 @dataclass(frozen=True)
@@ -118,7 +132,9 @@ class SourceSearch:
         self._over_tones = tone_responses(self.delays[None], aperture)[0].conj().T.contiguous()
 
     def __call__(self, snapshot: Tensor, noise: Tensor) -> tuple[Sources, Tensor]:
-        """Sources of snapshots (B, A, K) complex64 of noise power (B,), and the residual (B, A, K)."""
+        """Sources of snapshots (B, A, K) complex64 of noise power (B,),
+        and the residual (B, A, K).
+        """
         s = self.settings
         heard = mean_power(snapshot)
         scale = heard.sqrt()
@@ -128,7 +144,10 @@ class SourceSearch:
         prior, residual = delay, y
         for turn in range(s.rounds):
             new_direction, new_delay = self._peak_directions_and_delays(residual)
-            direction, delay = torch.cat([direction, new_direction], 1), torch.cat([delay, new_delay], 1)
+            direction, delay = (
+                torch.cat([direction, new_direction], 1),
+                torch.cat([delay, new_delay], 1),
+            )
             # Unit power in equal shares of all sources that there will be.
             prior = torch.cat([prior, torch.full_like(new_delay, 1 / (s.rounds * s.picks))], 1)
             last = turn == s.rounds - 1
@@ -137,8 +156,11 @@ class SourceSearch:
                 fit = self._fit_gains(y, inflated_noise, direction, delay, prior)
                 turned, moved = self._step_directions_and_delays(fit, inflated_noise)
                 direction, delay = direction + turned, delay + moved
-                # Tipping's update: a gain that noise explains shrinks its own prior, and with it its source.
-                prior = (fit.gain.abs().square() + fit.variance(inflated_noise)).clamp_min(LEAST_SHARE)
+                # Tipping's update: a gain that noise explains shrinks its own prior,
+                # and with it its source.
+                prior = (fit.gain.abs().square() + fit.variance(inflated_noise)).clamp_min(
+                    LEAST_SHARE
+                )
             if not last:
                 residual = y - fit.columns.channels(fit.gain)
         # What was not found yet counted as noise above; the posterior is of the known noise.
@@ -148,13 +170,17 @@ class SourceSearch:
 
     def _peak_directions_and_delays(self, residual: Tensor) -> tuple[Tensor, Tensor]:
         """The strongest local maxima of the correlation with the grid's atoms."""
-        score = torch.view_as_real(self._over_antennas @ (residual @ self._over_tones)).square().sum(-1)
+        score = (
+            torch.view_as_real(self._over_antennas @ (residual @ self._over_tones)).square().sum(-1)
+        )
         cube = score.view(-1, *self.shape)
         peaks = torch.where(_dilate(cube) == cube, cube, 0).flatten(1)
         at = peaks.topk(self.settings.picks, 1).indices
         return self.cosines[at // len(self.delays)], self.delays[at % len(self.delays)]
 
-    def _fit_gains(self, y: Tensor, noise: Tensor, direction: Tensor, delay: Tensor, prior: Tensor) -> _Fit:
+    def _fit_gains(
+        self, y: Tensor, noise: Tensor, direction: Tensor, delay: Tensor, prior: Tensor
+    ) -> _Fit:
         """Best gains of given sources, and the gradient by their directions and delays."""
         n = delay.shape[1]
         columns = SourceColumns.from_sources(direction, delay, self.aperture)
@@ -171,7 +197,9 @@ class SourceSearch:
         return _Fit(columns, gain, inverse, slope, curvature, gain_slopes)
 
     def _step_directions_and_delays(self, fit: _Fit, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """A Gauss-Newton step of directions (B, N, 2) and delays (B, N) on the residual of the best gains."""
+        """A Gauss-Newton step of directions (B, N, 2) and delays (B, N)
+        on the residual of the best gains.
+        """
         n = fit.gain.shape[1]
         reach = self._step_deviations(n)
         factor = Factor.from_gram(self._scaled_curvature(fit, noise), "ignore")
@@ -189,14 +217,20 @@ class SourceSearch:
     def _to_sources(
         self, fit: _Fit, noise: Tensor, direction: Tensor, delay: Tensor, scale: Tensor
     ) -> Sources:
-        """The sources and their posterior, in the snapshot's units; half the noise is in the real part."""
+        """The sources and their posterior, in the snapshot's units;
+        half the noise is in the real part.
+        """
         reach = self._step_deviations(fit.gain.shape[1])
         gains = repeat_per_coordinate(fit.gain * scale[:, None])
         spread = torch.linalg.inv(self._scaled_curvature(fit, noise)) * (reach[:, None] * reach)
         return Sources(
-            direction, delay, fit.gain * scale[:, None], fit.inverse * (noise * scale**2)[:, None, None],
-            spread * (noise / 2)[:, None, None], -(fit.gain_slopes.mH * gains[:, None]),
-        )  # fmt: skip
+            direction,
+            delay,
+            fit.gain * scale[:, None],
+            fit.inverse * (noise * scale**2)[:, None, None],
+            spread * (noise / 2)[:, None, None],
+            -(fit.gain_slopes.mH * gains[:, None]),
+        )
 
     def _step_deviations(self, count: int) -> Tensor:
         """Standard deviations (3 N,) of a step before anything is known."""
@@ -205,7 +239,8 @@ class SourceSearch:
 
 @dataclass(frozen=True)
 class _Fit:
-    """Gains of given sources, and the projected problem of their places (columns of unit gains, scaled).
+    """Gains of given sources, and the projected problem of their places (columns
+    of unit gains, scaled).
 
     Attributes:
         columns: atoms and slopes.
@@ -213,7 +248,8 @@ class _Fit:
         inverse: (B, N, N) of the regularised Gram matrix of the atoms.
         slope: (B, 3 N) downhill.
         curvature: (B, 3 N, 3 N).
-        gain_slopes: (B, 3 N, N) what the slopes of unit gains have in common with the gains' inverse.
+        gain_slopes: (B, 3 N, N) what the slopes of unit gains have in common with the gains'
+            inverse.
     """
 
     columns: SourceColumns
@@ -241,8 +277,12 @@ def _dilate(cube: Tensor) -> Tensor:
     return cube
 
 
-def _make_grid(aperture: Aperture, s: SearchSettings) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
-    """Cosines (G, 2), delays (T,), and the shape of both together; one cosine where the array is a line."""
+def _make_grid(
+    aperture: Aperture, s: SearchSettings
+) -> tuple[Tensor, Tensor, tuple[int, int, int]]:
+    """Cosines (G, 2), delays (T,), and the shape of both together;
+    one cosine where the array is a line.
+    """
     axes = []
     for axis in range(2):
         extent = float(aperture.places[:, axis].max() - aperture.places[:, axis].min())

@@ -94,7 +94,9 @@ def make_sections(
 
 
 def warnings(rows: pd.DataFrame) -> list[str]:
-    """Return what a reader must know first, each once: the loads of a busy machine are one range."""
+    """Return what a reader must know first, each once:
+    the loads of a busy machine are one range.
+    """
     # Loads differ from run to run: as remarks of their own there would be one a run.
     fits = own_rows(rows)
     without_load = ({**run.facts, "machine/load": None} for run in fits.run)
@@ -102,7 +104,9 @@ def warnings(rows: pd.DataFrame) -> list[str]:
     scored = fits[fits.value.notna()]
     score = scored.apply(score_db, axis=1).astype(float) if len(scored) else scored.value
     if tables.has_draws(scored):  # the best setting's mean over draws, not its best draw
-        best = str(average(scored.assign(score=score), ["setting"], ["score"])["mean"].score.idxmax())
+        best = str(
+            average(scored.assign(score=score), ["setting"], ["score"])["mean"].score.idxmax()
+        )
         facts = scored.run[scored.setting == best].iloc[0].facts
         for ahead, figure in judged_by(facts).items():
             every = tables.leads_of_baselines(rows[rows.run.isin(scored.run)], best, figure)
@@ -136,12 +140,19 @@ def render_html(title: str, note: str, sections: Sequence[Section]) -> str:
 
 
 def write_report(
-    folder: Path, title: str, rows: pd.DataFrame, fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = (),
+    folder: Path,
+    title: str,
+    rows: pd.DataFrame,
+    fronts: Sequence[tuple[str, dict[str, np.ndarray]]] = (),
     figures: Sequence[str] = (),
-) -> list[Section]:  # fmt: skip
-    """Write `report.html`, `report.md`, a CSV file per table, and plots in the formats `figures`."""
+) -> list[Section]:
+    """Write `report.html`, `report.md`, a CSV file per table,
+    and plots in the formats `figures`.
+    """
     sections, count = make_sections(rows, fronts), len(own_rows(rows))
-    note = f"{count} run{'s' * (count > 1)}; made by {summary.program_version(summary.provenance())}"
+    note = (
+        f"{count} run{'s' * (count > 1)}; made by {summary.program_version(summary.provenance())}"
+    )
     (folder / "report.html").write_text(render_html(title, note, sections), encoding="utf-8")
     parts = [f"# {title}\n\n{note}\n"]
     for study in sections:

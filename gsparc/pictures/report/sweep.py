@@ -34,14 +34,19 @@ class SweepReport(Callback):
     """A Hydra callback: does nothing in a single run.
 
     Args:
-        retime: time the models of the sweep when all jobs are done, in turns, with nothing beside them.
+        retime: time the models of the sweep when all jobs are done, in turns, with nothing beside
+            them.
         rounds: visits to each model by the clock.
         rounds_s: no new round after this [s].
         pictures: drawn beside `sweep.png`, names of `confidence_pictures.PICTURES`.
     """
 
     def __init__(
-        self, retime: bool = True, rounds: int = 40, rounds_s: float = 60.0, pictures: Sequence[str] = ()
+        self,
+        retime: bool = True,
+        rounds: int = 40,
+        rounds_s: float = 60.0,
+        pictures: Sequence[str] = (),
     ) -> None:
         self.retime, self.rounds, self.rounds_s, self.pictures = retime, rounds, rounds_s, pictures
 
@@ -52,12 +57,16 @@ class SweepReport(Callback):
         error = job_return._return_value
         message = error_in_one_line(error) if isinstance(error, BaseException) else str(error)
         folder = Path(config.hydra.runtime.output_dir)
-        # The mark that `on_multirun_end` counts failures by: other processes' jobs are seen as files alone.
+        # The mark that `on_multirun_end` counts failures by:
+        # other processes' jobs are seen as files alone.
         (folder / FAILURE).write_text(message + "\n", encoding="utf-8")
         overrides = " ".join(config.hydra.overrides.task)
         # The console shows the sentence, the job's own log the traceback, too.
-        log.error("job %s (%s) failed, others go on: %s", folder.name, overrides, message, exc_info=error)
-        # Hydra raises the first failed job's error and ends the sweep: it is told that the job ended well.
+        log.error(
+            "job %s (%s) failed, others go on: %s", folder.name, overrides, message, exc_info=error
+        )
+        # Hydra raises the first failed job's error and ends the sweep:
+        # it is told that the job ended well.
         job_return.status = JobStatus.COMPLETED
         job_return.return_value = None
 
@@ -96,7 +105,9 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
         table = table_of_seeds(group)
         (folder / f"{stem}.csv").write_text(table.csv(), encoding="utf-8")
         plots.draw_sweep(group, f"{title}: {section.title}", folder / f"{stem}.png")
-        draw_confidences(settings.pictures, group, section.title, folder, stem.removeprefix("sweep"))
+        draw_confidences(
+            settings.pictures, group, section.title, folder, stem.removeprefix("sweep")
+        )
         console.print(*(one.without(*WIDE) for one in (table, table_of_leads(group)) if one.rows))
         seeds = {run.config.get("split.seed") for run in fits.run}
         if fits.split.iloc[0] == "random" and len(seeds) > 1 == fits.draw.nunique():
@@ -109,9 +120,13 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
 
 
 def equal_settings(own: pd.DataFrame) -> list[str]:
-    """Return settings of rows with their `run` that have equal figures, one line for those that agree."""
+    """Return settings of rows with their `run` that have equal figures,
+    one line for those that agree.
+    """
     alike: dict[str, list[str]] = defaultdict(list)
     for setting, runs in own.groupby("setting", sort=False).run:
-        figures = (sorted(one for one in run.facts.items() if one[0].startswith(SCORED)) for run in runs)
+        figures = (
+            sorted(one for one in run.facts.items() if one[0].startswith(SCORED)) for run in runs
+        )
         alike[repr(sorted(map(repr, figures)))].append(str(setting))
     return [list_first(names) for names in alike.values() if len(names) > 1]

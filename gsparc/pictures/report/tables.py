@@ -8,7 +8,13 @@ from functools import partial
 import numpy as np
 import pandas as pd
 
-from gsparc.evaluation.metric_formats import CALIBRATION, OF_KIND, heading_of, number_format, sample_column
+from gsparc.evaluation.metric_formats import (
+    CALIBRATION,
+    OF_KIND,
+    heading_of,
+    number_format,
+    sample_column,
+)
 from gsparc.evaluation.paired import Lead, lead_over_runs
 from gsparc.evaluation.results import average, distinct_baselines, own_rows
 from gsparc.evaluation.table import P50, P95, TRAIN, Column, Interval, Row, Table, figure_column
@@ -20,22 +26,27 @@ LEVEL = 0.95
 WORST = 3
 # Two latencies of one model: caches hold what was asked before it, of baselines or of other models.
 TIMED = (
-    "Queries: baselines are timed in turns within a run, the models of a sweep again after it, in turns with "
+    "Queries: baselines are timed in turns within a run, the models of a sweep again after it, "
+    "in turns with "
     "one another: a run's own table has other milliseconds."
 )
 SETTING = Column("method and setting", "", of="setting")
 SEED = Column("seed", "d", of="seed")
 # By its seed, as the command line has it; by its hash where the settings are gone.
-DRAW = Column("draw", "", "split.seed", lambda row: str(row["run"].config.get("split.seed", row["draw"])))
+DRAW = Column(
+    "draw", "", "split.seed", lambda row: str(row["run"].config.get("split.seed", row["draw"]))
+)
 SIZE = Column("Gaussians", "d", of="gaussians")
 
 
 def bootstrap_interval(
     values: np.ndarray, weights: np.ndarray | None = None, seed: int = 0
 ) -> tuple[float, float]:
-    """Return ends of the 95 % interval of a mean (n,), or of sum(values) / sum(weights), resampling samples.
+    """Return ends of the 95 % interval of a mean (n,), or of sum(values) / sum(weights),
+    resampling samples.
 
-    Samples are taken as independent; neighbours under `split=grouped` are not, so it is a lower bound.
+    Samples are taken as independent; neighbours under `split=grouped` are not,
+    so it is a lower bound.
     """
     # A fixed seed: the same run has the same interval in every report.
     draw = np.random.default_rng(seed).integers(0, len(values), (DRAWS, len(values)))
@@ -54,7 +65,9 @@ def interval_of_figure(row: Row, figure: str) -> Interval | None:
     return Interval(value) if parts is None else Interval(value, *bootstrap_interval(*parts))
 
 
-def _parts(own: Mapping[str, np.ndarray], figure: str) -> tuple[np.ndarray, np.ndarray | None] | None:
+def _parts(
+    own: Mapping[str, np.ndarray], figure: str
+) -> tuple[np.ndarray, np.ndarray | None] | None:
     """Per-sample numbers whose (weighted) mean is the figure."""
     # The ratio of sums, not a mean of ratios, which one silent row would decide.
     if sample_column(figure) == "error_power" and "error_power" in own and "target_power" in own:
@@ -74,7 +87,9 @@ def _interval(average: pd.Series) -> Interval | None:
     if not np.isnan(average["error"]):
         return Interval(average["mean"], error=average["error"])
     # A single seed has no spread: no brackets.
-    return Interval(average["mean"], *([] if np.isnan(average["std"]) else average[["least", "largest"]]))
+    return Interval(
+        average["mean"], *([] if np.isnan(average["std"]) else average[["least", "largest"]])
+    )
 
 
 def has_draws(rows: pd.DataFrame) -> bool:
@@ -88,7 +103,8 @@ def leads_of_baselines(rows: pd.DataFrame, setting: str, figure: str) -> dict[st
     beside = rows[rows.baseline & rows.run.isin(own.run)]
     others = {str(name): theirs for name, theirs in beside.groupby("method", sort=False)}
     return {
-        name: lead_over_runs(_judged(theirs, figure), _judged(own, figure)) for name, theirs in others.items()
+        name: lead_over_runs(_judged(theirs, figure), _judged(own, figure))
+        for name, theirs in others.items()
     }
 
 
@@ -98,7 +114,8 @@ def _judged(rows: pd.DataFrame, figure: str) -> list[Row]:
 
 
 def _figures(rows: pd.DataFrame) -> list[str]:
-    """Figures of these data, first the one that decides: with silent rows it is none of the usual ones.
+    """Figures of these data, first the one that decides:
+    with silent rows it is none of the usual ones.
 
     Medians that no run has, as of older ones, are left out.
     """
@@ -117,22 +134,27 @@ def _run_columns(rows: pd.DataFrame) -> list[Column]:
 
 
 def table_of_results(rows: pd.DataFrame) -> Table:
-    """Return every run and every baseline of one study: accuracy, what it cost, memory, size, effects,
-    origin.
+    """Return every run and every baseline of one study: accuracy, what it cost, memory, size,
+    effects, origin.
     """
     note = "95 % interval: bootstrap over test samples"
     columns = [
         *_run_columns(rows),
         *(figure_column(f, note, partial(interval_of_figure, figure=f)) for f in _figures(rows)),
         figure_column(CALIBRATION, "1: deviations are right"),
-        TRAIN, P50, P95, Column("batch of 64, ms each", ".3g", of="batch_ms"),
+        TRAIN,
+        P50,
+        P95,
+        Column("batch of 64, ms each", ".3g", of="batch_ms"),
         Column("points measured", "d", of="measured"),
         Column("s simulated", ".3g", "of the ray tracer that made the data", "simulate_s"),
-        Column("memory MB", ".0f", of="memory_mb"), SIZE, Column("effects", "", of="effects"),
+        Column("memory MB", ".0f", of="memory_mb"),
+        SIZE,
+        Column("effects", "", of="effects"),
         Column("load", ".2f", "1-minute load per core while measured", "load"),
         Column("data", "", of=lambda row: str(row["data"])[:8]),
         Column("commit", "", of=lambda row: str(row["git"])[:8]),
-    ]  # fmt: skip
+    ]
     note = f"Brackets: 95 % intervals over test samples (independent samples assumed). {TIMED}"
     records = pd.concat([own_rows(rows), distinct_baselines(rows)]).to_dict("records")
     return Table.from_rows("Results", columns, records, note=note)  # type: ignore[arg-type]
@@ -156,7 +178,10 @@ def table_of_seeds(rows: pd.DataFrame) -> Table:
     note += "(split.redraw=true where the data name their test rows). "
     if several:
         note = "± standard error of the mean over draws of the split (split.seed). "
-    columns, title = [SETTING, *also, *counted, *spread], f"Settings over {'draws' if several else 'seeds'}"
+    columns, title = (
+        [SETTING, *also, *counted, *spread],
+        (f"Settings over {'draws' if several else 'seeds'}"),
+    )
     return Table(title, columns, lines, note + TIMED, ends={"low": "least", "high": "largest"})
 
 
@@ -174,9 +199,18 @@ def table_of_leads(rows: pd.DataFrame) -> Table:
                 gain = Interval(-lead.ahead_db, error=lead.error_db)
                 lines.append([setting, against, gain, lead.pairs, verdict])
     ahead = Column("ahead of it, dB", ".2f")
-    columns = [SETTING, Column("against", ""), ahead, Column("pairs", ""), Column("significant", "")]
+    columns = [
+        SETTING,
+        Column("against", ""),
+        ahead,
+        Column("pairs", ""),
+        Column("significant", ""),
+    ]
     figure = heading_of(fits.figure.iloc[0])
-    note = f"Of {figure}, on the same draws, seeds or rows; ± standard error; significant: 95 %, Student's t."
+    note = (
+        f"Of {figure}, on the same draws, seeds or rows; ± standard error; significant: 95 %, "
+        "Student's t."
+    )
     if fits.seed.nunique(dropna=False) == 1 and any("test rows" in str(line[3]) for line in lines):
         note += " Of one seed: what seeds change is not in the error (seed=0,1,2)."
     return Table("Paired differences", columns, lines, note)
@@ -192,7 +226,9 @@ def _spread_columns(rows: pd.DataFrame) -> list[Column]:
 
 
 def differing_settings(rows: pd.DataFrame) -> dict[str, str]:
-    """Return, by setting, resolved values in which runs differ besides what was swept: `init=sphere, ...`."""
+    """Return, by setting, resolved values in which runs differ besides what was swept:
+    `init=sphere, ...`.
+    """
     firsts = own_rows(rows).groupby("setting", sort=False).run.first()
     every = {setting: run.resolved for setting, run in firsts.items()}
     # Names of all runs: a setting may be in one alone.

@@ -1,1 +1,3 @@
-"""Variants of a model and methods under the same data, splits and clock: stored cells, tables, figures."""
+"""Variants of a model and methods under the same data, splits and clock: stored cells, tables,
+figures.
+"""

@@ -115,7 +115,8 @@ class Problem:
 
 
 def read_entries(group: str, of: type[Entry], config: Mapping[str, Any]) -> dict[str, Entry]:
-    """Return named settings of conf/compare.yaml, `methods` or `splits`; one that is null is left out.
+    """Return named settings of conf/compare.yaml, `methods` or `splits`;
+    one that is null is left out.
 
     Raises:
         ValueError: an entry with an unknown setting.
@@ -124,12 +125,16 @@ def read_entries(group: str, of: type[Entry], config: Mapping[str, Any]) -> dict
     for name, entry in config.items():
         if entry is None:
             continue
-        values = {k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry).items()}
+        values = {
+            k: tuple(v) if isinstance(v, (list, tuple)) else v for k, v in dict(entry).items()
+        }
         entries[str(name)] = from_settings(of, {"name": str(name), **values}, f"{group}.{name}")
     return entries
 
 
-def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[SplitChoice]) -> list[Problem]:
+def load_problems(
+    name: str, settings: Mapping[str, Any], splits: Sequence[SplitChoice]
+) -> list[Problem]:
     """Load what `conf/dataset` names, with the given settings, once for all draws of all splits."""
     read: tuple[Measurements, str] | None = None
     problems = []
@@ -144,12 +149,17 @@ def load_problems(name: str, settings: Mapping[str, Any], splits: Sequence[Split
             folds = split_for(to_dict(config.split), read[0])
             problems.append(Problem(name, split.name, chosen, read[0], folds, read[1], draw))
         if folds.of_release and split.draws > 1:
-            log.warning("%s, split %s: draws move validation rows alone: %s", name, split.name, REDRAW)
+            log.warning(
+                "%s, split %s: draws move validation rows alone: %s", name, split.name, REDRAW
+            )
     return problems
 
 
 def compose(
-    settings: Mapping[str, Any], overrides: Sequence[str], draw: int | None = None, seed: int | None = None
+    settings: Mapping[str, Any],
+    overrides: Sequence[str],
+    draw: int | None = None,
+    seed: int | None = None,
 ) -> DictConfig:
     """Return the configuration `train.py` would see.
 
@@ -192,7 +202,8 @@ def load_every_problem(settings: Mapping[str, Any]) -> list[Problem]:
     for name, entry in ((name, entry or {}) for name, entry in settings["datasets"].items()):
         locations = [path for key, path in entry.items() if key in ("root", "file")]
         paths = [path or fetched_path_or_none(entry.get("dataset", name)) for path in locations]
-        if paths and not any(paths):  # a plugin's dataset may need none, whatever else is said of it
+        # A plugin's dataset may need none, whatever else is said of it
+        if paths and not any(paths):
             absent.append(name)
             continue
         choices = [
@@ -209,7 +220,9 @@ def load_every_problem(settings: Mapping[str, Any]) -> list[Problem]:
     # Sort is stable: datasets keep the order in which they are named.
     problems.sort(key=lambda problem: (problem.draw or 0, order.index(problem.split)))
     if not problems and len(absent) == len(settings["datasets"]):
-        raise ValueError("no dataset has a path; say datasets.rfid.root=DIR or datasets.newrf.file=FILE")
+        raise ValueError(
+            "no dataset has a path; say datasets.rfid.root=DIR or datasets.newrf.file=FILE"
+        )
     if not problems:
         raise ValueError(f"only={settings['only']}: matches no dataset and split that are there")
     return problems
@@ -259,14 +272,19 @@ class Cell:
 
     def __str__(self) -> str:
         effort = ANY if self.effort is None else f"{self.effort:g}"
-        return f"{self.dataset}/{self.split}/{self.method}/{effort}/{ANY if self.seed is None else self.seed}"
+        seed = ANY if self.seed is None else self.seed
+        return f"{self.dataset}/{self.split}/{self.method}/{effort}/{seed}"
 
 
 def plan_cells(
-    problems: Sequence[Problem], methods: Mapping[str, Contender], efforts: Sequence[float],
-    seeds: Sequence[int], only: Sequence[str] = (),
-) -> list[tuple[Problem, Cell]]:  # fmt: skip
-    """List all cells, the most useful first: every problem's table before further efforts and seeds.
+    problems: Sequence[Problem],
+    methods: Mapping[str, Contender],
+    efforts: Sequence[float],
+    seeds: Sequence[int],
+    only: Sequence[str] = (),
+) -> list[tuple[Problem, Cell]]:
+    """List all cells, the most useful first:
+    every problem's table before further efforts and seeds.
 
     Args:
         problems: the most wanted first; one of several draws of a split gives a method its seed.
@@ -308,7 +326,9 @@ def plan_cells(
                 f"only: {pattern!r} matches no cell; they are dataset/split/method/effort/seed, "
                 f"like {names[0] if names else 'rfid/random/gp/any/any'}"
             )
-    return [one for one in cells if not only or any(fnmatchcase(str(one[1]), part) for part in only)]
+    return [
+        one for one in cells if not only or any(fnmatchcase(str(one[1]), part) for part in only)
+    ]
 
 
 def plan_jobs(settings: Mapping[str, Any], cells_dir: Path) -> list[Job]:
@@ -319,21 +339,35 @@ def plan_jobs(settings: Mapping[str, Any], cells_dir: Path) -> list[Job]:
     for effort in settings["efforts"]:
         POSITIVE.check("efforts", effort)
     problems = load_every_problem(settings)
-    cells = plan_cells(problems, methods, settings["efforts"], settings["seeds"], wanted_cells(settings))
+    cells = plan_cells(
+        problems, methods, settings["efforts"], settings["seeds"], wanted_cells(settings)
+    )
     datasets = {name: of or {} for name, of in settings["datasets"].items()}
     return [
-        job_of_cell(cell, methods[cell.method], datasets[cell.dataset], problem, cells_dir, settings["reuse"])
+        job_of_cell(
+            cell,
+            methods[cell.method],
+            datasets[cell.dataset],
+            problem,
+            cells_dir,
+            settings["reuse"],
+        )
         for problem, cell in cells
     ]
 
 
 def job_of_cell(
-    cell: Cell, contender: Contender, settings: Mapping[str, Any], problem: Problem, cells_dir: Path,
+    cell: Cell,
+    contender: Contender,
+    settings: Mapping[str, Any],
+    problem: Problem,
+    cells_dir: Path,
     reuse: bool = False,
-) -> Job:  # fmt: skip
+) -> Job:
     """Compose a cell's configuration and name its folder, `dataset/split/method/effort/seed`.
 
-    Of a split that is drawn several times, models of the first draw are kept: queries are timed with those.
+    Of a split that is drawn several times, models of the first draw are kept:
+    queries are timed with those.
     """
     overrides = [*problem.chosen, *contender.overrides(cell.effort)]
     config = compose(settings, overrides, problem.draw, cell.seed)
@@ -341,6 +375,13 @@ def job_of_cell(
     # Two seconds for loading and scoring a fold; time left and `limit_s` go by this.
     fit_s = 2.0 + (contender.train_s or usual_s) * (cell.effort or 1.0)
     return Job(
-        cell, config, cells_dir / str(cell), problem.data, problem.folds, problem.content,
-        expected_s=len(problem.folds.folds) * fit_s, keeps_models=not problem.draw, reuse=reuse,
-    )  # fmt: skip
+        cell,
+        config,
+        cells_dir / str(cell),
+        problem.data,
+        problem.folds,
+        problem.content,
+        expected_s=len(problem.folds.folds) * fit_s,
+        keeps_models=not problem.draw,
+        reuse=reuse,
+    )

@@ -33,9 +33,11 @@ class Contender:
         problems: patterns of dataset/split that it takes part in; empty for all.
         given: what it reads beside places, by such patterns; the last one that matches counts.
         train_s: seconds that its fit takes at effort 1, as far as they are known [s].
-        stations: takes part only where there are several stations, some rows of each being learned from.
+        stations: takes part only where there are several stations, some rows of each being learned
+            from.
         scene: takes part only where the measurements name the scene that they were made in.
-        networks: takes part where stations are sectors of a network, which have one model whatever is chosen.
+        networks: takes part where stations are sectors of a network, which have one model whatever
+            is chosen.
     """
 
     name: str
@@ -52,14 +54,18 @@ class Contender:
     def serves(self, problem: Problem) -> bool:
         """Return whether it can take part."""
         suits = not self.kinds or problem.kind in self.kinds
-        suits &= not self.problems or any(fnmatchcase(problem.name, pattern) for pattern in self.problems)
+        suits &= not self.problems or any(
+            fnmatchcase(problem.name, pattern) for pattern in self.problems
+        )
         # Booleans compare as 0 and 1: what a method needs, the problem must have.
         needs = problem.stations >= self.stations and problem.scene >= self.scene
         return suits and needs and self.networks >= problem.network
 
     def reads(self, problem: Problem) -> str:
         """Return what it is given beside places; "" for nothing."""
-        return ([what for where, what in self.given.items() if fnmatchcase(problem.name, where)] or [""])[-1]
+        return (
+            [what for where, what in self.given.items() if fnmatchcase(problem.name, where)] or [""]
+        )[-1]
 
     def overrides(self, effort: float | None) -> list[str]:
         """Return overrides of train.yaml, but for the seed."""
@@ -73,7 +79,9 @@ class Unlisted(Contender):
     def serves(self, problem: Problem) -> bool:
         """See `Contender.serves`."""
         kind, folds = method_class(self.name), problem.folds.folds
-        return super().serves(problem) and all(kind.stands_beside(problem.data, fold) for fold in folds)
+        return super().serves(problem) and all(
+            kind.stands_beside(problem.data, fold) for fold in folds
+        )
 
 
 def unlisted_contenders() -> dict[str, Contender]:
@@ -82,6 +90,12 @@ def unlisted_contenders() -> dict[str, Contender]:
     file = config_folder() / "compare.yaml"
     listed = load_yaml(file.read_text(encoding="utf-8"), file)["methods"]
     exclusions = {*listed, *({*built_in_methods()} - {*plain_methods()})}
-    classes = {name: import_target(path) for name, path in all_methods().items() if name not in exclusions}
+    classes = {
+        name: import_target(path) for name, path in all_methods().items() if name not in exclusions
+    }
     # One that cannot be imported is warned of.
-    return {name: Unlisted(name, effort=method.takes_effort) for name, method in classes.items() if method}
+    return {
+        name: Unlisted(name, effort=method.takes_effort)
+        for name, method in classes.items()
+        if method
+    }

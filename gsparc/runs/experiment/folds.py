@@ -30,14 +30,18 @@ log = logging.getLogger("gsparc.models")  # of which the console shows warnings 
 
 
 def effort_settings(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what of a context decides how much is searched, and on which rows; it makes no object."""
+    """Return what of a context decides how much is searched, and on which rows;
+    it makes no object.
+    """
     split = config.get("split")
     values = split if split is None or isinstance(split, dict) else to_dict(split)
     return {
         # `get`: configurations of other commands, and older ones, lack some of these keys.
-        "seed": int(config.get("seed", 0)), "effort": float(config.get("effort", 1.0)),
-        "stations": config.get("stations", "auto"), "split": values and split_settings(values),
-    }  # fmt: skip
+        "seed": int(config.get("seed", 0)),
+        "effort": float(config.get("effort", 1.0)),
+        "stations": config.get("stations", "auto"),
+        "split": values and split_settings(values),
+    }
 
 
 def build_callbacks(nodes: Mapping[str, Any] | None) -> list[Callback]:
@@ -52,7 +56,8 @@ class FoldFits:
     Attributes:
         methods: one per fold.
         train_s: seconds of each fit [s], without validation.
-        train_cpu_s: processor seconds of each fit, of all threads [s]: a busy machine does not inflate them.
+        train_cpu_s: processor seconds of each fit, of all threads [s]: a busy machine does not
+            inflate them.
         notes: what the first fold's fit said.
         cost: of all fits together.
     """
@@ -65,39 +70,57 @@ class FoldFits:
 
     def facts(self) -> dict[str, Any]:
         """Return what a summary says of the fits."""
-        notes = [note for note in self.notes if not isinstance(note, Caution)]  # those were warnings
-        facts = {"time/train_cpu_s": fmean(self.train_cpu_s), "model/learned": "\n".join(notes) or None}
-        facts["model/refused"] = "\n".join(note for note in self.notes if isinstance(note, Severe)) or None
+        # Those were warnings
+        notes = [note for note in self.notes if not isinstance(note, Caution)]
+        facts = {
+            "time/train_cpu_s": fmean(self.train_cpu_s),
+            "model/learned": "\n".join(notes) or None,
+        }
+        facts["model/refused"] = (
+            "\n".join(note for note in self.notes if isinstance(note, Severe)) or None
+        )
         if self.cost.stages:
             facts |= {"time/cost": self.cost.describe(), "time/unused_s": self.cost.unused_s}
         return facts
 
 
-def folds_to_resume(ckpt_path: str | None, factory: MethodFactory, split: Split) -> list[Path | None]:
-    """Return what each fold goes on from, a file or a folder; each of several has its own in the run's.
+def folds_to_resume(
+    ckpt_path: str | None, factory: MethodFactory, split: Split
+) -> list[Path | None]:
+    """Return what each fold goes on from, a file or a folder;
+    each of several has its own in the run's.
 
     Raises:
         ValueError: a file that belongs to no fold, or a method that trains in one piece.
     """
     path, folds = None if ckpt_path is None else Path(ckpt_path), len(split.folds)
-    if path is not None and not path.is_dir() and not factory.resumable:  # a folder has finished parts
-        raise ValueError(f"ckpt_path: {factory.name} trains in one piece; start again without ckpt_path")
+    # A folder has finished parts
+    if path is not None and not path.is_dir() and not factory.resumable:
+        raise ValueError(
+            f"ckpt_path: {factory.name} trains in one piece; start again without ckpt_path"
+        )
     if path is None or folds == 1:
         return [path] * folds
     run = fitting.run_folder(path, fitting.FOLDS)
     every = [run / f"fold{number}" for number in range(folds)]
     # A file that belongs to no fold says nothing of where the other folds stand.
     if path.is_file() and not {*every} & {*path.parents} and not list(run.glob("fold*")):
-        raise ValueError(f"ckpt_path={path}: split={split.name} has {folds} folds, give the run's folder")
+        raise ValueError(
+            f"ckpt_path={path}: split={split.name} has {folds} folds, give the run's folder"
+        )
     return [folder if folder.is_dir() else None for folder in every]
 
 
 def fold_contexts(
     whole: FitContext, split: Split, resumes: Sequence[Path | None] | None = None
 ) -> list[FitContext]:
-    """Return the contexts of its folds, each of several with a folder and series of figures of its own."""
+    """Return the contexts of its folds, each of several with a folder and series
+    of figures of its own.
+    """
     count = len(split.folds)
-    contexts = [whole.for_part(f"fold{number}") for number in range(count)] if count > 1 else [whole]
+    contexts = (
+        [whole.for_part(f"fold{number}") for number in range(count)] if count > 1 else [whole]
+    )
     every = zip(contexts, resumes or [None] * count, strict=True)
     return [replace(context, resume=resume) for context, resume in every]
 
@@ -108,24 +131,41 @@ def checkpoints(contexts: Sequence[FitContext]) -> tuple[Path, ...]:
 
 
 def keep_fold(
-    split: Split, contexts: Sequence[FitContext], run_id: str,
-    number: int, data: Measurements, fold: Fold, fitted: Method, report: FitReport,
-) -> None:  # fmt: skip
+    split: Split,
+    contexts: Sequence[FitContext],
+    run_id: str,
+    number: int,
+    data: Measurements,
+    fold: Fold,
+    fitted: Method,
+    report: FitReport,
+) -> None:
     """Write the checkpoint of a fold as soon as it is fitted, and say what its fit notes."""
     context = contexts[number]
     for note in report.notes:
         log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
     extra = fitting.run_extra(report, data, fold, context)
     extra |= Hearing.from_learned(data, fold.learned()).to_extra()
-    extra |= {"fold": number, "split_sha256": split.sha256, "run_id": run_id, "tested": len(fold.test)}
-    extra["read_notes"] = [] if context.datamodule is None else [*map(str, context.datamodule.notes)]
+    extra |= {
+        "fold": number,
+        "split_sha256": split.sha256,
+        "run_id": run_id,
+        "tested": len(fold.test),
+    }
+    extra["read_notes"] = (
+        [] if context.datamodule is None else [*map(str, context.datamodule.notes)]
+    )
     checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)
 
 
 def end_curves(
-    contexts: Sequence[FitContext], seconds: Sequence[float], columns: Mapping[str, Any], eval_on: str
+    contexts: Sequence[FitContext],
+    seconds: Sequence[float],
+    columns: Mapping[str, Any],
+    eval_on: str,
 ) -> None:
-    """End the curve of every fold with its seconds and the error of what was fitted on the rows scored.
+    """End the curve of every fold with its seconds and the error of what was fitted
+    on the rows scored.
 
     `columns` are those of `per_sample.csv`.
     """
@@ -137,10 +177,14 @@ def end_curves(
 
 
 def fit_folds(
-    factory: MethodFactory, data: Measurements, split: Split, contexts: Sequence[FitContext], *,
+    factory: MethodFactory,
+    data: Measurements,
+    split: Split,
+    contexts: Sequence[FitContext],
+    *,
     learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None,
     keep: Callable[[int, Measurements, Fold, Method, FitReport], None] | None = None,
-) -> FoldFits:  # fmt: skip
+) -> FoldFits:
     """Fit an unfitted method on every fold.
 
     Args:
@@ -148,14 +192,16 @@ def fit_folds(
         data, split: learned from `train` and `val` of each fold.
         contexts: of each fold's fit.
         learned: what is learned from instead, such as displaced or fewer measurements.
-        keep: called after each fit with the fold's number, what it learned from, the method and its report.
+        keep: called after each fit with the fold's number, what it learned from, the method and its
+            report.
 
     Raises:
         ValueError: the method does not serve these data.
         RuntimeError: training diverged.
     """
     # Pickled for other processes, they would write into this run's files from several at once.
-    if uses_other_processes() and len(split.folds) > 1:  # loggers and loaders of a run are of its process
+    # Loggers and loaders of a run are of its process
+    if uses_other_processes() and len(split.folds) > 1:
         contexts = [replace(context, loggers=(), datamodule=None) for context in contexts]
 
     def of_fold(number: int) -> tuple[Measurements, Fold]:
@@ -165,7 +211,9 @@ def fit_folds(
     def fitted(number: int) -> tuple[Method, FitReport]:
         there, rows = of_fold(number)
         # Stations are counted in the data that are learned from, which `learned` may have changed.
-        return fitting.fit_or_resume(wrap_per_station(factory, there), there, rows, contexts[number])
+        return fitting.fit_or_resume(
+            wrap_per_station(factory, there), there, rows, contexts[number]
+        )
 
     by_fold: dict[int, tuple[Method, FitReport]] = {}
     try:
@@ -177,11 +225,17 @@ def fit_folds(
     except KeyboardInterrupt as stopped:
         if len(contexts) == 1:
             raise
-        cause, run_dir = str(stopped).partition("; ")[0] or "interrupted", contexts[0].run_dir.parent
+        cause, run_dir = (
+            str(stopped).partition("; ")[0] or "interrupted",
+            contexts[0].run_dir.parent,
+        )
         raise KeyboardInterrupt(f"{cause}; go on with ckpt_path={run_dir}") from None
     methods, reports = zip(*(by_fold[number] for number in sorted(by_fold)), strict=True)
     return FoldFits(
         # Notes of the first fold stand for all: the others differ in numbers.
-        methods, tuple(one.seconds for one in reports), tuple(one.cpu_s for one in reports),
-        reports[0].notes, sum((one.cost for one in reports), NO_COST),
-    )  # fmt: skip
+        methods,
+        tuple(one.seconds for one in reports),
+        tuple(one.cpu_s for one in reports),
+        reports[0].notes,
+        sum((one.cost for one in reports), NO_COST),
+    )

@@ -16,9 +16,21 @@ from gsparc.models.method import Method
 log = logging.getLogger(__name__)
 
 # Groups that methods name in `settings_read`; all others concern the run, and are always followed.
-JUDGED = ("model", "init", "trainer", "callbacks", "dataset.batch_size", "effort", "stations", "split")
-NAMES = ("model._target_", "model.name", "model.guesses", "split.name")  # say nothing of what is done
-ALONE = "a plain process has all the weight, Gaussians (%s) none: model=splat is the field alone, and "
+JUDGED = (
+    "model",
+    "init",
+    "trainer",
+    "callbacks",
+    "dataset.batch_size",
+    "effort",
+    "stations",
+    "split",
+)
+# Say nothing of what is done
+NAMES = ("model._target_", "model.name", "model.guesses", "split.name")
+ALONE = (
+    "a plain process has all the weight, Gaussians (%s) none: model=splat is the field alone, and "
+)
 ALONE += "model.effects.residual=false leaves the process out"
 REDRAW = "the dataset names its test rows: say split.redraw=true"
 
@@ -49,11 +61,18 @@ def warn_of_unheeded(config: DictConfig, method: Method, data: Measurements) -> 
     followed |= {"effort"} if method.takes_effort else set()
     followed |= {"stations"} if data.site.several else set()
     # `random` alone takes the rows that a release names, and then no other setting of it.
-    released = data.release_split is not None and config.split.name == "random" and not config.split.redraw
+    released = (
+        data.release_split is not None and config.split.name == "random" and not config.split.redraw
+    )
     followed |= set() if released else {"split"}
     why: dict[str, list[str]] = defaultdict(list)
     for path, text in command_line_options().items():
-        if path != "model" and path not in NAMES and _lies_in(path, JUDGED) and not _lies_in(path, followed):
+        if (
+            path != "model"
+            and path not in NAMES
+            and _lies_in(path, JUDGED)
+            and not _lies_in(path, followed)
+        ):
             why[_instead(path, method)].append(text)
     words = "; ".join(f"{', '.join(options)} ({text})" for text, options in why.items())
     if why:

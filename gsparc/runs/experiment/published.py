@@ -13,7 +13,8 @@ WORDS = ["earlier", "label", "given", "cpu", "commit", "date", "tested"]
 
 
 def read_published(file: str | Path) -> pd.DataFrame:
-    """Return the rows of a `compare.csv` as `average_cells` returns them, without the runs they are of.
+    """Return the rows of a `compare.csv` as `average_cells` returns them,
+    without the runs they are of.
 
     Raises:
         ValueError: a file that is no such table; it is named.
@@ -36,9 +37,11 @@ def read_published(file: str | Path) -> pd.DataFrame:
 
 
 def beside_published(rows: pd.DataFrame, published: pd.DataFrame) -> pd.DataFrame:
-    """Return rows, and behind them the published ones of the same test rows that none of them is of.
+    """Return rows, and behind them the published ones of the same test rows
+    that none of them is of.
 
-    Both are as of `average_cells`; how far methods are behind the best is of the runs measured here.
+    Both are as of `average_cells`; how far methods are behind the best is
+    of the runs measured here.
     """
     key = [*GROUP, "tested"]
     row_keys = {tuple(one) for one in rows[key].fillna(-1.0).to_numpy()}

@@ -1,6 +1,7 @@
 """Lists of jobs, such as fits, done one after the other in one process, which reads data once.
 
-Each fit is kept as it ends; their models are timed at the end, asked in turns, with nothing beside them.
+Each fit is kept as it ends; their models are timed at the end, asked in turns,
+with nothing beside them.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ from gsparc.runs.open_runs import open_files
 log = logging.getLogger(__name__)
 
 REFUSED = "not possible"  # in the error of an effect that the data do not allow
-SLOW_MS = 200.0  # from here on a method would slow the rounds of the others: it has rounds of its own
+# From here on a method would slow the rounds of the others: it has rounds of its own
+SLOW_MS = 200.0
 ENDLESS_MS = 10_000.0  # from here on it is timed once
 # 60 rounds give a 95th percentile from three samples beyond it.
 FAST = ClockSettings(rounds=60, rounds_s=30.0)
@@ -60,7 +62,8 @@ class Job:
         folder: of the run.
         data, split: measurements and folds.
         content: hash of the measurements, see `measurements_hash`.
-        learned: what a fold learns from instead, such as displaced or fewer measurements; `name` says of it.
+        learned: what a fold learns from instead, such as displaced or fewer measurements; `name`
+            says of it.
         expected_s: seconds it may take, guessed [s].
         keeps_models: whether its models stay, to be asked later.
         reuse: whether a result of another program counts, too.
@@ -106,10 +109,16 @@ Made = TypeVar("Made")
 
 
 def run_list(
-    make: Callable[[Piece], Made], pieces: Sequence[Piece], what: str, *, name: Callable[[Piece], str] = str,
-    refused: list[str] | None = None, **how: Any,
-) -> Iterator[tuple[Piece, Made]]:  # fmt: skip
-    """Yield each piece with what is made of it, as they end; a piece that fails is logged and left out.
+    make: Callable[[Piece], Made],
+    pieces: Sequence[Piece],
+    what: str,
+    *,
+    name: Callable[[Piece], str] = str,
+    refused: list[str] | None = None,
+    **how: Any,
+) -> Iterator[tuple[Piece, Made]]:
+    """Yield each piece with what is made of it, as they end;
+    a piece that fails is logged and left out.
 
     Args:
         make: may raise whatever a plugin does.
@@ -122,9 +131,11 @@ def run_list(
             yield pieces[number], result
             continue
         log.log(
-            logging.INFO if REFUSED in why else logging.WARNING, "%s is left out: %s",
-            name(pieces[number]), why,
-        )  # fmt: skip
+            logging.INFO if REFUSED in why else logging.WARNING,
+            "%s is left out: %s",
+            name(pieces[number]),
+            why,
+        )
         if refused is not None:
             refused.append(why)
 
@@ -137,14 +148,18 @@ def _tried(make: Callable[[Piece], Made], piece: Piece) -> tuple[Any, str]:
         if is_out_of_space(error):  # the others would be made in vain
             raise
         unforeseen = not isinstance(error, ValueError | RuntimeError)  # says where it is
-        return None, error_in_one_line(error) + (f"\n{traceback.format_exc()}" if unforeseen else "")
+        return None, error_in_one_line(error) + (
+            f"\n{traceback.format_exc()}" if unforeseen else ""
+        )
 
 
 def _fit_once(fit: Fit, job: Job) -> None:
     run_once(job.folder, job.state, partial(fit, job), reuse=job.reuse)
 
 
-def run_jobs(jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float | None = None) -> pd.DataFrame:
+def run_jobs(
+    jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float | None = None
+) -> pd.DataFrame:
     """Do the jobs that are not done yet, log how long they take, and return the frame of all.
 
     A job that fails is logged and left out; the others go on.
@@ -156,13 +171,15 @@ def run_jobs(jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float |
         limit_s: no job is started that would end later [s].
 
     Returns:
-        Columns of `results.frame`, those of the jobs' names, `job`, and `earlier` (commit of another program
-        that it was measured with; "" for this one's).
+        Columns of `results.frame`, those of the jobs' names, `job`, and `earlier` (commit of
+        another program that it was measured with; "" for this one's).
 
     Raises:
         ValueError: none can be done; why the first cannot.
     """
-    found = {str(one.name): one.row() for one in jobs if read_finished(one.folder, one.state, one.reuse)}
+    found = {
+        str(one.name): one.row() for one in jobs if read_finished(one.folder, one.state, one.reuse)
+    }
     missing = [one for one in jobs if str(one.name) not in found]
     log.info("%d cells, %d already done", len(jobs), len(found))
     if train and missing:
@@ -182,7 +199,9 @@ def run_jobs(jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float |
     here, refused = missing if train else [], list[str]()
     how: dict[str, Any] = {"cost": lambda one: one.expected_s, "wanted": fits, "refused": refused}
     try:
-        for job, _ in run_list(partial(_fit_once, fit), here, "cells", name=lambda one: str(one.name), **how):
+        for job, _ in run_list(
+            partial(_fit_once, fit), here, "cells", name=lambda one: str(one.name), **how
+        ):
             found[str(job.name)] = row = job.row()
             value = format(row["value"], number_format(row["figure"]))
             log.info("%s: %s %s after %.1f s", job.name, row["figure"], value, row["train_s"])
@@ -215,25 +234,31 @@ def time_queries(
 
 
 def time_by_dataset(filled: pd.DataFrame) -> pd.DataFrame:
-    """Return columns `TIMED`, of the first split of each dataset that is there and keeps its models.
+    """Return columns `TIMED`, of the first split of each dataset that is there
+    and keeps its models.
 
     Of that alone: models of fewer measurements answer faster. `filled` is the frame of `run_jobs`.
     """
     rows = []
     for dataset, here in filled.groupby("dataset", sort=False):
-        fits = here[(here.split == here.split.iloc[0]) & here.run.map(lambda run: bool(run.checkpoints))]
+        fits = here[
+            (here.split == here.split.iloc[0]) & here.run.map(lambda run: bool(run.checkpoints))
+        ]
         # The first of a method's cells stands for all of its efforts and seeds.
         first = fits.drop_duplicates("method").set_index("method")
         if len(first):
             log.info("%s: timing single queries of every method in turns", dataset)
             files, job = first.run.map(lambda run: run.checkpoints[0]), first.job.iloc[0]
             found = time_queries(files.to_dict(), job.data, job.split)
-            rows += [{**first.loc[name, TIMED[:2]], "method": name, **one} for name, one in found.items()]
+            rows += [
+                {**first.loc[name, TIMED[:2]], "method": name, **one} for name, one in found.items()
+            ]
     return pd.DataFrame(rows, columns=TIMED)
 
 
 def time_again(rows: pd.DataFrame, *, rounds: int = 40, rounds_s: float = 60.0) -> pd.DataFrame:
-    """Return the frame with the times of single queries, which each run's `render_ms.csv` has from now on.
+    """Return the frame with the times of single queries,
+    which each run's `render_ms.csv` has from now on.
 
     A sweep runs jobs at the same time, which disturbs their times; call this after it.
 
@@ -257,7 +282,9 @@ def time_again(rows: pd.DataFrame, *, rounds: int = 40, rounds_s: float = 60.0) 
             continue
         calls[number] = call
         threads[number] = int(run.facts.get("machine/threads") or torch.get_num_threads())
-    times = timing.time_interleaved(calls, replace(timing.BLOCKS, rounds=rounds, rounds_s=rounds_s), threads)
+    times = timing.time_interleaved(
+        calls, replace(timing.BLOCKS, rounds=rounds, rounds_s=rounds_s), threads
+    )
     for number, ms in times.items():
         write_samples(runs[number].folder / "render_ms.csv", {"render_ms": ms})
     return frame_of_runs(read_run(run.folder) for run in runs)

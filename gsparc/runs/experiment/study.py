@@ -29,8 +29,8 @@ class Condition:
     """One state of the data.
 
     Attributes:
-        what: what was changed: `none`, places of a `query` or in training (`train`; `train_known`: by a known
-            error), `directions` of arrival, or how many measurements one may `keep`.
+        what: what was changed: `none`, places of a `query` or in training (`train`; `train_known`:
+            by a known error), `directions` of arrival, or how many measurements one may `keep`.
         amount: by how much: metres, degrees, or a share up to 1 and a number of rows above.
     """
 
@@ -46,7 +46,9 @@ class Condition:
         # A query's error changes nothing that is learned: one training serves all of them.
         return Condition() if self.what == "query" else self
 
-    def change_training(self, data: Measurements, fold: Fold, seed: int) -> tuple[Measurements, Fold]:
+    def change_training(
+        self, data: Measurements, fold: Fold, seed: int
+    ) -> tuple[Measurements, Fold]:
         """Return data and rows of a fold under this condition."""
         if self.what == "keep":
             return data, thin_fold(fold, self.amount, seed)
@@ -56,14 +58,26 @@ class Condition:
             return data, fold
         # Both ends of learning: validation rows are measured with the same instrument.
         moved = add_position_errors(data, fold.learned(), self.amount, seed)
-        position_std = np.full(len(data), self.amount) if self.what == "train_known" else moved.position_std
+        position_std = (
+            np.full(len(data), self.amount) if self.what == "train_known" else moved.position_std
+        )
         return replace(moved, position_std=position_std), fold
 
 
 ROW = (
-    "variant", "what", "amount", "effects", "rows", "figure", "value", "spread", "train_s", "train_cpu_s",
-    "query_ms", "query_p95_ms",
-)  # fmt: skip
+    "variant",
+    "what",
+    "amount",
+    "effects",
+    "rows",
+    "figure",
+    "value",
+    "spread",
+    "train_s",
+    "train_cpu_s",
+    "query_ms",
+    "query_p95_ms",
+)
 
 
 @dataclass(frozen=True)
@@ -84,13 +98,19 @@ class Round(Condition):
 
 
 def plan_rounds(
-    configs: Mapping[str, DictConfig], conditions: Sequence[Condition], rounds: int, data: Measurements,
-    split: Split, folder: Path,
-) -> list[Job]:  # fmt: skip
-    """List a study's fits: every variant under every condition that changes what is learned from, in rounds.
+    configs: Mapping[str, DictConfig],
+    conditions: Sequence[Condition],
+    rounds: int,
+    data: Measurements,
+    split: Split,
+    folder: Path,
+) -> list[Job]:
+    """List a study's fits: every variant under every condition that changes what is learned from,
+    in rounds.
 
     Args:
-        configs: of the variants by name, as composed from conf/train.yaml, with the seed of the first round.
+        configs: of the variants by name, as composed from conf/train.yaml, with the seed of the
+            first round.
         conditions: of the data.
         rounds: trainings of each, in turns; each has another seed, of the draws of errors as well.
         data, split: as they are before any condition.
@@ -104,15 +124,20 @@ def plan_rounds(
         change = partial(condition.change_training, seed=job_config.seed)
         name = Round(condition.what, condition.amount, variant, turn)
         unchanged = condition.what == "none"
-        jobs.append(Job(name, job_config, place, data, split, content, learned=None if unchanged else change))  # type: ignore[arg-type]
+        jobs.append(
+            Job(
+                name, job_config, place, data, split, content, learned=None if unchanged else change
+            )
+        )  # type: ignore[arg-type]
     return jobs
 
 
 def ask_moved(fits: pd.DataFrame, conditions: Sequence[Condition]) -> pd.DataFrame:
     """Return a row per variant, round and condition, of the frame of `run_jobs`.
 
-    Under a `query` condition what was learned from undisturbed rows is asked where these are said to be.
-    `rows` are what was learned from, mean over folds; `model` is the file of the first fold's.
+    Under a `query` condition what was learned from undisturbed rows is asked where these are said
+    to be. `rows` are what was learned from, mean over folds;
+    `model` is the file of the first fold's.
     """
     rows, (data, split) = [], (fits.job.iloc[0].data, fits.job.iloc[0].split)
     for condition, fit in product(conditions, fits.to_dict("records")):
@@ -125,12 +150,16 @@ def ask_moved(fits: pd.DataFrame, conditions: Sequence[Condition]) -> pd.DataFra
             tested = np.concatenate([fold.test for fold in split.folds])
             moved = add_position_errors(data, tested, condition.amount, fit["seed"])
             methods = [loading.load(file)[0] for file in fit["run"].checkpoints]
-            row["value"] = pool_figures(score_methods(methods, moved, split), moved, split)[fit["figure"]]
+            row["value"] = pool_figures(score_methods(methods, moved, split), moved, split)[
+                fit["figure"]
+            ]
         rows.append(row)
     return pd.DataFrame(rows)
 
 
-def average_rounds(fits: pd.DataFrame, conditions: Sequence[Condition], clock: ClockSettings) -> pd.DataFrame:
+def average_rounds(
+    fits: pd.DataFrame, conditions: Sequence[Condition], clock: ClockSettings
+) -> pd.DataFrame:
     """Put rounds together, and time the models of the last one in turns.
 
     Args:
@@ -140,10 +169,10 @@ def average_rounds(fits: pd.DataFrame, conditions: Sequence[Condition], clock: C
 
     Returns:
         A row per variant and condition, columns `ROW` (those of `study.csv`).
-        `effects` that the variant computes; measurements (`rows`) that it learned from, mean over folds.
-        `figure`, `value`: accuracy on the test rows, mean over rounds; `spread`: standard deviation.
-        `train_s`, `train_cpu_s`: training of one model by the clock and of the processor, median over
-        rounds [s].
+        `effects` that the variant computes; measurements (`rows`) that it learned from, mean over
+        folds. `figure`, `value`: accuracy on the test rows, mean over rounds; `spread`: standard
+        deviation. `train_s`, `train_cpu_s`: training of one model by the clock and of the
+        processor, median over rounds [s].
         `query_ms`, `query_p95_ms`: single queries, timed in turns with all other rows' [ms].
         NaN where there is no spread.
     """
@@ -153,12 +182,17 @@ def average_rounds(fits: pd.DataFrame, conditions: Sequence[Condition], clock: C
     last = {name: (name, "last") for name in ("effects", "rows", "figure", "model")}
     median = {name: (name, "median") for name in ("train_s", "train_cpu_s")}
     by = ["variant", "what", "amount"]
-    rows, averages = every.groupby(by, sort=False).agg(**last, **median), average(every, by, ["value"])
+    rows, averages = (
+        every.groupby(by, sort=False).agg(**last, **median),
+        average(every, by, ["value"]),
+    )
     rows = rows.assign(value=averages["mean"].value, spread=averages["std"].value).reset_index()
     order = [list(fits.variant.unique()).index(variant) for variant in rows.variant]
     rows = rows.iloc[np.argsort(order, kind="stable")].reset_index(drop=True)
     # Conditions that share a training share its model and its time: a file is timed once.
-    times = time_queries({str(file): file for file in rows.model.unique()}, job.data, job.split, clock)
+    times = time_queries(
+        {str(file): file for file in rows.model.unique()}, job.data, job.split, clock
+    )
     for name in ("query_ms", "query_p95_ms"):
         rows[name] = [times[str(file)][name] for file in rows.model]
     return rows.assign(effects=rows.effects.str.replace("+", ", "))[list(ROW)]
@@ -166,15 +200,17 @@ def average_rounds(fits: pd.DataFrame, conditions: Sequence[Condition], clock: C
 
 @dataclass(frozen=True)
 class DataChanges:
-    """What a study changes about the data, one thing at a time; nothing: the variants alone are compared.
+    """What a study changes about the data, one thing at a time; nothing:
+    the variants alone are compared.
 
     Attributes:
         title: of its table and figure.
         errors_m: standard deviations of each coordinate of places [m].
-        errors_deg: of directions of arrival about each of two axes, where receivers measured them [degrees].
+        errors_deg: of directions of arrival about each of two axes, where receivers measured them
+            [degrees].
         train_errors: whether training positions are disturbed, too; else those of queries alone.
-        keep: training sets, as shares of the rows up to 1 or as numbers of rows above; smaller ones are
-            subsets of larger ones. Validation rows are thinned with them, test rows stay.
+        keep: training sets, as shares of the rows up to 1 or as numbers of rows above; smaller ones
+            are subsets of larger ones. Validation rows are thinned with them, test rows stay.
     """
 
     title: str
@@ -185,18 +221,31 @@ class DataChanges:
 
     def __post_init__(self) -> None:
         if not all(float(keep) > 0 for keep in self.keep):
-            raise ValueError(f"keep={list(self.keep)}: shares up to 1 or numbers of rows are needed")
+            raise ValueError(
+                f"keep={list(self.keep)}: shares up to 1 or numbers of rows are needed"
+            )
 
     def conditions(self) -> list[Condition]:
-        """Return the data as they are, but where rows are thinned, then every change by every amount."""
+        """Return the data as they are, but where rows are thinned,
+        then every change by every amount.
+        """
         placed = ("query", *(("train", "train_known") if self.train_errors else ()))
-        amounts = {**dict.fromkeys(placed, self.errors_m), "directions": self.errors_deg, "keep": self.keep}
-        changed = [Condition(what, float(amount)) for what, every in amounts.items() for amount in every]
+        amounts = {
+            **dict.fromkeys(placed, self.errors_m),
+            "directions": self.errors_deg,
+            "keep": self.keep,
+        }
+        changed = [
+            Condition(what, float(amount)) for what, every in amounts.items() for amount in every
+        ]
         return changed if self.keep else [Condition(), *changed]
 
 
-def add_position_errors(data: Measurements, rows: np.ndarray, error_m: float, seed: int) -> Measurements:
-    """Add errors N(0, error_m^2) per coordinate to the recorded places of `rows`; measured values stay.
+def add_position_errors(
+    data: Measurements, rows: np.ndarray, error_m: float, seed: int
+) -> Measurements:
+    """Add errors N(0, error_m^2) per coordinate to the recorded places of `rows`;
+    measured values stay.
 
     Rows of one place, heard by several stations, have one error.
     """
@@ -222,7 +271,9 @@ def add_direction_errors(
         ValueError: no directions.
     """
     if data.directions is None:
-        raise ValueError(f"{data.site.name}: no directions of arrival to disturb; take kind.errors_deg=[]")
+        raise ValueError(
+            f"{data.site.name}: no directions of arrival to disturb; take kind.errors_deg=[]"
+        )
     rng, sigma = np.random.default_rng(seed), np.radians(error_deg)
     measured = []
     for true in data.directions:
@@ -238,7 +289,8 @@ def add_direction_errors(
 
 
 def thin_fold(fold: Fold, keep: float, seed: int) -> Fold:
-    """Return a fold with fewer rows to learn from; smaller ones are subsets of larger ones of the same seed.
+    """Return a fold with fewer rows to learn from;
+    smaller ones are subsets of larger ones of the same seed.
 
     Args:
         fold: its training and validation rows are thinned alike, its test rows stay.

@@ -37,20 +37,47 @@ from gsparc.models.registry import plain_methods
 from gsparc.runs.experiment.runner import TIMED
 
 BESIDE = {  # figures beside the score, by their columns
-    "coverage": "interval/coverage_90", "outage": "outage/brier", "after_constant": "rmse_db_after_constant",
-    "chi2": CALIBRATION, **{name: name for figures in OF_KIND.values() for name in figures.compared},
-}  # fmt: skip
+    "coverage": "interval/coverage_90",
+    "outage": "outage/brier",
+    "after_constant": "rmse_db_after_constant",
+    "chi2": CALIBRATION,
+    **{name: name for figures in OF_KIND.values() for name in figures.compared},
+}
 # Within .5 dB [dB of the score] speed may matter more: the fastest of these is named.
 CLOSE_DB = 0.5
 BESIDE_NOTE = "*: a row of beside=, with the seconds of the machine that measured it"
 GROUP = [*PROBLEM, "effort", "method"]
 CELL = [*GROUP[:2], "method", "effort", "seed", "figure", "value", "train_s", "train_cpu_s", "load"]
 ROW = [
-    *GROUP, "score_db", "spread_db", "seeds", "draws", "figure", "value", "value_error", "behind_db",
-    "behind_error_db", *BESIDE, "second_figure", "second_value", "train_s",
-    "train_cpu_s", "query_ms", "query_p95_ms", "to_copy", "load", "earlier", "label", "given", "gaussians",
-    "memory_mb", "cpu", "commit", "date", "tested",
-]  # fmt: skip
+    *GROUP,
+    "score_db",
+    "spread_db",
+    "seeds",
+    "draws",
+    "figure",
+    "value",
+    "value_error",
+    "behind_db",
+    "behind_error_db",
+    *BESIDE,
+    "second_figure",
+    "second_value",
+    "train_s",
+    "train_cpu_s",
+    "query_ms",
+    "query_p95_ms",
+    "to_copy",
+    "load",
+    "earlier",
+    "label",
+    "given",
+    "gaussians",
+    "memory_mb",
+    "cpu",
+    "commit",
+    "date",
+    "tested",
+]
 SPREADS = ["score_error_db", "score_std_db"]  # `spread_db` by what it is
 CSV = [name for one in ROW for name in (SPREADS if one == "spread_db" else [one])]
 
@@ -61,14 +88,18 @@ def _scored(own: Row) -> dict[str, Any]:
     second = figures.columns[0] if own["figure"] == WITH_SILENT else figures.second
     label = str(own["label"] or "")
     return {
-        "result": own, "score_db": score_db(own), "second_figure": second, "second_value": own.get(second),
+        "result": own,
+        "score_db": score_db(own),
+        "second_figure": second,
+        "second_value": own.get(second),
         **{name: own.get(figure) for name, figure in BESIDE.items()},
         "label": label[label.find(" (") :] if " (" in label else "",
         # "20261129T153822-2c93ceee", "014896424e456e89…": when, and by which program.
-        "date": str(own["run_id"] or "")[:8], "commit": str(own["git"] or "")[:8],
+        "date": str(own["run_id"] or "")[:8],
+        "commit": str(own["git"] or "")[:8],
         # Draws are hashes of numbers of rows: of other data they may be the same.
         "tested": f"{str(own['data'] or '')[:8]}/{own['draw']}",
-    }  # fmt: skip
+    }
 
 
 def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd.DataFrame:
@@ -79,28 +110,38 @@ def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd
         timed: of `time_by_dataset`; None: nothing was timed.
 
     Returns:
-        Columns `ROW` (see `columns_of_csv`), and `results`, a row of each seed or draw; NaN where something
-        is not known.
+        Columns `ROW` (see `columns_of_csv`), and `results`, a row of each seed or draw; NaN where
+        something is not known.
         `effort`: NaN for a method that counts nothing, which stands in the tables of all efforts.
         `score_db`: larger is better [dB]: PSNR, -10 log10 NMSE, or -RMSE; `spread_db`: its standard
         deviation over `seeds`, of `draws` of the split the standard error of the mean.
-        `figure`, `value`: the figure behind the score; `value_error`: its standard error over draws.
-        `behind_db`: how much the best over draws has more, and its standard error, see `lead_over_runs`.
-        `psnr_db_median` and the like: medians over test rows.
-        `coverage`: share of measured powers within the predicted 90 % interval; `outage`: Brier score of
-        predicted outages; `after_constant`: RMSE of powers after a constant of each station [dB]; `chi2`: of
-        `reduced_chi_squared`.
+        `figure`, `value`: the figure behind the score; `value_error`: its standard error over
+        draws. `behind_db`: how much the best over draws has more, and its standard error, see
+        `lead_over_runs`. `psnr_db_median` and the like: medians over test rows.
+        `coverage`: share of measured powers within the predicted 90 % interval; `outage`: Brier
+        score of predicted outages; `after_constant`: RMSE of powers after a constant of each
+        station [dB]; `chi2`: of `reduced_chi_squared`.
         `train_s`, `train_cpu_s`: seconds of training per model, on the clock and of the processor.
-        `query_ms`, `query_p95_ms`: one query; `to_copy`: in units of a 16 MiB copy of the same rounds.
-        `load`: 1-minute load per core at the end of the training.
+        `query_ms`, `query_p95_ms`: one query; `to_copy`: in units of a 16 MiB copy of the same
+        rounds. `load`: 1-minute load per core at the end of the training.
         `earlier`: commits of other programs that it was measured with.
         `label`: what most draws say behind the method's name, ` (Vecchia 30)`.
-        `given`: what it reads beside places; `gaussians`: of a model; `memory_mb`: while it was fitted [MB].
-        `cpu`, `commit`, `date`: of the latest fit; `tested`: hashes of data and test rows of all draws.
+        `given`: what it reads beside places; `gaussians`: of a model; `memory_mb`: while it was
+        fitted [MB]. `cpu`, `commit`, `date`: of the latest fit; `tested`: hashes of data and test
+        rows of all draws.
     """
     if filled.empty:
         return pd.DataFrame(columns=ROW).astype({"draws": bool})
-    means = ["score_db", "value", *BESIDE, "second_value", "train_s", "train_cpu_s", "load", "gaussians"]
+    means = [
+        "score_db",
+        "value",
+        *BESIDE,
+        "second_value",
+        "train_s",
+        "train_cpu_s",
+        "load",
+        "gaussians",
+    ]
     means += ["memory_mb"]
     records: list[Row] = filled.to_dict("records")  # type: ignore[assignment]
     cells = pd.DataFrame([{**row, **_scored(row)} for row in records])
@@ -133,7 +174,9 @@ def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd
 
 
 def _with_behind(rows: pd.DataFrame) -> pd.DataFrame:
-    """Add how much the problem's best of the methods with most draws has more [dB], and its error."""
+    """Add how much the problem's best of the methods with most draws has more [dB],
+    and its error.
+    """
     rows = rows.assign(behind_db=np.nan, behind_error_db=np.nan)
     for _, here in rows[rows.draws].groupby(PROBLEM):
         # A method that failed on hard draws has an easier mean: it is no best.
@@ -145,20 +188,26 @@ def _with_behind(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def columns_of_csv(rows: pd.DataFrame) -> dict[str, list[Any]]:
-    """Return the columns of `compare.csv`, with the signs of the tables and errors by what they are."""
+    """Return the columns of `compare.csv`, with the signs of the tables and errors
+    by what they are.
+    """
     several = rows.draws.astype(bool)
     columns = rows.assign(
         score_db=[shown(*one) for one in zip(rows.figure, rows.score_db, strict=True)],
-        score_error_db=rows.spread_db.where(several), score_std_db=rows.spread_db.where(~several),
-        draws=rows.seeds.where(several, 1), seeds=rows.seeds.where(~several, 1),
-    )  # fmt: skip
+        score_error_db=rows.spread_db.where(several),
+        score_std_db=rows.spread_db.where(~several),
+        draws=rows.seeds.where(several, 1),
+        seeds=rows.seeds.where(~several, 1),
+    )
     return columns[CSV].to_dict("list")
 
 
 def split_by_problem(rows: pd.DataFrame) -> list[pd.DataFrame]:
-    """Return a table per dataset, split and effort, best first; methods that count nothing stand in each.
+    """Return a table per dataset, split and effort, best first;
+    methods that count nothing stand in each.
 
-    Efforts are those of runs here; where all of these count nothing, published rows have the usual one.
+    Efforts are those of runs here; where all of these count nothing,
+    published rows have the usual one.
     """
     blocks = []
     for _, here in rows.groupby(PROBLEM, sort=False):
@@ -179,14 +228,25 @@ def title_of(block: pd.DataFrame) -> str:
 
 
 def remarks(block: pd.DataFrame, ours: str) -> list[str]:
-    """Return what the table shows about simple baselines and about our own default, favourable or not."""
+    """Return what the table shows about simple baselines and about our own default,
+    favourable or not.
+    """
     rows, plain = list(block.itertuples()), plain_methods()
     first = rows[0]
-    level = f"{score_heading(first.figure).partition(' (')[0]} {shown(first.figure, first.score_db):.2f}"
-    lines = [f"best: {first.method}, {level} after {first.train_cpu_s:.3g} processor seconds of training"]
+    level = (
+        f"{score_heading(first.figure).partition(' (')[0]} "
+        f"{shown(first.figure, first.score_db):.2f}"
+    )
+    lines = [
+        f"best: {first.method}, {level} after {first.train_cpu_s:.3g} processor seconds of training"
+    ]
     leads = {row.method: lead_over_runs(first.results, row.results) for row in rows[1:]}
     if len(rows) > 1 and (lead := leads[rows[1].method]):
-        before = "the same as" if lead.same else f"{lead.ahead_db:.2f} ± {lead.error_db:.2f} dB better than"
+        before = (
+            "the same as"
+            if lead.same
+            else (f"{lead.ahead_db:.2f} ± {lead.error_db:.2f} dB better than")
+        )
         lines[0] += f"; {before} {rows[1].method} (standard error over the same {lead.pairs})"
         lines[0] += "" if lead.same else f": {'' if lead.sure else 'not '}significant"
     cell = next((row for row in rows if row.method == ours), None)
@@ -194,7 +254,9 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
     figure = heading_of(first.figure)
     if cell is not None and cell is not first:
         gap = f"{ours} is {first.score_db - cell.score_db:.2f} dB behind {first.method}"
-        lines.append(gap if lead is None or lead.sure else lead.no_difference(first.method, ours, figure))
+        lines.append(
+            gap if lead is None or lead.sure else lead.no_difference(first.method, ours, figure)
+        )
     if first.method in plain and not block.method.isin(plain).all():
         wins = f"a simple baseline wins: take {first.method} for this data and split"
         if cell is None or lead is None or lead.sure:
@@ -204,7 +266,9 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
             continue
         ahead = lead_over_runs(row.results, cell.results)
         if ahead is None or ahead.sure:
-            lines.append(f"{row.method} (simple) also beats {ours}, by {row.score_db - cell.score_db:.2f} dB")
+            lines.append(
+                f"{row.method} (simple) also beats {ours}, by {row.score_db - cell.score_db:.2f} dB"
+            )
     close = block[(block.score_db >= first.score_db - CLOSE_DB) & block.query_ms.notna()]
     if len(close):
         quick = close.loc[close.query_ms.idxmin()]
@@ -224,16 +288,28 @@ def table_of(block: pd.DataFrame, ours: str) -> Table:
 
     `ours` is marked.
     """
-    figure, draws, value = block.figure.iloc[0], block.draws.any(), value_with_error("value", "value_error")
+    figure, draws, value = (
+        block.figure.iloc[0],
+        block.draws.any(),
+        value_with_error("value", "value_error"),
+    )
     columns = [
         (True, Column("method", "", of="named")),
         (True, Column(score_heading(figure), ".2f", of=_score)),
-        (draws, Column("behind the best, dB", ".2f", of=value_with_error("behind_db", "behind_error_db"))),
+        (
+            draws,
+            Column(
+                "behind the best, dB", ".2f", of=value_with_error("behind_db", "behind_error_db")
+            ),
+        ),
         (figure.startswith("nmse"), Column(figure, ".3g" if draws else ".4g", of=value)),
         (True, Column(block.second_figure.iloc[0], of="second_value")),
         *((block[n].notna().any(), figure_column(beside, of=n)) for n, beside in BESIDE.items()),
         (not draws and (block.seeds > 1).any(), Column("seeds, same split", "d", of="seeds")),
-        *((True, column) for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))),
+        *(
+            (True, column)
+            for column in (TRAIN, CPU, P50, P95, Column("x copy", ".2g", of="to_copy"))
+        ),
     ]
     published = _published(block)
     mark = np.where(published, "*", np.where(block.method == ours, " (ours)", ""))
@@ -251,7 +327,9 @@ def _published(block: pd.DataFrame) -> pd.Series:
 
 
 def shown(figure: str, score_db: float) -> float:
-    """Return a score as a reader knows it: of figures of which less is better, without its turned sign."""
+    """Return a score as a reader knows it: of figures of which less is better,
+    without its turned sign.
+    """
     return -score_db if lower_is_better(figure) else score_db
 
 
@@ -269,5 +347,9 @@ def markdown(blocks: Sequence[pd.DataFrame], ours: str) -> str:
 
 def methods_by_mean_behind(rows: pd.DataFrame) -> Iterable[str]:
     """Return methods, the least behind first: mean over the splits that each is possible on."""
-    behind = rows.assign(behind_db=rows.behind_db.fillna(0.0)).groupby("method", sort=False).behind_db.mean()
+    behind = (
+        rows.assign(behind_db=rows.behind_db.fillna(0.0))
+        .groupby("method", sort=False)
+        .behind_db.mean()
+    )
     return list(behind.sort_values(kind="stable").index)

@@ -27,32 +27,39 @@ from gsparc.runs.baselines import fit_baseline
 from gsparc.runs.experiment.runner import run_list
 
 POINT = (  # columns of the table of points
-    Column("not beaten", "", of="label"), Column("ms p50", ".3g", of="render_ms_p50"),
+    Column("not beaten", "", of="label"),
+    Column("ms p50", ".3g", of="render_ms_p50"),
     Column("ms p95", ".3g", of="render_ms_p95"),
-)  # fmt: skip
+)
 MADE = ["settings", "figure", "value", "score"]  # columns that are not in `tradeoff.csv`
 CLOSEST_DB = 100.0  # the precision of float32
 
 
 def measure_points(
-    candidates: Sequence[tuple[Settings, Method]], threads: Sequence[int], baselines: Sequence[str],
-    data: Measurements, split: Split, eval_on: str, clock: ClockSettings,
-) -> tuple[pd.DataFrame, pd.DataFrame]:  # fmt: skip
-    """Score and time ways of answering; the first is the full model, which the others are compared with.
+    candidates: Sequence[tuple[Settings, Method]],
+    threads: Sequence[int],
+    baselines: Sequence[str],
+    data: Measurements,
+    split: Split,
+    eval_on: str,
+    clock: ClockSettings,
+) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Score and time ways of answering; the first is the full model,
+    which the others are compared with.
 
     Args:
         candidates: what a method is reduced by, and the method that answers so.
         threads: CPU threads that each is timed with.
-        baselines: names of others beside them; those that do not serve the data, or whose deciding figure is
-            not defined, are left out, as are candidates that fail.
+        baselines: names of others beside them; those that do not serve the data, or whose deciding
+            figure is not defined, are left out, as are candidates that fail.
         data, split: as the model was trained with, its fold.
         eval_on: rows whose figures are shown.
         clock: how long to measure.
 
     Returns:
-        A row per candidate and number of threads, the fastest first, and one per other. Columns are the
-        those of `tradeoff.csv`, `settings`, and of the deciding figure its name `figure`, `value` and
-        `score`, larger is better. `front` marks those that no candidate beats,
+        A row per candidate and number of threads, the fastest first, and one per other. Columns are
+        the those of `tradeoff.csv`, `settings`, and of the deciding figure its name `figure`,
+        `value` and `score`, larger is better. `front` marks those that no candidate beats,
         `kept_with_model` those by their closeness to the full model, which takes no measurement.
 
     Raises:
@@ -73,7 +80,11 @@ def measure_points(
         results |= {"front": 0, "kept_with_model": 0}
         for used in threads:
             label = f"{describe_point(settings)}, {used} thread{'s' * (used > 1)}"
-            sizes = {"threads": used, "num_gaussians": method.count_components(), "settings": settings}
+            sizes = {
+                "threads": used,
+                "num_gaussians": method.count_components(),
+                "settings": settings,
+            }
             row = {"label": label, **dict.fromkeys(FACTS.values()), **results, **sizes, **knobs}
             ways.append(row | {"method": method})
     count = len(ways)
@@ -84,7 +95,10 @@ def measure_points(
     rows = pd.DataFrame(ways, dtype=object)
     # Predictors are asked in world coordinates, as a user would.
     places = data.moving[rows_to_score(split.folds[0], eval_on)]
-    calls = {i: Predictor(method, data.site).cycle_places(places) for i, method in rows.pop("method").items()}
+    calls = {
+        i: Predictor(method, data.site).cycle_places(places)
+        for i, method in rows.pop("method").items()
+    }
     times = pd.DataFrame(time_beside_copy(calls, clock, rows.threads.to_dict())).T
     rows = rows.assign(**{fact: times[name] for name, fact in FACTS.items()})
     rows = rows.assign(figure=figure, value=[defined_figure(way, figure) for way in ways])
@@ -95,7 +109,9 @@ def measure_points(
     return points.sort_values("render_ms_p50", kind="stable"), beside
 
 
-def _score(method: Method, data: Measurements, split: Split, eval_on: str) -> tuple[dict[str, Any], Tensor]:
+def _score(
+    method: Method, data: Measurements, split: Split, eval_on: str
+) -> tuple[dict[str, Any], Tensor]:
     """Figures of a method, and its answers (n, ...) in the order of batches."""
     means: list[Tensor] = []
     scores = score_methods([method], data, split, eval_on, means=means)
@@ -110,8 +126,12 @@ def closeness_db(answers: Tensor, whole: Tensor) -> float:
 
 
 def find_better(point: Row, others: pd.DataFrame) -> str | None:
-    """Return the most accurate other that is neither slower nor worse than a point; None without one."""
-    better = others[(others.render_ms_p50 <= point["render_ms_p50"]) & (others.score >= point["score"])]
+    """Return the most accurate other that is neither slower nor worse than a point;
+    None without one.
+    """
+    better = others[
+        (others.render_ms_p50 <= point["render_ms_p50"]) & (others.score >= point["score"])
+    ]
     return None if better.empty else str(better.label[better.score.astype(float).idxmax()])
 
 
@@ -122,13 +142,16 @@ def _cell(value: Any) -> Any:
 def facts_of(points: pd.DataFrame, others: pd.DataFrame) -> dict[str, Any]:
     """Return `tradeoff/*`, `baseline/<name>/*` and the full model's time and accuracy."""
     best = points[points.front == 1].to_dict("records")
-    full = next(row for row in points.to_dict("records") if not row["settings"])  # the fastest of its threads
+    # The fastest of its threads
+    full = next(row for row in points.to_dict("records") if not row["settings"])
     figure = full["figure"]
     facts: dict[str, Any] = {
         "tradeoff/points": len(points),
         "tradeoff/front": len(best),
         "tradeoff/figure": figure,
-        "tradeoff/front_beaten_by_others": sum(find_better(row, others) is not None for row in best),
+        "tradeoff/front_beaten_by_others": sum(
+            find_better(row, others) is not None for row in best
+        ),
         "time/copy_ms": full["render_ms_p50"] / full["ratio_to_copy"],
         **{f"time/{name}": full[name] for name in ("render_ms_p50", "render_ms_p95")},
         f"test/{figure}": full["value"],

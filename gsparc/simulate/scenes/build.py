@@ -50,7 +50,9 @@ def build_survey(scene: SceneSettings, sampling: Sampling) -> Survey:
     ground = _around(scene, tracer, area) if allowed is None else Ground(allowed)
     georeference = None if town is None else town.georeference
     # Heights of masts count from the highest surface, a roof where there is one.
-    masts = _stated(scene, tracer.surface_height, georeference) or [_in_the_middle(tracer, ground, area)]
+    masts = _stated(scene, tracer.surface_height, georeference) or [
+        _in_the_middle(tracer, ground, area)
+    ]
     placed = place_receivers(scene, area, ground, town)
     if scene.moved:
         tracer, _, allowed = _load(scene, sampling)
@@ -61,12 +63,15 @@ def build_survey(scene: SceneSettings, sampling: Sampling) -> Survey:
     return Survey(engines, placed.places, tuple(m.name for m in masts), placed.time_s, georeference)
 
 
-def known_scene(stated: str | None, provenance: Mapping[str, str], carrier_hz: float) -> SceneSettings:
+def known_scene(
+    stated: str | None, provenance: Mapping[str, str], carrier_hz: float
+) -> SceneSettings:
     """Return the scene that measurements were made in.
 
     Args:
-        stated: the name of a scene that comes with Sionna or is built here, or the path of an extract of
-            OpenStreetMap (*.osm) or of a scene file (*.xml); None: the one that the provenance names.
+        stated: the name of a scene that comes with Sionna or is built here, or the path of an
+            extract of OpenStreetMap (*.osm) or of a scene file (*.xml); None: the one that the
+            provenance names.
         provenance, carrier_hz: of the measurements; materials are taken at that carrier [Hz].
 
     Raises:
@@ -99,10 +104,14 @@ def has_known_scene(provenance: Mapping[str, str]) -> bool:
         return False
 
 
-def load_tracer(scene: SceneSettings, sampling: Sampling, transmitter: np.ndarray, name: str) -> RayTracer:
-    """Return the scene alone, to be traced from a place (3,) [m] with the antenna that it states there.
+def load_tracer(
+    scene: SceneSettings, sampling: Sampling, transmitter: np.ndarray, name: str
+) -> RayTracer:
+    """Return the scene alone, to be traced from a place (3,)
+    [m] with the antenna that it states there.
 
-    Of several there, sectors of a mast, it is the one that `name` ends with; without one an isotropic one.
+    Of several there, sectors of a mast, it is the one that `name` ends with;
+    without one an isotropic one.
 
     Raises:
         ValueError, SimulatorMissing: see `build_survey`.
@@ -111,7 +120,9 @@ def load_tracer(scene: SceneSettings, sampling: Sampling, transmitter: np.ndarra
     masts = _stated(scene, tracer.surface_height, None if town is None else town.georeference) or []
     here = [mast for mast in masts if np.linalg.norm(mast.position - transmitter) < SAME_PLACE_M]
     called = [mast for mast in here if name.endswith(mast.name)]
-    return tracer.with_transmitter(transmitter, next((mast.antenna for mast in called or here), ISOTROPIC))
+    return tracer.with_transmitter(
+        transmitter, next((mast.antenna for mast in called or here), ISOTROPIC)
+    )
 
 
 def _shoebox(scene: SceneSettings) -> Survey:
@@ -121,15 +132,21 @@ def _shoebox(scene: SceneSettings) -> Survey:
     size, reflection = np.array(stated.size_m, float), np.array(stated.reflection, complex)
     boxes = [box(f"box{k}", "", *corners) for k, corners in enumerate(stated.boxes)]
     before, after = (
-        Room.from_size(size, reflection, occluders=np.array([one.keep_out for one in each]).reshape(-1, 2, 3))
+        Room.from_size(
+            size, reflection, occluders=np.array([one.keep_out for one in each]).reshape(-1, 2, 3)
+        )
         for each in (boxes, move_solids(boxes, read_moves(scene.moved))[0])
     )
     area = _area(scene, np.stack([before.lower, before.upper])[:, :2])
     middle = np.append(area.mean(0), CEILING * before.upper[2])
     masts = _stated(scene, None, None) or [Transmitter("tx", middle)]
     if any(mast.antenna.pattern != "iso" for mast in masts):
-        raise ValueError("scene.transmitters: a shoebox room knows isotropic antennas alone; pattern=iso")
-    engines: list[TracingEngine] = [ShoeboxEngine(after, mast.position, scene.carrier_hz) for mast in masts]
+        raise ValueError(
+            "scene.transmitters: a shoebox room knows isotropic antennas alone; pattern=iso"
+        )
+    engines: list[TracingEngine] = [
+        ShoeboxEngine(after, mast.position, scene.carrier_hz) for mast in masts
+    ]
     placed = place_receivers(scene, area, Ground(before.contains))
     placed = placed.subset(after.contains(placed.places))
     return Survey(engines, placed.places, tuple(mast.name for mast in masts), placed.time_s)
@@ -138,7 +155,9 @@ def _shoebox(scene: SceneSettings) -> Survey:
 def _load(
     scene: SceneSettings, sampling: Sampling
 ) -> tuple[RayTracer, Town | None, Callable[[np.ndarray], np.ndarray] | None]:
-    """The ray tracer, what a map holds, and a test of free places where objects know where nobody stands."""
+    """The ray tracer, what a map holds, and a test of free places where objects know
+    where nobody stands.
+    """
     source: Any = scene.builtin if scene.builtin is not None else Path(str(scene.xml))
     town, allowed, moves = None, None, read_moves(scene.moved)
     if scene.file is not None:
@@ -151,12 +170,17 @@ def _load(
     if moves:
         if isinstance(source, str | Path):
             raise ValueError(
-                "moved: objects of scenes that come as a file stand as they are; of our own they move"
+                "moved: objects of scenes that come as a file stand as they are; of our own they "
+                "move"
             )
         source, changed = move_solids(source, moves)
         allowed = stands_clear_of(changed)
     # At the origin for the time being: `with_transmitter` puts a copy at each transmitter.
-    return RayTracer(source, np.zeros(3), scene.carrier_hz, sampling, scene.scattering), town, allowed
+    return (
+        RayTracer(source, np.zeros(3), scene.carrier_hz, sampling, scene.scattering),
+        town,
+        allowed,
+    )
 
 
 def _area(scene: SceneSettings, box: np.ndarray) -> np.ndarray:

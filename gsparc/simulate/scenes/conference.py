@@ -1,7 +1,7 @@
 """The paper's conference room, 14 x 10 x 4 m, built by a seeded procedure.
 
-The paper names its size, tables, chairs, glass partitions, irregular walls and a transmitter near the
-ceiling; where they stand is ours.
+The paper names its size, tables, chairs, glass partitions, irregular walls and a transmitter near
+the ceiling; where they stand is ours.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ def conference_room(seed: int = 0) -> list[Solid]:
 
 
 def _shell(rng: np.random.Generator) -> list[Solid]:
-    """Floor, ceiling, and walls whose panels stand out by up to a decimetre; closed behind the panels."""
+    """Floor, ceiling, and walls whose panels stand out by up to a decimetre;
+    closed behind the panels.
+    """
     x, y, z = SIZE
     solids = [
         sheet("floor", "concrete", (0, 0, 0), (x, 0, 0), (0, y, 0)),
@@ -56,7 +58,9 @@ def _shell(rng: np.random.Generator) -> list[Solid]:
 
 
 def _listed(group: str, shift: float = 0.0) -> list[Solid]:
-    """Sheets (a corner, two sides) and boxes (two corners) of conference.csv; some moved along an axis."""
+    """Sheets (a corner, two sides) and boxes (two corners) of conference.csv;
+    some moved along an axis.
+    """
     solids = []
     for row in read_shipped_table(__package__, "conference.csv"):
         metres = np.array(row["metres"].split(), dtype=float).reshape(-1, 3)

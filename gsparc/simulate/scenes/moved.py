@@ -35,8 +35,12 @@ class Move(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if (self.name is None) != (self.by_m is None) or (self.name is None) == (self.box_m is None):
-            raise ValueError("moved: say name and by_m of what is there, or box_m of what is new, of each")
+        if (self.name is None) != (self.by_m is None) or (self.name is None) == (
+            self.box_m is None
+        ):
+            raise ValueError(
+                "moved: say name and by_m of what is there, or box_m of what is new, of each"
+            )
         if self.box_m is not None:
             BOXES.check("moved.box_m", [self.box_m])
 

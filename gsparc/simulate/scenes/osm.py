@@ -1,7 +1,9 @@
-"""A piece of OpenStreetMap as a scene: buildings extruded by height or levels, ground, materials by tag.
+"""A piece of OpenStreetMap as a scene: buildings extruded by height or levels, ground,
+materials by tag.
 
-The format: an extract *.osm in OSM XML, read by `osmnx` without a network. Tags: wiki.openstreetmap.org,
-`Key:building`, `Key:height`, `Key:building:levels`, `Key:building:material`.
+The format: an extract *.osm in OSM XML, read by `osmnx` without a network. Tags:
+wiki.openstreetmap.org, `Key:building`, `Key:height`, `Key:building:levels`,
+`Key:building:material`.
 """
 
 from __future__ import annotations
@@ -74,7 +76,9 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
         for shape in _polygons(geometry)
     ]
     if not shapes:
-        raise ValueError(f"scene.file={path}: no building in it; expected ways or relations with building=*")
+        raise ValueError(
+            f"scene.file={path}: no building in it; expected ways or relations with building=*"
+        )
     degrees = np.concatenate([np.array(shape.exterior.coords)[:, :2] for shape, _ in shapes])
     fault = find_invalid_coordinate(degrees[:, 1], degrees[:, 0])
     if fault is not None:
@@ -117,14 +121,18 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
 def _features(path: Path) -> list[tuple[Any, Mapping[str, Any]]]:
     """Geometry [deg] and tags of everything that is a building or a street."""
     if not path.is_file():
-        raise ValueError(f"scene.file={path}: no such file; expected an extract of OpenStreetMap, *.osm")
+        raise ValueError(
+            f"scene.file={path}: no such file; expected an extract of OpenStreetMap, *.osm"
+        )
     import osmnx
 
     try:
         table = osmnx.features_from_xml(path, tags={"building": True, "highway": True})
     except Exception as error:  # of XML, of osmnx, of shapely
         words = (str(error).strip().splitlines() or [type(error).__name__])[0]
-        raise ValueError(f"scene.file={path}: not an extract in OSM's XML ({words[:120]})") from None
+        raise ValueError(
+            f"scene.file={path}: not an extract in OSM's XML ({words[:120]})"
+        ) from None
     columns = [name for name in table.columns if name != "geometry"]
     rows = table[columns].to_dict("records")
     return list(zip(table.geometry, rows, strict=True))
@@ -199,7 +207,11 @@ def _extruded(shape: Any, low: float, high: float, origin: Georeference) -> Any:
 
 def _streets(geometry: Any, tags: Mapping[str, Any], origin: Georeference) -> list[np.ndarray]:
     kind = _tag(tags, "highway")
-    if kind in (None, *WALKED) or _tag(tags, "tunnel") == "yes" or geometry.geom_type != "LineString":
+    if (
+        kind in (None, *WALKED)
+        or _tag(tags, "tunnel") == "yes"
+        or geometry.geom_type != "LineString"
+    ):
         return []
     corners = np.array(geometry.coords)
     return [origin.from_degrees(corners[:, 1], corners[:, 0])]

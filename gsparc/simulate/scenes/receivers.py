@@ -28,7 +28,8 @@ class Ground:
     """What receivers stand on, and where they may.
 
     Attributes:
-        allowed: which of places (n, 3) [m], world, are not in, on or above what stands there (n,) bool.
+        allowed: which of places (n, 3) [m], world, are not in, on or above what stands there (n,)
+            bool.
         lift: turns heights above ground (or roof) of places (n, 3) into world z [m].
         open_sky: whether nothing is above those that are allowed.
     """
@@ -39,7 +40,9 @@ class Ground:
 
 
 class Placed(NamedTuple):
-    """Receivers (R, 3) float64 [m], world, and when (R,) each was there [s]; None where that says nothing."""
+    """Receivers (R, 3) float64 [m], world, and when (R,) each was there [s];
+    None where that says nothing.
+    """
 
     places: np.ndarray
     time_s: np.ndarray | None = None
@@ -92,7 +95,9 @@ def place_receivers(
             )
         log.warning("%s: left out", inside)
     if free.sum() < 2:
-        raise ValueError("scene.receivers: fewer than two places are free; is the area inside a building?")
+        raise ValueError(
+            "scene.receivers: fewer than two places are free; is the area inside a building?"
+        )
     return Placed(points, time_s).subset(free)
 
 
@@ -103,11 +108,15 @@ def _along(how: Layout, area: np.ndarray, streets: Sequence[np.ndarray]) -> np.n
         # One more than there are spacings: both ends of a side count.
         counts = np.floor((high - low) / how.spacing_m).astype(int) + 1
         if counts.prod() > MOST:
-            raise ValueError(f"scene.receivers.spacing_m={how.spacing_m:g}: {counts.prod():,} places")
+            raise ValueError(
+                f"scene.receivers.spacing_m={how.spacing_m:g}: {counts.prod():,} places"
+            )
         axes = [np.arange(n) * how.spacing_m + start for n, start in zip(counts, low, strict=True)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
     if not streets:
-        raise ValueError("scene.receivers.kind=streets: this scene has no streets; use grid or file")
+        raise ValueError(
+            "scene.receivers.kind=streets: this scene has no streets; use grid or file"
+        )
     walked = np.concatenate([_steps(line, how.spacing_m) for line in streets])
     return walked[((walked >= area[0]) & (walked <= area[1])).all(1)]
 
@@ -123,9 +132,13 @@ def _steps(line: np.ndarray, spacing: float) -> np.ndarray:
 
 
 def _of_file(how: Layout, town: Town | None, height: float) -> tuple[np.ndarray, np.ndarray | None]:
-    """Places (n, 3) and times (n,) of a file; heights that it does not give are the middle of the scene's."""
+    """Places (n, 3) and times (n,) of a file;
+    heights that it does not give are the middle of the scene's.
+    """
     if how.file is None:
-        raise ValueError("scene.receivers.file is missing; expected a table with x and y, or degrees")
+        raise ValueError(
+            "scene.receivers.file is missing; expected a table with x and y, or degrees"
+        )
     try:
         table, time_s = read_query_places(how.file, ["rx"]), read_times(how.file)
     except DataError as error:
@@ -136,7 +149,9 @@ def _of_file(how: Layout, town: Town | None, height: float) -> tuple[np.ndarray,
     across = listed.across
     if listed.degrees:
         if town is None:
-            raise ValueError(f"{how.file}: degrees, but this scene is nowhere on Earth; expected x and y")
+            raise ValueError(
+                f"{how.file}: degrees, but this scene is nowhere on Earth; expected x and y"
+            )
         across = town.georeference.from_degrees(*across.T)
     above = np.full(len(across), height) if listed.height is None else listed.height
     return np.column_stack([across, above]), time_s
@@ -171,7 +186,9 @@ def draw_places(
     """
     low, high = (np.array([*area[i], end(height)], dtype=float) for i, end in enumerate((min, max)))
     if not (np.isfinite([low, high]).all() and (high >= low).all() and (high > low)[:2].all()):
-        raise ValueError(f"scene.area_m, scene.height_m: expected lower below upper, got {low} and {high}")
+        raise ValueError(
+            f"scene.area_m, scene.height_m: expected lower below upper, got {low} and {high}"
+        )
     rng = np.random.default_rng(seed)
     places = np.empty((0, 3))
     for _ in range(TRIES * -(-count // DRAWN)):
@@ -184,7 +201,9 @@ def draw_places(
     raise ValueError(f"scene: {fit}; is that area inside a building?")
 
 
-def stands_clear_of(solids: Sequence[Solid], margin: float = 0.05) -> Callable[[np.ndarray], np.ndarray]:
+def stands_clear_of(
+    solids: Sequence[Solid], margin: float = 0.05
+) -> Callable[[np.ndarray], np.ndarray]:
     """Return a test: which places (n, 3) [m] stand `margin` [m] away from boxes and off sheets."""
     boxes = np.array([s.keep_out for s in solids if s.keep_out is not None]).reshape(-1, 2, 3)
     walls = [s.vertices for s in solids if s.keep_out is None]

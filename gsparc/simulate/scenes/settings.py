@@ -28,8 +28,8 @@ class Layout(Checked):
         kind: `area` (drawn at random), `grid`, `streets` (of a map) or `file`.
         spacing_m: of a grid, and along streets [m].
         file: a table with x, y and z, or latitude, longitude and height, and perhaps `time_s`.
-        inside: places in or on something that stands there are left out (`drop`) or an error (`refuse`);
-            None: an error out of a file, else left out.
+        inside: places in or on something that stands there are left out (`drop`) or an error
+            (`refuse`); None: an error out of a file, else left out.
     """
 
     kind: str = setting("area", choice("area", "grid", "streets", "file"))
@@ -46,13 +46,14 @@ class SceneSettings(Checked):
         name: of the dataset.
         num_receivers: how many, over an area.
         carrier_hz, bandwidth_hz, subcarriers: the band; subcarriers from end to end [Hz].
-        transmitter_m: (3,) of the only one [m]; None, without `transmitters`: in the middle, which is said.
+        transmitter_m: (3,) of the only one [m]; None, without `transmitters`: in the middle, which
+            is said.
         transmitters: settings of `transmitters.Mast` each, in place of `transmitter_m`.
-        area_m: [[x, y], [x, y]] lower and upper corner of where receivers are [m]; None: the middle, at most
-            400 m wide, which is said.
+        area_m: [[x, y], [x, y]] lower and upper corner of where receivers are [m]; None: the
+            middle, at most 400 m wide, which is said.
         height_m: lowest and highest height of a receiver [m].
-        over: what heights count from: the world's `zero`, the `ground` (what stands there is kept off) or
-            `roofs` (the highest surface, whatever it is).
+        over: what heights count from: the world's `zero`, the `ground` (what stands there is kept
+            off) or `roofs` (the highest surface, whatever it is).
         receivers: settings of `receivers.Layout`; None: drawn over the area.
         test_share: of the places held out for testing, drawn at random.
         builder: a procedure of ours (`conference_room`).
@@ -63,8 +64,8 @@ class SceneSettings(Checked):
         open_sky: receivers stand where nothing is above them; None: where the scene has no ceiling.
         scattering: scattering coefficient of all materials without one; None: by material.
         seed: of the procedure and of the receivers.
-        moved: settings of `moved.Move` each: the scene at a later time, with the same receivers but for those
-            that something would now stand on.
+        moved: settings of `moved.Move` each: the scene at a later time, with the same receivers but
+            for those that something would now stand on.
     """
 
     name: str
@@ -96,9 +97,13 @@ class SceneSettings(Checked):
             names = ", ".join(sources) or "none"
             raise ValueError(f"scene: give exactly one of {', '.join(SOURCES)}; got {names}")
         if self.transmitter_m is not None and self.transmitters is not None:
-            raise ValueError("scene: give transmitter_m or transmitters, not both (the other is null)")
+            raise ValueError(
+                "scene: give transmitter_m or transmitters, not both (the other is null)"
+            )
         if self.layout.kind == "area" and self.num_receivers < MIN_RECEIVERS:
-            raise ValueError(f"scene.num_receivers={self.num_receivers}: expected at least {MIN_RECEIVERS}")
+            raise ValueError(
+                f"scene.num_receivers={self.num_receivers}: expected at least {MIN_RECEIVERS}"
+            )
 
     @property
     def layout(self) -> Layout:

@@ -18,8 +18,20 @@ def list_shipped_scenes() -> list[str]:
 def shipped_scene_settings(name: str) -> dict[str, Any]:
     """Return what `scene=NAME` means for a shipped scene that has no file in `conf/scene`."""
     return {
-        "name": name, "builtin": name, "transmitter_m": None, "transmitters": None, "area_m": None,
-        "height_m": [1.2, 1.8], "over": "ground", "receivers": None, "open_sky": None, "num_receivers": 1000,
-        "test_share": 0.3, "carrier_hz": 3.5e9, "bandwidth_hz": 100.0e6, "subcarriers": 26,
-        "scattering": None, "seed": 0,
-    }  # fmt: skip
+        "name": name,
+        "builtin": name,
+        "transmitter_m": None,
+        "transmitters": None,
+        "area_m": None,
+        "height_m": [1.2, 1.8],
+        "over": "ground",
+        "receivers": None,
+        "open_sky": None,
+        "num_receivers": 1000,
+        "test_share": 0.3,
+        "carrier_hz": 3.5e9,
+        "bandwidth_hz": 100.0e6,
+        "subcarriers": 26,
+        "scattering": None,
+        "seed": 0,
+    }

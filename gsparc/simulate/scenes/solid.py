@@ -1,4 +1,6 @@
-"""Boxes and sheets of a scene built in code: triangles with an ITU material; triangles as a file."""
+"""Boxes and sheets of a scene built in code: triangles with an ITU material;
+triangles as a file.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,9 @@ class Solid:
     keep_out: np.ndarray | None = None
 
 
-def sheet(name: str, material: str, corner: ArrayLike, first: ArrayLike, second: ArrayLike) -> Solid:
+def sheet(
+    name: str, material: str, corner: ArrayLike, first: ArrayLike, second: ArrayLike
+) -> Solid:
     """Build a parallelogram from `corner` along two sides (3,) [m].
 
     >>> sheet("floor", "concrete", (0, 0, 0), (4, 0, 0), (0, 3, 0)).vertices[2].tolist()
@@ -56,15 +60,29 @@ def box(name: str, material: str, lower: ArrayLike, upper: ArrayLike, turn: floa
     cosine, sine = np.cos(turn), np.sin(turn)
     # Corners are rows: this is the transpose of the rotation by `turn`.
     offset[:, :2] = offset[:, :2] @ np.array([[cosine, sine], [-sine, cosine]])
-    faces = np.array([
-        [0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4],
-        [2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6], [1, 3, 5], [3, 7, 5],
-    ])  # fmt: skip
+    faces = np.array(
+        [
+            [0, 2, 1],
+            [1, 2, 3],
+            [4, 5, 6],
+            [5, 7, 6],
+            [0, 1, 4],
+            [1, 5, 4],
+            [2, 6, 3],
+            [3, 6, 7],
+            [0, 4, 2],
+            [2, 4, 6],
+            [1, 3, 5],
+            [3, 7, 5],
+        ]
+    )
     vertices = (low + high) / 2 + offset
     return Solid(name, material, vertices, faces, np.stack([vertices.min(0), vertices.max(0)]))
 
 
 def write_walls(triangles: np.ndarray, path: Path) -> None:
-    """Write triangles (n, 3, 3) [m], world, for `init=scene`, whole or not at all; none without area."""
+    """Write triangles (n, 3, 3) [m], world, for `init=scene`, whole or not at all;
+    none without area.
+    """
     lines = [f"- {corners}" for corners in np.round(triangles, MILLIMETRES).tolist()]
     write_whole(path, "\n".join(["walls:", *lines, ""]))

@@ -12,8 +12,11 @@ from gsparc.base.instantiate import from_settings
 from gsparc.base.limits import Checked, Limit, choice, finite_array, or_null, setting, whole
 from gsparc.data.georeference import Georeference
 
-NUMBERS = Limit("a list of two or three finite numbers", lambda v: finite_array(v).shape in ((2,), (3,)))
-PATTERNS = ("iso", "dipole", "hw_dipole", "tr38901")  # Sionna's; the last is 3GPP TR 38.901, table 7.3-1
+NUMBERS = Limit(
+    "a list of two or three finite numbers", lambda v: finite_array(v).shape in ((2,), (3,))
+)
+# Sionna's; the last is 3GPP TR 38.901, table 7.3-1
+PATTERNS = ("iso", "dipole", "hw_dipole", "tr38901")
 
 
 @dataclass(frozen=True)
@@ -82,7 +85,8 @@ def place_transmitters(
 
     Args:
         entries: settings of `Mast`.
-        surface: (n, 2) [m] -> (n,) [m] height of what is there; None where a scene has no such thing.
+        surface: (n, 2) [m] -> (n,) [m] height of what is there; None where a scene has no such
+            thing.
         georeference: of the world's origin; None where the scene is nowhere on Earth.
 
     Raises:
@@ -99,7 +103,9 @@ def place_transmitters(
         for sector in range(mast.sectors):
             azimuth = (mast.azimuth_deg + 360 * sector / mast.sectors) % 360
             label = name if mast.sectors == 1 else f"{name}-{sector + 1}"
-            transmitters.append(Transmitter(label, position, Antenna(pattern, azimuth, mast.downtilt_deg)))
+            transmitters.append(
+                Transmitter(label, position, Antenna(pattern, azimuth, mast.downtilt_deg))
+            )
     names = [one.name for one in transmitters]
     # Files tell stations apart by their names.
     twice = sorted({name for name in names if names.count(name) > 1})
@@ -121,10 +127,14 @@ def _position(
     values = np.array(getattr(mast, names[0]), dtype=np.float64)
     if names[0] == "position_deg":
         if georeference is None:
-            raise ValueError(f"{where}.position_deg: this scene is nowhere on Earth; give position_m")
+            raise ValueError(
+                f"{where}.position_deg: this scene is nowhere on Earth; give position_m"
+            )
         values = np.append(georeference.from_degrees(values[:1], values[1:2])[0], values[2:])
     if len(values) == 3:
         return values
     if mast.height_m is None or surface is None:
-        raise ValueError(f"{where}: give height_m, above what stands there, or three coordinates in metres")
+        raise ValueError(
+            f"{where}: give height_m, above what stands there, or three coordinates in metres"
+        )
     return np.append(values, surface(values[None])[0] + mast.height_m)

@@ -1,7 +1,7 @@
 """Whether spectra can be of the declared array on the declared grid, and carriers of their places.
 
-A Bartlett spectrum is a sum of few waves over directions, the lags of its array: what is outside them tells
-an array in another plane, or rows that are zenith angles, without any path being known.
+A Bartlett spectrum is a sum of few waves over directions, the lags of its array: what is outside
+them tells an array in another plane, or rows that are zenith angles, without any path being known.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from gsparc.tables.conventions import CONVENTIONS, convert_conventions
 ROWS = 16  # looked at
 UNEXPLAINED = 0.01  # share of the energy outside the lags, that measured spectra need not reach
 RIVAL = 0.2  # of that of what is declared: a rival that leaves less is named
-PLANES = {"xy": (0, 1, 2), "yz": (2, 0, 1), "xz": (0, 2, 1)}  # axes of the declared array, in each plane
+# Axes of the declared array, in each plane
+PLANES = {"xy": (0, 1, 2), "yz": (2, 0, 1), "xz": (0, 2, 1)}
 PIXELS = 400  # of an image, compared over carriers
 CLEAR, LEAST_GAIN = 4.0, 0.1  # standard errors, and at least of a correlation or pixel
 NEAR = 0.9  # cosine of an angle to the nearest pixel: of places a little below the horizon, too
@@ -85,12 +86,16 @@ def carrier_warnings(data: Measurements) -> list[str]:
     shifted = []
     for station, name in enumerate(stations.shown):
         others = np.nansum(np.delete(table, station, axis=0), axis=0)
-        fit = {by: _likeness(table[station], np.roll(others, by, axis=0))[1:-1] for by in (-1, 0, 1)}
+        fit = {
+            by: _likeness(table[station], np.roll(others, by, axis=0))[1:-1] for by in (-1, 0, 1)
+        }
         ways = [where for by, where in ((1, "before"), (-1, "after")) if _clear(fit[by] - fit[0])]
         shifted += [f"{name} ({where})" for where in ways]
     found = []
     if shifted:
-        symptom = "spectra are more like those of other carriers at the place before or after theirs"
+        symptom = (
+            "spectra are more like those of other carriers at the place before or after theirs"
+        )
         found.append(f"{symptom} at {', '.join(shifted)}: are their rows shifted by one?")
     mirrored = convert_conventions(data, ["clockwise"])
     gain = _along_direct_path(mirrored) - _along_direct_path(data)
@@ -114,7 +119,9 @@ def _along_direct_path(data: Measurements) -> np.ndarray:
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     cosine = away @ grid.directions().numpy().reshape(-1, 3).T
     pixel = cosine.argmax(1)
-    values = data.site.target.to_real(data.target.reshape(len(data), -1)[np.arange(len(data)), pixel])
+    values = data.site.target.to_real(
+        data.target.reshape(len(data), -1)[np.arange(len(data)), pixel]
+    )
     return np.where(cosine.max(1) > NEAR, values[:, 0], 0.0)
 
 

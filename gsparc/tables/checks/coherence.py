@@ -1,4 +1,6 @@
-"""Whether channels of neighbouring rows share phase, delay and level, or each packet has its own."""
+"""Whether channels of neighbouring rows share phase, delay and level,
+or each packet has its own.
+"""
 
 from __future__ import annotations
 
@@ -26,19 +28,22 @@ from gsparc.processes.few_rows import evenly_spaced
 
 log = logging.getLogger(__name__)
 
-NEAR, IN_LINE = 0.125, 0.5  # wavelengths between rows of nearly one channel, and of a steady phase advance
+# Wavelengths between rows of nearly one channel, and of a steady phase advance
+NEAR, IN_LINE = 0.125, 0.5
 MOST_ENTRIES = 4_000_000  # of channels from the first row on, which tell of all
 MOST = 400  # pairs or triples that are looked at
 FEWEST = 12
 AROUND = 6  # neighbours of a row that are looked at
 STRAIGHT, EVEN = -0.9, 0.7  # cosine at the middle row of three, and ratio of its distances
-OWN = {NEAR: 0.7, IN_LINE: 0.45}  # share of the correlation that rows with phases of their own keep at most
+# Share of the correlation that rows with phases of their own keep at most
+OWN = {NEAR: 0.7, IN_LINE: 0.45}
 ALIKE = {NEAR: (0.5, 0.8), IN_LINE: (0.6, 0.8)}  # correlation of neighbours of one shape, at least
 CHANCE = 2.0  # times the correlation of noise, within these limits
-SPREAD = 1.17  # standard error of such a scatter of independent pairs, times the root of their number
+# Standard error of such a scatter of independent pairs, times the root of their number
+SPREAD = 1.17
 MORE = 0.1  # of correlation that a free delay must bring
-# What rows of one place differ by, at least, and over that of rows of different ones: noise of 10 dB and 0 dB
-# below the signal leaves .1 and .5 of the power.
+# What rows of one place differ by, at least, and over that of rows of different ones: noise of 10
+# dB and 0 dB below the signal leaves .1 and .5 of the power.
 UNLIKE, AS_FAR = 0.1, 0.7
 SCATTER_DB = {NEAR: 2.0, IN_LINE: 3.2}  # of levels between neighbours, more than fading makes
 
@@ -50,8 +55,8 @@ class Coherence:
     Attributes:
         pairs: of neighbours that were compared.
         distance: between them, the median [m].
-        as_measured: size of the mean correlation with phases as they are; where rows are further apart than
-            an eighth wavelength, of the advance of the phase between three rows in line.
+        as_measured: size of the mean correlation with phases as they are; where rows are further
+            apart than an eighth wavelength, of the advance of the phase between three rows in line.
         phase, delay: mean correlation after a free phase, and after a delay too, of each pair.
         level_db: scatter of levels between neighbours [dB].
         unknown_factor: what each row must be allowed.
@@ -72,16 +77,20 @@ class Coherence:
             else f"every row has {describe_factor(self.unknown_factor)} of its own: "
         )
         return (
-            f"{tag}rows {self.distance * 1e3:.3g} mm apart correlate by {self.as_measured:.2f} as measured, "
-            f"by {self.phase:.2f} after a free phase, {self.delay:.2f} after a free delay too; their levels "
+            f"{tag}rows {self.distance * 1e3:.3g} mm apart correlate by {self.as_measured:.2f} "
+            "as measured, "
+            f"by {self.phase:.2f} after a free phase, {self.delay:.2f} after a free delay too; "
+            "their levels "
             f"scatter by {self.level_db:.1f} dB ({self.pairs} pairs)"
         )
 
 
 def estimate_coherence(data: Measurements) -> Coherence | None:
-    """Judge the phases of channels; None where no rows are near enough, or there is one entry a row.
+    """Judge the phases of channels; None where no rows are near enough,
+    or there is one entry a row.
 
-    Rows are compared within a run, and all antennas or stations of a moment as one. Nothing is drawn.
+    Rows are compared within a run, and all antennas or stations of a moment as one.
+    Nothing is drawn.
     """
     site = data.site
     if not site.target.is_complex or site.wavelength is None or data.uplink is not None:
@@ -111,16 +120,24 @@ def estimate_coherence(data: Measurements) -> Coherence | None:
     noise = np.sqrt(max(np.log(max(len(resolvable_delays(rows.tones)), 3)), 1.0) / values[0].size)
     if measured < OWN[reach] * phase and max(phase, delay) > np.clip(CHANCE * noise, *ALIKE[reach]):
         unknown_factor = "phase+delay" if delay > phase + MORE else "phase"
-        least = scatter * (1 - 2 * SPREAD / np.sqrt(len(near)))  # few pairs that fade scatter by chance
+        # Few pairs that fade scatter by chance
+        least = scatter * (1 - 2 * SPREAD / np.sqrt(len(near)))
         unknown_factor = "phase+delay+gain" if least > SCATTER_DB[reach] else unknown_factor
     distances = np.linalg.norm(rows.places[near[:, 0]] - rows.places[near[:, 1]], axis=1)
     return Coherence(
-        len(near), float(np.median(distances)), float(measured), phase, delay, scatter, unknown_factor
+        len(near),
+        float(np.median(distances)),
+        float(measured),
+        phase,
+        delay,
+        scatter,
+        unknown_factor,
     )
 
 
 def place_warnings(data: Measurements) -> list[str]:
-    """Warn of channels that are hardly more alike at one place than between places, after a free phase.
+    """Warn of channels that are hardly more alike at one place than between places,
+    after a free phase.
 
     Of one entry a row sizes are compared: a phase alone makes all others alike.
     """
@@ -143,7 +160,10 @@ def place_warnings(data: Measurements) -> list[str]:
     if within[best] < max(UNLIKE, AS_FAR * between[best]):
         return []
     text = f"rows at one place differ by {within[0]:.2f} of their power even after a free phase"
-    return [f"{text}, rows at different places by {between[0]:.2f} ({len(again)} pairs): places tell nothing"]
+    return [
+        f"{text}, rows at different places by {between[0]:.2f} ({len(again)} pairs): places "
+        "tell nothing"
+    ]
 
 
 def _unlike(rows: Snapshots, pairs: np.ndarray) -> np.ndarray:
@@ -158,7 +178,8 @@ def _unlike(rows: Snapshots, pairs: np.ndarray) -> np.ndarray:
 
 
 def set_unknown_factor(data: Measurements, align: str) -> Measurements:
-    """Return measurements with what is free of each row: as `align` says, `auto` by `estimate_coherence`.
+    """Return measurements with what is free of each row: as `align` says,
+    `auto` by `estimate_coherence`.
 
     Raises:
         SettingError: no such factor, or one of what are no channels.
@@ -166,7 +187,9 @@ def set_unknown_factor(data: Measurements, align: str) -> Measurements:
     choice("auto", *UNKNOWN_FACTORS).check("dataset.align", align)
     if not data.site.target.is_complex:
         if align not in ("auto", "none"):
-            raise SettingError(f"dataset.align={align}: is for channels, these are {data.site.kind}")
+            raise SettingError(
+                f"dataset.align={align}: is for channels, these are {data.site.kind}"
+            )
         return data
     unknown_factor: UnknownFactor = align  # type: ignore[assignment]
     if align == "auto":
@@ -175,7 +198,9 @@ def set_unknown_factor(data: Measurements, align: str) -> Measurements:
             return data
         unknown_factor = found.unknown_factor
         log.warning("%s; they are aligned (dataset.align=none keeps them as they are)", found)
-        if (spacing := neighbour_distance(data.moving) / (data.site.wavelength or np.inf)) > IN_LINE:
+        if (
+            spacing := neighbour_distance(data.moving) / (data.site.wavelength or np.inf)
+        ) > IN_LINE:
             what = "neighbours tell levels, not the shape over subcarriers"
             log.warning("places are %.3g wavelengths apart: %s", spacing, what)
     return replace(data, site=replace(data.site, unknown_factor=unknown_factor))
@@ -190,11 +215,15 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _neighbours(rows: Snapshots, reach: float, pairs: bool) -> np.ndarray:
-    """Rows of one run within `reach` [m]: pairs (P, 2), or triples (P, 3) in line, the middle one first."""
+    """Rows of one run within `reach` [m]: pairs (P, 2), or triples (P, 3) in line,
+    the middle one first.
+    """
     found = [np.zeros((0, 2 if pairs else 3), np.int64)]
     for _, run in rows_by(rows.run):
         at = rows.places[run]
-        near, index = (part.reshape(len(run), -1) for part in cKDTree(at).query(at, k=min(AROUND, len(run))))
+        near, index = (
+            part.reshape(len(run), -1) for part in cKDTree(at).query(at, k=min(AROUND, len(run)))
+        )
         good = (near <= reach) & (index != np.arange(len(run))[:, None])
         if pairs:
             one, column = np.nonzero(good & (index > np.arange(len(run))[:, None]))

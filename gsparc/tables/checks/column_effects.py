@@ -1,9 +1,11 @@
-"""What a column explains of levels that places and stations do not: another transmitter, a device, a number.
+"""What a column explains of levels that places and stations do not: another transmitter, a device,
+a number.
 
-Levels of each station are a correlated field over places, and noise. Three rivals are scored by likelihood,
-with a Bayesian information criterion for constants: a field for each value of the column (transmitters), an
-offset for each value over all stations (devices), a multiple of the value (a number). A column that follows
-the level, a quality or another reading of it, would win them all: it tells far rows as well as near ones.
+Levels of each station are a correlated field over places, and noise. Three rivals are scored by
+likelihood, with a Bayesian information criterion for constants: a field for each value of the
+column (transmitters), an offset for each value over all stations (devices), a multiple of the value
+(a number). A column that follows the level, a quality or another reading of it, would win them all:
+it tells far rows as well as near ones.
 """
 
 from __future__ import annotations
@@ -40,10 +42,12 @@ class Effect:
 
     Attributes:
         head: of the column.
-        kind: its values name transmitters, or devices that each have an offset, or are added to the level.
+        kind: its values name transmitters, or devices that each have an offset, or are added to the
+            level.
         share: of the variance that places and stations leave, that it explains.
         size: a device's largest offset to another [dB], or what a number is multiplied by.
-        contrast: what it leaves of differences between near rows over what it leaves between far ones.
+        contrast: what it leaves of differences between near rows over what it leaves between far
+            ones.
     """
 
     head: str
@@ -54,7 +58,8 @@ class Effect:
 
 
 TRUTHS = ({"true", "false"}, {"0", "1"}, {"yes", "no"}, {"t", "f"}, {"y", "n"})
-SMOOTH = 0.25  # of the variance about near rows, from which on levels follow these rather than a receiver
+# Of the variance about near rows, from which on levels follow these rather than a receiver
+SMOOTH = 0.25
 SURE = 5.0  # deviations of the logarithm of a ratio of variances
 
 
@@ -87,7 +92,9 @@ class LevelsAtPlaces:
         return LevelsAtPlaces(self.place[rows], self.station[rows], self.level[rows])
 
 
-def find_effects(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, np.ndarray]) -> list[Effect]:
+def find_effects(
+    links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, np.ndarray]
+) -> list[Effect]:
     """Return what columns explain, the most first, each beside those before it.
 
     Args:
@@ -103,8 +110,12 @@ def find_effects(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, n
     while len(links) >= LEAST_ROWS and len(found) < MOST_EFFECTS:
         plain, pairs = _fit(links, links.station), (_near_pairs(links), _far_pairs(links, rng))
         rest = [head for head in columns if head not in {one.head for one in found}]
-        candidates = [_effect(links, plain, pairs, head, texts[head], values[head]) for head in rest]
-        effects = sorted((one for one in candidates if one is not None), key=lambda one: one.contrast)
+        candidates = [
+            _effect(links, plain, pairs, head, texts[head], values[head]) for head in rest
+        ]
+        effects = sorted(
+            (one for one in candidates if one is not None), key=lambda one: one.contrast
+        )
         if not effects:
             break
         # Of columns that tell the same apart the first of the fewest values.
@@ -128,7 +139,8 @@ def run_warnings(data: Measurements) -> list[str]:
     links, rows = LevelsAtPlaces.of(data)
     hints = {
         "transmitter": "did what stands still move between them? dataset.runs=[NAME] takes one",
-        "device": "another gain or device in each? dataset.columns.device=HEAD takes offsets off a table's",
+        "device": "another gain or device in each? dataset.columns.device=HEAD takes offsets off "
+        "a table's",
     }
     return [
         f"runs explain {one.share:.0%} of what places and stations leave: {hints[one.kind]}"
@@ -137,10 +149,14 @@ def run_warnings(data: Measurements) -> list[str]:
     ]
 
 
-def find_filled(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, np.ndarray]) -> dict[str, str]:
-    """Return columns of truths, and which of their values rows have that were filled in from near ones.
+def find_filled(
+    links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, np.ndarray]
+) -> dict[str, str]:
+    """Return columns of truths, and which of their values rows have that were filled
+    in from near ones.
 
-    What is interpolated has no noise of its own: it differs far less from its neighbours than a measurement.
+    What is interpolated has no noise of its own:
+    it differs far less from its neighbours than a measurement.
     """
     filled, delta = {}, np.full(len(links), np.nan)
     for _, rows in rows_by(links.station):
@@ -151,8 +167,13 @@ def find_filled(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, np
         cells = np.char.lower(words[row])
         if {*np.unique(cells).tolist()} not in TRUTHS:
             continue
-        spread = {value: delta[(cells == value) & np.isfinite(delta)] for value in np.unique(cells).tolist()}
-        (smooth, less), (_, more) = sorted(spread.items(), key=lambda item: np.median(np.abs(item[1])))
+        spread = {
+            value: delta[(cells == value) & np.isfinite(delta)]
+            for value in np.unique(cells).tolist()
+        }
+        (smooth, less), (_, more) = sorted(
+            spread.items(), key=lambda item: np.median(np.abs(item[1]))
+        )
         if min(len(less), len(more)) < LEAST_ROWS / 3:
             continue
         ratio = math.log(max(float(np.var(less)), 1e-12) / float(np.var(more)))
@@ -161,7 +182,9 @@ def find_filled(links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, np
     return filled
 
 
-def _fit(links: LevelsAtPlaces, group: np.ndarray, columns: Sequence[np.ndarray] = ()) -> LevelField:
+def _fit(
+    links: LevelsAtPlaces, group: np.ndarray, columns: Sequence[np.ndarray] = ()
+) -> LevelField:
     return fit_level_field(links.place, links.level, group, columns)
 
 
@@ -170,9 +193,13 @@ def _devices(links: LevelsAtPlaces, code: np.ndarray) -> LevelField:
 
 
 def _effect(
-    links: LevelsAtPlaces, plain: LevelField, pairs: Sequence[np.ndarray], head: str, code: np.ndarray,
+    links: LevelsAtPlaces,
+    plain: LevelField,
+    pairs: Sequence[np.ndarray],
+    head: str,
+    code: np.ndarray,
     value: np.ndarray | None,
-) -> Effect | None:  # fmt: skip
+) -> Effect | None:
     """What one column explains; None: nothing, or it follows the level."""
     fits: dict[Kind, tuple[LevelField, float]] = {}
     if 0 < code.max() < len(code) / REPEATED:
@@ -184,7 +211,10 @@ def _effect(
             fits["device"] = offsets, contrast
     if value is not None:
         fit = _fit(links, links.station, [value])
-        exact = abs(fit.slope[0] / _power_of_ten(fit.slope[0]) - 1) < TOLERANCE and abs(fit.slope[0]) < 2
+        exact = (
+            abs(fit.slope[0] / _power_of_ten(fit.slope[0]) - 1) < TOLERANCE
+            and abs(fit.slope[0]) < 2
+        )
         if exact and (contrast := _contrast(links, pairs, value, float(fit.slope[0]))) < LESS:
             fits["number"] = fit, contrast
     kind = max(fits, key=lambda one: fits[one][0].score, default=None)
@@ -203,10 +233,11 @@ def _power_of_ten(slope: float) -> float:
 def _contrast(
     links: LevelsAtPlaces, pairs: Sequence[np.ndarray], code: np.ndarray, slope: float = 0.0
 ) -> float:
-    """What a column leaves of differences of near rows over what it leaves of far ones; 1: it follows levels.
+    """What a column leaves of differences of near rows over what it leaves of far ones; 1:
+    it follows levels.
 
-    What a transmitter, a device or a number adds is a large part of what near rows differ by and a small one
-    between far rows, whose places count; a quality tells far rows at least as well.
+    What a transmitter, a device or a number adds is a large part of what near rows differ by and a
+    small one between far rows, whose places count; a quality tells far rows at least as well.
 
     Args:
         links: as they are known so far.
@@ -222,7 +253,10 @@ def _contrast(
         mask = part == one
         whole, within = (_centred(value[mask], which[mask]) for value in (level, residual))
         within = within if slope else _centred(within, code[mask])
-        if np.var(within) < (1 - COPY[int(which.max() > 0)]) * np.var(whole) and mask.sum() >= LEAST_ROWS / 3:
+        if (
+            np.var(within) < (1 - COPY[int(which.max() > 0)]) * np.var(whole)
+            and mask.sum() >= LEAST_ROWS / 3
+        ):
             return 1.0
     rest = []
     for first, second in (pair.T for pair in pairs):
@@ -248,7 +282,9 @@ def _near_pairs(links: LevelsAtPlaces) -> np.ndarray:
     pairs = [np.zeros((0, 2), np.int64)]
     for _, rows in rows_by(links.station):
         count = min(NEAR + 1, len(rows))
-        index = rows[cKDTree(links.place[rows]).query(links.place[rows], k=count)[1].reshape(-1, count)]
+        index = rows[
+            cKDTree(links.place[rows]).query(links.place[rows], k=count)[1].reshape(-1, count)
+        ]
         both = np.sort(np.c_[np.repeat(rows, count), index.ravel()], axis=1)
         pairs.append(np.unique(both[both[:, 0] != both[:, 1]], axis=0))
     return np.concatenate(pairs)
@@ -256,7 +292,9 @@ def _near_pairs(links: LevelsAtPlaces) -> np.ndarray:
 
 def _far_pairs(links: LevelsAtPlaces, rng: np.random.Generator) -> np.ndarray:
     """Pairs (P, 2) of any rows of a station."""
-    pairs = np.concatenate([rng.choice(ids, (4 * NEAR * len(ids), 2)) for _, ids in rows_by(links.station)])
+    pairs = np.concatenate(
+        [rng.choice(ids, (4 * NEAR * len(ids), 2)) for _, ids in rows_by(links.station)]
+    )
     return pairs[pairs[:, 0] != pairs[:, 1]]
 
 

@@ -1,8 +1,9 @@
-"""What is constant over rows but for rounding: guard tones, dead antennas, dark pixels, stuck stations.
+"""What is constant over rows but for rounding: guard tones, dead antennas, dark pixels,
+stuck stations.
 
-Tones and antennas of channels are left out, as what a receiver fills in may be far stronger than what it
-measures, and would be most of every figure. Pixels are dark where no wave comes from; a station may be as it
-says: these are named alone.
+Tones and antennas of channels are left out, as what a receiver fills in may be far stronger than
+what it measures, and would be most of every figure. Pixels are dark where no wave comes from; a
+station may be as it says: these are named alone.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ NOTHING = 1e-6  # of the median entry, what a transform leaves of 0
 
 
 def mark_constants(data: Measurements, notes: list[str]) -> Measurements:
-    """Return channels with what is constant over rows marked as not measured; `notes` that name it are added.
+    """Return channels with what is constant over rows marked as not measured;
+    `notes` that name it are added.
 
     Of spectra and powers it is named alone. Values are those of the file, before they are scaled.
     """
@@ -31,11 +33,17 @@ def mark_constants(data: Measurements, notes: list[str]) -> Measurements:
     together = is_big(data.target) or not data.site.several
     labels = np.zeros(len(data), np.int64) if together else data.stations_of()
     heard = data.censored_side() == 0
-    constant = {t: _constant_of(data, rows) for t, rows in rows_by(labels) if heard[rows].sum() >= LEAST}
+    constant = {
+        t: _constant_of(data, rows) for t, rows in rows_by(labels) if heard[rows].sum() >= LEAST
+    }
     stuck = [t for t, entries in constant.items() if entries.all()]
     names = [data.site.every_station.shown[t] for t in stuck]
     if stuck:
-        who = f"of station{'s' if len(names) > 1 else ''} {list_first(names)} " if data.site.several else ""
+        who = (
+            f"of station{'s' if len(names) > 1 else ''} {list_first(names)} "
+            if data.site.several
+            else ""
+        )
         notes += [Caution(f"all rows {who}are the same: are they measurements?")]
     alive = [entries for t, entries in constant.items() if t not in stuck]
     common = np.asarray(np.array(alive or [np.zeros(shape)]).all(axis=0))
@@ -50,8 +58,13 @@ def mark_constants(data: Measurements, notes: list[str]) -> Measurements:
     which = [f"antenna {number}" for number in np.flatnonzero(antennas)]
     which += [f"tone {number}" for number in np.flatnonzero(tones)]
     which += [f"antenna {i} tone {k}" for i, k in np.argwhere(common & ~antennas[:, None] & ~tones)]
-    what = f"{name_row_ranges(which, count=LEAST)} (of {shape[0]} x {shape[1]}, from 0) are constant"
-    fault = f"{what} over all rows: guards, nulls or a dead input? left out of learning and of all figures"
+    what = (
+        f"{name_row_ranges(which, count=LEAST)} (of {shape[0]} x {shape[1]}, from 0) are constant"
+    )
+    fault = (
+        f"{what} over all rows: guards, nulls or a dead input? left out of learning and of "
+        "all figures"
+    )
     measured = np.broadcast_to(~common, data.target.shape)
     mask = measured if data.mask is None else measured & data.mask
     notes.append(Caution(fault))
@@ -59,7 +72,9 @@ def mark_constants(data: Measurements, notes: list[str]) -> Measurements:
 
 
 def leave_out_unmeasured(data: Measurements) -> Measurements:
-    """Return channels of the antennas and tones that any row measured; `Site.measured` says which."""
+    """Return channels of the antennas and tones that any row measured;
+    `Site.measured` says which.
+    """
     if not data.site.target.is_complex or data.mask is None:
         return data
     antennas, tones = data.target.shape[1:]
@@ -89,7 +104,9 @@ def leave_out_unmeasured(data: Measurements) -> Measurements:
 
 
 def _constant_of(data: Measurements, rows: np.ndarray) -> np.ndarray:
-    """Tell which entries (...) have one value wherever rows (n,) measured them, but for rounding."""
+    """Tell which entries (...) have one value wherever rows (n,) measured them,
+    but for rounding.
+    """
     whole = len(rows) == len(data)
     values = data.target if whole else data.target[rows]
     mask = data.mask if data.mask is None or whole else data.mask[rows]
@@ -105,5 +122,7 @@ def _constant_of(data: Measurements, rows: np.ndarray) -> np.ndarray:
         return known
     low, high = np.where(known[..., None], low, 0), np.where(known[..., None], high, 0)
     spread, size = (high - low).max(-1), np.maximum(np.abs(low), np.abs(high)).max(-1)
-    result: np.ndarray = known & (spread <= ROUNDING * size + NOTHING * float(np.median(size[known])))
+    result: np.ndarray = known & (
+        spread <= ROUNDING * size + NOTHING * float(np.median(size[known]))
+    )
     return result

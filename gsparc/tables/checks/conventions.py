@@ -1,11 +1,11 @@
 """Whether measurements follow the schema's conventions, told by the direct path between known ends.
 
 Each rival of `CONVENTIONS` is scored as the declared one is. Of channels the share of
-a row's power along the direct path counts, with a free factor for each row, free phases of the antennas and a
-free delay common to all rows, and whether the factors of rows agree; of spectra how much of the sphere is
-stronger than the direction of the other end; of powers how well they fall with distance. A row counts once,
-however many entries it has, since reflections are common to them, and rows within half a wavelength count as
-one. Places must agree, too.
+a row's power along the direct path counts, with a free factor for each row, free phases of the
+antennas and a free delay common to all rows, and whether the factors of rows agree; of spectra how
+much of the sphere is stronger than the direction of the other end; of powers how well they fall
+with distance. A row counts once, however many entries it has, since reflections are common to them,
+and rows within half a wavelength count as one. Places must agree, too.
 """
 
 from __future__ import annotations
@@ -27,13 +27,16 @@ from gsparc.tables.conventions import CONVENTIONS, convert_conventions, known_ar
 
 RATIO = math.log(1000)  # of likelihoods
 ROWS = 400
-ENTRIES = {"csi": 2**15, "spectrum": 2**22}  # of the rows drawn, at most, where that leaves LEAST rows
+# Of the rows drawn, at most, where that leaves LEAST rows
+ENTRIES = {"csi": 2**15, "spectrum": 2**22}
 LEAST = 64
 FEWEST = {"csi": 32, "spectrum": 50}  # rows that tell
 COHERENT = 8  # antennas, tones or both with one factor: fewer fit anything
 ANY = {"csi": 0.01, "spectrum": 0.003}  # share that no path explains
-FIT = {"csi": 0.12, "spectrum": 0.8}  # of the median row, at least of a rival; a worse one says nothing
-ONE_DELAY, CLEAR = 0.7, 0.15  # the same of one delay for all rows, and its gain: reflections fit one, too
+# Of the median row, at least of a rival; a worse one says nothing
+FIT = {"csi": 0.12, "spectrum": 0.8}
+# The same of one delay for all rows, and its gain: reflections fit one, too
+ONE_DELAY, CLEAR = 0.7, 0.15
 HALVINGS = 3  # of the places, into groups
 DROPPED = 2  # groups that speak most for a rival: the others must do so, too
 SHARED = 8  # rows with one phase, at least
@@ -42,7 +45,8 @@ LEAST_DB = 6.0  # of the largest value: less is no spectrum in decibels
 EDGE = 0.5  # of the strongest lobe's peak; further down lie other paths and the floor
 CLEAR_PLACES = math.log(1e6)  # of powers: shadowing is not Gaussian
 EXPONENTS = 1.0, 6.0  # of a law of distance
-LOBE = 0.5  # logarithm of the ratio for the median spectrum, at least: lobes of arrays are no exact beams
+# Logarithm of the ratio for the median spectrum, at least: lobes of arrays are no exact beams
+LOBE = 0.5
 
 
 @dataclass(frozen=True)
@@ -66,7 +70,9 @@ class Score:
 
 
 def convention_warnings(data: Measurements) -> list[str]:
-    """Name the convention that rows seem to follow instead of the declared one, and what mends it."""
+    """Name the convention that rows seem to follow instead of the declared one,
+    and what mends it.
+    """
     facts = data.site.target
     if facts.is_level:
         return _rivals_of_places(data)
@@ -82,7 +88,9 @@ def convention_warnings(data: Measurements) -> list[str]:
 
 
 def _arrayed(data: Measurements) -> tuple[Measurements, np.ndarray]:
-    """Rows, and labels (S,) int64 of those with one phase; stations heard at one place become an array."""
+    """Rows, and labels (S,) int64 of those with one phase;
+    stations heard at one place become an array.
+    """
     stations = data.site.every_station
     run, station = data.runs_of(), data.stations_of()
     single = data.site.target.is_complex and data.target.shape[1] == 1
@@ -111,20 +119,28 @@ def _drawn(data: Measurements) -> np.ndarray:
 
 
 def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[str]:
-    """A warning where a rival fits far better than what is declared, with those that fit as well."""
+    """A warning where a rival fits far better than what is declared,
+    with those that fit as well.
+    """
     facts, declared = data.site.target, _score(data, labels)
     rivals: dict[str, Score] = {}
     for name in _tried(few):
         with suppress(ValueError):  # a grid turned beyond a pole
             placed = convert_conventions(data, [name])
             # Within a wavelength all places are one: whatever does not move fits.
-            if facts.is_image or np.ptp(placed.moving, axis=0).max() > LIGHT / placed.site.tones().mean():
+            if (
+                facts.is_image
+                or np.ptp(placed.moving, axis=0).max() > LIGHT / placed.site.tones().mean()
+            ):
                 one = _score(placed, labels)
                 delayed = one.fit > ONE_DELAY and (one.rows - declared.rows).mean() > CLEAR
                 if one.fit > FIT[facts.kind] and (delayed or name != "delays_removed"):
                     rivals[name] = one
     best = max(rivals.values(), key=lambda one: one.log_likelihood, default=declared)
-    if _of_most_groups(best.rows - declared.rows, data) + (best.phases - declared.phases) / 2 <= RATIO:
+    if (
+        _of_most_groups(best.rows - declared.rows, data) + (best.phases - declared.phases) / 2
+        <= RATIO
+    ):
         return []
     how = f"{len(data.target)} rows drawn fit the direct path more than 1,000 times better"
     return _mending(how, {name: one.log_likelihood for name, one in rivals.items()})
@@ -143,12 +159,16 @@ def _mending(how: str, rivals: Mapping[str, float]) -> list[str]:
 
 
 def _rivals_of_places(data: Measurements) -> list[str]:
-    """A warning where powers fall with distance far better at places as another convention has them.
+    """A warning where powers fall with distance far better at places
+    as another convention has them.
 
-    Beside a field of levels for each station: what is alike about near rows says nothing of distances.
+    Beside a field of levels for each station:
+    what is alike about near rows says nothing of distances.
     """
     links, rows = LevelsAtPlaces.of(data)
-    candidates = np.flatnonzero(np.isfinite(np.hstack([data.tx, data.rx_position])[rows]).all(axis=1))
+    candidates = np.flatnonzero(
+        np.isfinite(np.hstack([data.tx, data.rx_position])[rows]).all(axis=1)
+    )
     if data.site.paired or len(candidates) < FEWEST["spectrum"]:
         return []
     drawn = candidates[draw_rows(len(candidates), ROWS, 0)]
@@ -165,7 +185,9 @@ def _rivals_of_places(data: Measurements) -> list[str]:
     best, declared = max(rivals.values(), default=-math.inf), score(data, -math.inf)
     if not best - declared > CLEAR_PLACES:
         return []
-    return _mending(f"{len(drawn)} powers drawn fall with distance a million times likelier", rivals)
+    return _mending(
+        f"{len(drawn)} powers drawn fall with distance a million times likelier", rivals
+    )
 
 
 def _groups(place: np.ndarray) -> np.ndarray:
@@ -185,11 +207,15 @@ def _of_most_groups(gain: np.ndarray, data: Measurements) -> float:
 
 
 def _score(data: Measurements, labels: np.ndarray) -> Score:
-    return _spectra(data) if data.site.target.is_image else _channels(data, data.site.tones(), labels)
+    return (
+        _spectra(data) if data.site.target.is_image else _channels(data, data.site.tones(), labels)
+    )
 
 
 def _channels(data: Measurements, tones: np.ndarray, labels: np.ndarray) -> Score:
-    """By the share of power along the direct path, with factors of rows and antennas and a common delay."""
+    """By the share of power along the direct path,
+    with factors of rows and antennas and a common delay.
+    """
     measured = np.ones(data.target.shape, bool) if data.mask is None else data.mask
     values = np.where(measured, data.target, 0).astype(np.complex128)
     away, array = (data.tx - data.rx_position)[:, None], known_array(data)
@@ -206,7 +232,8 @@ def _channels(data: Measurements, tones: np.ndarray, labels: np.ndarray) -> Scor
         used /= measured.any(axis=2).sum(axis=1).clip(1)
     power = (used * (np.abs(values) ** 2).sum(axis=(1, 2))).clip(1e-300)
 
-    def best(share: np.ndarray) -> tuple[np.ndarray, int]:  # likelihoods (S,) at the delay that fits best
+    # Likelihoods (S,) at the delay that fits best
+    def best(share: np.ndarray) -> tuple[np.ndarray, int]:
         rows = -np.log1p(-(1 - ANY["csi"]) * (share / power[:, None]).clip(0, 1))
         delay = int(rows.sum(axis=0).argmax())
         return rows[:, delay], delay
@@ -240,12 +267,18 @@ def _common(factor: np.ndarray, labels: np.ndarray) -> float:
 
 
 def _spectra(data: Measurements) -> Score:
-    """By the share of the sphere that is stronger than the direction of the other end; half of it outside."""
+    """By the share of the sphere that is stronger than the direction of the other end;
+    half of it outside.
+    """
     grid = data.site.grid
     assert grid is not None
     x, y, z = np.einsum("sji,sj->is", data.rx_rotation, data.tx - data.rx_position)
-    row = np.rint((np.arctan2(z, np.hypot(x, y)) - grid.first_elevation) / grid.elevation_step).astype(int)
-    column = np.rint((np.arctan2(y, x) - grid.first_azimuth) / grid.azimuth_step % grid.per_turn).astype(int)
+    row = np.rint(
+        (np.arctan2(z, np.hypot(x, y)) - grid.first_elevation) / grid.elevation_step
+    ).astype(int)
+    column = np.rint(
+        (np.arctan2(y, x) - grid.first_azimuth) / grid.azimuth_step % grid.per_turn
+    ).astype(int)
     column = column % grid.width if grid.periodic else column
     inside = (row >= 0) & (row < grid.height) & (column < grid.width)
     angle = grid.solid_angles().numpy() / float(grid.solid_angles().sum())
@@ -258,17 +291,25 @@ def _spectra(data: Measurements) -> Score:
 
 
 def _decibels(data: Measurements) -> list[str]:
-    """A warning where the strongest lobes of spectra fall as parabolas to their edges, not as beams do."""
+    """A warning where the strongest lobes of spectra fall as parabolas to their edges,
+    not as beams do.
+    """
     grid, values = data.site.grid, data.target.astype(np.float64) * data.site.target_scale
     assert grid is not None
     if data.target.dtype.kind != "f" or values.max() < LEAST_DB:
         return []
-    gains = np.array([_lobe(one.ravel(), grid.directions().numpy().reshape(-1, 3)) for one in values])
+    gains = np.array(
+        [_lobe(one.ravel(), grid.directions().numpy().reshape(-1, 3)) for one in values]
+    )
     gains = np.nan_to_num(gains)
     if _of_most_groups(gains, data) < RATIO or np.median(gains) < LOBE:
         return []
-    how = f"the strongest lobes of {len(values)} spectra drawn, up to {values.max():.3g}, fit a beam"
-    return [f"{how} more than 1,000 times better as decibels: dataset.decibels=true makes them linear"]
+    how = (
+        f"the strongest lobes of {len(values)} spectra drawn, up to {values.max():.3g}, fit a beam"
+    )
+    return [
+        f"{how} more than 1,000 times better as decibels: dataset.decibels=true makes them linear"
+    ]
 
 
 def _lobe(values: np.ndarray, directions: np.ndarray) -> float:

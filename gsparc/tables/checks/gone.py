@@ -1,4 +1,6 @@
-"""Stations that lists of the strongest hold up to a row and never again, though the drive comes back."""
+"""Stations that lists of the strongest hold up to a row and never again,
+though the drive comes back.
+"""
 
 from __future__ import annotations
 
@@ -13,15 +15,19 @@ from gsparc.data.spacing import number_squares, usual_step
 from gsparc.processes.few_rows import evenly_spaced
 from gsparc.tables.links.strongest import strongest_lists
 
-REACH, SAMPLE = 10.0, 500  # usual steps to lists that count as near; lists that tell how alike these are
+# Usual steps to lists that count as near; lists that tell how alike these are
+REACH, SAMPLE = 10.0, 500
 MOST = 20_000_000  # distances held at once
 ABOVE_DB = 6.0  # the weakest of a list, where it should hold a station
 LEAST = 12  # later lists near earlier ones that held a station
-CHANCE, SURE = 1e-6, 0.95  # that a station which is there stays out of all; most that one list is trusted
+# That a station which is there stays out of all; most that one list is trusted
+CHANCE, SURE = 1e-6, 0.95
 
 
 def gone_warnings(data: Measurements) -> list[str]:
-    """Warn of stations that no list of the strongest holds from a row on, though nearby earlier ones did."""
+    """Warn of stations that no list of the strongest holds from a row on,
+    though nearby earlier ones did.
+    """
     lists = strongest_lists(data) if data.site.maps_levels else None
     if lists is None or data.place is None:
         return []
@@ -34,17 +40,28 @@ def gone_warnings(data: Measurements) -> list[str]:
     # A station that a step of its level made another ends there.
     gone = {t: first for t, first in gone.items() if FROM_ROW not in stations.name[t]}
     who = [stations.shown[t] for t in gone]
-    row = data.row_names[heard[lists.first[order[max(gone.values(), default=0)]]]].partition(", station")[0]
-    finding = f"{list_first(who, 12)}: in no list from {row} on, though earlier ones nearby held them"
-    advice = "if so, remove later rows near it, or all cells of its site (dataset.stations=[names to keep])"
-    return [Severe(f"{finding}: off, or gone? They are learned as weak there: {advice}")] * bool(who)
+    row = data.row_names[heard[lists.first[order[max(gone.values(), default=0)]]]].partition(
+        ", station"
+    )[0]
+    finding = (
+        f"{list_first(who, 12)}: in no list from {row} on, though earlier ones nearby held them"
+    )
+    advice = (
+        "if so, remove later rows near it, or all cells of its site "
+        "(dataset.stations=[names to keep])"
+    )
+    return [Severe(f"{finding}: off, or gone? They are learned as weak there: {advice}")] * bool(
+        who
+    )
 
 
 def find_gone(level: np.ndarray, place: np.ndarray, reach: float) -> dict[int, int]:
-    """Return the first list without a station, by stations that are in none from there on, but should be.
+    """Return the first list without a station, by stations that are in none from there on,
+    but should be.
 
-    A list should hold what the nearest earlier one holds well above its own weakest, as often as earlier
-    lists do what the nearest of another pass holds. Lists of one square err together and count as one.
+    A list should hold what the nearest earlier one holds well above its own weakest, as often as
+    earlier lists do what the nearest of another pass holds.
+    Lists of one square err together and count as one.
 
     Args:
         level: (M, T) [dB] in the order of measuring, NaN where a station is not listed.

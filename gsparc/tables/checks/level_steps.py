@@ -1,4 +1,6 @@
-"""Steps in the level of a station over the rows: a gain was changed, a cable came loose, another antenna."""
+"""Steps in the level of a station over the rows: a gain was changed, a cable came loose,
+another antenna.
+"""
 
 from __future__ import annotations
 
@@ -42,11 +44,12 @@ def detect_level_steps(
 ) -> tuple[LevelStep, ...]:
     """Find where the level of one station changes though the places do not explain it.
 
-    The level is a line in the logarithm of the distance, plus a field (`gsparc.processes.level_field`), plus
-    a step at an unknown row. For every row the step's generalised least-squares estimate and its variance
-    follow from two cumulative sums of the inverse covariance; the largest is kept, and the search repeated
-    with it, like binary segmentation (Scott and Knott, Biometrics 30, 1974). Places seen before and after a
-    step count most, as they should.
+    The level is a line in the logarithm of the distance, plus a field
+    (`gsparc.processes.level_field`), plus a step at an unknown row. For every row the step's
+    generalised least-squares estimate and its variance follow from two cumulative sums of the
+    inverse covariance; the largest is kept, and the search repeated with it, like binary
+    segmentation (Scott and Knott, Biometrics 30, 1974).
+    Places seen before and after a step count most, as they should.
 
     Args:
         position: (n, 2) or (n, 3) [m], in the order of measuring.
@@ -83,17 +86,24 @@ def _blocks(rows: np.ndarray, most: int) -> list[np.ndarray]:
     """Consecutive rows in at most about `most` groups, none across a gap."""
     size = max(3, math.ceil(len(rows) / most))  # a median of three does not see a single wrong row
     pieces = np.split(rows, np.flatnonzero(np.diff(rows) > 10 * size) + 1)
-    return [block for piece in pieces for block in np.array_split(piece, math.ceil(len(piece) / size))]
+    return [
+        block for piece in pieces for block in np.array_split(piece, math.ceil(len(piece) / size))
+    ]
 
 
-def _search(precision: np.ndarray, level: np.ndarray, regressors: np.ndarray) -> tuple[list[int], np.ndarray]:
-    """First blocks after steps of `LEAST_SIGMAS` and more, and estimates [dB] of all of them together."""
+def _search(
+    precision: np.ndarray, level: np.ndarray, regressors: np.ndarray
+) -> tuple[list[int], np.ndarray]:
+    """First blocks after steps of `LEAST_SIGMAS` and more,
+    and estimates [dB] of all of them together.
+    """
     count = len(level)
     margin = max(3, int(SHORTEST * count))
     after: list[int] = []
     for _ in range(MOST_STEPS):
         after.append(_best(precision, level, regressors, after, margin))
-        for i in range(len(after)) if len(after) > 1 else ():  # the first was found without the others
+        # The first was found without the others
+        for i in range(len(after)) if len(after) > 1 else ():
             others = after[:i] + after[i + 1 :]
             after[i] = _best(precision, level, regressors, others, margin)
     while True:
@@ -108,7 +118,9 @@ def _search(precision: np.ndarray, level: np.ndarray, regressors: np.ndarray) ->
         after.pop(int(sigmas.argmin()))
 
 
-def _best(precision: np.ndarray, level: np.ndarray, mean: np.ndarray, steps: list[int], margin: int) -> int:
+def _best(
+    precision: np.ndarray, level: np.ndarray, mean: np.ndarray, steps: list[int], margin: int
+) -> int:
     """The block after the most significant step, besides `steps`."""
     count = len(level)
     design = np.column_stack([mean, *(_step(count, k) for k in steps)])

@@ -1,4 +1,6 @@
-"""Levels of powers as links, one station's at one place each, that questions of plausibility are asked of."""
+"""Levels of powers as links, one station's at one place each,
+that questions of plausibility are asked of.
+"""
 
 from __future__ import annotations
 
@@ -29,7 +31,8 @@ class LinkLevels:
         names: (T,) of the stations, for people.
         keys: (T,) as settings take them.
         station_position: (T, 3), in the world [m]; NaN where it is not known.
-        limited: stations with rows below a level of hearing that the file states, or that lists leave out.
+        limited: stations with rows below a level of hearing that the file states, or that lists
+            leave out.
     """
 
     position: np.ndarray
@@ -44,7 +47,9 @@ class LinkLevels:
 
     def heard(self) -> Iterator[tuple[int, np.ndarray]]:
         """Yield each station, and its rows (k,) with a value."""
-        yield from ((t, rows[np.isfinite(self.level_db[rows])]) for t, rows in rows_by(self.station))
+        yield from (
+            (t, rows[np.isfinite(self.level_db[rows])]) for t, rows in rows_by(self.station)
+        )
 
 
 def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkLevels | None:
@@ -71,13 +76,15 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     floor_known = "sensitivity_db" in data.provenance or len(floors) > len(np.unique(floors[:, 0]))
     limited = frozenset(floors[:, 0].astype(int).tolist() if floor_known else ())
     absent = np.zeros(0, np.int64)
-    # What was not heard is known to be weak, or was said to be unknown, which `links.absent` judges; a file
-    # with a station for each place, as of serving cells, has no empty cells.
+    # What was not heard is known to be weak, or was said to be unknown, which `links.absent`
+    # judges; a file with a station for each place, as of serving cells, has no empty cells.
     absence_stated = data.censored is not None or data.provenance.get("absent") == "unknown"
     if not absence_stated and np.mean(np.bincount(np.unique(link) // count) == 1) < ALONE:
         absent = np.setdiff1d(np.arange(len(first) * count), link)
     parts = [name.split(FROM_ROW) for name in stations.name]
-    for t in [t for t, (name, *_) in enumerate(parts) if sum(name == other for other, *_ in parts) > 1]:
+    for t in [
+        t for t, (name, *_) in enumerate(parts) if sum(name == other for other, *_ in parts) > 1
+    ]:
         # A part of a station is not absent before its first row or after its last.
         at, visits = absent // count, which[station == t]
         within = (at > visits.min(initial=len(first))) & (at < visits.max(initial=0))

@@ -12,20 +12,26 @@ from gsparc.base.errors import list_first
 from gsparc.processes.level_field import fit_level_field
 from gsparc.tables.checks.link_levels import LinkLevels
 
-LEAST, MOST, SITES = 20, 100, 100  # places where a site was heard, that tell; those, and sites, looked at
+# Places where a site was heard, that tell; those, and sites, looked at
+LEAST, MOST, SITES = 20, 100, 100
 CLEAR = math.log(1e12)  # ratio of likelihoods: shadowing is not Gaussian
-LIKELY = math.log(30)  # the same of kilometres: few sites stand within a thousandth of the reach of 0, 0
+# The same of kilometres: few sites stand within a thousandth of the reach of 0, 0
+LIKELY = math.log(30)
 FEW = 3  # sites at places of others: of two a hill may be the reason
-STRONG, SHARES = 10, (1, 0.75, 0.5)  # a tenth of a site's levels lies about it, its beams ahead of it
+# A tenth of a site's levels lies about it, its beams ahead of it
+STRONG, SHARES = 10, (1, 0.75, 0.5)
 SLOPES = -60.0, -10.0  # of levels over the logarithm of the distance [dB]
 
 
 def misplaced_warnings(levels: LinkLevels) -> list[str]:
-    """Warn of sites whose levels tell other places: each other's, shifted ones, or their own in kilometres.
+    """Warn of sites whose levels tell other places: each other's, shifted ones,
+    or their own in kilometres.
 
     Of the sectors of a site the strongest counts, so that no beam makes up for a distance.
     """
-    where, first, site = np.unique(levels.station_position, axis=0, return_index=True, return_inverse=True)
+    where, first, site = np.unique(
+        levels.station_position, axis=0, return_index=True, return_inverse=True
+    )
     site, finite = site.reshape(-1)[levels.station], np.isfinite(where).all(axis=1)
     heard = dict[int, np.ndarray]()
     for one in np.flatnonzero(finite)[:SITES].tolist():
@@ -40,7 +46,9 @@ def misplaced_warnings(levels: LinkLevels) -> list[str]:
     names, kilometres = [levels.names[t] for t in first], list[str]()
     for one, rows in heard.items():
         some = np.random.default_rng(0).permutation(rows)[:MOST]
-        places = np.vstack([where[one], where[one] * [1e3, 1e3, 1], where[one] + shifts, where[finite]])
+        places = np.vstack(
+            [where[one], where[one] * [1e3, 1e3, 1], where[one] + shifts, where[finite]]
+        )
         gain = _gains(levels.position[some], levels.level_db[some], places)
         kilometres += [names[one]] * bool(gain[0] > LIKELY)
         shifted += np.maximum(gain[1 : 1 + len(SHARES)], -LIKELY)
@@ -48,14 +56,19 @@ def misplaced_warnings(levels: LinkLevels) -> list[str]:
         gains[one, finite] = gain[1 + len(SHARES) :] - math.log(len(where))
     gains[np.diag_indices(len(where))] = 0
     who = list_first(kilometres)
-    finding = f"levels of {who} fall with distance from a place a thousand times as far: is it in kilometres?"
+    finding = (
+        f"levels of {who} fall with distance from a place a thousand times as far: is it "
+        "in kilometres?"
+    )
     stated, likely = linear_sum_assignment(gains, maximize=True)
     warnings, moved = [finding] * bool(kilometres), np.flatnonzero(stated != likely)
     exchanged = gains[stated, likely].sum()
     if shifted.max() > max(CLEAR, exchanged) and len(heard) >= FEW:
         x, y, _ = shifts[shifted.argmax()]
         finding = f"fall with distance from places ({x:+.0f}, {y:+.0f}) m beside the stated ones"
-        warnings.append(f"levels of all {len(heard)} sites {finding}: is their list about another origin?")
+        warnings.append(
+            f"levels of all {len(heard)} sites {finding}: is their list about another origin?"
+        )
     elif len(moved) >= FEW and exchanged > CLEAR:
         pairs = list_first([f"{names[i]} from that of {names[likely[i]]}" for i in moved])
         finding = f"levels fall with distance from places of other stations, {pairs}"
@@ -64,7 +77,8 @@ def misplaced_warnings(levels: LinkLevels) -> list[str]:
 
 
 def _gains(place: np.ndarray, level: np.ndarray, rivals: np.ndarray) -> np.ndarray:
-    """Logarithms of likelihoods (k,) of levels (n,) by distances from rivals (k + 1, 3), less the first's.
+    """Logarithms of likelihoods (k,) of levels (n,) by distances from rivals (k + 1, 3),
+    less the first's.
 
     Beside one field for all, which fits best with the first or the likeliest of the others.
     """
@@ -72,7 +86,10 @@ def _gains(place: np.ndarray, level: np.ndarray, rivals: np.ndarray) -> np.ndarr
     away = np.log10(np.maximum(cdist(place, rivals), nearest))
     with np.errstate(divide="ignore", invalid="ignore"):  # of levels that are all alike
         likeliest = 1 + int(np.nan_to_num(np.corrcoef(level, away[:, 1:].T)[0, 1:]).argmin())
-        fields = [fit_level_field(place, level, np.zeros(len(level)), [away[:, k]]) for k in (0, likeliest)]
+        fields = [
+            fit_level_field(place, level, np.zeros(len(level)), [away[:, k]])
+            for k in (0, likeliest)
+        ]
         precision = max(fields, key=lambda one: one.score).precision(place)
         table = np.column_stack([level, away])
         table -= precision.sum(axis=0) @ table / precision.sum()

@@ -1,7 +1,9 @@
-"""Warnings about readable measurements: units, columns, copies, wild rows, stations that changed or were off.
+"""Warnings about readable measurements: units, columns, copies, wild rows,
+stations that changed or were off.
 
-Pure functions of arrays; each returns lines for a person, none where nothing looks wrong. Rows are links,
-what one station measured at one place, in the order of measuring; levels are in dB or dBm, NaN for no value.
+Pure functions of arrays; each returns lines for a person, none where nothing looks wrong. Rows are
+links, what one station measured at one place, in the order of measuring; levels are in dB or dBm,
+NaN for no value.
 """
 
 from __future__ import annotations
@@ -25,14 +27,17 @@ SATURATED = 0.01  # of all levels, at least
 PILE = 0.05  # of all levels, at least: no level of a receiver holds as many by chance
 APART_DB, GAP_DB = 20.0, 3.0  # between a mark and all levels; below a pile that holds many
 REPEATS, FEW_APART = 3, 0.02
-NOISE_DB, PILED = 4.0, 1 / 3  # width of a pile of a receiver's noise; its share of the levels, at least
+# Width of a pile of a receiver's noise; its share of the levels, at least
+NOISE_DB, PILED = 4.0, 1 / 3
 HIGHEST_DBM, LOWEST_DBM = 60.0, -174.0  # a kilowatt received; thermal noise in a hertz
 OUTLIER_DB = 25.0  # from the rows before and after: more than fading does between neighbours
 SPREADS = 10.0  # scaled median absolute deviations of that difference
 NEIGHBOURS = 5  # rows on each side
 LONG_GAP = 20  # rows without a value, or at one place, in one piece
-LEAST = 5  # rows, of levels that all agree but for one, and of stations at one place or with one content
-STILL_DB = 10.0  # between levels of one place, at least: fading of who stands still is faster than it is deep
+# Rows, of levels that all agree but for one, and of stations at one place or with one content
+LEAST = 5
+# Between levels of one place, at least: fading of who stands still is faster than it is deep
+STILL_DB = 10.0
 FEW = 0.005  # of a station's rows: fewer are no sign of a limit
 WEAK_DB = 6.0  # above the weakest value: heard only just
 BESIDE, ODDS = 6, 3.0  # values around; of missing ones to lie beside weak ones, for one of values
@@ -47,7 +52,12 @@ def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) 
     """
     texts = [*level_warnings(levels.level_db), *two_unit_warnings(levels), *floor_warnings(levels)]
     severe = map(Severe, [*texts, *misplaced_warnings(levels)])
-    warnings = [*severe, *twin_warnings(levels), *still_warnings(levels), *outlier_row_warnings(levels)]
+    warnings = [
+        *severe,
+        *twin_warnings(levels),
+        *still_warnings(levels),
+        *outlier_row_warnings(levels),
+    ]
     return [*warnings, *step_warnings(levels, steps), *gap_warnings(levels)]
 
 
@@ -71,19 +81,32 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
     different, counts = np.unique(values, return_counts=True)
     others = len(values) - counts.max()
     if others <= min(1, len(values) // LEAST):
-        but = f" but {others}, {values[values != different[counts.argmax()]][0]:g} dB," if others else ""
-        return [f"all levels{but} are {different[counts.argmax()]:g} dB: is it the column of levels?"]
+        but = (
+            (f" but {others}, {values[values != different[counts.argmax()]][0]:g} dB,")
+            if others
+            else ""
+        )
+        return [
+            f"all levels{but} are {different[counts.argmax()]:g} dB: is it the column of levels?"
+        ]
     low, high = float(values.min()), float(values.max())
     if low < 0 and high > HIGHEST_DBM:
         count = int((values > HIGHEST_DBM).sum())
         why = "a sign lost, or a kilowatt received?"
         return [f"{count} levels above {HIGHEST_DBM:g} dBm, up to {high:g}: {why}"]
     if np.median(values) < LOWEST_DBM:
-        return [f"levels of {low:.4g} to {high:.4g}, most below thermal noise of a hertz: in decibels?"]
+        return [
+            f"levels of {low:.4g} to {high:.4g}, most below thermal noise of a hertz: in decibels?"
+        ]
     whole = (np.abs(values - values.round()) < 1e-3).all()  # powers in single precision
     if low >= 0 and (high <= 1 or high > HIGHEST_DBM or whole):
-        finding = f"no level of {low:g} to {high:g} is below 0: losses (store minus them; dataset.columns."
-        return [f"{finding}rssi_db=HEAD*-1), per cent, an index, or linear (give it as rssi, in W)?"]
+        finding = (
+            f"no level of {low:g} to {high:g} is below 0: losses (store minus them; "
+            "dataset.columns."
+        )
+        return [
+            f"{finding}rssi_db=HEAD*-1), per cent, an index, or linear (give it as rssi, in W)?"
+        ]
     return []
 
 
@@ -95,7 +118,10 @@ def two_unit_warnings(levels: LinkLevels) -> list[str]:
         if len(used) > NEIGHBOURS:
             differences.append(np.abs(level - level[cKDTree(place).query(place, 2)[1][:, 1]]))
     rows = np.concatenate(differences)
-    far, between = int((rows > APART_DB).sum()), int(((rows > APART_DB / 2) & (rows <= APART_DB)).sum())
+    far, between = (
+        int((rows > APART_DB).sum()),
+        int(((rows > APART_DB / 2) & (rows <= APART_DB)).sum()),
+    )
     if far <= max(REPEATS, FEW_APART * len(rows), between):
         return []
     finding = f"{far} of {len(rows)} levels are over {APART_DB:g} dB from that of the nearest row"
@@ -105,15 +131,24 @@ def two_unit_warnings(levels: LinkLevels) -> list[str]:
 def floor_warnings(levels: LinkLevels) -> list[str]:
     """Warn of stations whose levels pile up at a receiver's own noise, or lowest reading."""
     piles, names = find_noise(levels.station, levels.level_db, levels.limited), levels.names
-    # Upwards, so that levels below what is said are those of the pile; single precision has errors of 1e-6.
+    # Upwards, so that levels below what is said are those of the pile;
+    # single precision has errors of 1e-6.
     floors = [
-        ("" if t < 0 else _of([names[t]], len(names)), float(np.ceil(round(100 * top, 3)) / 100), share)
+        (
+            "" if t < 0 else _of([names[t]], len(names)),
+            float(np.ceil(round(100 * top, 3)) / 100),
+            share,
+        )
         for t, (top, share) in piles.items()
     ]
-    shares = list_first([f"{share:.0%} of the levels{who} below {top:g} dB" for who, top, share in floors])
+    shares = list_first(
+        [f"{share:.0%} of the levels{who} below {top:g} dB" for who, top, share in floors]
+    )
     return [
-        f"not heard? {shares} look like a receiver's noise or lowest reading, but are learned as signals; "
-        f"sensitivity_db={top:g} in the file (of a table dataset.columns.sensitivity_db={top:g}, or a "
+        f"not heard? {shares} look like a receiver's noise or lowest reading, but are learned as "
+        "signals; "
+        f"sensitivity_db={top:g} in the file (of a table dataset.columns.sensitivity_db={top:g}, "
+        "or a "
         "column) takes lower levels as not heard"
         for top in sorted(top for _, top, _ in floors)[-1:]
     ]
@@ -122,7 +157,8 @@ def floor_warnings(levels: LinkLevels) -> list[str]:
 def find_noise(
     station: np.ndarray, level_db: np.ndarray, limited: Container[int] = ()
 ) -> dict[int, tuple[float, float]]:
-    """Return `find_floor_pile` of stations (n,) whose levels (n,) [dB] have one, else that of all under -1.
+    """Return `find_floor_pile` of stations (n,) whose levels (n,) [dB] have one,
+    else that of all under -1.
 
     NaN are no levels; stations `limited` have a level of hearing that is known.
     """
@@ -136,11 +172,12 @@ def find_noise(
 
 
 def find_floor_pile(levels: np.ndarray) -> tuple[float, float] | None:
-    """Return the level below which a pile at the lowest of levels (n,) lies, and its share; None without.
+    """Return the level below which a pile at the lowest of levels (n,) lies, and its share;
+    None without.
 
-    The lowest level may repeat. Else signals become rarer upwards no faster than exponentially (distances and
-    shadowing have log-concave densities in decibels): a pile is one that far fewer follow than that law with
-    the mean of all lets expect.
+    The lowest level may repeat. Else signals become rarer upwards no faster than exponentially
+    (distances and shadowing have log-concave densities in decibels): a pile is one that far fewer
+    follow than that law with the mean of all lets expect.
     """
     levels, (different, counts) = np.sort(levels), np.unique(levels, return_counts=True)
     if len(counts) < 4:
@@ -150,9 +187,11 @@ def find_floor_pile(levels: np.ndarray) -> tuple[float, float] | None:
     window_counts = np.searchsorted(levels, levels + NOISE_DB, "right") - np.arange(len(levels))
     first, count = int(window_counts.argmax()), int(window_counts.max())
     top = levels[first] + NOISE_DB
-    after, end = np.searchsorted(levels, top + np.array([1, 1 + NOISE_DB]))  # a decibel above the pile
+    # A decibel above the pile
+    after, end = np.searchsorted(levels, top + np.array([1, 1 + NOISE_DB]))
     low = first <= 0.1 * count + 2 and count >= max(PILED * len(levels), 15)
-    if not low or len(levels) - end < PILE * len(levels):  # few far above: the range of all is small
+    # Few far above: the range of all is small
+    if not low or len(levels) - end < PILE * len(levels):
         return None
     most = end - after + np.sqrt(end - after) + 1  # a deviation more than were counted
     expected = count * np.exp(-(NOISE_DB + 1) / (levels[first:] - levels[first]).mean())
@@ -161,7 +200,9 @@ def find_floor_pile(levels: np.ndarray) -> tuple[float, float] | None:
 
 
 def find_saturation(values: np.ndarray) -> float | None:
-    """Return the highest of levels (n,) where it repeats as no level of a receiver does by chance."""
+    """Return the highest of levels (n,) where it repeats as no level
+    of a receiver does by chance.
+    """
     different, counts = np.unique(values[np.isfinite(values)], return_counts=True)
     piled = len(counts) > 1 and counts[-1] > max(SATURATED * counts.sum(), 10, 5 * counts[-2])
     return float(different[-1]) if piled else None
@@ -170,9 +211,9 @@ def find_saturation(values: np.ndarray) -> float | None:
 def find_marks(values: np.ndarray) -> list[float]:
     """Return levels [dB] among (n,) that repeat exactly, apart from all others: marks, not levels.
 
-    At either end more than 20 dB apart, and far beside the spread of the rest; at the upper end, as rows
-    beside a station are strong, not below 0 or nearly as far as all others lie apart; at the lower end a
-    pile needs only a gap, as a receiver's own levels have none.
+    At either end more than 20 dB apart, and far beside the spread of the rest; at the upper end, as
+    rows beside a station are strong, not below 0 or nearly as far as all others lie apart; at the
+    lower end a pile needs only a gap, as a receiver's own levels have none.
     """
     marks: list[float] = []
     rest = values[np.isfinite(values)]
@@ -185,7 +226,9 @@ def find_marks(values: np.ndarray) -> list[float]:
         usual = max(GAP_DB, 5 * float(np.median(steps)))
         piled = counts[0] > max(PILE * len(rest), 10) and counts[0] > 5 * float(np.median(counts))
         piled = piled and steps[0] >= usual
-        enough = (steps[[0, -1]] > np.maximum(APART_DB, 0.3 * np.array(spans))) & (counts[[0, -1]] >= REPEATS)
+        enough = (steps[[0, -1]] > np.maximum(APART_DB, 0.3 * np.array(spans))) & (
+            counts[[0, -1]] >= REPEATS
+        )
         beyond = different[-1] >= 0 or steps[-1] > max(1.5 * APART_DB, 0.7 * spans[1])
         found = different[[0, -1]][enough & [True, beyond] | [piled, False]].tolist()
         if not found:
@@ -195,9 +238,11 @@ def find_marks(values: np.ndarray) -> list[float]:
 
 
 def still_warnings(levels: LinkLevels) -> list[str]:
-    """Warn of a place that many rows in a piece share while levels change as on a way: a fix stood still.
+    """Warn of a place that many rows in a piece share while levels change as on a way:
+    a fix stood still.
 
-    Where nothing moves, levels differ from row to row as much as they do in all (J. von Neumann, 1941).
+    Where nothing moves, levels differ from row to row as much as they do
+    in all (J. von Neumann, 1941).
     """
     still: dict[tuple[str, str, int], dict[str, float]] = defaultdict(dict)
     alone: dict[str, float] = {}
@@ -208,21 +253,31 @@ def still_warnings(levels: LinkLevels) -> list[str]:
             continue
         for piece in np.split(used, moves):
             level = levels.level_db[piece]
-            if len(piece) >= LONG_GAP and np.ptp(level) > STILL_DB and np.diff(level).var() < level.var() / 2:
+            if (
+                len(piece) >= LONG_GAP
+                and np.ptp(level) > STILL_DB
+                and np.diff(level).var() < level.var() / 2
+            ):
                 where = levels.rows[piece[0]], levels.rows[piece[-1]], len(piece)
                 still[where][levels.names[t]] = float(np.ptp(level))
-    finding = f"all rows{_of([*alone], len(levels.names))} are at one place, while levels change by up to "
-    return [f"{finding}{max([0.0, *alone.values()]):.0f} dB: elsewhere nothing is learned of it"] * bool(
-        alone
-    ) + [
-        f"{first} to {last}: one place for {count} rows, while levels change by {max(who.values()):.0f} dB"
+    finding = (
+        f"all rows{_of([*alone], len(levels.names))} are at one place, while levels change "
+        "by up to "
+    )
+    return [
+        f"{finding}{max([0.0, *alone.values()]):.0f} dB: elsewhere nothing is learned of it"
+    ] * bool(alone) + [
+        f"{first} to {last}: one place for {count} rows, while levels change by "
+        f"{max(who.values()):.0f} dB"
         f"{_of([*who], len(levels.names))}: did the fix stand still? take them out"
         for (first, last, count), who in still.items()
     ]
 
 
 def twin_warnings(levels: LinkLevels) -> list[str]:
-    """Warn of stations whose names differ by capitals alone, or that hold equal levels at equal places."""
+    """Warn of stations whose names differ by capitals alone,
+    or that hold equal levels at equal places.
+    """
     alike: dict[tuple[str, object], list[str]] = defaultdict(list)
     for t, used in levels.heard():
         rows = np.column_stack([levels.position[used], levels.level_db[used]])
@@ -231,11 +286,15 @@ def twin_warnings(levels: LinkLevels) -> list[str]:
             content = rows[np.lexsort(rows.T)].tobytes()
             alike["hold the same levels at the same places", content].append(levels.names[t])
     named = [(how, names) for (how, _), names in alike.items() if len(names) > 1]
-    return [f"stations {list_first(names)} {how}: one, under several names?" for how, names in named]
+    return [
+        f"stations {list_first(names)} {how}: one, under several names?" for how, names in named
+    ]
 
 
 def outlier_row_warnings(levels: LinkLevels) -> list[str]:
-    """Warn of single rows whose level is far from those before and after them at the same station."""
+    """Warn of single rows whose level is far from those before and after them
+    at the same station.
+    """
     warnings = []
     for t, bad, most in find_outlier_rows(levels):
         where = f"station {levels.names[t]}: " if len(levels.names) > 1 else ""
@@ -272,16 +331,22 @@ def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) ->
             for step in station_steps
         )
         first = ",".join(str(levels.file_row[step.first]) for step in station_steps)
-        setting = f"'dataset.level_steps={{{levels.keys[t]}:[{first}]}}' (rows from 0) makes it another"
+        setting = (
+            f"'dataset.level_steps={{{levels.keys[t]}:[{first}]}}' (rows from 0) makes it another"
+        )
         setting = "" if names[t] == UNNAMED else f" {setting} station from there on"
-        warnings.append(f"{who} {change}, which the places do not explain: another gain or antenna?{setting}")
+        warnings.append(
+            f"{who} {change}, which the places do not explain: another gain or antenna?{setting}"
+        )
     return warnings
 
 
 def find_level_steps(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
     """Return stations and their steps, which name rows of `levels`."""
     steps = []
-    blocks = int(np.clip(20 * MOST_BLOCKS / max(len(np.unique(levels.station)), 1), 200, MOST_BLOCKS))
+    blocks = int(
+        np.clip(20 * MOST_BLOCKS / max(len(np.unique(levels.station)), 1), 200, MOST_BLOCKS)
+    )
     for t, used in rows_by(levels.station):
         where = levels.station_position[t]
         where = where if np.isfinite(where).all() else None
@@ -293,11 +358,12 @@ def find_level_steps(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
 def gap_warnings(levels: LinkLevels) -> list[str]:
     """Warn of missing levels: long runs of rows (a station was off), scattered ones (not heard?).
 
-    Missing values count as not heard where they lie beside weak ones far oftener than values do: places
-    tell, not the order of rows. A long run of others is an outage.
+    Missing values count as not heard where they lie beside weak ones far oftener than values do:
+    places tell, not the order of rows. A long run of others is an outage.
     """
     names, rows, warnings = levels.names, levels.rows, list[str]()
-    outages: dict[tuple[str, str, int], list[str]] = defaultdict(list)  # by first row, last row, length
+    # By first row, last row, length
+    outages: dict[tuple[str, str, int], list[str]] = defaultdict(list)
     silent, faint, plain = list[str](), dict[str, int](), dict[str, int]()  # how many, by station
     for t, used in rows_by(levels.station):
         name = str(names[t])
@@ -320,7 +386,10 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
             (faint if unheard else plain)[name] = count
     if faint:
         # First of all: what is not heard and not said so leaves weak stations far too strong.
-        text = f"{sum(faint.values())} levels are missing{_of([*faint], len(names))}, beside the weakest ones"
+        text = (
+            f"{sum(faint.values())} levels are missing{_of([*faint], len(names))}, beside the "
+            "weakest ones"
+        )
         advice = "not heard? then say dataset.absent=silent"
         warnings.append(f"{advice}: {text}; left out, weak levels are predicted too high")
     for (first, last, length), who in sorted(outages.items(), key=lambda item: -item[0][2]):
@@ -335,7 +404,9 @@ def gap_warnings(levels: LinkLevels) -> list[str]:
 
 
 def _levels_beside(place: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Mean levels (n,) of the values nearest to each place (n, d) of one station, its own left out."""
+    """Mean levels (n,) of the values nearest to each place (n, d) of one station,
+    its own left out.
+    """
     heard = np.flatnonzero(np.isfinite(level))
     near = heard[cKDTree(place[heard]).query(place, range(1, min(BESIDE + 1, len(heard)) + 1))[1]]
     others = near != np.arange(len(place))[:, None]

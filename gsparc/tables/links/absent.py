@@ -19,7 +19,9 @@ UNLISTED_EACH = 2  # rows of what is not listed for one that is
 
 
 def add_absent(check: Checker, measured: str, count: int) -> None:
-    """Say that each of `count` stations without a level at a place where others have one was not heard."""
+    """Say that each of `count` stations without a level at a place
+    where others have one was not heard.
+    """
     if measured != "rssi_db":
         return check.problems.add("dataset.absent", f"goes with levels [dB], not with {measured}")
     arrays = check.raw.arrays
@@ -40,13 +42,16 @@ def add_absent(check: Checker, measured: str, count: int) -> None:
     empty = np.flatnonzero(~has_level & some[of_place])  # cells of a wide table
     check.raw.arrays["rssi_db"][empty] = -np.inf
     silent = len(gaps) + len(empty)
-    check.notes.append(f"{silent} links without a level were not heard, as dataset.absent=silent says")
+    check.notes.append(
+        f"{silent} links without a level were not heard, as dataset.absent=silent says"
+    )
 
 
 def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -> int:
     """Add rows, twice as many as are heard, of what lists of the strongest or a floor leave out.
 
-    Returns how many lists leave out. Where `absent` is not `auto` what it does to figures is said alone.
+    Returns how many lists leave out. Where `absent` is not `auto` what it does
+    to figures is said alone.
     """
     arrays, count = check.raw.arrays, len(stations)
     levels, of, floor = arrays["rssi_db"], arrays["station"], _floors(arrays, count)
@@ -54,11 +59,16 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
     heard = np.flatnonzero(np.isfinite(levels) if whole else np.zeros(0))
     if not len(heard) or ("sensitivity_db" in arrays and floor is None):
         return 0
-    # Noise below a stated level has its place in a list, and bounds what is not listed by that level.
-    levels = np.where(np.isfinite(levels), np.fmax(levels, arrays.get("sensitivity_db", -np.inf)), levels)
+    # Noise below a stated level has its place in a list,
+    # and bounds what is not listed by that level.
+    levels = np.where(
+        np.isfinite(levels), np.fmax(levels, arrays.get("sensitivity_db", -np.inf)), levels
+    )
     moving = arrays[f"{OTHER[static]}_position"][heard].astype(np.float64)
     moving = np.where(np.abs(moving) > FARTHEST, np.nan, moving)  # refused where positions are read
-    lists = StrongestLists.from_rows(arrays["place"][heard], of[heard], levels[heard], moving, count)
+    lists = StrongestLists.from_rows(
+        arrays["place"][heard], of[heard], levels[heard], moving, count
+    )
     strongest = lists.are_strongest()
     # What is known not to be heard, of marks or a stated sensitivity, needs no guess.
     limit_known = floor is not None or np.isneginf(levels).any() or bool(find_marks(levels[heard]))
@@ -71,12 +81,19 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
     if found is not None:
         (floor, may), lists = found, replace(lists, length=0)
         missing = "levels are missing beside weak ones alone"
-        how = f"not heard, below each station's weakest ({np.nanmin(floor):.4g} to {np.nanmax(floor):.4g} dB)"
+        how = (
+            f"not heard, below each station's weakest ({np.nanmin(floor):.4g} to "
+            f"{np.nanmax(floor):.4g} dB)"
+        )
         out = np.isnan(lists.level).any(0) & ~np.isnan(floor) & ~may.any(0)
         if out.any():
-            how += f", but of {list_first(np.array(stations.shown)[out])} unknown, strong ones are lost"
+            how += (
+                f", but of {list_first(np.array(stations.shown)[out])} unknown, strong ones "
+                "are lost"
+            )
     else:
-        # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave out.
+        # Without a stated sensitivity, the weakest level heard anywhere bounds what lists leave
+        # out.
         stated = np.full(count, np.nan if floor is None else floor)
         floor = np.nan_to_num(stated, nan=levels[heard].min())
         is_lossy = lists.short_are_lost(floor)
@@ -89,8 +106,13 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
         if absent == "silent":
             weakest = np.nanmin(lists.level[lists.full], 1)
             does = f"what full lists leave out is below their weakest ({weakest.min():.4g} to "
-            does += f"{weakest.max():.4g} dB), not all below {np.nanmin(floor):.4g}: predictions are too low"
-        check.notes.append(Severe(f"{missing} with dataset.absent={absent}: {does}; leave absent out"))
+            does += (
+                f"{weakest.max():.4g} dB), not all below {np.nanmin(floor):.4g}: predictions "
+                "are too low"
+            )
+        check.notes.append(
+            Severe(f"{missing} with dataset.absent={absent}: {does}; leave absent out")
+        )
         return 0
     most, every = UNLISTED_EACH * len(heard), int(may.sum())
     of_list, station, below = lists.bound_unlisted(floor, most, may)
@@ -103,7 +125,9 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
 
 
 def _floors(arrays: dict[str, np.ndarray], count: int) -> np.ndarray | None:
-    """The sensitivity (), or (T,) of `count` stations where their rows agree; None elsewhere, or without."""
+    """The sensitivity (), or (T,) of `count` stations where their rows agree; None elsewhere,
+    or without.
+    """
     floor = arrays.get("sensitivity_db")
     if floor is None or floor.ndim == 0:
         return floor
@@ -117,5 +141,7 @@ def _repeat(check: Checker, like: np.ndarray, station: np.ndarray) -> None:
     arrays = take_rows(check.raw.arrays, like, len(check.raw.arrays["station"]))
     heard = len(like) - len(station)
     arrays["station"] = np.r_[arrays["station"][:heard], station]
-    arrays["rssi_db"] = np.r_[arrays["rssi_db"][:heard].astype(np.float64), np.full(len(station), -np.inf)]
+    arrays["rssi_db"] = np.r_[
+        arrays["rssi_db"][:heard].astype(np.float64), np.full(len(station), -np.inf)
+    ]
     check.raw = replace(check.raw, arrays=arrays)

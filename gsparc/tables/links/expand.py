@@ -1,7 +1,9 @@
-"""From files with stations, missing or censored values, or an unknown transmitter to one row per link.
+"""From files with stations, missing or censored values,
+or an unknown transmitter to one row per link.
 
-A file may hold one row per place and a column per station (wide), or one row per link that names its station
-(long). In memory every row is a link: tx, rx, what was measured between them, and which station it is of.
+A file may hold one row per place and a column per station (wide), or one row per link that names
+its station (long). In memory every row is a link: tx, rx, what was measured between them,
+and which station it is of.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ STATION_FIELDS = ("station", *(f"station_{name}" for name in _OF_STATIONS), *SEC
 
 
 def expand_links(check: Checker, measured: str, part: Selection) -> Links | None:
-    """Replace `check.raw` by rows of links, stations, places and runs as numbers; None: something is wrong.
+    """Replace `check.raw` by rows of links, stations, places and runs as numbers; None:
+    something is wrong.
 
     Args:
         check: of the file; notes say what was left out.
@@ -40,7 +43,8 @@ def expand_links(check: Checker, measured: str, part: Selection) -> Links | None
     """
     check_said(check.raw.attributes)
     check.raw = replace(check.raw, arrays=dict(check.raw.arrays))
-    rows = len(check.raw.arrays[measured])  # numbers of the file: rows are repeated and left out below
+    # Numbers of the file: rows are repeated and left out below
+    rows = len(check.raw.arrays[measured])
     check.raw.arrays.setdefault("row_name", numbered_rows(rows))
     check.raw.arrays["file_row"] = np.arange(rows)
     well, origin = positions_in_metres(check, measured)
@@ -59,8 +63,12 @@ def expand_links(check: Checker, measured: str, part: Selection) -> Links | None
     return replace(links, georeference=origin)
 
 
-def _selected(check: Checker, measured: str, stations: Stations | None, part: Selection) -> Stations | None:
-    """Leave out what `part` does not hold, and number runs and places anew; the stations that are left."""
+def _selected(
+    check: Checker, measured: str, stations: Stations | None, part: Selection
+) -> Stations | None:
+    """Leave out what `part` does not hold, and number runs and places anew;
+    the stations that are left.
+    """
     arrays, stations, notes = select(check.raw.arrays, measured, stations, part, check.source)
     check.raw, check.notes = replace(check.raw, arrays=arrays), [*check.notes, *notes]
     runs = check.read_array("run", arrays[measured].shape[:1])
@@ -70,13 +78,18 @@ def _selected(check: Checker, measured: str, stations: Stations | None, part: Se
 
 
 def _without_table(check: Checker, measured: str, part: Selection) -> Links | None:
-    """A file of one static end, of an end at few places, of two ends that move, or of powers from nowhere."""
+    """A file of one static end, of an end at few places, of two ends that move,
+    or of powers from nowhere.
+    """
     for name in check.present(*STATION_FIELDS):
-        return check.refuse(name, "given without station_position; expected the stations' places, (T, 3)")
+        return check.refuse(
+            name, "given without station_position; expected the stations' places, (T, 3)"
+        )
     _selected(check, measured, None, part)
     arrays = check.raw.arrays
     rows = len(arrays[measured])
-    # Powers alone can be learned without the transmitter's place: channels and spectra need both ends.
+    # Powers alone can be learned without the transmitter's place:
+    # channels and spectra need both ends.
     if measured in POWERS and not check.present("tx_position") and "rx_position" in arrays:
         check.notes.append("no tx_position: the transmitter's place is unknown")
         arrays["tx_position"] = np.full(3, np.nan)
@@ -121,12 +134,17 @@ def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
     rows, long = len(values), "station" in arrays
     if not long and (values.ndim < 2 or values.shape[1] != count):
         return check.refuse(
-            measured, f"expected shape (S, {count}, ...), a column for each station, found {values.shape}; "
+            measured,
+            f"expected shape (S, {count}, ...), a column for each station, found "
+            f"{values.shape}; "
             "or say which station each row is of with `station` (S,)",
-        )  # fmt: skip
+        )
     station = read_station_of_row(check, rows, count) if long else np.tile(np.arange(count), rows)
     row = np.repeat(np.arange(rows), 1 if long else count)
-    stated = {name: check.read_real(name, (), (count,), (rows,)) for name in ("carrier_hz", "sensitivity_db")}
+    stated = {
+        name: check.read_real(name, (), (count,), (rows,))
+        for name in ("carrier_hz", "sensitivity_db")
+    }
     positions = check.read_real(ends[0], (rows, 3))
     if static == "tx" and stations.rotation is not None:
         check.refuse("station_orientation", "transmitting stations are not turned; leave it out")
@@ -137,7 +155,8 @@ def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
         check.raw = _unrolled(check.raw, measured, count)
     check.raw.arrays["station"] = station
     for name, value in stated.items():
-        if value is not None and value.ndim:  # of as many rows as stations, carriers are taken as of rows
+        # Of as many rows as stations, carriers are taken as of rows
+        if value is not None and value.ndim:
             by_row = len(value) == rows and (rows != count or name == "carrier_hz")
             check.raw.arrays[name] = value[row if by_row else station]
             if by_row and rows == count and len(np.unique(value)) > 1:
@@ -163,5 +182,7 @@ def _unrolled(raw: Raw, measured: str, count: int) -> Raw:
     for name, array in wide.items():
         if array.shape[:2] == (rows, count):
             wide[name] = array.reshape(rows * count, *array.shape[2:])
-    other = {name: array for name, array in raw.arrays.items() if name not in (*MEASUREMENTS, "mask")}
+    other = {
+        name: array for name, array in raw.arrays.items() if name not in (*MEASUREMENTS, "mask")
+    }
     return replace(raw, arrays=take_rows(other, np.repeat(np.arange(rows), count), rows) | wide)

@@ -26,10 +26,14 @@ FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less 
 
 def _are_levels(value: Any) -> bool:
     listed = np.atleast_1d(np.array(value, object)).ravel().tolist()
-    return all(isinstance(one, int | float) and not isinstance(one, bool) and one < np.inf for one in listed)
+    return all(
+        isinstance(one, int | float) and not isinstance(one, bool) and one < np.inf
+        for one in listed
+    )
 
 
-# Of powers that were not measured, by a setting or an attribute of the file: the default, and what may be.
+# Of powers that were not measured, by a setting or an attribute of the file: the default,
+# and what may be.
 SAID = {
     "absent": ("auto", choice("auto", "unknown", "silent")),
     "not_heard": (None, or_null(Limit("a list of levels [dB] like [-999]", _are_levels))),
@@ -44,7 +48,8 @@ def check_said(attributes: Mapping[str, Any]) -> None:
 
 
 def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) -> Links | None:
-    """Leave out rows without a value; censored ones hold the level that they lie below or above, masked.
+    """Leave out rows without a value; censored ones hold the level that they lie below or above,
+    masked.
 
     Args:
         check: of the file, whose `raw` is changed; takes notes, and what is wrong.
@@ -88,7 +93,9 @@ def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) 
         floor, censored = np.full(len(values), values[values > 0].min()), (values == 0) & marked
     if floor is not None:
         arrays[measured] = np.where(censored, floor, arrays[measured])
-    is_missing = (unknown if mask is None else unknown & mask.astype(bool)).any(axis=axes) & ~censored
+    is_missing = (unknown if mask is None else unknown & mask.astype(bool)).any(
+        axis=axes
+    ) & ~censored
     if mask is not None and is_missing.any():
         return links  # marked as measured, and is not: refused where values are read
     keep = marked & ~is_missing
@@ -104,7 +111,11 @@ def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) 
         below = np.ones(1) if floor is None or not censored.any() else floor[censored]
         below = to_decibels(below) if measured == "rssi" else below
         limits = f"{below.min():.4g}" + f" to {below.max():.4g}" * bool(np.ptp(below))
-        what = "not listed" + " or not heard" * bool(censored.sum() > unlisted) if unlisted else "not heard"
+        what = (
+            "not listed" + " or not heard" * bool(censored.sum() > unlisted)
+            if unlisted
+            else "not heard"
+        )
         unheard = f"powers were {what}: below {limits} dB"
         for flags, what in ((~keep, f"values are missing{none}"), (censored, unheard)):
             check.notes += [f"{flags.sum()} of {len(keep)} {what}"] if flags.any() else []
@@ -118,10 +129,15 @@ def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) 
 
 
 def _stated_floor(check: Checker, measured: str, values: np.ndarray) -> np.ndarray | None:
-    """The level (S,) [dB] below which the file says that nothing is heard; None without, or of no use."""
+    """The level (S,) [dB] below which the file says that nothing is heard; None without,
+    or of no use.
+    """
     level = check.read_real("sensitivity_db", (), (1,), values.shape[:1])
     saturates = not isinstance(check.raw.attributes.get("saturation_db", "auto"), str)
-    for name, is_set in (("sensitivity_db", level is not None), ("dataset.saturation_db", saturates)):
+    for name, is_set in (
+        ("sensitivity_db", level is not None),
+        ("dataset.saturation_db", saturates),
+    ):
         if is_set and measured != "rssi_db":
             return check.refuse(name, f"goes with rssi_db, not with {measured}")
     if level is None or values.ndim != 1:
@@ -135,23 +151,28 @@ def _stated_floor(check: Checker, measured: str, values: np.ndarray) -> np.ndarr
 def _below_floor(
     check: Checker, values: np.ndarray, floor: np.ndarray, known: np.ndarray, silent: np.ndarray
 ) -> np.ndarray:
-    """Which of known values (S,) lie below a level of hearing (S,), (S,) bool; one far below all is noted."""
+    """Which of known values (S,) lie below a level of hearing (S,), (S,) bool;
+    one far below all is noted.
+    """
     below = known & (values < floor)
     if below.any():
         share = f"{below.sum()} of {known.sum()} levels lie below sensitivity_db"
         check.notes.append(Caution(f"{share}: taken as not heard; has it the unit of the levels?"))
     highest = np.fmax.reduce(floor[silent | below], initial=-np.inf)
-    weakest = values[known & ~below].astype(float).min(initial=np.inf)  # whole numbers know no infinity
+    # Whole numbers know no infinity
+    weakest = values[known & ~below].astype(float).min(initial=np.inf)
     if FAR_BELOW_DB < weakest - highest < np.inf:
         check.notes.append(
-            f"sensitivity_db={highest:.4g} is {weakest - highest:.0f} dB below the weakest power heard: "
+            f"sensitivity_db={highest:.4g} is {weakest - highest:.0f} dB below the weakest power "
+            "heard: "
             "is it the receiver's? places where nothing was heard count as weaker still"
         )
     return below
 
 
 def forget_unknown(check: Checker, moving: str) -> None:
-    """Make marks that lie beside strong levels as well as beside weak ones NaN: no value, and not unheard.
+    """Make marks that lie beside strong levels as well as beside weak ones NaN: no value,
+    and not unheard.
 
     Args:
         check: of rows of links, whose `raw` is changed; takes notes.
@@ -174,33 +195,51 @@ def forget_unknown(check: Checker, moving: str) -> None:
         beside: list[bool] = []
         marked = (values == mark) & np.isfinite(place).all(1)
         for one in np.unique(station[marked]):
-            heard_rows, marked_rows = (np.flatnonzero(rows & (station == one)) for rows in (heard, marked))
+            heard_rows, marked_rows = (
+                np.flatnonzero(rows & (station == one)) for rows in (heard, marked)
+            )
             if len(heard_rows) < BESIDE:
                 continue
             near = cKDTree(place[heard_rows]).query(place[marked_rows], k=BESIDE)[1]
             level = values[heard_rows].astype(float)
             beside += (level[near].mean(1) < np.median(level)).tolist()
         # A coin that falls on either side: of few marks nothing is told.
-        if not (mark == 0 and alone) and (len(beside) < LEAST_MARKS or np.mean(beside) > WEAK_SHARE):
+        if not (mark == 0 and alone) and (
+            len(beside) < LEAST_MARKS or np.mean(beside) > WEAK_SHARE
+        ):
             continue
         check.raw.arrays["rssi_db"] = np.where(values == mark, np.nan, check.raw.arrays["rssi_db"])
         share = f"{int((values == mark).sum())} of {len(values)} levels"
         where = "" if mark == 0 and alone else ", beside strong levels as well as weak ones"
-        note = f"{share} are exactly {round(mark, 6) + 0:g}, apart from all others{where}: no value, left out"
-        check.notes.append(Caution(f"{note}; dataset.not_heard=[{mark:.12g}] takes them as not heard"))
+        note = (
+            f"{share} are exactly {round(mark, 6) + 0:g}, apart from all others{where}: no "
+            "value, left out"
+        )
+        check.notes.append(
+            Caution(f"{note}; dataset.not_heard=[{mark:.12g}] takes them as not heard")
+        )
 
 
 def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None) -> np.ndarray:
-    """Which of levels (S,) are marks for "not heard", (S,) bool: those that the file names, else found."""
+    """Which of levels (S,) are marks for "not heard", (S,) bool: those that the file names,
+    else found.
+    """
     setting = check.raw.attributes.get("not_heard")
-    marks = find_marks(values) if setting is None else np.atleast_1d(np.asarray(setting, np.float64)).tolist()
+    marks = (
+        find_marks(values)
+        if setting is None
+        else np.atleast_1d(np.asarray(setting, np.float64)).tolist()
+    )
     # `not_heard=[]` keeps minus infinity as a level, too.
     silent = np.isin(values, marks) | ((values == -np.inf) & (setting is None or len(marks) > 0))
     floor = "sensitivity_db"
     if level is None and silent.any() and np.isfinite(values[~silent]).any():
         floor = f"{values[~silent & np.isfinite(values)].min():.4g} dB, the weakest level heard"
     for mark in marks if setting is None else ():
-        share = f"{int((values == mark).sum())} of {len(values)} levels are exactly {round(mark, 6) + 0:g}"
+        share = (
+            f"{int((values == mark).sum())} of {len(values)} levels are exactly "
+            f"{round(mark, 6) + 0:g}"
+        )
         note = f"{share}, apart from all others: taken as not heard, that is below {floor}"
         does = "refuses" if abs(mark) > MOST_DB else "keeps"
         say = f"dataset.not_heard=[] {does} them, sensitivity_db= sets another level"
@@ -209,9 +248,17 @@ def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None)
 
 
 def _saturated(check: Checker, values: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Which of levels (S,) are at least the file's, or the found, level of saturation, (S,) bool."""
+    """Which of levels (S,) are at least the file's, or the found, level of saturation, (S,)
+    bool.
+    """
     limit = check.raw.attributes.get("saturation_db", "auto")
-    level = find_saturation(values[known]) if limit == "auto" else None if limit == "none" else float(limit)
+    level = (
+        find_saturation(values[known])
+        if limit == "auto"
+        else None
+        if limit == "none"
+        else float(limit)
+    )
     if level is None:
         return np.zeros(len(values), bool)
     # Both in float32: a file's level may differ from the decimal setting by its rounding.

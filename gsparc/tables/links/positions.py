@@ -19,14 +19,16 @@ NO_FIX_DEG, NO_FIX_M = 1.0, 1e4  # from 0, 0 to the median of all other rows, at
 
 
 def positions_in_metres(check: Checker, measured: str) -> tuple[bool, Georeference | None]:
-    """Replace positions in `check.raw` by (n, 3) [m]; whether all went well, and the origin of degrees.
+    """Replace positions in `check.raw` by (n, 3) [m]; whether all went well,
+    and the origin of degrees.
 
     Args:
         check: of the file; takes notes of rows that are left out, and what is wrong.
         measured: name of the measurement.
     """
     before = len(check.problems)  # what is already noted does not keep from noting more
-    # Rows without a fix go before the projection: 0, 0 degrees would move its origin far from the site.
+    # Rows without a fix go before the projection: 0,
+    # 0 degrees would move its origin far from the site.
     _without_fix(check, measured)
     origin = _in_metres(check)
     return len(check.problems) == before and _heights(check), origin
@@ -37,14 +39,21 @@ def _without_fix(check: Checker, measured: str) -> None:
     arrays = check.raw.arrays
     degrees = "latitude" in arrays
     for name in ("latitude",) if degrees else check.present("rx_position", "tx_position"):
-        pair = [arrays[one] for one in (name, "longitude") if one in arrays] if degrees else [arrays[name]]
+        pair = (
+            [arrays[one] for one in (name, "longitude") if one in arrays]
+            if degrees
+            else [arrays[name]]
+        )
         rows, kinds = len(arrays[measured]), {p.dtype.kind for p in pair}
         if any(p.ndim != 2 - degrees or len(p) != rows for p in pair) or not kinds <= {*"iuf"}:
             continue
         if len(pair) < 1 + degrees:  # refused where degrees are read
             continue
         place = np.column_stack(pair)[:, :2].astype(np.float64)
-        null, earth = (place == 0).all(axis=1), np.array(ON_EARTH if degrees else [(-FARTHEST, FARTHEST)] * 2)
+        null, earth = (
+            (place == 0).all(axis=1),
+            np.array(ON_EARTH if degrees else [(-FARTHEST, FARTHEST)] * 2),
+        )
         off = np.asarray(~((place >= earth[:, 0]) & (place <= earth[:, 1])).all(axis=1))
         fixes = place[~(null | off)]
         if not len(fixes):
@@ -55,12 +64,16 @@ def _without_fix(check: Checker, measured: str) -> None:
             _unknown_at_zero(check, degrees)
             faults[f"{'latitude and longitude' if degrees else 'x and y'} are 0: no fix"] = null
         # One value that repeats is a mark of a logger; several are faults only where they are few.
-        if off.sum() <= max(1, FEW * rows) or (2 * off.sum() < rows and not np.ptp(place[off], axis=0).any()):
+        if off.sum() <= max(1, FEW * rows) or (
+            2 * off.sum() < rows and not np.ptp(place[off], axis=0).any()
+        ):
             x, y = place[off.argmax()]
             faults[f"no such place on Earth, ({x:g}, {y:g}) {'degrees' if degrees else 'm'}"] = off
         for what, out in [(what, out) for what, out in faults.items() if out.any()]:
             which = name_row_ranges([str(name) for name in arrays["row_name"][out]])
-            check.notes.append(Caution(f"{which}: {what}; these {out.sum()} of {rows} rows are left out"))
+            check.notes.append(
+                Caution(f"{which}: {what}; these {out.sum()} of {rows} rows are left out")
+            )
         keep = ~np.any([*faults.values()], axis=0)
         if faults and not keep.all():
             check.raw = replace(check.raw, arrays=take_rows(arrays, np.flatnonzero(keep), rows))
@@ -73,12 +86,16 @@ def _unknown_at_zero(check: Checker, degrees: bool) -> None:
     names = ("station_latitude", "station_longitude") if degrees else ("station_position",)
     if not set(names) <= set(arrays) or len({len(arrays[name]) for name in names}) > 1:
         return
-    at_zero = np.flatnonzero((np.column_stack([arrays[name] for name in names])[:, :2] == 0).all(axis=1))
+    at_zero = np.flatnonzero(
+        (np.column_stack([arrays[name] for name in names])[:, :2] == 0).all(axis=1)
+    )
     for name in names:
         arrays[name] = arrays[name].astype(np.float64)
         arrays[name][at_zero] = np.nan
     if len(at_zero):
-        who = list_first([arrays["station_name"][i] if "station_name" in arrays else i for i in at_zero])
+        who = list_first(
+            [arrays["station_name"][i] if "station_name" in arrays else i for i in at_zero]
+        )
         check.notes.append(Caution(f"stations at 0, 0: {who}: no fix; their places are unknown"))
 
 
@@ -91,7 +108,9 @@ def _heights(check: Checker) -> bool:
         if height in arrays and not flat:
             check.refuse(height, f"given, but {name} has three coordinates or is missing")
         elif height not in arrays and flat:
-            check.refuse(name, f"two coordinates; expected three, or the height above ground as {height} [m]")
+            check.refuse(
+                name, f"two coordinates; expected three, or the height above ground as {height} [m]"
+            )
         elif flat and (above := check.read_real(height, (), arrays[name].shape[:-1])) is not None:
             place = arrays[name].astype(np.float64)
             column = np.broadcast_to(above, place.shape[:-1])[..., None]
@@ -101,7 +120,9 @@ def _heights(check: Checker) -> bool:
 
 
 def _in_metres(check: Checker) -> Georeference | None:
-    """Degrees in `check.raw` replaced by positions (n, 2) [m]; None without any, or with a fault (noted)."""
+    """Degrees in `check.raw` replaced by positions (n, 2) [m]; None without any,
+    or with a fault (noted).
+    """
     for prefix in ("", "station_"):
         pair = check.present(f"{prefix}latitude", f"{prefix}longitude")
         if len(pair) == 1:
@@ -109,12 +130,16 @@ def _in_metres(check: Checker) -> Georeference | None:
     arrays, before = check.raw.arrays, len(check.problems)
     if "latitude" not in arrays:
         if "station_latitude" in arrays:
-            return check.refuse("station_latitude", "given without latitude and longitude of the other end")
+            return check.refuse(
+                "station_latitude", "given without latitude and longitude of the other end"
+            )
         return _stated(check)
     if "station_position" in arrays:
         fault = "in metres beside places in degrees; expected station_latitude"
         return check.refuse("station_position", fault)
-    places = {prefix: _read(check, prefix) for prefix in ("", "station_") if f"{prefix}latitude" in arrays}
+    places = {
+        prefix: _read(check, prefix) for prefix in ("", "station_") if f"{prefix}latitude" in arrays
+    }
     if len(check.problems) > before:
         return None
     # About the rows rather than the stations: a distant station must not distort the site.
@@ -125,7 +150,9 @@ def _in_metres(check: Checker) -> Georeference | None:
         if prefix in places:
             valid = np.isfinite(places[prefix][0])
             arrays[f"{name}_position"] = np.full((valid.size, 2), np.nan)
-            arrays[f"{name}_position"][valid] = origin.from_degrees(*(part[valid] for part in places[prefix]))
+            arrays[f"{name}_position"][valid] = origin.from_degrees(
+                *(part[valid] for part in places[prefix])
+            )
             if f"{name}_height" not in arrays:
                 arrays[f"{name}_height"] = np.array(0.0)
                 check.notes.append(f"no {name}_height: taken as 0 m")
@@ -137,14 +164,18 @@ def _in_metres(check: Checker) -> Georeference | None:
 
 
 def _stated(check: Checker) -> Georeference | None:
-    """The origin of positions in metres, where attributes of the file say where on Earth it lies."""
+    """The origin of positions in metres, where attributes of the file say where
+    on Earth it lies.
+    """
     degrees = [check.raw.attributes.get(f"origin_{name}") for name in ("latitude", "longitude")]
     if degrees == [None, None]:
         return None
     try:
         return Georeference(*(float(value) for value in degrees))  # type: ignore[arg-type]
     except (TypeError, ValueError) as error:
-        return check.refuse("origin_latitude", f"with origin_longitude {degrees}: expected degrees ({error})")
+        return check.refuse(
+            "origin_latitude", f"with origin_longitude {degrees}: expected degrees ({error})"
+        )
 
 
 def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
@@ -152,7 +183,8 @@ def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
     longitude = None if latitude is None else check.read_real(f"{prefix}longitude", latitude.shape)
     if latitude is None or longitude is None:
         return np.zeros(0), np.zeros(0)
-    absent = np.isnan(latitude) & np.isnan(longitude) & bool(prefix)  # a station whose place nobody knows
+    # A station whose place nobody knows
+    absent = np.isnan(latitude) & np.isnan(longitude) & bool(prefix)
     # Zeros stand in for places that nobody knows, which would be refused as no degrees.
     fault = find_invalid_coordinate(*np.where(absent, 0, (latitude, longitude)))
     if fault:

@@ -1,4 +1,6 @@
-"""The ends of the links of a file: which stands still, at which places, named how, at which carriers."""
+"""The ends of the links of a file: which stands still, at which places, named how,
+at which carriers.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +14,24 @@ from gsparc.data.spacing import number_places
 from gsparc.tables.own_checks import HIGHEST_HZ, LOWEST_HZ, Checker
 
 # Of a station's beam, in the order of `Stations.sector`.
-SECTOR = ("station_azimuth", "station_tilt", "station_width", "station_thickness", "station_power_db",
-          "station_site")  # fmt: skip
-PER_STATION = ("sensitivity_db", "carrier_hz", *SECTOR)  # of a list of stations, beside their places
+SECTOR = (
+    "station_azimuth",
+    "station_tilt",
+    "station_width",
+    "station_thickness",
+    "station_power_db",
+    "station_site",
+)
+# Of a list of stations, beside their places
+PER_STATION = ("sensitivity_db", "carrier_hz", *SECTOR)
 FULL_TURN = 360.0
 LINKS_PER_STATION = 8  # fewer rows at each distinct place of an end: that end moves
 
 
 def find_static_end(check: Checker, rx: np.ndarray, tx: np.ndarray) -> Links:
-    """Find which end stands still, at one place or at few, whose rows are then numbered; None: both move."""
+    """Find which end stands still, at one place or at few, whose rows are then numbered; None:
+    both move.
+    """
     ends: dict[End, np.ndarray] = {"tx": tx, "rx": rx}
     places = {end: np.unique(where, axis=0, return_inverse=True) for end, where in ends.items()}
     few: End = min(ends, key=lambda end: len(places[end][0]))
@@ -29,7 +40,9 @@ def find_static_end(check: Checker, rx: np.ndarray, tx: np.ndarray) -> Links:
         return Links("rx" if len(places["rx"][0]) == 1 else "tx")
     if len(table) * LINKS_PER_STATION > len(rx) or len(table) * 2 > len(places[OTHER[few]][0]):
         return Links(None)
-    check.notes.append(f"the {ENDS[few]} stands at {len(table)} places: taken as {len(table)} stations")
+    check.notes.append(
+        f"the {ENDS[few]} stands at {len(table)} places: taken as {len(table)} stations"
+    )
     check.raw.arrays["station"] = which.reshape(-1).astype(np.int64)
     check.raw.arrays["place"] = number_places(ends[OTHER[few]])
     return Links(few, Stations(table, tuple(str(i) for i in range(len(table)))))
@@ -66,7 +79,9 @@ def read_station_table(check: Checker, may_miss: bool = False) -> Stations | Non
         sector = np.stack([np.full(count, np.nan) if part is None else part for part in parts], 1)
         wrong = np.abs(sector[:, :4]).max(initial=0, where=np.isfinite(sector[:, :4]))
         if wrong > FULL_TURN:
-            return check.refuse("station_azimuth", f"{wrong:g}; expected degrees, none beyond {FULL_TURN:g}")
+            return check.refuse(
+                "station_azimuth", f"{wrong:g}; expected degrees, none beyond {FULL_TURN:g}"
+            )
     labels = None if label is None else tuple(map(str, label))
     return Stations(places, called, rotation, sector=sector, label=labels)
 
@@ -86,7 +101,9 @@ def read_station_of_row(check: Checker, rows: int, count: int) -> np.ndarray | N
 ONE_CARRIER = 1.05  # channels of one band within this ratio are one carrier to a field of powers
 
 
-def _of_one(check: Checker, station: np.ndarray, carrier: np.ndarray, names: Sequence[str]) -> np.ndarray:
+def _of_one(
+    check: Checker, station: np.ndarray, carrier: np.ndarray, names: Sequence[str]
+) -> np.ndarray:
     """Carriers (n,) [Hz] of links, those of one station that lie close together at their middle."""
     different, which = np.unique(carrier, return_inverse=True)
     bands: list[int] = []
@@ -100,13 +117,17 @@ def _of_one(check: Checker, station: np.ndarray, carrier: np.ndarray, names: Seq
         return carrier
     most = names[one[count.argmax(), 0]]
     note = f"station {most} at {count.max()} carriers within {100 * (ONE_CARRIER - 1):.0f} % is one"
-    check.notes.append(f"{note}, and the like; dataset.columns.station=STATION+CARRIER tells them apart")
+    check.notes.append(
+        f"{note}, and the like; dataset.columns.station=STATION+CARRIER tells them apart"
+    )
     ends = [different[np.array(bands) == number] for number in range(bands[-1] + 1)]
     return np.array([(end[0] + end[-1]) / 2 for end in ends])[band]
 
 
 def split_by_carrier(check: Checker, stations: Stations, hopping: bool) -> Stations:
-    """Part stations at several carriers, one for each; where `hopping`, carriers of a band are one."""
+    """Part stations at several carriers, one for each; where `hopping`,
+    carriers of a band are one.
+    """
     arrays = check.raw.arrays
     carrier = arrays.get("carrier_hz")
     if carrier is None or carrier.ndim == 0:

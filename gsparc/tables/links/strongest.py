@@ -1,10 +1,10 @@
 """Lists of the strongest: drive tests that list a bounded number of stations at each moment.
 
-A station that a full list leaves out is at most as strong as the weakest that it holds: a level of its own
-row. In a list that is not full it is below what the receiver hears.
+A station that a full list leaves out is at most as strong as the weakest that it holds: a level of
+its own row. In a list that is not full it is below what the receiver hears.
 
-Where all that is heard is listed, levels end at a floor: they are missing beside weak ones alone. Levels that
-were lost, in outages or at random, are missing beside strong ones, too.
+Where all that is heard is listed, levels end at a floor: they are missing beside weak ones alone.
+Levels that were lost, in outages or at random, are missing beside strong ones, too.
 """
 
 from __future__ import annotations
@@ -30,14 +30,18 @@ ABOVE_DB = 6.0  # of a neighbour's weakest, where a station drops out of lists, 
 WHOLE = 0.5  # of the rows, those of moments that leave none out
 ALONE = 0.9  # of the moments, that hold one station where what is logged is the one that serves
 SERVED = 0.5  # of what chance leaves, that near moments hold the same one more often
-SWITCHES, HYSTERESIS_DB = 5, 3.0  # near moments of two, at least; what these differ by more than others
+# Near moments of two, at least; what these differ by more than others
+SWITCHES, HYSTERESIS_DB = 5, 3.0
 RUN = 3  # such moments in a row: how alike neighbours are
 NEAREST = 30  # lists that tell which stations may be listed at a place
 FLOOR = 2.0  # per cent of a station's levels that may lie below its floor
-STRONG_DB, SPREADS = 10.0, 3.0  # above the floor, at least; and in deviations between neighbouring places
+# Above the floor, at least; and in deviations between neighbouring places
+STRONG_DB, SPREADS = 10.0, 3.0
 LEAST_LINKS = 30  # of those missing beside levels, and of strong levels
-# Share missing beside strong levels, and of strong ones among levels beside missing ones: with a floor up to
-# .013 and .04 (simulated drives), of outages and random losses .01 to .5 and .3 to .85 (also POWDER).
+# Share missing beside strong levels, and of strong ones among levels beside missing ones:
+# with a floor up to
+# .013 and .04 (simulated drives), of outages and random losses .01 to .5 and .3
+# to .85 (also POWDER).
 LOST, BESIDE_STRONG = 0.02, 0.1
 
 
@@ -46,7 +50,8 @@ def number_lists(place: np.ndarray, station: np.ndarray) -> np.ndarray:
 
     Args:
         place: (n,) int64, number of each row's place.
-        station: (n,) of each row: one that comes again begins another list, unless it comes twice in a row.
+        station: (n,) of each row: one that comes again begins another list, unless it comes twice
+            in a row.
     """
     first = np.r_[True, np.diff(place) != 0]
     if first.sum() > 2 * len(np.unique(place)):  # not in the order of time
@@ -86,7 +91,9 @@ class StrongestLists(Stored):
     def from_rows(
         cls, place: np.ndarray, who: np.ndarray, level: np.ndarray, at: np.ndarray, count: int
     ) -> StrongestLists:
-        """Build from rows (n,) of numbered places `at` (n, 3) [m], stations `who` of `count`, levels [dB]."""
+        """Build from rows (n,) of numbered places `at` (n, 3) [m], stations `who` of `count`,
+        levels [dB].
+        """
         lists = number_lists(place, who)
         number, first, which = np.unique(lists, return_index=True, return_inverse=True)
         table = np.full((len(number), count), np.nan)
@@ -118,11 +125,14 @@ class StrongestLists(Stored):
         return (np.isfinite(self.level).sum(1) >= self.length) & (self.length > 0)
 
     def are_strongest(self) -> bool:
-        """Tell whether many hold as many as any, fewer than there are, and stations drop out when weak.
+        """Tell whether many hold as many as any, fewer than there are,
+        and stations drop out when weak.
 
         Stations of one place alone are missing elsewhere whatever ends a list: they are not asked.
         """
-        of_places = [len(np.unique(self.place[rows], axis=0)) > 1 for rows in np.isfinite(self.level).T]
+        of_places = [
+            len(np.unique(self.place[rows], axis=0)) > 1 for rows in np.isfinite(self.level).T
+        ]
         if not all(of_places):
             level = self.level[:, of_places]
             length = min(self.length, int(np.isfinite(level).sum(1).max(initial=0)))
@@ -140,8 +150,8 @@ class StrongestLists(Stored):
     def serve_one(self) -> bool:
         """Tell whether the one station of a moment is its strongest: a log of the serving cell.
 
-        Near moments then mostly hold the same, and where they do not both are about as strong: what is
-        measured one after the other, or where somebody chose to, changes more often and by more.
+        Near moments then mostly hold the same, and where they do not both are about as strong: what
+        is measured one after the other, or where somebody chose to, changes more often and by more.
         """
         own, near = np.isfinite(self.level), np.isfinite(self.beside)
         moments = np.flatnonzero(own.any(1) & near.any(1))
@@ -157,7 +167,9 @@ class StrongestLists(Stored):
     def beside(self) -> np.ndarray:
         """(M, T) levels at the nearest other place, NaN where there are none."""
         moments = np.flatnonzero(np.isfinite(self.place).all(1))
-        places, first, which = np.unique(self.place[moments], axis=0, return_index=True, return_inverse=True)
+        places, first, which = np.unique(
+            self.place[moments], axis=0, return_index=True, return_inverse=True
+        )
         result = np.full(self.level.shape, np.nan)
         if len(places) > 1:
             near = cKDTree(places).query(places, k=2)[1][:, 1]
@@ -171,14 +183,18 @@ class StrongestLists(Stored):
         return self.beside > floor + max(STRONG_DB, SPREADS * spread)
 
     def short_are_lost(self, floor: np.ndarray) -> bool:
-        """Tell whether lists that are not full lack stations that are strong beside them, as in outages."""
+        """Tell whether lists that are not full lack stations that are strong beside them,
+        as in outages.
+        """
         missing = np.isnan(self.level) & ~self.full[:, None] & np.isfinite(self.beside)
         return bool((missing & self.strong_beside(floor)).sum() > BESIDE_STRONG * missing.sum())
 
     def below_floor(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return floors (T,) [dB] and which links (M, T) lie below; None where missing ones look lost.
+        """Return floors (T,) [dB] and which links (M, T) lie below;
+        None where missing ones look lost.
 
-        A link beside a strong one, and a station with several of these, are taken as lost in any case.
+        A link beside a strong one, and a station with several of these,
+        are taken as lost in any case.
         """
         missing, floor = np.isnan(self.level), np.full(self.level.shape[1], np.nan)
         heard = ~missing.all(0)
@@ -195,8 +211,13 @@ class StrongestLists(Stored):
     def listed_near(self, places: np.ndarray) -> np.ndarray:
         """Return which stations (n, T) any of the lists nearest to places (n, 3) [m] holds."""
         has_fix = np.isfinite(self.place).all(1)
-        listed, result = np.isfinite(self.level[has_fix]), np.zeros((len(places), self.level.shape[1]), bool)
-        near = cKDTree(self.place[has_fix]).query(places, range(1, min(NEAREST, len(listed)) + 1))[1]
+        listed, result = (
+            np.isfinite(self.level[has_fix]),
+            np.zeros((len(places), self.level.shape[1]), bool),
+        )
+        near = cKDTree(self.place[has_fix]).query(places, range(1, min(NEAREST, len(listed)) + 1))[
+            1
+        ]
         for one in near.T:  # together they would take much memory
             result |= listed[one]
         return result
@@ -204,8 +225,9 @@ class StrongestLists(Stored):
     def bound_unlisted(self, floor: np.ndarray, most: int, may: np.ndarray) -> Silent:
         """Return moments (m,), stations (m,) and levels (m,) [dB] that these are below.
 
-        Half of them are all that some moments leave out, spread over the drive: only those tell how strong
-        stations are that are seldom listed. The rest are drawn, first of stations that are listed nearby.
+        Half of them are all that some moments leave out, spread over the drive: only those tell how
+        strong stations are that are seldom listed. The rest are drawn,
+        first of stations that are listed nearby.
 
         Args:
             floor: (T,) level of lists that are not full [dB].
@@ -226,7 +248,9 @@ class StrongestLists(Stored):
 
 
 def strongest_lists(data: Measurements) -> StrongestLists | None:
-    """Return what is listed at each moment, where these are lists of the strongest; None elsewhere."""
+    """Return what is listed at each moment, where these are lists of the strongest;
+    None elsewhere.
+    """
     if data.place is None or data.station is None or not data.site.several:
         return None
     heard = np.flatnonzero(data.censored_side() <= 0)

@@ -1,4 +1,6 @@
-"""Fields exported for C answer as the model does, from any number of threads; what is damaged is refused."""
+"""Fields exported for C answer as the model does, from any number of threads;
+what is damaged is refused.
+"""
 
 import importlib.util
 import os
@@ -54,14 +56,23 @@ def of_sources(tones, antennas=1, clutter=False):
     frequency = 2.4e9 + 1e6 * np.arange(tones)
     array = np.c_[0.05 * np.arange(antennas), np.zeros((antennas, 2))]
     heard = rx[:, None] + array
-    far = np.stack([np.linalg.norm(heard - place, axis=-1) for place in (tx, tx * [-1, 1, 1])])[..., None]
+    far = np.stack([np.linalg.norm(heard - place, axis=-1) for place in (tx, tx * [-1, 1, 1])])[
+        ..., None
+    ]
     csi = (np.exp(-2j * np.pi * frequency / LIGHT * far) / far).sum(0)
     given = {} if antennas == 1 else {"array_position": array}
     settings = {"searches": 1, "clutter": clutter, "search_rows": 80}
     return gsparc.fit(
-        rx=rx, tx=tx, csi=csi, frequency_hz=frequency, model="image_source_gp", settings=settings,
-        effort=0.3, rx_rotation=np.eye(3), **given,
-    )  # fmt: skip
+        rx=rx,
+        tx=tx,
+        csi=csi,
+        frequency_hz=frequency,
+        model="image_source_gp",
+        settings=settings,
+        effort=0.3,
+        rx_rotation=np.eye(3),
+        **given,
+    )
 
 
 def of_images(model, **settings):
@@ -101,7 +112,19 @@ def driver(library, *options):
     out = library.with_name("driver")
     source = ROOT / "tests" / "helpers" / "driver.cpp"
     linked = ["-L", library.parent, "-lgsparc_field", f"-Wl,-rpath,{library.parent}"]
-    given = ["g++", "-O1", "-std=c++17", "-pthread", *options, source, "-I", SOURCES, *linked, "-o", out]
+    given = [
+        "g++",
+        "-O1",
+        "-std=c++17",
+        "-pthread",
+        *options,
+        source,
+        "-I",
+        SOURCES,
+        *linked,
+        "-o",
+        out,
+    ]
     subprocess.run(given, check=True, capture_output=True, text=True, timeout=300)
     return out
 
@@ -122,7 +145,9 @@ def example():
 def test_a_form_says_what_it_is_and_its_file_is_checked(tmp_path):
     predictor = of_powers(60)
     found = make.compile_model(predictor)
-    assert (found.form.kind, found.error) == (4, 0) and found.summary == "a process of powers, exactly"
+    assert (found.form.kind, found.error) == (4, 0) and found.summary == (
+        "a process of powers, exactly"
+    )
     blob = pack_form(found.form, predictor.site.origin, found.error)
     magic, version, checksum, size, _ = HEAD.unpack(blob[: HEAD.size])
     assert (magic, version, size) == (b"GSPARC\r\n", 2, len(blob))
@@ -140,27 +165,42 @@ def test_channels_without_sources_and_stations_are_refused_in_one_line():
     rng = np.random.default_rng(0)
     rx, csi = rng.uniform(size=(20, 3)), rng.normal(size=20) + 1j
     waves = gsparc.fit(rx=rx, tx=[3.0, 2, 1], csi=csi, frequency_hz=2.4e9, model="complex_gp")
-    refused(r"^complex_gp: channels that are no sum of image sources [^\n]*$", make.compile_model, waves)
-    refused(r"^gp: of spectra only rendered Gaussians can be compiled", make.compile_model, of_images("gp"))
+    refused(
+        r"^complex_gp: channels that are no sum of image sources [^\n]*$", make.compile_model, waves
+    )
+    refused(
+        r"^gp: of spectra only rendered Gaussians can be compiled",
+        make.compile_model,
+        of_images("gp"),
+    )
     moving = SimpleNamespace(method=waves.method, site=replace(waves.site, static_end=None))
-    refused(r"^to=c: channels and spectra of two moving ends .* stands still$", make.compile_model, moving)
+    refused(
+        r"^to=c: channels and spectra of two moving ends .* stands still$",
+        make.compile_model,
+        moving,
+    )
 
 
 MODELS = {
-    "powers, all rows": partial(of_powers, 300), "powers, variance of the nearest": partial(of_powers, 1500),
+    "powers, all rows": partial(of_powers, 300),
+    "powers, variance of the nearest": partial(of_powers, 1500),
     "powers, the nearest": partial(of_powers, 700),
     "powers, a mean of processes": partial(of_powers, 120, "gsparc"),
-    "powers, distilled": partial(of_powers, 80, "idw"), "sources": partial(of_sources, 1),
-    "sources, many tones": partial(of_sources, 40), "sources, four antennas": partial(of_sources, 7, 4),
+    "powers, distilled": partial(of_powers, 80, "idw"),
+    "sources": partial(of_sources, 1),
+    "sources, many tones": partial(of_sources, 40),
+    "sources, four antennas": partial(of_sources, 7, 4),
     "image of Gaussians": partial(of_images, "gsparc", effects=EffectSettings(residual=False)),
     "array": None,
-}  # fmt: skip
+}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", MODELS)
 def test_the_library_answers_as_the_model(name, library, example, tmp_path, monkeypatch):
-    """At random places to 1e-5 of the scale, with variance and unknown share where these are exact."""
+    """At random places to 1e-5 of the scale,
+    with variance and unknown share where these are exact.
+    """
     monkeypatch.setattr(powers, "MOST_ROWS", 500 if name == "powers, the nearest" else 6000)
     torch.set_num_threads(1)
     predictor = MODELS[name]() if MODELS[name] else of_an_array(tmp_path)
@@ -211,7 +251,8 @@ def test_threads_agree_nothing_is_allocated_and_damage_is_refused(library, tmp_p
     path.write_bytes(blob)
     run = partial(subprocess.run, capture_output=True, text=True, check=True, timeout=300)
     asked = driver(library)
-    said = run([asked, path, "8", "10000000"]).stdout  # of a tenth two threads' collision was often missed
+    # Of a tenth two threads' collision was often missed
+    said = run([asked, path, "8", "10000000"]).stdout
     assert said.split() == ["queries", "10000000", "wrong", "0", "allocations", "0"]
     cut = files(tmp_path, 1000, partial(damaged, blob))
     assert run([asked, *cut]).stdout.split() == ["refused", "1000"]
@@ -222,16 +263,22 @@ def test_sizes_whose_product_left_32_bits_were_written_beyond(library, example, 
     """65,536 x 65,536 entries: none in 32 bits: no factors were needed, and answers had no room."""
     sizes = [1, 1, 65536, 65536, 1, 1]
     arrays = {
-        name: np.ones(count) for name, count in field_files.needed(3, sizes).items() if name != "factors"
+        name: np.ones(count)
+        for name, count in field_files.needed(3, sizes).items()
+        if name != "factors"
     }
     double = ("moving", "sources", "images", "combs", "offsets")
-    arrays = {name: value.astype("f8" if name in double else "f4") for name, value in arrays.items()}
+    arrays = {
+        name: value.astype("f8" if name in double else "f4") for name, value in arrays.items()
+    }
     form = Form(3, [*map(float, sizes), 1e9], arrays | {"middle": np.zeros(3)})
     (path := tmp_path / "field.gsparc").write_bytes(pack_form(form, np.zeros(3)))
     refused("factors is missing", example.Field, path, library)
     arrays = arrays | {"middle": np.zeros(3), "factors": np.ones(2 << 20, "f4")}
     sizes = [1, 1, 1, 1 << 20, 1, 1]
-    fits = {name: np.resize(arrays[name], count) for name, count in field_files.needed(3, sizes).items()}
+    fits = {
+        name: np.resize(arrays[name], count) for name, count in field_files.needed(3, sizes).items()
+    }
     fits |= {"middle": np.zeros(3), "combs": np.array([1e9, 1e6, 1e5])}
     path.write_bytes(pack_form(Form(3, [*map(float, sizes), 1e9], fits), np.zeros(3)))
     refused("an answer of 209715200000 numbers", example.Field, path, library)
@@ -252,14 +299,20 @@ def test_places_that_python_refuses_were_answered_by_the_library(library, exampl
 
 @pytest.mark.slow
 def test_the_stated_error_missed_the_metres_under_a_station(monkeypatch):
-    """Of 256 draws over 400 x 400 m none was there; and it was linear, which a few strong places decide."""
+    """Of 256 draws over 400 x 400 m none was there; and it was linear,
+    which a few strong places decide.
+    """
     monkeypatch.setitem(make.ANSWERED, "rssi", 1500)
     rng, tx = np.random.default_rng(0), np.array([200.0, 200, 3])
     rx = rng.uniform([0, 0, 0], [400, 400, 2], (300, 3))
     level = -40 - 20 * np.log10(np.linalg.norm(rx - tx, axis=1))
     predictor = gsparc.fit(rx=rx, tx=tx, rssi=level, model="idw")
     found = make.compile_model(predictor, 4096)
-    assert found.form.predictor is not None and "RMSE dB" in found.summary and "at the worst" in found.summary
+    assert (
+        found.form.predictor is not None
+        and "RMSE dB" in found.summary
+        and "at the worst" in found.summary
+    )
     places = make.random_places(predictor.site, 3_000, 9)
     own, whole = (make.ask_model(one, places)[:, 0] for one in (found.form.predictor, predictor))
     apart = 10 * np.log10(own / whole)
@@ -273,17 +326,23 @@ def test_the_stated_error_missed_the_metres_under_a_station(monkeypatch):
 @pytest.mark.timeout(900 + FUZZ_S)
 @pytest.mark.parametrize("portable", ["OFF", "ON"])
 def test_sanitizers_see_nothing(tmp_path, portable, capsys):
-    """Sound files, and those with several fields changed whose checksums are right: refused, or answered from
-    within. `GSPARC_FUZZ_S=3600`: for an hour."""
+    """Sound files, and those with several fields changed whose checksums are right: refused, or
+    answered from within. `GSPARC_FUZZ_S=3600`: for an hour."""
     library = built(tmp_path / "library", "-DGSPARC_SANITIZE=ON", f"-DGSPARC_PORTABLE={portable}")
     asked = driver(library, "-fsanitize=address,undefined", "-DGSPARC_WATCHED")
     models = (of_powers(60), of_powers(40, "idw"), of_sources(5), of_sources(3, 4))
-    forms = [field_files.an_array(), *(make.compile_model(predictor, 64).form for predictor in models)]
+    forms = [
+        field_files.an_array(),
+        *(make.compile_model(predictor, 64).form for predictor in models),
+    ]
     until, seed, slow, refused = time.monotonic() + FUZZ_S, 0, 0, 0
     while seed < 2 or time.monotonic() < until:
         for number, form in enumerate(forms):
             (sound := tmp_path / "sound").write_bytes(pack_form(form, np.zeros(3)))
-            given = [sound, *files(tmp_path, 100, partial(field_files.mutated, form), (seed, number))]
+            given = [
+                sound,
+                *files(tmp_path, 100, partial(field_files.mutated, form), (seed, number)),
+            ]
             found = subprocess.run([asked, *given], capture_output=True, text=True, timeout=300)
             slow += found.returncode == -signal.SIGALRM
             assert found.returncode in (0, -signal.SIGALRM), (seed, number, found.stderr[-2000:])
@@ -302,14 +361,28 @@ def test_the_command_writes_a_folder_whose_library_and_example_build(tmp_path, m
     monkeypatch.setattr("gsparc.runs.output.run_directory", lambda: tmp_path)
     config = campaigns.compose(f"ckpt={path}", f"out={out}", config="export")
     facts = export.task(config)
-    assert facts["export/error"] == 0 and (out / "field.gsparc").stat().st_size == facts["export/bytes"]
+    assert (
+        facts["export/error"] == 0
+        and (out / "field.gsparc").stat().st_size == facts["export/bytes"]
+    )
     refused("is there already", export.task, config)
     for command in (
         ["cmake", "-S", out / "source" / "field", "-B", out / "build", "-DGSPARC_PORTABLE=ON"],
         ["cmake", "--build", out / "build"],
-        ["cc", EXAMPLES / "query.c", "-I", out, "-L", out / "build", "-lgsparc_field",
-         f"-Wl,-rpath,{out / 'build'}", "-lm", "-o", tmp_path / "query"],
-    ):  # fmt: skip
+        [
+            "cc",
+            EXAMPLES / "query.c",
+            "-I",
+            out,
+            "-L",
+            out / "build",
+            "-lgsparc_field",
+            f"-Wl,-rpath,{out / 'build'}",
+            "-lm",
+            "-o",
+            tmp_path / "query",
+        ],
+    ):
         subprocess.run(command, check=True, capture_output=True, timeout=300)
     query = [tmp_path / "query", out / "field.gsparc", "110", "60", "1"]
     said = subprocess.run(query, check=True, capture_output=True, text=True).stdout
@@ -331,4 +404,8 @@ def test_a_distilled_form_was_wrong_by_the_law_of_distance_outside_its_box():
         places = middle + reach * np.c_[np.cos(around), np.sin(around), 0 * around]
         error = found.form.predictor.rssi(**{predictor.site.moving_end: places})
         error = error - predictor.rssi(**{predictor.site.moving_end: places})
-        assert np.abs(error).max() < min(1.5, 1.5 * float(said[2])), (away, np.abs(error).max(), said[0])
+        assert np.abs(error).max() < min(1.5, 1.5 * float(said[2])), (
+            away,
+            np.abs(error).max(),
+            said[0],
+        )

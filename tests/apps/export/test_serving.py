@@ -1,4 +1,6 @@
-"""Answers over HTTP: many clients, malformed requests, clients that die, a stop after what is under way."""
+"""Answers over HTTP: many clients, malformed requests, clients that die,
+a stop after what is under way.
+"""
 
 import contextlib
 import http.client
@@ -40,7 +42,9 @@ def fitted(kind="rssi", model=None, save=None):
     rx = rng.uniform([0, 0, 0], [20, 20, 2], (60, 3))
     far = np.linalg.norm(rx - TX, axis=1)
     if kind == "rssi":
-        return gsparc.fit(rx=rx, tx=TX, rssi=-40 - 20 * np.log10(far), model=model or "gp", save=save)
+        return gsparc.fit(
+            rx=rx, tx=TX, rssi=-40 - 20 * np.log10(far), model=model or "gp", save=save
+        )
     csi = (np.exp(-2j * np.pi * 30e6 / 3e8 * far) / far)[:, None, None]
     return gsparc.fit(rx=rx, tx=TX, csi=csi, frequency_hz=30e6, model="complex_gp", save=save)
 
@@ -120,8 +124,12 @@ def test_json_and_raw_bodies_hold_what_the_model_answers(powers, served):
     assert status == 200 and headers["x-shape"] == "7,1"
     np.testing.assert_allclose(np.frombuffer(body, "<f4"), expected[:, 0], rtol=1e-5)
     assert json.loads(served.get("/healthz")[1]) == {
-        "status": "ok", "kind": "rssi", "model": "gp", "end": "rx", "unit": "dBm"
-    }  # fmt: skip
+        "status": "ok",
+        "kind": "rssi",
+        "model": "gp",
+        "end": "rx",
+        "unit": "dBm",
+    }
 
 
 def test_a_media_type_in_capitals_was_taken_for_json(served):
@@ -179,28 +187,31 @@ def test_32_clients_get_their_own_answers_computed_together(powers, monkeypatch)
     assert sum(calls) == sum(map(len, given)) and len(calls) < len(given)
 
 
-@pytest.mark.parametrize(("body", "kind", "status"), [
-    ("", "application/json", 422),
-    ("{", "application/json", 422),
-    ("[1, 2]", "application/json", 422),
-    ('{"places": "here"}', "application/json", 422),
-    ('{"places": [[1, 2]]}', "application/json", 422),
-    ('{"places": [[1, 2], [3, 4, 5]]}', "application/json", 422),
-    ('{"places": [[1, 2, NaN]]}', "application/json", 422),
-    ('{"places": []}', "application/json", 422),
-    (b"\xff\xfe", "application/json", 422),
-    ('{"places": [[1, 2, 1e300]]}', "application/json", 422),
-    ('{"places": [[1, 2, 1%s]]}' % ("0" * 400), "application/json", 422),
-    ('{"places": [[1, 2, true]]}', "application/json", 422),
-    ('{"places": [[1, 2, "3"]]}', "application/json", 422),
-    ('{"places": [[1, 2, 3]], "unit": "km"}', "application/json", 422),
-    ('{"places": ' + "[" * 60, "application/json", 422),
-    ('{"places": ' + "[" * 9000, "application/json", 413),
-    (b"12345", RAW, 422),
-    (np.full(3, np.inf, "<f4").tobytes(), RAW, 422),
-    (np.zeros((65, 3), "<f4").tobytes(), RAW, 413),
-    (b"0" * 100_000, RAW, 413),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("body", "kind", "status"),
+    [
+        ("", "application/json", 422),
+        ("{", "application/json", 422),
+        ("[1, 2]", "application/json", 422),
+        ('{"places": "here"}', "application/json", 422),
+        ('{"places": [[1, 2]]}', "application/json", 422),
+        ('{"places": [[1, 2], [3, 4, 5]]}', "application/json", 422),
+        ('{"places": [[1, 2, NaN]]}', "application/json", 422),
+        ('{"places": []}', "application/json", 422),
+        (b"\xff\xfe", "application/json", 422),
+        ('{"places": [[1, 2, 1e300]]}', "application/json", 422),
+        ('{"places": [[1, 2, 1%s]]}' % ("0" * 400), "application/json", 422),
+        ('{"places": [[1, 2, true]]}', "application/json", 422),
+        ('{"places": [[1, 2, "3"]]}', "application/json", 422),
+        ('{"places": [[1, 2, 3]], "unit": "km"}', "application/json", 422),
+        ('{"places": ' + "[" * 60, "application/json", 422),
+        ('{"places": ' + "[" * 9000, "application/json", 413),
+        (b"12345", RAW, 422),
+        (np.full(3, np.inf, "<f4").tobytes(), RAW, 422),
+        (np.zeros((65, 3), "<f4").tobytes(), RAW, 413),
+        (b"0" * 100_000, RAW, 413),
+    ],
+)
 def test_malformed_requests_are_refused_and_the_next_is_answered(served, body, kind, status):
     found = served.post(body, kind)
     assert found[0] == status and "\n" not in json.loads(found[1])["detail"]
@@ -218,7 +229,8 @@ def test_a_client_that_dies_is_no_matter(powers, caplog):
     with Served(powers) as served:
         for sent in (
             b"POST /predict HTTP/1.1\r\nhost: a\r\ncontent-length: 500\r\n\r\n{",
-            b"POST /predict HTTP/1.1\r\nhost: a\r\ncontent-length: 25\r\n\r\n" + b'{"places": [[1, 2, 1.5]]}',
+            b"POST /predict HTTP/1.1\r\nhost: a\r\ncontent-length: "
+            b"25\r\n\r\n" + b'{"places": [[1, 2, 1.5]]}',
             b"nonsense\r\n\r\n",
         ):
             for _ in range(8):
@@ -246,7 +258,9 @@ def test_raw_places_in_utm_metres_were_rounded_to_half_a_metre():
     utm = gsparc.fit(rx=rx + north, tx=TX + north, rssi=level, model="gp")
     with Served(utm) as served:
         status, body, _ = served.post((rx[:2] + north).astype("<f4").tobytes(), RAW)
-        assert status == 422 and "float32, which moves in steps of 0.5 m" in json.loads(body)["detail"]
+        assert (
+            status == 422 and "float32, which moves in steps of 0.5 m" in json.loads(body)["detail"]
+        )
         assert served.post(as_json(rx[:2] + north))[0] == 200
 
 
@@ -344,7 +358,15 @@ def commanded(folder, predictor, *settings, files=None):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    line = [sys.executable, "-m", "gsparc", "serve", f"ckpt={folder}/model.ckpt", f"port={port}", *settings]
+    line = [
+        sys.executable,
+        "-m",
+        "gsparc",
+        "serve",
+        f"ckpt={folder}/model.ckpt",
+        f"port={port}",
+        *settings,
+    ]
     allow = files and partial(resource.setrlimit, resource.RLIMIT_NOFILE, (files, files))
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     served = subprocess.Popen(line, cwd=folder, env=environment, preexec_fn=allow)
@@ -370,7 +392,10 @@ def asked(port, places):
 
 @pytest.mark.slow
 def test_the_command_serves_until_it_is_told_to_stop(powers, tmp_path):
-    with commanded(tmp_path, powers, "delay_ms=1000") as (served, port), ThreadPoolExecutor(1) as clients:
+    with (
+        commanded(tmp_path, powers, "delay_ms=1000") as (served, port),
+        ThreadPoolExecutor(1) as clients,
+    ):
         answer = clients.submit(asked, port, [[1, 2, 1]])
         time.sleep(0.5)
         served.send_signal(signal.SIGTERM)  # while the request waits for others
@@ -394,7 +419,9 @@ def test_an_honest_client_is_answered_among_hostile_ones(kind, tmp_path, request
     attack, late, memory = [sys.executable, str(HOSTILE)], [], []
     with commanded(tmp_path, predictor) as (served, port):
         assert asked(port, [[1, 2, 1]])[0] == 200
-        hostile = subprocess.Popen([*attack, str(port), str(HOSTILE_S), "1024" if kind == "powers" else "4"])
+        hostile = subprocess.Popen(
+            [*attack, str(port), str(HOSTILE_S), "1024" if kind == "powers" else "4"]
+        )
         draw, started = np.random.default_rng(0), time.monotonic()
         while hostile.poll() is None:
             place = draw.uniform(0, 4, (1, 3))
@@ -419,7 +446,10 @@ def test_a_second_request_hid_in_a_body_of_two_ends(served):
     """`Content-Length` beside `Transfer-Encoding` was answered, and what stood behind it, too."""
     body = as_json([[1, 2, 1]])
     chunked = f"{len(body):x}\r\n{body.decode() if isinstance(body, bytes) else body}\r\n0\r\n\r\n"
-    head = "POST /predict HTTP/1.1\r\nHost: a\r\nContent-Type: application/json\r\nContent-Length: 4\r\n"
+    head = (
+        "POST /predict HTTP/1.1\r\nHost: a\r\nContent-Type: "
+        "application/json\r\nContent-Length: 4\r\n"
+    )
     with socket.create_connection(("127.0.0.1", served.port), timeout=10) as client:
         client.sendall((head + "Transfer-Encoding: chunked\r\n\r\n" + chunked).encode())
         client.sendall(b"GET /healthz HTTP/1.1\r\nHost: a\r\n\r\n")
@@ -433,21 +463,31 @@ def test_a_second_request_hid_in_a_body_of_two_ends(served):
 
 def test_a_repeated_key_answered_the_second(served):
     body = b'{"places": [[1, 2, 1]], "places": [[9, 9, 1]]}'
-    assert ask_http(served.port, "POST", "/predict", body, {"Content-Type": "application/json"})[0] == 422
+    assert (
+        ask_http(served.port, "POST", "/predict", body, {"Content-Type": "application/json"})[0]
+        == 422
+    )
 
 
 def test_no_page_loads_scripts_from_elsewhere(served):
-    assert [ask_http(served.port, "GET", path, None, {})[0] for path in ("/docs", "/redoc")] == [404, 404]
+    assert [ask_http(served.port, "GET", path, None, {})[0] for path in ("/docs", "/redoc")] == [
+        404,
+        404,
+    ]
 
 
 @pytest.mark.parametrize("path", ["/predict?unit=dBm", "/std?a", "/healthz?verbose=1", "/?="])
 def test_what_stands_after_a_question_mark_was_read_nowhere(served, path):
     body = as_json([[1, 2, 1]])
-    status, answer = ask_http(served.port, "POST", path, body, {"Content-Type": "application/json"})[:2]
+    status, answer = ask_http(
+        served.port, "POST", path, body, {"Content-Type": "application/json"}
+    )[:2]
     assert status == 422 and b"nothing is read after ?" in answer
 
 
-@pytest.mark.parametrize("coding, status", [("gzip", 415), ("identity, br", 415), ("Identity", 200)])
+@pytest.mark.parametrize(
+    "coding, status", [("gzip", 415), ("identity, br", 415), ("Identity", 200)]
+)
 def test_bodies_that_said_they_are_packed_were_read_as_places(served, coding, status):
     """Twelve bytes of a packed raw body are some place on Earth."""
     heads = {"Content-Type": RAW, "Content-Encoding": coding}
@@ -459,7 +499,9 @@ def test_raw_places_are_of_one_media_type_alone(served):
     """`application/octet-streamx` was taken for raw, and of two types the first counted."""
     assert served.post(np.zeros((1, 3), "<f4").tobytes(), RAW + "x")[0] == 422
     body = np.zeros((1, 3), "<f4").tobytes()
-    head = f"POST /predict HTTP/1.1\r\nHost: a\r\nConnection: close\r\nContent-Length: {len(body)}\r\n"
+    head = (
+        f"POST /predict HTTP/1.1\r\nHost: a\r\nConnection: close\r\nContent-Length: {len(body)}\r\n"
+    )
     with socket.create_connection(("127.0.0.1", served.port), timeout=10) as client:
         types = f"Content-Type: {RAW}\r\nContent-Type: application/json\r\n\r\n"
         client.sendall((head + types).encode() + body)
@@ -477,7 +519,11 @@ def told(tmp_path):
     stored = checkpoint.read(path)
     predictor = gsparc.load(stored)
     with Served(predictor, "word", ToldFile(stored, gsparc.load), request_s=1) as running:
-        yield path, predictor, partial(running.post, **{"path": "/update", "authorization": "Bearer word"})
+        yield (
+            path,
+            predictor,
+            partial(running.post, **{"path": "/update", "authorization": "Bearer word"}),
+        )
 
 
 ROW = json.dumps({"places": [[1.0, 2.0, 1.0]], "levels": [[-90.0]]})
@@ -517,7 +563,9 @@ def test_levels_that_were_measured_change_the_answers_and_are_stored(told):
 
 
 def test_rows_that_a_full_disk_refused_were_answered_by_all_the_same(told):
-    """The file cannot be written, which is no `OSError` then: nothing was taken back, and it said 422."""
+    """The file cannot be written, which is no `OSError` then: nothing was taken back,
+    and it said 422.
+    """
     path, predictor, post = told
     before, answers = path.read_bytes(), post(as_json([[1, 2, 1]]), path="/predict")[1]
     with Limited(len(before) // 2):

@@ -12,8 +12,10 @@ def test_points_without_any_failed_block_were_drawn_as_rates(tmp_path, monkeypat
     figures = []
     monkeypatch.setattr(pictures, "save", lambda figure, path: figures.append(figure))
     errors = np.array([240, 24, 0])
-    curve = pd.DataFrame({"bler": errors / 480, "errors": errors, "blocks": 480, "ber": [0.1, 0.01, 0.0]},
-                         index=[0.0, 2.0, 4.0])  # fmt: skip
+    curve = pd.DataFrame(
+        {"bler": errors / 480, "errors": errors, "blocks": 480, "ber": [0.1, 0.01, 0.0]},
+        index=[0.0, 2.0, 4.0],
+    )
     pictures.draw_errors({"qpsk": {"perfect": curve}}, "hall", tmp_path / "bler.png")
     above, below = figures[0].axes[:2]
     limits = [line for line in above.lines if line.get_marker() == "v" and len(line.get_xdata())]

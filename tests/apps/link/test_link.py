@@ -17,13 +17,22 @@ from gsparc import load
 from gsparc.apps.link.adaptation import Adaptation, Band, Rates
 from gsparc.apps.link.channels import true_channels
 from gsparc.apps.link.pusch import Pusch, frequency_correlation
-from gsparc.apps.link.study import beam_facts, beam_gain, beam_loss_db, find_crossing, rate_facts, send_blocks
+from gsparc.apps.link.study import (
+    beam_facts,
+    beam_gain,
+    beam_loss_db,
+    find_crossing,
+    rate_facts,
+    send_blocks,
+)
 from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
 from gsparc.prediction.channels import centred_grid, interpolate_tones, resource_grid
 from gsparc.processes.uncertainty import binomial_interval
 
-needs_sionna = pytest.mark.skipif(find_spec("sionna") is None, reason="the extra `sionna` is not installed")
+needs_sionna = pytest.mark.skipif(
+    find_spec("sionna") is None, reason="the extra `sionna` is not installed"
+)
 
 
 @pytest.fixture(autouse=True)
@@ -54,7 +63,9 @@ def test_interpolation_hits_a_channel_it_was_not_shown() -> None:
 
     def response(frequency):
         turns = np.outer(delays, frequency - 2.4e9)
-        return torch.from_numpy((gains @ np.exp(-2j * np.pi * turns)).astype(np.complex64))[None, None]
+        return torch.from_numpy((gains @ np.exp(-2j * np.pi * turns)).astype(np.complex64))[
+            None, None
+        ]
 
     wanted = centred_grid(float(tones.mean()), 30e3, 240)
     miss = interpolate_tones(response(tones), tones, wanted) - response(wanted)
@@ -88,7 +99,9 @@ def test_beams_gain_the_number_of_antennas_and_lose_what_is_wrong() -> None:
 
 
 def test_beams_without_a_prediction_or_without_a_channel_have_figures() -> None:
-    """A prediction of exactly 0, or one silent test channel, ended the command: -inf is no figure."""
+    """A prediction of exactly 0, or one silent test channel, ended the command:
+    -inf is no figure.
+    """
     true = drawn()(4, 2, 3)
     silent = true.clone()
     silent[1] = 0
@@ -115,12 +128,16 @@ def test_crossing_and_intervals() -> None:
     assert np.isclose(find_crossing(pd.Series([1.0, 0.1, 0.01])), 1.0)
     assert find_crossing(pd.Series([1.0, 0.5, 0.2])) is None
     low, high = binomial_interval(10, 100)
-    assert low < 0.1 < high and binomial_interval(0, 10)[0] == 0 and binomial_interval(10, 10)[1] == 1
+    assert (
+        low < 0.1 < high and binomial_interval(0, 10)[0] == 0 and binomial_interval(10, 10)[1] == 1
+    )
     assert binomial_interval(0, 0) == (0, 1)
 
 
 def test_truth_of_the_streets_is_in_the_snapshot_s_own_frame() -> None:
-    """Recomputed rays, turned by offsets found on the uplink, equal the measured downlink up to its noise."""
+    """Recomputed rays, turned by offsets found on the uplink,
+    equal the measured downlink up to its noise.
+    """
     data = city("all")
     rows = fold().test
     exact, source = true_channels(data, rows, data.site.subcarriers_hz)
@@ -158,7 +175,9 @@ def test_a_coarse_look_may_be_all_there_is() -> None:
             assert len(order)
             failed = np.arange(len(order)) % 2 == 0
             own = {"ebno_db": level, "position": order, "failed": failed, "wrong": failed * 0.1}
-            return pd.concat([pd.DataFrame(own | {"receiver": name}) for name in ("perfect", "predicted")])
+            return pd.concat(
+                [pd.DataFrame(own | {"receiver": name}) for name in ("perfect", "predicted")]
+            )
 
     nothing = Band(*[torch.zeros(5, 1)] * 3)
     for fine, blocks in ((8, 8), (20, 20)):
@@ -210,7 +229,9 @@ def test_pilots_mend_a_prediction_and_a_prediction_mends_pilots() -> None:
     assert wrong["predicted_pilots"] < wrong["predicted"] - 0.05
     assert wrong["perfect"] - 0.02 <= wrong["predicted_pilots"] <= wrong["lmmse"] + 0.02
     # Without any doubt the pilots are not listened to, with all of it the prediction is not.
-    sure, deaf = (pusch.receivers[name]._channel_estimator for name in ("predicted_pilots", "lmmse"))
+    sure, deaf = (
+        pusch.receivers[name]._channel_estimator for name in ("predicted_pilots", "lmmse")
+    )
     y = draw(4, 1, 1, 14, 48)
     pusch._prior = guess[:4], torch.zeros(4)
     assert torch.allclose(sure(y, torch.tensor(0.1))[0][:, 0, 0, 0, 0, 0], guess[:4], atol=1e-2)
@@ -225,12 +246,26 @@ def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
     module = SimpleNamespace(measurements=data)
     monkeypatch.setattr("gsparc.runs.open_runs.datamodule", lambda settings, trusted: module)
     monkeypatch.setattr("gsparc.runs.open_runs.split_for", lambda settings, found: _split())
-    answer = knock(COMMANDS["link"].run, "link", [
-        f"ckpt={file}", "pusch.ebno_db.qpsk=[3.0,4.0]", "pusch.ebno_db.qam16=[7.0]", "pusch.coarse=16",
-        "pusch.fine=32", "pusch.batch=16", "pusch.iterations=4", "mcs.snr_db=[15]",
-        "promise.limit_db=0", "promise.alpha=0.4", "promise.delta=0.4", "dataset.name=x", "split.name=y",
-        f"hydra.run.dir={tmp_path}",
-    ])  # fmt: skip
+    answer = knock(
+        COMMANDS["link"].run,
+        "link",
+        [
+            f"ckpt={file}",
+            "pusch.ebno_db.qpsk=[3.0,4.0]",
+            "pusch.ebno_db.qam16=[7.0]",
+            "pusch.coarse=16",
+            "pusch.fine=32",
+            "pusch.batch=16",
+            "pusch.iterations=4",
+            "mcs.snr_db=[15]",
+            "promise.limit_db=0",
+            "promise.alpha=0.4",
+            "promise.delta=0.4",
+            "dataset.name=x",
+            "split.name=y",
+            f"hydra.run.dir={tmp_path}",
+        ],
+    )
     assert answer.status == 0, answer
     facts = json.loads((tmp_path / "summary.json").read_text())
     assert {"mcs.png", "bler.png", "acceptance.png"} <= {p.name for p in tmp_path.iterdir()}
@@ -239,7 +274,9 @@ def test_the_command_leaves_everything(trained, tmp_path, monkeypatch) -> None:
     assert facts["pusch/truth"] == "rays" and 0 <= facts["tradeoff/qpsk/predicted/100%"] <= 1
     assert find_unexplained(tmp_path) == []
     found = {key: value for key, value in facts.items() if key.endswith("/ebno_at_bler_0.1")}
-    crossed = any(value is not None for key, value in found.items() if key.startswith("pusch/qpsk/"))
+    crossed = any(
+        value is not None for key, value in found.items() if key.startswith("pusch/qpsk/")
+    )
     assert crossed != any(line.startswith("qpsk: no curve") for line in answer.out)
 
 
@@ -253,21 +290,39 @@ def test_a_threshold_by_hand_the_paper_s_rule_and_receivers(trained, tmp_path, m
     )
     monkeypatch.setattr("gsparc.runs.open_runs.split_for", lambda settings, found: _split())
     words = [
-        f"ckpt={trained[1]}", "pusch.ebno_db.qpsk=[9.0]", "pusch.ebno_db.qam16=[]", "pusch.coarse=16",
-        "pusch.fine=16", "pusch.iterations=4", "mcs.snr_db=[15]", "threshold=0.59", "rule=target",
-        "receivers=[perfect,ls,lmmse,predicted]", "dataset.name=x", "split.name=y",
+        f"ckpt={trained[1]}",
+        "pusch.ebno_db.qpsk=[9.0]",
+        "pusch.ebno_db.qam16=[]",
+        "pusch.coarse=16",
+        "pusch.fine=16",
+        "pusch.iterations=4",
+        "mcs.snr_db=[15]",
+        "threshold=0.59",
+        "rule=target",
+        "receivers=[perfect,ls,lmmse,predicted]",
+        "dataset.name=x",
+        "split.name=y",
         f"hydra.run.dir={tmp_path}",
-    ]  # fmt: skip
+    ]
     answer = knock(COMMANDS["link"].run, "link", words)
     assert answer.status == 0, answer
     facts = json.loads((tmp_path / "summary.json").read_text())
-    assert facts["threshold"] == 0.59 and "promise/bound" not in facts and facts["mcs/15dB/care"] is None
+    assert (
+        facts["threshold"] == 0.59
+        and "promise/bound" not in facts
+        and facts["mcs/15dB/care"] is None
+    )
     assert {"ls", "lmmse"} < {key.split("/")[2] for key in facts if key.startswith("pusch/qpsk/")}
     assert any(line.startswith("qpsk: no curve crosses 10 %") for line in answer.out)
     assert not any("behind" in line for line in answer.out)
     assert find_unexplained(tmp_path) == []
-    for wrong, message in (("receivers=[perfect]", "predicted must be among"), ("rule=best", "rule='best'")):
-        refused = knock(COMMANDS["link"].run, "link", [*words, wrong, f"hydra.run.dir={tmp_path / 'no'}"])
+    for wrong, message in (
+        ("receivers=[perfect]", "predicted must be among"),
+        ("rule=best", "rule='best'"),
+    ):
+        refused = knock(
+            COMMANDS["link"].run, "link", [*words, wrong, f"hydra.run.dir={tmp_path / 'no'}"]
+        )
         assert refused.status == 1 and message in refused.err[-1]
 
 

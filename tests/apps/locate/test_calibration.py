@@ -21,7 +21,9 @@ def levels(places):
 
 
 def snapshots(count, rng, wrong):
-    """Noise alike at pairs of stations, `wrong` times what the field says, now and then four times that."""
+    """Noise alike at pairs of stations, `wrong` times what the field says,
+    now and then four times that.
+    """
     places = rng.uniform(0, 10, (count, 3)) * [1, 1, 0]
     shared = np.repeat(rng.normal(0, 1, (count, 2)), 2, axis=1)
     return places, levels(places) + wrong * shared * np.where(rng.random((count, 1)) < 0.1, 4, 1)
@@ -37,7 +39,8 @@ def looked(values, cells):
 
 @pytest.mark.slow
 def test_areas_hold_the_promised_share(monkeypatch):
-    monkeypatch.setattr(calibration, "LOOKS", 50)  # whatever trust is found, its level holds the share
+    # Whatever trust is found, its level holds the share
+    monkeypatch.setattr(calibration, "LOOKS", 50)
     rng = np.random.default_rng(0)
     cells = cover_box(CORNERS, 400, False)
     (places, values), (others, tested) = (snapshots(count, rng, 3.0) for count in (150, 400))
@@ -46,7 +49,8 @@ def test_areas_hold_the_promised_share(monkeypatch):
     field = replace(Trust(1.0, 1.0, 100.0), level=0.9)
     seen = list(zip(looked(tested, cells), others, strict=True))
     held, believed = (
-        [one.posterior(how).mass_above(place) <= how.level for one, place in seen] for how in (trust, field)
+        [one.posterior(how).mass_above(place) <= how.level for one, place in seen]
+        for how in (trust, field)
     )
     assert 0.84 < np.mean(held) < 0.96, "within two deviations of 150 and 400 drawn places"
     assert np.mean(believed) < 0.7, "as the field itself says they would not"

@@ -46,7 +46,9 @@ def test_a_predicted_spectrum_is_located_where_it_was_predicted(trained):
 
 def test_areas_are_those_that_were_calibrated(trained, caplog):
     predictor = gsparc.load(trained)
-    spectrum = predictor.spectrum(tx=(predictor.site.moving_box + predictor.site.origin).mean(0)[None])
+    spectrum = predictor.spectrum(
+        tx=(predictor.site.moving_box + predictor.site.origin).mean(0)[None]
+    )
     with caplog.at_level(logging.WARNING):
         before = locate(predictor, spectrum)[0]
     assert "not calibrated" in caplog.text
@@ -73,14 +75,19 @@ def test_a_snapshot_unlike_all_that_were_left_out_had_an_area_as_any_other(train
     predictor = gsparc.load(path)
     like = predictor.spectrum(tx=(predictor.site.moving_box + predictor.site.origin).mean(0)[None])
     unlike = np.roll(np.asarray(like), like.shape[-1] // 2, -1)[..., ::-1, :].copy()
-    assert [bool(one.doubt) for one in locate(predictor, np.concatenate([like, unlike]))] == [False, True]
+    assert [bool(one.doubt) for one in locate(predictor, np.concatenate([like, unlike]))] == [
+        False,
+        True,
+    ]
 
 
 def test_the_larger_box_was_asked_about_again_by_each_call(trained, tmp_path, monkeypatch):
     path = shutil.copy(trained, tmp_path / "model.ckpt")
     checkpoint.update_extra(path, calibrated(worst=0.0))
     predictor, asked, moments = gsparc.load(path), [], SiteField.moments_at
-    spectrum = predictor.spectrum(tx=(predictor.site.moving_box + predictor.site.origin).mean(0)[None])
+    spectrum = predictor.spectrum(
+        tx=(predictor.site.moving_box + predictor.site.origin).mean(0)[None]
+    )
     counted = lambda field, places: asked.append(len(places)) or moments(field, places)  # noqa: E731
     monkeypatch.setattr(SiteField, "moments_at", counted)
     for _ in range(2):
@@ -94,7 +101,9 @@ def test_stations_at_one_place_were_asked_in_different_parts(tmp_path, monkeypat
     counted = lambda self, query: rows.append(len(query)) or answer(self, query)  # noqa: E731
     monkeypatch.setattr(Predictor, "predict_query", counted)
     monkeypatch.setattr("gsparc.apps.locate.site_field.CHUNK", 9)
-    SiteField(predictor).moments_at(torch.from_numpy(np.tile(predictor.site.moving_box[:1, :3], (7, 1))))
+    SiteField(predictor).moments_at(
+        torch.from_numpy(np.tile(predictor.site.moving_box[:1, :3], (7, 1)))
+    )
     assert rows == [8, 6], "of two stations"
 
 
@@ -109,7 +118,9 @@ def test_missing_and_silent_stations_are_no_values(tmp_path):
 
 
 def test_visits_of_a_place_are_snapshots_of_their_own():
-    """The second row of a station there is of the second snapshot, whichever order stations come in."""
+    """The second row of a station there is of the second snapshot,
+    whichever order stations come in.
+    """
     place = np.repeat([[0.0, 0, 1], [5, 5, 1], [9, 0, 1]], [4, 2, 2], axis=0)
     station, level = np.array([0, 1, 1, 0, 0, 1, 0, 1]), -50.0 - np.arange(8)
     ends = {"station_position": np.array([[0.0, 9, 5], [9, 9, 5]]), "station": station}
@@ -119,11 +130,14 @@ def test_visits_of_a_place_are_snapshots_of_their_own():
     assert sorted(heard) == sorted([[-50, -51], [-53, -52], [-54, -55], [-56, -57]])
 
 
-@pytest.mark.parametrize("values, more, said", [
-    (np.zeros((2, 3)), {}, r"values \(2, 3\) torch.float64 are no spectrum"),
-    (np.zeros((1, 9, 36), complex), {}, "are no spectrum"),
-    (np.full((1, 9, 36), np.nan), {}, "in which nothing was heard"),
-    (np.zeros((1, 9, 36)), {"silent": [[True]]}, "silent"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "values, more, said",
+    [
+        (np.zeros((2, 3)), {}, r"values \(2, 3\) torch.float64 are no spectrum"),
+        (np.zeros((1, 9, 36), complex), {}, "are no spectrum"),
+        (np.full((1, 9, 36), np.nan), {}, "in which nothing was heard"),
+        (np.zeros((1, 9, 36)), {"silent": [[True]]}, "silent"),
+    ],
+)
 def test_values_of_another_kind_are_refused_in_one_line(trained, values, more, said):
     refused(said, locate, gsparc.load(trained), values, **more)

@@ -33,7 +33,9 @@ def heard(values, places):
 def test_a_hall_is_learned_also_from_two_rows(name):
     known, asked = hall(300, 0), hall(100, 1)
     place, each_ms, fit_s = locate_by_neighbours(name, known, asked)
-    assert np.median(np.linalg.norm(place - asked.place, axis=1)) < 1.2 and each_ms > 0 and fit_s > 0
+    assert (
+        np.median(np.linalg.norm(place - asked.place, axis=1)) < 1.2 and each_ms > 0 and fit_s > 0
+    )
     assert np.isfinite(locate_by_neighbours(name, known.subset(np.arange(2)), asked)[0]).all()
     silent = heard(np.full((4, 8), np.nan), known.place[:4])
     with pytest.raises(ValueError, match="no row that could be learned from holds a value"):
@@ -64,7 +66,9 @@ def test_a_table_was_called_as_the_trained_file(tmp_path):
 
 
 def test_silence_tells_rooms_apart():
-    known = heard(np.array([[-50, np.nan], [-50, -60.0]] * 4), np.array([[0.0, 0, 0], [9.0, 0, 0]] * 4))
+    known = heard(
+        np.array([[-50, np.nan], [-50, -60.0]] * 4), np.array([[0.0, 0, 0], [9.0, 0, 0]] * 4)
+    )
     np.testing.assert_allclose(locate_by_neighbours("nearest", known, known)[0], known.place)
 
 

@@ -18,7 +18,11 @@ def gaussians(cells, middles, width=0.2):
 
 def test_cells_cover_the_plane_that_was_walked():
     cells = cover_box(PLACES, 400, False)
-    assert 300 < len(cells) < 600 and (cells.edge[:, 2] == 0).all() and (cells.centre[:, 2] == 1.5).all()
+    assert (
+        300 < len(cells) < 600
+        and (cells.edge[:, 2] == 0).all()
+        and (cells.centre[:, 2] == 1.5).all()
+    )
     assert cells.volume.sum() == pytest.approx(np.ptp(PLACES[:, :2], axis=0).prod())
 
 
@@ -41,7 +45,9 @@ def test_cells_near_trained_places():
 def test_cells_where_a_plan_is_open():
     left = cover_box(PLACES, 400, False, lambda places: places[:, 0] < 2.0)
     assert (left.centre[:, 0] < 2.0).all() and 150 < len(left) < 300
-    refused("no open floor", cover_box, PLACES, 400, False, lambda places: np.zeros(len(places), bool))
+    refused(
+        "no open floor", cover_box, PLACES, 400, False, lambda places: np.zeros(len(places), bool)
+    )
 
 
 def test_peak_is_between_middles_of_cells():
@@ -61,7 +67,9 @@ def test_errors_of_recorded_places_widen_an_area():
     area = cells.volume[densest_cells(wide.log_density, cells.volume, 0.9)].sum()
     assert area == pytest.approx(-2 * np.pi * (0.2**2 + 0.3**2) * np.log(0.1), rel=0.03)
     place = np.array([2.3, 1.1, 1.5])
-    assert wide.log_density_at(place) == pytest.approx(wide.log_density[cells.index_of(place)], abs=0.05)
+    assert wide.log_density_at(place) == pytest.approx(
+        wide.log_density[cells.index_of(place)], abs=0.05
+    )
 
 
 def test_area_of_a_known_density_holds_its_share():

@@ -38,13 +38,22 @@ def test_a_polygon_keeps_its_holes(tmp_path):
 
 
 def test_squares_inside_buildings_counted_as_covered(tmp_path):
-    """A drive measures outdoors: of simulated towns 66 % were promised, 59 % covered, 70 % outdoors."""
+    """A drive measures outdoors: of simulated towns 66 % were promised, 59 % covered,
+    70 % outdoors.
+    """
     house = geojson(tmp_path / "house.geojson", [[[2, 2], [6, 2], [6, 5], [2, 5], [2, 2]]])
     grid = lay_grid(None, [0, 0, 10, 10], 1.5, 0.5, buildings=house)
     assert grid.inside.sum() == 400 - 8 * 6 and not grid.inside[5, 5] and grid.inside[3, 5]
     kept = lay_grid(None, [0, 0, 10, 10], 1.5, 0.5, buildings=house, indoors=True)
     assert kept.inside.all() and kept.indoors.sum() == 8 * 6 and kept.indoors[5, 5]
-    refused("buildings=.*: no such file", lay_grid, None, [0, 0, 9, 9], 1.5, buildings=tmp_path / "a.geojson")
+    refused(
+        "buildings=.*: no such file",
+        lay_grid,
+        None,
+        [0, 0, 9, 9],
+        1.5,
+        buildings=tmp_path / "a.geojson",
+    )
 
 
 CORNERS = np.array([[0.0, 0], [40, 0], [40, 30], [0, 30], [0, 0]])
@@ -57,7 +66,9 @@ DEGREES = np.stack(ORIGIN.to_degrees(CORNERS)[::-1], axis=1)
 def test_areas_in_another_order_projection_or_format_were_refused(tmp_path, caplog, way, text):
     drawn = DEGREES[:, ::-1] if way == "latitude first" else DEGREES
     if way.startswith("EPSG"):
-        drawn = np.stack(Transformer.from_crs(4326, way, always_xy=True).transform(*DEGREES.T), axis=1)
+        drawn = np.stack(
+            Transformer.from_crs(4326, way, always_xy=True).transform(*DEGREES.T), axis=1
+        )
     corners = ", ".join(f"{x:.12g} {y:.12g}" for x, y in drawn)
     area = f"POLYGON (({corners}))" if text else geojson(tmp_path / "a.geojson", [drawn.tolist()])
     shape, _ = read_shapes(area, "area", ORIGIN)
@@ -68,56 +79,67 @@ def test_areas_in_another_order_projection_or_format_were_refused(tmp_path, capl
 
 
 def test_a_plan_lies_where_its_two_points_say(tmp_path):
-    plan = read_floor_plan(image(tmp_path / "p.png"), [[0, 100, 5, 1], [200, 100, 25, 1]])  # 10 a metre
+    # 10 a metre
+    plan = read_floor_plan(image(tmp_path / "p.png"), [[0, 100, 5, 1], [200, 100, 25, 1]])
     assert np.allclose(plan.corners(), [[5, 11], [25, 11], [25, 1], [5, 1]])
-    turned = read_floor_plan(tmp_path / "p.png", [[0, 0, 0, 0], [100, 0, 0, 10]])  # its right is north
+    # Its right is north
+    turned = read_floor_plan(tmp_path / "p.png", [[0, 0, 0, 0], [100, 0, 0, 10]])
     assert np.allclose(turned.corners()[1], [0, 20]) and np.allclose(turned.corners()[3], [10, 0])
     grid = lay_grid(None, None, 1.5, 1.0, plan)
     assert grid.inside.sum() == 200
 
 
-@pytest.mark.parametrize("said, how", [
-    ("x1 must be above", {"area": [3, 0, 1, 2]}),
-    (r"expected \[x0,y0,x1,y1\]", {"area": [1, 2, 3]}),
-    ("no coordinate in metres", {"area": [0, 0, 1e9, 1]}),
-    ("no such file", {"area": "missing.geojson"}),
-    (r"or a \*.geojson file", {"area": "area.txt"}),
-    (r"expected \[x0,y0,x1,y1\] in", {"area": [0, 0, "nan", 1]}),
-    ("nothing says where", {"area": None}),
-    ("above 0", {"step_m": 0}),
-    ("above 0", {"step_m": -1.0}),
-    ("memory", {"step_m": 1e-4, "area": [0, 0, 1e5, 1e5]}),
-    ("height_m=nan", {"height_m": float("nan")}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "said, how",
+    [
+        ("x1 must be above", {"area": [3, 0, 1, 2]}),
+        (r"expected \[x0,y0,x1,y1\]", {"area": [1, 2, 3]}),
+        ("no coordinate in metres", {"area": [0, 0, 1e9, 1]}),
+        ("no such file", {"area": "missing.geojson"}),
+        (r"or a \*.geojson file", {"area": "area.txt"}),
+        (r"expected \[x0,y0,x1,y1\] in", {"area": [0, 0, "nan", 1]}),
+        ("nothing says where", {"area": None}),
+        ("above 0", {"step_m": 0}),
+        ("above 0", {"step_m": -1.0}),
+        ("memory", {"step_m": 1e-4, "area": [0, 0, 1e5, 1e5]}),
+        ("height_m=nan", {"height_m": float("nan")}),
+    ],
+)
 def test_spoilt_grids(said, how):
     refused(said, lay_grid, None, **{"area": [0, 0, 4, 4], "height_m": 1.5, "step_m": 0.5, **how})
 
 
-@pytest.mark.parametrize("said, content", [
-    ("empty polygon", '{"type": "Polygon", "coordinates": [[[0, 0], [1, 1], [2, 2], [0, 0]]]}'),
-    ("no polygon|corners", '{"type": "Polygon", "coordinates": []}'),
-    ("not readable", '{"type": "Polygon", "coordinates": [[[0, 0], ["a", 1], [2, 2]]]}'),
-    ("NaN", '{"type": "Polygon", "coordinates": [[[0, 0], [NaN, 1], [2, 2]]]}'),
-    ("no polygon", '{"type": "LineString", "coordinates": [[0, 0], [1, 1]]}'),
-    ("no polygon", '{"type": "FeatureCollection", "features": []}'),
-    ("not readable", "not json"),
-    ("not readable", "[1, 2]"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "said, content",
+    [
+        ("empty polygon", '{"type": "Polygon", "coordinates": [[[0, 0], [1, 1], [2, 2], [0, 0]]]}'),
+        ("no polygon|corners", '{"type": "Polygon", "coordinates": []}'),
+        ("not readable", '{"type": "Polygon", "coordinates": [[[0, 0], ["a", 1], [2, 2]]]}'),
+        ("NaN", '{"type": "Polygon", "coordinates": [[[0, 0], [NaN, 1], [2, 2]]]}'),
+        ("no polygon", '{"type": "LineString", "coordinates": [[0, 0], [1, 1]]}'),
+        ("no polygon", '{"type": "FeatureCollection", "features": []}'),
+        ("not readable", "not json"),
+        ("not readable", "[1, 2]"),
+    ],
+)
 def test_spoilt_polygons(tmp_path, said, content):
     path = tmp_path / "a.geojson"
     path.write_text(content)
     refused(said, lay_grid, None, str(path), 1.5, 0.5)
 
 
-@pytest.mark.parametrize("said, points, content", [
-    ("has no scale", None, None),
-    ("two points", [[0, 0, 0, 0]], None),
-    ("two points", [[0, 0, 1, "x"], [50, 50, 1, 1]], None),
-    ("no scale", [[5, 5, 0, 0], [5, 5, 9, 9]], None),
-    ("one place", [[0, 0, 1, 1], [50, 50, 1, 1]], None),
-    ("not an image", [[0, 0, 0, 0], [9, 9, 9, 9]], "hello"),
-    ("no such file", None, ""),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "said, points, content",
+    [
+        ("has no scale", None, None),
+        ("two points", [[0, 0, 0, 0]], None),
+        ("two points", [[0, 0, 1, "x"], [50, 50, 1, 1]], None),
+        ("no scale", [[5, 5, 0, 0], [5, 5, 9, 9]], None),
+        ("one place", [[0, 0, 1, 1], [50, 50, 1, 1]], None),
+        ("not an image", [[0, 0, 0, 0], [9, 9, 9, 9]], "hello"),
+        ("no such file", None, ""),
+    ],
+)
 def test_spoilt_plans(tmp_path, said, points, content):
     path = image(tmp_path / "p.png")
     if content is not None:
@@ -136,17 +158,22 @@ def test_a_plan_of_too_many_pixels_was_said_to_be_no_image(tmp_path):
         ):
             file.write(struct.pack(">I", len(content)) + kind + content)
             file.write(struct.pack(">I", zlib.crc32(kind + content)))
-    said = r"too large an image .Image size .2500000000 pixels..; at most 178,956,970 pixels are read"
+    said = (
+        r"too large an image .Image size .2500000000 pixels..; at most 178,956,970 pixels are read"
+    )
     refused(said, read_floor_plan, tmp_path / "p.png", None)
 
 
-@pytest.mark.parametrize("said, how", [
-    ("no station 'nord'", {"stations": ["nord"]}),
-    ("name one", {"stations": []}),
-    ("0 to 1", {"load": 1.5}),
-    ("one per station", {"load": [1, 1, 1]}),
-    ("no station 'south'", {"load": {"south": 1}}),
-    ("stood still", {"other_end": [0, 0, 1]}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "said, how",
+    [
+        ("no station 'nord'", {"stations": ["nord"]}),
+        ("name one", {"stations": []}),
+        ("0 to 1", {"load": 1.5}),
+        ("one per station", {"load": [1, 1, 1]}),
+        ("no station 'south'", {"load": {"south": 1}}),
+        ("stood still", {"other_end": [0, 0, 1]}),
+    ],
+)
 def test_spoilt_maps(said, how):
     refused(said, predict_map, gsparc.load(town_model()), **{"step_m": 5.0, **how})

@@ -29,8 +29,12 @@ def test_a_screen_is_drawn_where_it_stands():
 def test_cells_that_are_called_by_numbers_had_no_map_of_changes():
     """Of two cells 101 and 102 in one model `select_station` was asked for the cells 0 and 1."""
     both = np.stack([levels(PLACES, 0), levels(PLACES, 1)], 1)
-    both[:, 1] += np.where(PLACES[:, 0] < np.median(PLACES[:, 0]), 30.0, -30.0)  # it serves one half
-    stations = {"station_position": [[9.0, 9.0, 2.6], [1.0, 1.0, 2.6]], "station_name": ["101", "102"]}
+    # It serves one half
+    both[:, 1] += np.where(PLACES[:, 0] < np.median(PLACES[:, 0]), 30.0, -30.0)
+    stations = {
+        "station_position": [[9.0, 9.0, 2.6], [1.0, 1.0, 2.6]],
+        "station_name": ["101", "102"],
+    }
     predictor = gsparc.fit(rx=PLACES, rssi=both, model="gsparc", **stations)
     predictor.update(rx=PLACES[:60], rssi=both[:60] - [0.0, 11.0])
     field = add_changes(predict_map(predictor, step_m=2.0, promise=None), predictor)

@@ -14,16 +14,23 @@ from gsparc.base.errors import DataError
 
 
 def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
-    """Drawn in degrees with heights and a hole; rasterio masks the file's cells by the same polygon."""
+    """Drawn in degrees with heights and a hole;
+    rasterio masks the file's cells by the same polygon.
+    """
     pytest.importorskip("rasterio", reason="rasterio is not installed: pip install 'gsparc[maps]'")
     import rasterio
     from rasterio.features import geometry_mask
     from rasterio.warp import transform_geom
 
     predictor = town_on_earth()
-    rings = [[[5, 5], [75, 10], [60, 55], [10, 50], [5, 5]], [[30, 20], [50, 20], [40, 40], [30, 20]]]
-    degrees = [np.stack([*ORIGIN.to_degrees(np.array(ring, float))[::-1], np.full(len(ring), 570.0)], 1)
-               for ring in rings]  # fmt: skip
+    rings = [
+        [[5, 5], [75, 10], [60, 55], [10, 50], [5, 5]],
+        [[30, 20], [50, 20], [40, 40], [30, 20]],
+    ]
+    degrees = [
+        np.stack([*ORIGIN.to_degrees(np.array(ring, float))[::-1], np.full(len(ring), 570.0)], 1)
+        for ring in rings
+    ]
     drawn = {"type": "Polygon", "coordinates": [ring.tolist() for ring in degrees]}
     (tmp_path / "area.geojson").write_text(json.dumps({"type": "Feature", "geometry": drawn}))
     found = predict_map(predictor, tmp_path / "area.geojson", step_m=1.0)
@@ -33,7 +40,9 @@ def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
         units = dict(zip(file.descriptions, file.units, strict=True))
         assert units["upper_db"] == found.unit and units["sinr_db"] == "dB" and not units["outage"]
         power = file.read(1)
-        outside = geometry_mask([transform_geom("EPSG:4326", file.crs, drawn)], file.shape, file.transform)
+        outside = geometry_mask(
+            [transform_geom("EPSG:4326", file.crs, drawn)], file.shape, file.transform
+        )
     assert (np.isnan(power) == outside).mean() > 0.999  # centres on an edge go either way
     np.testing.assert_array_equal(np.flipud(power), found.at_best_server(found.power_db))
 
@@ -53,7 +62,9 @@ def test_a_file_for_other_programs_said_neither_unit_nor_colours(tmp_path):
         assert (tags["unit"], tags["threshold_db"]) == ("dB", "-70.0")
         assert file.crs.to_wkt().startswith('PROJCS["equidistant_about_47.2_11.3"')  # was "unknown"
     with rasterio.open(tmp_path / "best.tif") as file:
-        assert file.dtypes == ("uint16",) and file.colormap(1)[1][:3] == tuple((255 * colours[1]).astype(int))
+        assert file.dtypes == ("uint16",) and file.colormap(1)[1][:3] == tuple(
+            (255 * colours[1]).astype(int)
+        )
         np.testing.assert_array_equal(np.flipud(file.read(1)), np.nan_to_num(number, nan=NO_CLASS))
 
 
@@ -72,7 +83,12 @@ def test_polygons_of_best_servers_had_no_names(tmp_path):
     north, east = ORIGIN.to_degrees(found.grid.places(cell)[:, :2])
     for k in range(2):
         inside = np.any(
-            [contains_xy(area, east, north) for area, one in areas if one == (k, found.stations[k])], axis=0
+            [
+                contains_xy(area, east, north)
+                for area, one in areas
+                if one == (k, found.stations[k])
+            ],
+            axis=0,
         )
         np.testing.assert_array_equal(inside, number.reshape(-1)[cell] == k)
 

@@ -71,11 +71,16 @@ def test_outage_follows_the_errors_and_not_a_bell():
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_silent_rows_are_as_wide_as_what_they_hide(side):
-    """Of unlisted cells only those on the wrong side of their level counted: intervals held .97 of them."""
+    """Of unlisted cells only those on the wrong side of their level counted:
+    intervals held .97 of them.
+    """
     known, fresh = evidence(), evidence(seed=1)
     bound = known.mean_db + np.random.default_rng(2).normal(0, 3, len(known))
     hidden = side * (bound - known.level_db) > 0
-    parts = {"level_db": np.where(hidden, bound, known.level_db), "side": (side * hidden).astype(np.int8)}
+    parts = {
+        "level_db": np.where(hidden, bound, known.level_db),
+        "side": (side * hidden).astype(np.int8),
+    }
     censored = HeldOutLevels(**{**vars(known), **parts})
     found, whole = calibrate(censored), calibrate(known)
     assert found.tail is None and found.half.mean() == pytest.approx(whole.half.mean(), rel=0.1)
@@ -99,7 +104,9 @@ def test_too_little_evidence_promises_nothing():
 
 
 def test_a_level_above_everything_was_reached_in_a_thousandth():
-    """0.1 % of a city had 300 dBm: the rarest error that was seen went on for ever. Few distances crashed."""
+    """0.1 % of a city had 300 dBm: the rarest error that was seen went on for ever.
+    Few distances crashed.
+    """
     rng = np.random.default_rng(0)
     level, row = rng.normal(-80, 5, 2000), np.arange(2000)
     evidence = HeldOutLevels(

@@ -1,4 +1,6 @@
-"""A map is what the model predicts cell by cell, with its layers over stations and words on its pictures."""
+"""A map is what the model predicts cell by cell,
+with its layers over stations and words on its pictures.
+"""
 
 import json
 from dataclasses import replace
@@ -50,7 +52,10 @@ def test_cells_hold_what_the_model_predicts(predictor):
             float(predictor.select_station(name).rssi(rx=place)[0]), abs=1e-3
         )
     assert (found.lower_db < found.power_db).all() and (found.power_db < found.upper_db).all()
-    west, east = found.best_server[int(MASTS[0, 1] / 4), int(MASTS[0, 0] / 4)], found.best_server[11, 17]
+    west, east = (
+        found.best_server[int(MASTS[0, 1] / 4), int(MASTS[0, 0] / 4)],
+        found.best_server[11, 17],
+    )
     assert (west, east) == (0, 1)
     assert ((found.outage >= 0) & (found.outage <= 1)).all() and not found.calibrated
 
@@ -61,9 +66,14 @@ def test_squares_in_buildings_take_a_stated_loss(predictor, tmp_path):
     how = {"area": [0, 0, 80, 60], "step_m": 4.0, "threshold_db": -90}
     inside = {"buildings": tmp_path / "house.geojson", "indoor_db": [15, 6]}
     without, found = (predict_map(predictor, **how, **more) for more in ({}, inside))
-    lost, wider = without.power_db - found.power_db, found.expected_error_db**2 - without.expected_error_db**2
+    lost, wider = (
+        without.power_db - found.power_db,
+        found.expected_error_db**2 - without.expected_error_db**2,
+    )
     assert found.grid.indoors.sum() == 64 and found.grid.inside.all()
-    np.testing.assert_allclose(lost, 15.0 * np.broadcast_to(found.grid.indoors, lost.shape), atol=1e-4)
+    np.testing.assert_allclose(
+        lost, 15.0 * np.broadcast_to(found.grid.indoors, lost.shape), atol=1e-4
+    )
     np.testing.assert_allclose(
         wider, 36.0 * np.broadcast_to(found.grid.indoors, lost.shape), rtol=1e-3, atol=1e-3
     )
@@ -73,7 +83,9 @@ def test_squares_in_buildings_take_a_stated_loss(predictor, tmp_path):
 
 
 def test_a_unit_of_maps_changed_their_names_alone():
-    """`unit=dBm` of levels in dBW wrote dBm beside the same numbers and the threshold of the others."""
+    """`unit=dBm` of levels in dBW wrote dBm beside the same numbers
+    and the threshold of the others.
+    """
     stored = gsparc.load(town_model())
     predictor = Predictor(stored.method, replace(stored.site, level_unit="dBW"), extra=stored.extra)
     own = predict_map(predictor, step_m=8.0, threshold_db=-90, noise_db=-100)
@@ -112,7 +124,9 @@ def test_ratio_of_signal_to_interference_by_hand():
     assert sinr(power, np.array([1.0, 0.1]), None)[0] == pytest.approx(20)
     assert sinr(power, np.ones(2), -60.0)[0] == pytest.approx(10 - 10 * np.log10(2))
     assert sinr(power, np.ones(2), -80.0)[1] == pytest.approx(20)
-    assert np.isnan(sinr(power, np.ones(2), -80.0)[2]) and np.isnan(sinr(power, np.ones(2), None)[1])
+    assert np.isnan(sinr(power, np.ones(2), -80.0)[2]) and np.isnan(
+        sinr(power, np.ones(2), None)[1]
+    )
     assert best_server(power).tolist() == [0, 1, REFUSED]
     assert read_loads({"b": 0.2}, ["a", "b"]).tolist() == [1.0, 0.2]
     assert read_loads({"Roof": 0.2}, ["a", "b"], ["Tower", "Roof"]).tolist() == [1.0, 0.2]
@@ -126,7 +140,8 @@ def test_each_band_has_levels_and_servers_of_its_own(predictor, monkeypatch):
     for number, band in enumerate(("800 MHz", "2600 MHz")):
         np.testing.assert_array_equal(drawn[f"power {band}"], found.power_db[number])
         assert (drawn[f"best_server {band}"] == 0).all()
-    assert (drawn["overlap"] == 1).all() and "sinr" not in drawn  # nobody interferes on another carrier
+    # Nobody interferes on another carrier
+    assert (drawn["overlap"] == 1).all() and "sinr" not in drawn
 
 
 def test_sectors_that_err_together_are_told_apart():
@@ -140,7 +155,9 @@ def test_sectors_that_err_together_are_told_apart():
 
 
 def test_the_chance_of_a_best_server_was_a_product_of_all_that_it_beats():
-    """Of six alike it was 1/32; given its own level it is one of six. Lists' levels were its floor."""
+    """Of six alike it was 1/32; given its own level it is one of six.
+    Lists' levels were its floor.
+    """
     power, error = np.full((6, 1), -60.0), np.full((6, 1), 6.0)
     found = server_chance(power, error, np.full(6, -np.inf))[0]
     assert found == pytest.approx(1 / 6, abs=5e-3)
@@ -151,7 +168,9 @@ def test_coverage_counted_the_named_station_alone():
     power, error, below = np.array([[-100.0], [-100.0]]), np.full((2, 1), 6.0), np.array([0.5])
 
     def found(*alike):
-        return field_map.outage_probability(power, error, -100.0, np.array(alike)[:, None], below)[0]
+        return field_map.outage_probability(power, error, -100.0, np.array(alike)[:, None], below)[
+            0
+        ]
 
     assert found(1.0, 0.0) == pytest.approx(0.25, abs=1e-3)
     assert found(1.0, 0.5) == pytest.approx(1 / 3, abs=5e-3)  # 1/4 + asin(r) / (2 pi)
@@ -161,7 +180,9 @@ def test_coverage_counted_the_named_station_alone():
 
 
 def test_twenty_one_stations_had_twenty_colours():
-    """Those of neighbours were shades of one hue: areas side by side have different ones, and names."""
+    """Those of neighbours were shades of one hue: areas side by side have different ones,
+    and names.
+    """
     classes = np.kron(np.arange(24.0).reshape(4, 6), np.ones((6, 6)))
     found = assign_colours(classes, 24)
     assert found.min() >= 0 and found.max() < 10
@@ -198,37 +219,52 @@ def test_a_station_was_named_best_where_nothing_was_known_or_above_the_floor(pre
     error = np.full((2, 4), 5.0)
     free = server_chance(power, error, np.full(2, -np.inf))
     assert free[:2] == pytest.approx([1.0, 0.5], abs=1e-4) and np.isnan(free[2]) and free[3] == 1
-    # Unknown in the last cell, as in `outage`: weaker. As strong as usual its Brier score was .20, now .18.
+    # Unknown in the last cell, as in `outage`: weaker. As strong as usual its Brier score was .20,
+    # now .18.
     told = server_chance(power, error, np.array([-60.0, -100.0]))
     assert told[[0, 3]] == pytest.approx([0.5, 0.5], abs=1e-4)
     quiet = predict_map(predictor, step_m=10.0)
     loud = predict_map(predictor, step_m=10.0, noise_db=0.0)
-    assert not quiet.unsure.any() and loud.unsure.all() and loud.summarise()["map/server_unsure"] == 1
+    assert (
+        not quiet.unsure.any() and loud.unsure.all() and loud.summarise()["map/server_unsure"] == 1
+    )
     unsure = {layer.name: layer.unsure for layer in list_layers(loud)}
     assert unsure["best_server"] is not None and unsure["power"] is None
 
 
 def test_the_floor_of_a_station_is_its_level_or_what_was_weakest():
     level, row = np.append(np.linspace(-100, -50, 101), [-90.0, -70.0]), np.arange(103)
-    evidence = HeldOutLevels(level, level, np.ones(103), np.zeros(103), row, (row > 100) * 1, row > 100)
+    evidence = HeldOutLevels(
+        level, level, np.ones(103), np.zeros(103), row, (row > 100) * 1, row > 100
+    )
     promise = Promise(evidence, np.zeros((1, 3)), np.zeros(1, np.int64), 1.0)
     assert _hearing_floors(promise, [0, 1], None) == pytest.approx([-99.5, -90])
     assert _hearing_floors(None, [0, 1], -95.0).tolist() == [-95, -95]
 
 
 def test_a_threshold_below_all_that_was_measured_was_said_to_be_met_everywhere(predictor):
-    """100.0% of a city (100.0% to 100.0%) had -100 dBm or more, where the weakest measured was -100.6."""
+    """100.0% of a city (100.0% to 100.0%) had -100 dBm or more,
+    where the weakest measured was -100.6.
+    """
     level, row = np.linspace(-100.6, -50, 400), np.arange(400)
     place = np.random.default_rng(0).uniform(0, 60, (400, 3))
-    evidence = HeldOutLevels(level, level, np.ones(400), np.linspace(0, 90, 400), row // 10, row * 0, row % 2)
+    evidence = HeldOutLevels(
+        level, level, np.ones(400), np.linspace(0, 90, 400), row // 10, row * 0, row % 2
+    )
     promise = Promise(evidence, place, row % 2, 5.0)
     for threshold, said in ((-100, 1), (-90, 0)):
         found = predict_map(predictor, step_m=20.0, threshold_db=threshold, promise=promise)
-        assert sum("or below what was measured (lowest -100.6)" in note for note in found.notes) == said
+        assert (
+            sum("or below what was measured (lowest -100.6)" in note for note in found.notes)
+            == said
+        )
         assert not any("above all" in note for note in found.notes)
     found = predict_map(predictor, step_m=20.0, threshold_db=60, promise=promise)
     assert np.nanmin(found.outage) == 1  # .1 % of the squares had it
-    assert any("threshold_db=60 is above all that was measured (highest -50)" in note for note in found.notes)
+    assert any(
+        "threshold_db=60 is above all that was measured (highest -50)" in note
+        for note in found.notes
+    )
 
 
 def test_spectra_have_no_power(predictor, monkeypatch):
@@ -277,7 +313,9 @@ def test_nothing_is_promised_of_a_station_that_was_never_heard(predictor):
         choose_stations(predictor, ["east"], promise)
 
 
-def test_a_map_named_cells_by_the_numbers_of_the_drive_where_the_list_has_names(predictor, monkeypatch):
+def test_a_map_named_cells_by_the_numbers_of_the_drive_where_the_list_has_names(
+    predictor, monkeypatch
+):
     monkeypatch.setitem(vars(predictor.site.stations), "label", ("Roof 1", "Tower"))
     found = predict_map(predictor, step_m=8.0, stations=["east", "Roof 1"])
     assert found.stations == ("Tower", "Roof 1")
@@ -305,11 +343,17 @@ def draw(field, name):
     pictures.draw_layer(field, layer, "unused.png", "")
 
 
-def test_axes_of_a_map_were_metres_from_an_origin_that_they_did_not_name(predictor, drawn, monkeypatch):
+def test_axes_of_a_map_were_metres_from_an_origin_that_they_did_not_name(
+    predictor, drawn, monkeypatch
+):
     draw(predict_map(predictor, step_m=4.0), "power")
-    monkeypatch.setattr(predictor, "site", replace(predictor.site, georeference=Georeference(47.2, 11.3)))
+    monkeypatch.setattr(
+        predictor, "site", replace(predictor.site, georeference=Georeference(47.2, 11.3))
+    )
     draw(predict_map(predictor, step_m=4.0), "power")
-    pictures.draw_measurement_plan(plan_measurements(predictor, 2), "unused.png", None, predictor, None)
+    pictures.draw_measurement_plan(
+        plan_measurements(predictor, 2), "unused.png", None, predictor, None
+    )
     said = [figure.axes[0].get_xlabel() for figure in drawn]
     assert said == ["x [m]", "metres east of 11.3° E", "metres east of 11.3° E"]
 
@@ -318,7 +362,10 @@ def test_a_legend_of_ten_cells_did_not_say_that_others_serve_less(drawn, predict
     field = predict_map(predictor, step_m=4.0)
     number = np.arange(field.grid.inside.size).reshape(field.grid.inside.shape) % 24
     layer = pictures.Layer(
-        "best_server", 1.0 * number, pictures.Legend("", -0.5, 23.5), tuple("abcdefghijklmnopqrstuvwx")
+        "best_server",
+        1.0 * number,
+        pictures.Legend("", -0.5, 23.5),
+        tuple("abcdefghijklmnopqrstuvwx"),
     )
     pictures.draw_layer(field, layer, "unused.png", "")
     words = [text.get_text() for text in drawn[0].legends[0].get_texts()]
@@ -330,7 +377,10 @@ def test_a_legend_of_twelve_cells_left_two_out(drawn, predictor):
     number = np.arange(field.grid.inside.size).reshape(field.grid.inside.shape) % 12
     legend = pictures.Legend("", -0.5, 11.5)
     pictures.draw_layer(
-        field, pictures.Layer("best_server", 1.0 * number, legend, tuple("abcdefghijkl")), "unused.png", ""
+        field,
+        pictures.Layer("best_server", 1.0 * number, legend, tuple("abcdefghijkl")),
+        "unused.png",
+        "",
     )
     words = [text.get_text() for text in drawn[0].legends[0].get_texts()]
     assert {*"abcdefghijkl"} <= {*words} and not any("more" in word for word in words)

@@ -1,4 +1,6 @@
-"""One more station goes where the others do not serve, by models that know stations they never heard."""
+"""One more station goes where the others do not serve,
+by models that know stations they never heard.
+"""
 
 import json
 from dataclasses import replace
@@ -74,7 +76,9 @@ def test_candidates_lay_on_diagonal_stripes(together):
 
 
 def test_the_share_as_it_is_was_taken_as_exact(together, promise):
-    """Of a new station without error the interval had no width; old and new share are now drawn together."""
+    """Of a new station without error the interval had no width;
+    old and new share are now drawn together.
+    """
     predictor, how = gsparc.load(together[2]), {"threshold_db": -75.0, "promise": promise}
     found = place_station(predictor, **how, count=4, error=NewStationError(0.0, 1e-3, 4))
     left, right, low, high = found.grid.extent
@@ -85,9 +89,13 @@ def test_the_share_as_it_is_was_taken_as_exact(together, promise):
     assert (width > 0.02).all() and (width < 1.1 * np.ptp(now)).all() and (gained > 0).all()
 
 
-def test_any_fault_of_a_covariance_was_taken_for_a_model_without_one(together, promise, monkeypatch):
+def test_any_fault_of_a_covariance_was_taken_for_a_model_without_one(
+    together, promise, monkeypatch
+):
     predictor = gsparc.load(together[2])
-    monkeypatch.setattr(Predictor, "covariance", lambda *_, **__: pytest.fail("nothing is asked and dropped"))
+    monkeypatch.setattr(
+        Predictor, "covariance", lambda *_, **__: pytest.fail("nothing is asked and dropped")
+    )
     field = predict_map(predictor, step_m=4.0, threshold_db=-75.0, promise=promise)
     low, high = covered_between(field, predictor, promise)
     assert low < 1 - np.nanmean(field.outage) < high
@@ -99,7 +107,9 @@ def test_an_interval_of_no_width_stood_where_no_station_was_left_out(together):
 
 
 def test_sectors_left_out_one_by_one_were_told_by_others_of_their_site(together, monkeypatch):
-    """And of lists the strong rows alone counted: 5.3 dB off in a network, 1.9 dB with silent rows."""
+    """And of lists the strong rows alone counted: 5.3 dB off in a network,
+    1.9 dB with silent rows.
+    """
     method, data, _ = together
     stations, rows = data.site.stations, np.arange(len(data))
     four = replace(stations, position=np.repeat(stations.position, 2, 0), name=(*"abcd",))
@@ -116,16 +126,24 @@ def test_sectors_left_out_one_by_one_were_told_by_others_of_their_site(together,
     monkeypatch.setattr("gsparc.apps.maps.placing.leave_out", evidence)
     monkeypatch.setattr("gsparc.apps.maps.placing.LEAST_STATIONS", 2)
     fold = Fold(rows, rows[:0], rows[:1])
-    found = new_station_error(Learned(method, method_class("distance_law"), data, fold, FitContext()))
+    found = new_station_error(
+        Learned(method, method_class("distance_law"), data, fold, FitContext())
+    )
     assert sorted(map(sorted, left)) == [[0, 1], [2, 3]] and found.stations == 2
     assert found.offset_db < 4  # 8 of those heard
 
 
 def test_intervals_took_four_stations_for_very_many(together, promise):
-    """Of halls' stations really left out, intervals of 90 % by the normal's 1.645 held 56 to 86 %."""
-    predictor, how = gsparc.load(together[2]), {"threshold_db": -75.0, "count": 4, "promise": promise}
+    """Of halls' stations really left out, intervals of 90 %
+    by the normal's 1.645 held 56 to 86 %.
+    """
+    predictor, how = (
+        gsparc.load(together[2]),
+        {"threshold_db": -75.0, "count": 4, "promise": promise},
+    )
     few, many = (
-        place_station(predictor, **how, error=NewStationError(3.0, 1.0, stations)) for stations in (4, 10_000)
+        place_station(predictor, **how, error=NewStationError(3.0, 1.0, stations))
+        for stations in (4, 10_000)
     )
     assert (np.ptp(few.between[:, 2:], 1) > np.ptp(many.between[:, 2:], 1)).all()
     assert many.coverage == pytest.approx(few.coverage, abs=0.02)
@@ -149,7 +167,10 @@ def test_refused_squares_counted_as_not_served(together):
 
 def test_candidates_are_a_table_and_power_is_given(together, tmp_path):
     (tmp_path / "roofs.csv").write_text("name,x,y,z\nA,5,5,20\nB,75,5,12\n")
-    predictor, how = gsparc.load(together[2]), {"threshold_db": -75.0, "sites": tmp_path / "roofs.csv"}
+    predictor, how = (
+        gsparc.load(together[2]),
+        {"threshold_db": -75.0, "sites": tmp_path / "roofs.csv"},
+    )
     found = place_station(predictor, **how)
     named = dict(zip(found.given["name"].tolist(), found.places.tolist(), strict=True))
     assert named == {"A": [5, 5, 20], "B": [75, 5, 12]}
@@ -174,7 +195,9 @@ def test_polygons_of_candidates_were_read_as_a_table(together, tmp_path):
         (tmp_path / f"{number}.geojson").write_text(json.dumps(content))
         found.append(draws_shapes(tmp_path / f"{number}.geojson"))
     assert found == [True, False, False]
-    inside = place_station(predictor, threshold_db=-75.0, sites=tmp_path / "0.geojson", count=4).places
+    inside = place_station(
+        predictor, threshold_db=-75.0, sites=tmp_path / "0.geojson", count=4
+    ).places
     assert len(inside) > 1 and (inside[:, :2] >= 0).all() and (inside[:, :2] <= [60, 20]).all()
 
 
@@ -186,11 +209,14 @@ def test_two_stations_leave_none_out(together):
     assert new_station_error(learned).stations == 0
 
 
-@pytest.mark.parametrize("said, how", [
-    ("at least 1", {"count": 0}),
-    ("no such file", {"sites": "missing.geojson"}),
-    ("stations=together", {}),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "said, how",
+    [
+        ("at least 1", {"count": 0}),
+        ("no such file", {"sites": "missing.geojson"}),
+        ("stations=together", {}),
+    ],
+)
 def test_spoilt_wishes(together, said, how):
     model = together[2] if how else town_model()  # whose stations are known ones alone
     refused(said, place_station, gsparc.load(model), threshold_db=-75.0, **how)
@@ -207,7 +233,9 @@ def test_a_new_station_among_bands_was_put_in_one_that_nobody_named(together):
     assert named.find_alike(two.stations) == 0 and NewAntenna().find_alike(two.stations) is None
     assert "in the band of 2650 MHz" in assumption(two, 8.0, named)
     refused(
-        "no station's band; there are 1800, 2600 MHz", NewAntenna(carrier_hz=8e8).find_alike, two.stations
+        "no station's band; there are 1800, 2600 MHz",
+        NewAntenna(carrier_hz=8e8).find_alike,
+        two.stations,
     )
     known = replace(site, stations=replace(site.stations, carrier_hz=np.array([2.6e9, 2.6e9])))
     assert NewAntenna(carrier_hz=2.6e9).find_alike(known.stations) is None
@@ -219,5 +247,7 @@ def test_a_station_of_no_known_height_was_nan():
     stations = predictor.site.stations
     lost = replace(stations, position=np.full_like(stations.position, np.nan))
     predictor.site = replace(predictor.site, stations=lost)
-    with pytest.raises(DataError, match="no station's height is known; say station_height_m=METRES"):
+    with pytest.raises(
+        DataError, match="no station's height is known; say station_height_m=METRES"
+    ):
         place_station(predictor)

@@ -51,11 +51,15 @@ def test_a_plan_lowered_errors_of_stations_that_serve_nowhere(predictor):
     assert share.sum(0) == pytest.approx(2) and share[0] == pytest.approx([2, 1, 2], abs=0.2)
     assert (weigh_goal(level, spread, "all") == 1).all()
     doubt = weigh_goal(level + np.array([0, 0, 10]), spread, "strongest", -60)
-    assert doubt.sum(0)[0] > doubt.sum(0)[1] > 1e3 * doubt.sum(0)[2] and doubt.mean() == pytest.approx(1)
+    assert doubt.sum(0)[0] > doubt.sum(0)[1] > 1e3 * doubt.sum(0)[
+        2
+    ] and doubt.mean() == pytest.approx(1)
     assert weigh_goal(level, spread, "strongest", 0) == pytest.approx(share)  # nothing is in doubt
     area = [0, 0, 80, 60]
     both = {goal: plan_measurements(predictor, 1, area, goal=goal) for goal in ("strongest", "all")}
-    one = {goal: plan_measurements(predictor, 1, area, goal=goal, stations=["west"]) for goal in both}
+    one = {
+        goal: plan_measurements(predictor, 1, area, goal=goal, stations=["west"]) for goal in both
+    }
     assert both["strongest"].before_db != pytest.approx(both["all"].before_db, rel=1e-3)
     assert one["strongest"].before_db == pytest.approx(one["all"].before_db)
 
@@ -67,7 +71,9 @@ def test_corridors_and_a_length(tmp_path, predictor):
     assert len(found.path) and not len(plan_measurements(predictor, 2, route=False).path)
     on = (np.abs(found.places[:, 1] - 5) < 1e-6) | (np.abs(found.places[:, 0] - 40) < 1e-6)
     assert on.all() and sorted(found.chosen.tolist()) == list(range(10))
-    short = plan_measurements(predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5], route_m=30)
+    short = plan_measurements(
+        predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5], route_m=30
+    )
     assert short.length_m <= 30 and len(short.places) >= 1
 
 
@@ -88,11 +94,18 @@ def test_a_plan_went_to_corners_of_the_bounding_box_where_nothing_is_known(predi
     rng = np.random.default_rng(0)
     level, spread, row = rng.normal(size=60), np.ones(60), np.arange(60)
     evidence = HeldOutLevels(level, 0 * level, spread, row / 10, row, row % 2, row < 0)
-    known = np.column_stack([rng.uniform(0, [40, 60], (120, 2)), np.full(120, 1.5)]) - predictor.site.origin
+    known = (
+        np.column_stack([rng.uniform(0, [40, 60], (120, 2)), np.full(120, 1.5)])
+        - predictor.site.origin
+    )
     promise = Promise(evidence, known, np.arange(120) % 2, 5.0)
     found = plan_measurements(predictor, 6, promise=promise)
     reach = promise.calibration().reach
-    assert cKDTree(known + predictor.site.origin).query(found.at)[0].max() <= reach + found.grid.step < 10
+    assert (
+        cKDTree(known + predictor.site.origin).query(found.at)[0].max()
+        <= reach + found.grid.step
+        < 10
+    )
     assert found.places[:, 0].max() < 50 and not found.grid.inside[:, -1].any()
     assert plan_measurements(predictor, 6, [0, 0, 80, 60], promise=promise).at[:, 0].max() > 70
 
@@ -138,7 +151,10 @@ def test_a_station_that_is_not_listed_was_learned_nothing_of_by_its_sites_others
 
 def test_a_long_walk_for_nothing_was_not_called_so(predictor):
     found = plan_measurements(predictor, 1, route=True)
-    assert "hardly worth measuring: 1 places" in found.in_vain and 0 < found.scatter_db < found.before_db
+    assert (
+        "hardly worth measuring: 1 places" in found.in_vain
+        and 0 < found.scatter_db < found.before_db
+    )
     assert not plan_measurements(None, 9, [0, 0, 30, 30]).in_vain
 
 
@@ -148,33 +164,41 @@ def test_a_walk_is_not_longer_than_it_must_be():
     tour = Tour(np.abs(at - at.T) * 1.0, int(np.argmin(at)), None)
     for place in rng.permutation(np.flatnonzero(at)):
         tour.add(place)
-    assert tour.metres[-1] == pytest.approx(11) and sorted(tour.walk[1:-1]) == sorted(np.flatnonzero(at))
+    assert tour.metres[-1] == pytest.approx(11) and sorted(tour.walk[1:-1]) == sorted(
+        np.flatnonzero(at)
+    )
 
 
 def test_a_drive_went_straight_from_place_to_place_where_streets_were_given():
-    shapely = pytest.importorskip("shapely", reason="shapely is not installed: pip install 'gsparc[maps]'")
+    shapely = pytest.importorskip(
+        "shapely", reason="shapely is not installed: pip install 'gsparc[maps]'"
+    )
     grid = [[[0, 0], [100, 0]], [[50, -50], [50, 50]], [[0, 40], [100, 40]], [[200, 0], [300, 0]]]
     streets = StreetGraph.from_lines([shapely.LineString(line) for line in grid], 10)
     ways = Ways.between(np.array([[0.0, 0], [10, 40], [200, 0], [-5, 0]]), streets)
     # By the crossing at (50, 0) and that at (50, 40), though no corner of a line is there.
     assert ways.length[0, 1] == pytest.approx(50 + 40 + 40)
     assert ways.length[3, 1] == pytest.approx(5 + 130)  # from beside the street
-    assert ways.length[0, 2] == pytest.approx(200) and not ways.along[0, 2]  # streets that do not meet
+    # Streets that do not meet
+    assert ways.length[0, 2] == pytest.approx(200) and not ways.along[0, 2]
     path = ways.path_through(np.array([0, 1]))
     assert [50, 0] in path.tolist() and [50, 40] in path.tolist()
     assert np.hypot(*np.diff(path, axis=0).T).sum() == pytest.approx(130)
 
 
-@pytest.mark.parametrize("how, said", [
-    ({"count": 0}, "at least 1"),
-    ({"count": 2, "route_m": -1}, "above 0"),
-    ({"count": 2, "start": [1]}, "two finite numbers"),
-    ({"count": 2, "least_gain_db": -1}, "at least 0"),
-    ({"count": 2, "length_m": 0}, "above 0"),
-    ({"count": 2, "goal": "best"}, "one of strongest, all"),
-    ({"count": 2, "area": None}, "nothing says where"),
-    ({"count": 2, "walkable": "missing.geojson"}, "no such file"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "how, said",
+    [
+        ({"count": 0}, "at least 1"),
+        ({"count": 2, "route_m": -1}, "above 0"),
+        ({"count": 2, "start": [1]}, "two finite numbers"),
+        ({"count": 2, "least_gain_db": -1}, "at least 0"),
+        ({"count": 2, "length_m": 0}, "above 0"),
+        ({"count": 2, "goal": "best"}, "one of strongest, all"),
+        ({"count": 2, "area": None}, "nothing says where"),
+        ({"count": 2, "walkable": "missing.geojson"}, "no such file"),
+    ],
+)
 def test_spoilt_wishes(how, said):
     with pytest.raises(DataError, match=said):
         plan_measurements(None, **{"area": [0, 0, 9, 9], **how})

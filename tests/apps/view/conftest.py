@@ -1,4 +1,6 @@
-"""Models small enough to be trained here: spectra of rendered Gaussians, and powers of two stations."""
+"""Models small enough to be trained here: spectra of rendered Gaussians,
+and powers of two stations.
+"""
 
 from functools import cache
 from pathlib import Path

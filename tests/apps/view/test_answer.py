@@ -21,7 +21,9 @@ def test_a_fade_is_said_to_be_one():
 
 @pytest.mark.slow
 def test_a_spectrum_and_a_power_are_answered(spectrum_view, power_view):
-    spectrum = predict_answer(spectrum_view.viewed.predictor_of(None), spectrum_view.initial_places(None))
+    spectrum = predict_answer(
+        spectrum_view.viewed.predictor_of(None), spectrum_view.initial_places(None)
+    )
     assert spectrum.spectrum.shape == (16, 32) and spectrum.level_db is None
     assert set(spectrum.ends) == {"tx", "rx"}
     name = power_view.viewed.stations[1]

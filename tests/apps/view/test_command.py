@@ -39,13 +39,16 @@ def test_without_viser_one_line_says_what_to_install(here, monkeypatch, more):
         view(here, here / "missing.ckpt", *more)
 
 
-@pytest.mark.parametrize("more, said", [
-    (["save=scene.png"], "expected a name that ends with .html, .ply"),
-    (["port=70000"], "at least 0 and at most 65535"),
-    (["save=a.ply", "station=nowhere"], "there are east, west"),
-    (["save=a.ply", "at=[1,2]"], "three finite numbers"),
-    (["save=a.ply"], "holds no Gaussians to write"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "more, said",
+    [
+        (["save=scene.png"], "expected a name that ends with .html, .ply"),
+        (["port=70000"], "at least 0 and at most 65535"),
+        (["save=a.ply", "station=nowhere"], "there are east, west"),
+        (["save=a.ply", "at=[1,2]"], "three finite numbers"),
+        (["save=a.ply"], "holds no Gaussians to write"),
+    ],
+)
 def test_what_cannot_be_is_said_and_nothing_is_written(here, monkeypatch, more, said):
     monkeypatch.chdir(here)
     with pytest.raises(DataError, match=said):
@@ -57,7 +60,11 @@ def test_a_model_whose_data_are_gone_is_shown_without_them(tmp_path):
     viewed = open_model(town_model(), {"file": str(tmp_path / "gone.npz")})
     assert viewed.data is None and "measured points are not drawn" in viewed.notes[0]
     scene = build_scene(viewed, None, "west", viewed.measured_at("west"))
-    assert {part.name for part in scene.parts} == {"station west", "station east", "box of measurements"}
+    assert {part.name for part in scene.parts} == {
+        "station west",
+        "station east",
+        "box of measurements",
+    }
 
 
 def test_powers_in_dbm_were_shown_in_db_by_default(monkeypatch):
@@ -76,7 +83,9 @@ def test_a_unit_of_pictures_changed_their_names_alone(monkeypatch):
     assert (dbm.site.level_unit, dbw.site.level_unit) == ("dBm", "dBW")
     level, lower = (predict_levels(one.predictor_of("west"), places)[0] for one in (dbm, dbw))
     np.testing.assert_allclose(lower, level - 30, atol=1e-4)
-    np.testing.assert_allclose(dbw.measured_at("west").values, dbm.measured_at("west").values - 30, atol=1e-4)
+    np.testing.assert_allclose(
+        dbw.measured_at("west").values, dbm.measured_at("west").values - 30, atol=1e-4
+    )
     with pytest.raises(ValueError, match=r"unit=mW: of powers in dBm expected dBm, dBW$"):
         open_model(town_model(), unit="mW")
 

@@ -23,7 +23,9 @@ def settle(work, seconds=5.0):
 
 
 def job(done, *said, begun=None, go=None):
-    """Appends each of `said` in a step of its own; with events, begins and waits until it may go on."""
+    """Appends each of `said` in a step of its own; with events,
+    begins and waits until it may go on.
+    """
 
     def steps():
         if begun is not None:
@@ -43,7 +45,11 @@ def job(done, *said, begun=None, go=None):
         (("plane", [0, 1, 2]), [("answer", ["answer"], True)], [0, "answer", 1, 2]),
         (("a", ["a"] * 3), [("b", ["b"] * 3, False)], ["a", "b"] * 3),
     ],
-    ids=["of many drags the first and last", "urgent between steps of a long one", "two clients by turns"],
+    ids=[
+        "of many drags the first and last",
+        "urgent between steps of a long one",
+        "two clients by turns",
+    ],
 )
 def test_order(work, first, then, order):
     done, begun, go = [], threading.Event(), threading.Event()

@@ -32,7 +32,8 @@ def test_a_sheet_lies_north_up_and_is_clear_where_nothing_is_known(power_view):
     values[0, 0] = np.nan  # south-west
     dot = power_view.station("west").dot
     assert power_view.station("west").power is not None
-    made = plane_sheet("plane", grid, values, Legend("", 0.0, 1.0), dot / 2)  # so that dots are seen whole
+    # So that dots are seen whole
+    made = plane_sheet("plane", grid, values, Legend("", 0.0, 1.0), dot / 2)
     assert made.image[-1, 0, 3] == 0 and (made.image[:-1, :, 3] > 0).all()
     left, _, _, high = grid.extent
     assert dot > 0
@@ -41,9 +42,15 @@ def test_a_sheet_lies_north_up_and_is_clear_where_nothing_is_known(power_view):
 
 
 def test_a_plane_of_channels_has_the_level_that_answers_have(tmp_path):
-    """It was of the mean alone: up to 24 dB below the answer where the mean fades and the error does not."""
+    """It was of the mean alone: up to 24 dB below the answer where the mean fades
+    and the error does not.
+    """
     viewed = open_model(trained(channels(tmp_path / "room.npz", shape="S"), "gp"))
     *_, plane = refine_plane(viewed.predictor_of(None), lay_power_plane(viewed, {"step_m": 0.5}))
-    said = [predict_answer(viewed.predictor_of(None), {"rx": place}) for place in plane.grid.places()]
+    said = [
+        predict_answer(viewed.predictor_of(None), {"rx": place}) for place in plane.grid.places()
+    ]
     assert any(one.response is not None and one.spread_db > 2 for one in said)
-    np.testing.assert_allclose(plane.level_db[plane.grid.inside], [one.level_db for one in said], atol=1e-3)
+    np.testing.assert_allclose(
+        plane.level_db[plane.grid.inside], [one.level_db for one in said], atol=1e-3
+    )

@@ -38,7 +38,9 @@ def test_every_field_says_what_a_splat_viewer_takes_it_for(tmp_path):
     scales = np.exp(np.column_stack([found[f"scale_{k}"] for k in range(3)]))
     np.testing.assert_allclose(scales, made.scales, rtol=1e-5)
     assert np.isfinite(found["opacity"]).all()
-    np.testing.assert_allclose(1 / (1 + np.exp(-found["opacity"])), made.opacities, rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(
+        1 / (1 + np.exp(-found["opacity"])), made.opacities, rtol=1e-5, atol=1e-4
+    )
     rgb = 0.5 + Y00 * np.column_stack([found[f"f_dc_{k}"] for k in range(3)])
     np.testing.assert_allclose(rgb, colours / 255, atol=1e-6)
     turns = np.column_stack([found[f"rot_{k}"] for k in range(4)])
@@ -57,7 +59,11 @@ def test_none_and_what_is_not_finite_are_refused(tmp_path):
 def test_covariances_are_those_of_turned_axes():
     half = np.pi / 4
     turned = GaussianCloud(
-        np.zeros((1, 3)), np.array([[3.0, 1, 2]]), np.array([[np.cos(half), 0, 0, np.sin(half)]]),
-        np.ones(1), np.ones(1), "",
-    )  # fmt: skip
+        np.zeros((1, 3)),
+        np.array([[3.0, 1, 2]]),
+        np.array([[np.cos(half), 0, 0, np.sin(half)]]),
+        np.ones(1),
+        np.ones(1),
+        "",
+    )
     np.testing.assert_allclose(turned.covariances()[0], np.diag([1.0, 9, 4]), atol=1e-12)

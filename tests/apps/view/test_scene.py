@@ -21,7 +21,10 @@ def test_values_that_are_not_known_are_grey():
     found = legend.to_colours(np.array([np.nan, 0.0, 1.0, 5.0]))
     assert tuple(found[0]) == (170, 170, 170) and (found[2] == found[3]).all()
     assert (found[1] != found[2]).any()
-    assert Legend.over("nothing", np.full(3, np.nan)).high > Legend.over("nothing", np.full(3, np.nan)).low
+    assert (
+        Legend.over("nothing", np.full(3, np.nan)).high
+        > Legend.over("nothing", np.full(3, np.nan)).low
+    )
 
 
 def test_a_floor_plan_and_the_grid_lie_beneath_the_plane(power_view):

@@ -35,9 +35,12 @@ def visit():
 
     def come(view, number=0):
         client = SimpleNamespace(
-            client_id=number, scene=server.scene, gui=server.gui, camera=server.initial_camera,
+            client_id=number,
+            scene=server.scene,
+            gui=server.gui,
+            camera=server.initial_camera,
             atomic=server.atomic,
-        )  # fmt: skip
+        )
         return Session(client, view, work)
 
     yield come
@@ -69,10 +72,18 @@ class Visitor:
     def __init__(self, server):
         there = set(server.sessions)
         self.socket = connect(
-            server.address.replace("http", "ws"), subprotocols=[f"viser-v{viser.__version__}"],
-            max_size=None, compression=None,
-        )  # fmt: skip
-        camera = {"position": (0.0, -9, 8), "fov": 1.3, "near": 0.01, "far": 1e3, "look_at": (0.0, 0, 0)}
+            server.address.replace("http", "ws"),
+            subprotocols=[f"viser-v{viser.__version__}"],
+            max_size=None,
+            compression=None,
+        )
+        camera = {
+            "position": (0.0, -9, 8),
+            "fov": 1.3,
+            "near": 0.01,
+            "far": 1e3,
+            "look_at": (0.0, 0, 0),
+        }
         camera |= {"image_height": 700, "image_width": 1100, "up_direction": (0.0, 0, 1)}
         self.say("ViewerCameraMessage", wxyz=(1.0, 0, 0, 0), **camera)
         threading.Thread(target=self.read, daemon=True).start()
@@ -118,7 +129,9 @@ def test_a_spectrum_follows_on_the_sphere_and_in_the_panel(visit, spectrum_view)
     low, high = spectrum_view.viewed.box()
     drag(session, "tx", low + 0.2 * (high - low))
     settle(session)
-    assert (session.nodes["sphere"].colors != before).any() and (session.picture.image != panel).any()
+    assert (session.nodes["sphere"].colors != before).any() and (
+        session.picture.image != panel
+    ).any()
     assert "emi" in session.legend.content
     session._show_part("gaussians", False)
     assert not session.nodes["gaussians"].visible and "emi" not in session.legend.content
@@ -177,7 +190,8 @@ def test_another_station_is_another_answer_and_the_weakest_cell_can_be_visited(v
     here = session.places["rx"]
     session._go("next weak place")
     settle(session)
-    assert np.linalg.norm(session.places["rx"] - here) > 5  # it stayed where it was, however often one asked
+    # It stayed where it was, however often one asked
+    assert np.linalg.norm(session.places["rx"] - here) > 5
     session.laid.value = False
     session.want_plane()
     settle(session)
@@ -214,17 +228,27 @@ def test_of_two_clients_one_vanishes_and_the_other_is_answered(power_view):
         assert wait(lambda: set(server.sessions) == {one.number})
         one.drag([40.0, 10.0, 1.5])
         assert wait(lambda: "receiver at 40.00, 10.00" in one.session.answer_text.content)
-        assert wait(lambda: not server.work._jobs) and server.address.startswith("http://127.0.0.1:")
+        assert wait(lambda: not server.work._jobs) and server.address.startswith(
+            "http://127.0.0.1:"
+        )
     finally:
         server.stop()
 
 
 def test_a_page_showed_one_of_several_stations(power_view):
     text = render_page(power_view, steps=8)
-    assert "nothing is computed here" in text and text.rstrip().endswith("</html>") and len(text) > 500_000
-    assert "for 2 of 2 stations (west, east), one after another" in text and "plays 8 recorded places" in text
+    assert (
+        "nothing is computed here" in text
+        and text.rstrip().endswith("</html>")
+        and len(text) > 500_000
+    )
+    assert (
+        "for 2 of 2 stations (west, east), one after another"
+    ) in text and "plays 8 recorded places" in text
     assert "west: measured received power" in text and "east: measured received power" in text
-    assert "for 1 of 2 stations (west); station=NAME shows another" in render_page(power_view, steps=2)
+    assert ("for 1 of 2 stations (west); station=NAME shows another") in render_page(
+        power_view, steps=2
+    )
 
 
 @pytest.mark.slow
@@ -234,5 +258,7 @@ def test_a_page_opens_from_its_file_and_asks_for_nothing(browser, tmp_path, spec
     browser.get(file.as_uri())
     assert "nothing is computed here" in browser.find_element("css selector", "details").text
     assert wait(lambda: browser.find_elements("css selector", "canvas"), 30)
-    asked = browser.execute_script("return performance.getEntriesByType('resource').map(e => e.name)")
+    asked = browser.execute_script(
+        "return performance.getEntriesByType('resource').map(e => e.name)"
+    )
     assert not [name for name in asked if name.startswith(("http:", "https:", "ws:"))]

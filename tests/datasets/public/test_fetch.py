@@ -1,5 +1,4 @@
 """Public data from a local server: what comes, what is refused in one line, and what is kept."""
-# ruff: noqa: E501 (a case is a row of a table)
 
 import contextlib
 import csv
@@ -50,7 +49,9 @@ def test_a_set_is_fetched_once(mirror, monkeypatch, tmp_path, caplog):
 
 def test_what_is_damaged_is_fetched_again_and_alone(mirror, monkeypatch, tmp_path):
     offer(
-        monkeypatch, tmp_path, *(mirror.serve(f"release/{n}", c) for n, c in (("1.bin", ONE), ("2.csv", TWO)))
+        monkeypatch,
+        tmp_path,
+        *(mirror.serve(f"release/{n}", c) for n, c in (("1.bin", ONE), ("2.csv", TWO))),
     )
     folder = fetch("room")
     (folder / "1.bin").write_bytes(ONE[:-1] + bytes([ONE[-1] ^ 1]))
@@ -99,7 +100,10 @@ def changed(request, content):
 
 
 FAULTS = {
-    "wrong hash": (changed, r"not the 3,000 bytes of the pinned revision \(SHA-256\); it was not kept"),
+    "wrong hash": (
+        changed,
+        r"not the 3,000 bytes of the pinned revision \(SHA-256\); it was not kept",
+    ),
     "too short": (short, "not the 3,000 bytes of the pinned revision"),
     "too long": (endless, "not the 3,000 bytes of the pinned revision"),
     "cut short": (cut, r"cut short; what is there is kept: say `gsparc data room` again"),
@@ -111,13 +115,17 @@ FAULTS = {
 
 
 @pytest.mark.parametrize("case", FAULTS)
-def test_a_file_that_is_not_the_pinned_one_is_said_and_not_kept(mirror, monkeypatch, tmp_path, case):
+def test_a_file_that_is_not_the_pinned_one_is_said_and_not_kept(
+    mirror, monkeypatch, tmp_path, case
+):
     answer, says = FAULTS[case]
     first = mirror.serve("release/first.csv", TWO)
     offer(
-        monkeypatch, tmp_path, first,
+        monkeypatch,
+        tmp_path,
+        first,
         mirror.serve("release/1.bin", ONE, *[answer] * (40 if answer is moved else 1)),
-    )  # fmt: skip
+    )
     with pytest.raises(DataError, match=says) as error:
         fetch("room", timeout_s=0.3, retries=0)
     assert "\n" not in str(error.value) and "release/1.bin" in str(error.value)
@@ -138,7 +146,8 @@ def test_a_failure_that_passes_is_tried_again_and_a_redirect_followed(
 
 
 @pytest.mark.parametrize(
-    "path", ["release/../../../escaped", "/etc/escaped", "release/..\\escaped", "release/link/escaped"]
+    "path",
+    ["release/../../../escaped", "/etc/escaped", "release/..\\escaped", "release/link/escaped"],
 )
 def test_a_path_that_leaves_the_folder_is_refused_before_anything_is_fetched(
     mirror, monkeypatch, tmp_path, path, refused
@@ -166,7 +175,9 @@ def test_a_licence_that_is_not_stated_is_asked_for(mirror, monkeypatch, tmp_path
 
 
 def test_a_cache_that_cannot_be_written(mirror, monkeypatch, tmp_path, refused):
-    """Root may write into a folder without the permission: a file where the folder should be stands for it."""
+    """Root may write into a folder without the permission:
+    a file where the folder should be stands for it.
+    """
     room = offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE))
     room.folder.parent.mkdir(parents=True)
     room.folder.write_text("in the way")
@@ -198,7 +209,9 @@ def test_a_fetch_that_was_killed_is_said_again(mirror, monkeypatch, tmp_path):
         mirror.serve("release/1.bin", b"1" * 5000, lambda r, c: (stalls(r, c), time.sleep(3))),
     )
     helpers = str(Path(mirrors.__file__).parent)
-    child = subprocess.Popen([sys.executable, "-c", SLOW.format(helpers=helpers, folder=str(tmp_path))])
+    child = subprocess.Popen(
+        [sys.executable, "-c", SLOW.format(helpers=helpers, folder=str(tmp_path))]
+    )
     deadline = time.monotonic() + 60
     while not mirror.asked and time.monotonic() < deadline:
         time.sleep(0.05)
@@ -215,7 +228,8 @@ def test_a_fetch_that_was_killed_is_said_again(mirror, monkeypatch, tmp_path):
 def test_data_without_files_say_in_one_line_how_to_get_them(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     for name, says in {
-        "newrf": "get it with `gsparc data newrf` (0.4 MB in 1 file), or say dataset.file=FILE for dataset=newrf",
+        "newrf": "get it with `gsparc data newrf` (0.4 MB in 1 file), or say dataset.file=FILE "
+        "for dataset=newrf",
         "ble": "get it from https://github.com/philotuxo/Position-Annotated-BLE-RSSI-Dataset",
         "sionna": "make one with `gsparc simulate`, or say dataset.file=FILE for dataset=sionna",
         "own": "dataset.file is not set; say dataset.file=FILE for dataset=own",
@@ -241,8 +255,13 @@ def test_every_pinned_file_is_listed_as_it_was_published():
 def test_the_list_tells_size_licence_and_source(capsys):
     assert command.main([]) == 0
     listed = capsys.readouterr().out
-    assert "newrf-rooms: all nine rooms" in listed and "5.6 MB in 9 files; MIT; dataset=newrf" in listed
-    assert "github.com/wenchaozheng/WRF-GSplus at e564f31844" in listed and "no licence stated" in listed
+    assert (
+        "newrf-rooms: all nine rooms" in listed
+        and ("5.6 MB in 9 files; MIT; dataset=newrf") in listed
+    )
+    assert (
+        "github.com/wenchaozheng/WRF-GSplus at e564f31844"
+    ) in listed and "no licence stated" in listed
 
 
 @pytest.mark.slow

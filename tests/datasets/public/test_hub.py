@@ -18,12 +18,15 @@ REVISION = "0123456789" * 4
 
 @pytest.fixture
 def room(monkeypatch, tmp_path):
-    """The authors' layout on a local server that answers as the hub does; `files` by their paths."""
+    """The authors' layout on a local server that answers as the hub does;
+    `files` by their paths.
+    """
     pytest.importorskip("huggingface_hub", reason="huggingface_hub is not installed")
     from huggingface_hub import constants
 
     files = {
-        "gateway_info.yml": b"gateway1:\n  position: [0.0, 0.5, 3.0]\n  orientation: [0.0, 0.0, 0.0, 1.0]\n",
+        "gateway_info.yml": b"gateway1:\n  position: [0.0, 0.5, 3.0]\n  orientation: [0.0, 0.0, "
+        b"0.0, 1.0]\n",
         "rx_pos.csv": b"x,y,z\n" + b"".join(b"%d,1,1.2\n" % k for k in range(6)),
         "train_index.txt": b"00001\n00002\n00003\n00004\n",
         "test_index.txt": b"00005\n00006\n",
@@ -31,7 +34,9 @@ def room(monkeypatch, tmp_path):
     for k in range(1, 7):
         np.save(tmp_path / "one.npy", np.full((90, 360), k / 10, np.float32))
         files[f"spectrum/{k:05d}.npy"] = (tmp_path / "one.npy").read_bytes()
-    files = {f"room/{name}": content for name, content in files.items()} | {"card.md": b"others' files"}
+    files = {f"room/{name}": content for name, content in files.items()} | {
+        "card.md": b"others' files"
+    }
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self):
@@ -40,11 +45,17 @@ def room(monkeypatch, tmp_path):
                 content = files[self.path.split(f"/resolve/{REVISION}/")[1]]
                 headers = {"ETag": f'"{hash(content):x}"', "X-Repo-Commit": REVISION}
             elif "/tree/" in self.path:
-                listed = [{"type": "file", "path": p, "size": len(c), "oid": p} for p, c in files.items()]
+                listed = [
+                    {"type": "file", "path": p, "size": len(c), "oid": p} for p, c in files.items()
+                ]
                 content = json.dumps(listed).encode()
             else:
-                siblings = [{"rfilename": path, "size": len(content)} for path, content in files.items()]
-                content = json.dumps({"id": "makers/sets", "sha": REVISION, "siblings": siblings}).encode()
+                siblings = [
+                    {"rfilename": path, "size": len(content)} for path, content in files.items()
+                ]
+                content = json.dumps(
+                    {"id": "makers/sets", "sha": REVISION, "siblings": siblings}
+                ).encode()
             self.send_response(200)
             for name, value in {**headers, "Content-Length": str(len(content))}.items():
                 self.send_header(name, value)
@@ -58,13 +69,17 @@ def room(monkeypatch, tmp_path):
             return
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
-        threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+        threading.Thread(
+            target=server.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True
+        ).start()
         at = f"http://127.0.0.1:{server.server_port}"
         address = at + "/{repo_id}/resolve/{revision}/{filename}"
         monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", address)
         monkeypatch.setattr(constants, "ENDPOINT", at)
         monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-        one = PublicSet("room", "a room", None, "its makers", "rfid", hub="makers/sets", strip="room")
+        one = PublicSet(
+            "room", "a room", None, "its makers", "rfid", hub="makers/sets", strip="room"
+        )
         monkeypatch.setattr(fetching, "public_sets", lambda: {"room": one})
         yield files
         server.shutdown()

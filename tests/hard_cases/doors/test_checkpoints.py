@@ -1,9 +1,9 @@
 """Hostile and damaged checkpoints at the doors that read them: nothing executes, one line says why.
 
-Remedy: gsparc/models/checkpoint.py (weights-only unpickling, only classes of gsparc are built). Each hostile file
-would leave a mark; no mark may appear. Naive: `pickle.load` and `torch.load(weights_only=False)` leave it.
+Remedy: gsparc/models/checkpoint.py (weights-only unpickling, only classes of gsparc are built).
+Each hostile file would leave a mark; no mark may appear. Naive: `pickle.load` and
+`torch.load(weights_only=False)` leave it.
 """
-# ruff: noqa: E501 (a case is a row of a table)
 
 import builtins
 import io
@@ -48,13 +48,17 @@ def payloads(mark: Path) -> dict[str, object]:
     """Objects whose unpickling by an ordinary unpickler touches `mark`."""
     code = f"open({str(mark)!r}, 'w')"
     return {
-        "os.system": Calls(os.system, f"touch {mark}"), "eval": Calls(eval, code), "exec": Calls(exec, code),
+        "os.system": Calls(os.system, f"touch {mark}"),
+        "eval": Calls(eval, code),
+        "exec": Calls(exec, code),
         "open": Calls(builtins.open, str(mark), "w"),
-        "subprocess": Calls(subprocess.call, ["touch", str(mark)]), "Path.touch": Calls(Path.touch, mark),
-        "torch.save": Calls(torch.save, {}, str(mark)), "numpy.save": Calls(np.save, str(mark), np.ones(1)),
+        "subprocess": Calls(subprocess.call, ["touch", str(mark)]),
+        "Path.touch": Calls(Path.touch, mark),
+        "torch.save": Calls(torch.save, {}, str(mark)),
+        "numpy.save": Calls(np.save, str(mark), np.ones(1)),
         "getattr": Calls(getattr, Calls(__import__, "os"), "system"),
         "a class of ours": checkpoint.StoredModel("m", "t", "", None, {}),
-    }  # fmt: skip
+    }
 
 
 @pytest.fixture(scope="module")
@@ -106,31 +110,56 @@ def test_nothing_executes(sound, tmp_path, name, place):
 
 
 def test_commands_refuse_them_in_one_line(sound, tmp_path):
-    path = altered(sound[0], tmp_path / "hostile.ckpt", state={"x": payloads(tmp_path / MARK)["eval"]})
+    path = altered(
+        sound[0], tmp_path / "hostile.ckpt", state={"x": payloads(tmp_path / MARK)["eval"]}
+    )
     assert_refused_everywhere(path, sound[1], tmp_path / "run", "could run code")
     given = [
-        "dataset=own", f"dataset.file={sound[1]}", f"ckpt_path={path}", f"hydra.run.dir={tmp_path / 'r2'}",
-    ]  # fmt: skip
-    answer = knock(train, "train.py", [*given, "logger=none", "threads=1", "model.effects.phase=false"])
+        "dataset=own",
+        f"dataset.file={sound[1]}",
+        f"ckpt_path={path}",
+        f"hydra.run.dir={tmp_path / 'r2'}",
+    ]
+    answer = knock(
+        train, "train.py", [*given, "logger=none", "threads=1", "model.effects.phase=false"]
+    )
     assert_refused(answer, "could run code", tmp_path / "r2")
     assert not (tmp_path / MARK).exists()
 
 
 @pytest.mark.parametrize(
     "target",
-    ["os.system", "builtins.exec", 3, "pathlib.Path.touch", "gsparc.models.checkpoint.os.system", "gsparc.datasets.load.log",
-     "torch.load", "gsparc.models.registry.build", "gsparc.nowhere.Nothing", "gsparc", "", "hydra.utils.call"],
-)  # fmt: skip
+    [
+        "os.system",
+        "builtins.exec",
+        3,
+        "pathlib.Path.touch",
+        "gsparc.models.checkpoint.os.system",
+        "gsparc.datasets.load.log",
+        "torch.load",
+        "gsparc.models.registry.build",
+        "gsparc.nowhere.Nothing",
+        "gsparc",
+        "",
+        "hydra.utils.call",
+    ],
+)
 def test_configurations_that_ask_to_run_something(sound, tmp_path, target):
     mark = tmp_path / MARK
     config = f"model: {{_target_: '{target}', _args_: ['{mark}']}}\n"
     for name, changes in {
         "named": {"config": config, "target": target},
-        "nested": {"config": f"model: {{_target_: gsparc.models.baselines.idw.InverseDistance, power: {config[7:-1]}}}\n",
-                   "target": "gsparc.models.baselines.idw.InverseDistance"},
-        "listed": {"config": f"model: {{_target_: gsparc.models.baselines.idw.InverseDistance, power: [{config[7:-1]}]}}\n",
-                   "target": "gsparc.models.baselines.idw.InverseDistance"},
-    }.items():  # fmt: skip
+        "nested": {
+            "config": "model: {_target_: gsparc.models.baselines.idw.InverseDistance, "
+            f"power: {config[7:-1]}}}\n",
+            "target": "gsparc.models.baselines.idw.InverseDistance",
+        },
+        "listed": {
+            "config": "model: {_target_: gsparc.models.baselines.idw.InverseDistance, "
+            f"power: [{config[7:-1]}]}}\n",
+            "target": "gsparc.models.baselines.idw.InverseDistance",
+        },
+    }.items():
         assert_refused_here(altered(sound[0], tmp_path / f"{name}.ckpt", **changes), "")
     assert not mark.exists()
 
@@ -152,21 +181,29 @@ def nested(width: int, depth: int) -> list:
 @pytest.mark.parametrize(
     "changes,says",
     [
-        *(({"version": one}, f"of version {one}, this gsparc reads 2; train again") for one in (99, "2", 1, None)),
+        *(
+            ({"version": one}, f"of version {one}, this gsparc reads 2; train again")
+            for one in (99, "2", 1, None)
+        ),
         ({"format": "other"}, "not a gsparc checkpoint"),
         ({"site": {}}, "incomplete"),
         ({"site": None}, "incomplete"),
         ({"state": [1, 2]}, "incomplete"),
         ({"state": {}}, "cannot be restored"),
-        ({"target": "gsparc.models.baselines.gp.GaussianProcess", "config": ""}, "cannot be restored"),
+        (
+            {"target": "gsparc.models.baselines.gp.GaussianProcess", "config": ""},
+            "cannot be restored",
+        ),
         ({"config": "model: ["}, "not YAML"),
         ({"config": "a: !!python/object/apply:os.system ['true']"}, "not YAML"),
         ({"config": aliased()}, "aliases"),
-        *(({"state": {"x": part}}, "many times")
-          for part in (nested(9, 9), nested(1, 100), torch.zeros(1).expand(1 << 40))),
+        *(
+            ({"state": {"x": part}}, "many times")
+            for part in (nested(9, 9), nested(1, 100), torch.zeros(1).expand(1 << 40))
+        ),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
-)  # fmt: skip
+)
 def test_content_that_does_not_fit(sound, tmp_path, changes, says):
     assert_refused_here(altered(sound[0], tmp_path / "odd.ckpt", **changes), says)
 
@@ -183,9 +220,14 @@ def other_files() -> dict[str, bytes]:
     weights = io.BytesIO()
     torch.save({"w": torch.ones(2)}, weights)
     return {
-        "text": b"hello", "pickle": pickle.dumps({"a": 1}), "zip": archive.getvalue(), "empty zip": empty.getvalue(),
-        "npz": array.getvalue(), "weights": weights.getvalue(), "zeros": bytes(5000),
-    }  # fmt: skip
+        "text": b"hello",
+        "pickle": pickle.dumps({"a": 1}),
+        "zip": archive.getvalue(),
+        "empty zip": empty.getvalue(),
+        "npz": array.getvalue(),
+        "weights": weights.getvalue(),
+        "zeros": bytes(5000),
+    }
 
 
 @pytest.mark.parametrize("kind", [*other_files(), "absent", 0.0, 0.01, 0.3, 0.9, 0.999])
@@ -199,7 +241,9 @@ def test_files_of_other_kinds_and_cut_short(sound, tmp_path, kind):
 
 
 def test_an_ordinary_unpickler_would_run_them(tmp_path):
-    """Naive: what every payload does to `pickle.load`; without it nothing above would show anything."""
+    """Naive: what every payload does to `pickle.load`;
+    without it nothing above would show anything.
+    """
     for name, thing in payloads(tmp_path / MARK).items():
         if name in ("a class of ours", "getattr"):
             continue
@@ -212,9 +256,14 @@ def test_an_ordinary_unpickler_would_run_them(tmp_path):
 def test_a_deflated_entry_is_not_inflated(sound, tmp_path):
     """3 MB held one entry of 3 GB: 65 s and 6.4 GB, and it loaded."""
     bomb = tmp_path / "bomb.ckpt"
-    with zipfile.ZipFile(sound[0]) as archive, zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as copy:
+    with (
+        zipfile.ZipFile(sound[0]) as archive,
+        zipfile.ZipFile(bomb, "w", zipfile.ZIP_DEFLATED) as copy,
+    ):
         for name in archive.namelist():
             copy.writestr(name, archive.read(name))
         copy.writestr("archive/more", bytes(1 << 24))
     assert bomb.stat().st_size < 1 << 20
-    assert_refused_everywhere(bomb, sound[1], tmp_path / "run", "compressed, or larger than the file")
+    assert_refused_everywhere(
+        bomb, sound[1], tmp_path / "run", "compressed, or larger than the file"
+    )

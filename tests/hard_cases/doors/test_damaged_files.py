@@ -1,7 +1,8 @@
-"""Files whose bytes are damaged: cut short, overwritten, made to hang or crash the library that reads them.
+"""Files whose bytes are damaged: cut short, overwritten,
+made to hang or crash the library that reads them.
 
-Remedy: gsparc/base/hdf5_text.py; text of variable length is first read by a program of its own, for a
-bounded time. Found: damage in a global heap of HDF5 that hangs or crashes libhdf5.
+Remedy: gsparc/base/hdf5_text.py; text of variable length is first read by a program of its own, for
+a bounded time. Found: damage in a global heap of HDF5 that hangs or crashes libhdf5.
 """
 
 import random
@@ -20,7 +21,10 @@ def users_file(path: Path) -> Path:
     """As h5py writes text by itself: of variable length, in a global heap."""
     rng = np.random.default_rng(0)
     with h5py.File(path, "w") as file:
-        file["rx_position"], file["tx_position"] = rng.uniform(0, 3, (12, 3)), np.array([4.0, 1.0, 2.0])
+        file["rx_position"], file["tx_position"] = (
+            rng.uniform(0, 3, (12, 3)),
+            np.array([4.0, 1.0, 2.0]),
+        )
         file["csi"], file["frequency_hz"] = rng.normal(size=12) + 1j, 2.4e9
         file["row_name"] = [f"Raum {i}" for i in range(12)]
         file.attrs["name"] = "garage"
@@ -55,7 +59,9 @@ def test_a_reader_that_hangs_or_crashes_is_told_apart(tmp_path, monkeypatch):
     path = users_file(tmp_path / "mine.h5")
     monkeypatch.setattr(hdf5_text, "READ", "import time; time.sleep(60)")
     assert "cannot be read in 0.5 s" in str(hdf5_text.hdf5_text_error(path, seconds=0.5))
-    monkeypatch.setattr(hdf5_text, "READ", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
+    monkeypatch.setattr(
+        hdf5_text, "READ", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"
+    )
     with pytest.raises(DataError, match=r"mine\.h5: damaged \(its text crashes the HDF5 library\)"):
         load_own(path)
 

@@ -22,24 +22,32 @@ def channels() -> Arrays:
     """Every array that goes with channels, all sound."""
     rng, rows = np.random.default_rng(0), 12
     return {
-        "rx_position": rng.uniform(0, 3, (rows, 3)), "tx_position": np.array([4.0, 1.0, 2.0]),
+        "rx_position": rng.uniform(0, 3, (rows, 3)),
+        "tx_position": np.array([4.0, 1.0, 2.0]),
         "csi": rng.normal(size=(rows, 2, 3)) + 1j * rng.normal(size=(rows, 2, 3)),
-        "frequency_hz": np.array([2.40e9, 2.41e9, 2.42e9]), "carrier_hz": np.array(2.41e9),
-        "array_position": np.array([[0.0, 0, 0], [0.06, 0, 0]]), "rx_orientation": np.array([1.0, 0, 0, 0]),
-        "mask": np.ones((rows, 2, 3), dtype=bool), "noise_variance": np.full(rows, 0.01),
-        "path_offsets": np.arange(rows + 1), "path_direction": np.tile([0.0, 0.6, 0.8], (rows, 1)),
-        "split_train": np.arange(8), "split_test": np.arange(8, 12),
+        "frequency_hz": np.array([2.40e9, 2.41e9, 2.42e9]),
+        "carrier_hz": np.array(2.41e9),
+        "array_position": np.array([[0.0, 0, 0], [0.06, 0, 0]]),
+        "rx_orientation": np.array([1.0, 0, 0, 0]),
+        "mask": np.ones((rows, 2, 3), dtype=bool),
+        "noise_variance": np.full(rows, 0.01),
+        "path_offsets": np.arange(rows + 1),
+        "path_direction": np.tile([0.0, 0.6, 0.8], (rows, 1)),
+        "split_train": np.arange(8),
+        "split_test": np.arange(8, 12),
         "row_name": np.array([f"Größe {i} 米" for i in range(rows)]),
-    }  # fmt: skip
+    }
 
 
 def spectra() -> Arrays:
     """Every array that goes with spectra, all sound."""
     rng = np.random.default_rng(0)
     return {
-        "rx_position": np.array([4.0, 1.0, 2.0]), "tx_position": rng.uniform(0, 3, (10, 3)),
-        "spectrum": rng.uniform(0, 1, (10, 9, 36)), "grid_deg": np.array([0.0, 0, 10, 10]),
-    }  # fmt: skip
+        "rx_position": np.array([4.0, 1.0, 2.0]),
+        "tx_position": rng.uniform(0, 3, (10, 3)),
+        "spectrum": rng.uniform(0, 1, (10, 9, 36)),
+        "grid_deg": np.array([0.0, 0, 10, 10]),
+    }
 
 
 def first(value: object) -> Callable[[np.ndarray], np.ndarray]:
@@ -54,17 +62,20 @@ def first(value: object) -> Callable[[np.ndarray], np.ndarray]:
 
 
 WAYS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-    "nan": first(np.nan), "infinite": first(-np.inf), "1e38": first(1e38),
+    "nan": first(np.nan),
+    "infinite": first(-np.inf),
+    "1e38": first(1e38),
     "negative": lambda a: -np.abs(a) - 1 if a.dtype.kind != "b" else -a.astype(int),
     "empty": lambda a: a[..., :0] if a.ndim else np.zeros(0),
     "one more axis": lambda a: a[..., None] if a.ndim else a[None, None],
     "one row more": lambda a: np.concatenate([a, a[-1:]]) if a.ndim else np.repeat(a, 2),
     "transposed": lambda a: a.T if a.ndim > 1 else np.stack([a.reshape(-1)] * 5),
-    "text": lambda a: np.full(a.shape, "three", dtype="U5"), "complex": lambda a: a + 1j,
+    "text": lambda a: np.full(a.shape, "three", dtype="U5"),
+    "complex": lambda a: a + 1j,
     "times": lambda a: np.full(a.shape, np.datetime64("2026-01-01")),
     "a record": lambda a: np.zeros(a.shape, dtype=[("x", "f8"), ("y", "f8")]),
     "huge integers": lambda a: np.full(a.shape, 2**63, dtype=np.uint64),
-}  # fmt: skip
+}
 LEFT_OUT = {  # a place of the end that moves, of few rows: they go, with a warning
     (kind, name, way)
     for kind, name in (("channels", "rx_position"), ("spectra", "tx_position"))
@@ -110,7 +121,9 @@ def store(path: Path, arrays: Arrays) -> Path:
 @pytest.mark.parametrize("kind", ["channels", "spectra"])
 def test_the_sound_ones_are_read(tmp_path, kind, suffix):
     """Or else every refusal below would be for the wrong reason."""
-    path = store(tmp_path / f"größe 米.{suffix}", {"channels": channels, "spectra": spectra}[kind]())
+    path = store(
+        tmp_path / f"größe 米.{suffix}", {"channels": channels, "spectra": spectra}[kind]()
+    )
     answer = knock(lambda: check([str(path)]), "check", [])
     assert answer.status == 0 and answer.out[-1].endswith("good")
 
@@ -155,4 +168,6 @@ def test_units_that_say_another_length(tmp_path, unit):
     path = store(tmp_path / "units.h5", channels())
     with h5py.File(path, "a") as file:
         file["rx_position"].attrs["units"] = unit
-    assert_found_bad(knock(lambda: check([str(path)]), "check", []), f"units are '{unit}'; expected 'm'")
+    assert_found_bad(
+        knock(lambda: check([str(path)]), "check", []), f"units are '{unit}'; expected 'm'"
+    )

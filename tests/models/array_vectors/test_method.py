@@ -45,14 +45,21 @@ def small(known_campaign, tmp_path_factory):
     return method, method.fit(known_campaign[0], _fold(160), FitContext(folder)), folder
 
 
-@pytest.mark.parametrize("grid", [SphereGrid.hemisphere(6, 10), SphereGrid(5, 7, 0.1, 0.3, 0.2, 0.4)])
+@pytest.mark.parametrize(
+    "grid", [SphereGrid.hemisphere(6, 10), SphereGrid(5, 7, 0.1, 0.3, 0.2, 0.4)]
+)
 @pytest.mark.parametrize("height", [0.0, 0.07])
 def test_renderer_equals_the_plain_beamformer(grid, height):
-    """With and without the half-turn shortcut: on any grid, and with an element out of the plane [m]."""
+    """With and without the half-turn shortcut: on any grid,
+    and with an element out of the plane [m].
+    """
     array = planar_array()
     array[3, 2] = height
     rng = np.random.default_rng(0)
-    site, background = array_site(grid, array), torch.from_numpy(rng.random((grid.height, grid.width)))
+    site, background = (
+        array_site(grid, array),
+        torch.from_numpy(rng.random((grid.height, grid.width))),
+    )
     h = torch.from_numpy(rng.normal(size=(3, 16)) + 1j * rng.normal(size=(3, 16))) / 30
     share = torch.tensor([[0.0], [0.5], [1.0]], dtype=torch.float64)
     expected = (spectra(site, h).square() + share[:, :, None].square() * background.square()).sqrt()
@@ -75,7 +82,9 @@ def test_alignment_undoes_phases_and_twins(known_campaign):
     data, truth = known_campaign
     partner, rng = index_mirror_elements(data.site.array), np.random.default_rng(1)
     scale = truth / np.linalg.norm(truth, axis=1, keepdims=True)
-    seen, twins = (spectra(data.site, torch.from_numpy(v)) for v in (scale, twin_vectors(scale, partner)))
+    seen, twins = (
+        spectra(data.site, torch.from_numpy(v)) for v in (scale, twin_vectors(scale, partner))
+    )
     torch.testing.assert_close(seen, twins)
     mixed = scale * np.exp(2j * np.pi * rng.random(160))[:, None]
     mixed[::3] = twin_vectors(mixed[::3], partner)
@@ -108,7 +117,9 @@ def test_cross_validation_with_gaps_equals_refitting(known_campaign):
     cross = kernel.correlations(at[far], at[7:8]).numpy()
     weights = np.linalg.solve(kernel.gram(at[far]).numpy(), cross)[:, 0]
     assert unknown[0, 0] == pytest.approx(1 - weights @ cross[:, 0], rel=1e-6)
-    assert error[0, 0] == pytest.approx((np.abs((weights @ v[far]) @ matrix.conj()) ** 2).mean(), rel=1e-6)
+    assert error[0, 0] == pytest.approx(
+        (np.abs((weights @ v[far]) @ matrix.conj()) ** 2).mean(), rel=1e-6
+    )
 
 
 def test_fit_without_a_run_folder_writes_nothing(known_campaign, tmp_path, monkeypatch):
@@ -128,7 +139,9 @@ def test_it_beats_neighbours(known_campaign, small, tmp_path):
     assert ours.samples["mse"].mean() < 0.3 * theirs.samples["mse"].mean()
 
 
-def test_many_rows_are_told_by_few_places_and_aligned_by_a_part(known_campaign, small, tmp_path, monkeypatch):
+def test_many_rows_are_told_by_few_places_and_aligned_by_a_part(
+    known_campaign, small, tmp_path, monkeypatch
+):
     data, whole, few = known_campaign[0], small[0], ArrayField(SMALL)
     few.settings = replace(
         few.settings, emission=replace(few.settings.emission, encoding=EncodingSettings(anchors=40))

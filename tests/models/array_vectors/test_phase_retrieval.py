@@ -1,4 +1,6 @@
-"""Array vectors recovered from published spectra: residuals, ambiguities, scales, each solved once."""
+"""Array vectors recovered from published spectra: residuals, ambiguities, scales,
+each solved once.
+"""
 
 from dataclasses import replace
 
@@ -84,7 +86,9 @@ def test_only_requested_rows_are_recovered_and_each_once(known_campaign, monkeyp
     data = replace(data, site=replace(data.site, sha256="fresh"))
     asked, inner = [], vector_cache.recover_vectors
     monkeypatch.setattr(vector_cache, "AT_ONCE", 10)
-    monkeypatch.setattr(vector_cache, "recover_vectors", lambda *a: asked.append(len(a[1])) or inner(*a))
+    monkeypatch.setattr(
+        vector_cache, "recover_vectors", lambda *a: asked.append(len(a[1])) or inner(*a)
+    )
     watch = Stopwatch()  # of one fit, which pays once
     first = vector_cache.recover_cached(data, np.arange(10), watch=watch)
     again = vector_cache.recover_cached(data, np.arange(5, 25), watch=watch)
@@ -97,14 +101,18 @@ def test_only_requested_rows_are_recovered_and_each_once(known_campaign, monkeyp
     assert asked == [10, 8, 7, 3, 3]
 
 
-def test_seconds_of_vectors_that_another_fit_had_solved_were_not_counted(known_campaign, monkeypatch, caplog):
+def test_seconds_of_vectors_that_another_fit_had_solved_were_not_counted(
+    known_campaign, monkeypatch, caplog
+):
     """In a sweep the first job said 8.6 s, the next 2.6 s with five times as many Gaussians."""
     caplog.set_level("INFO", "gsparc")
     data, rows = known_campaign[0], np.arange(6)
     data = replace(data, site=replace(data.site, sha256="sweep"))
     first, second = Stopwatch(), Stopwatch()
     inner = vector_cache.recover_vectors
-    monkeypatch.setattr(vector_cache, "recover_vectors", lambda *given: first.charge(60.0) or inner(*given))
+    monkeypatch.setattr(
+        vector_cache, "recover_vectors", lambda *given: first.charge(60.0) or inner(*given)
+    )
     vector_cache.recover_cached(data, rows, watch=first)
     vector_cache.recover_cached(data, rows[:3], watch=second)
     vector_cache.recover_cached(data, rows, watch=second)

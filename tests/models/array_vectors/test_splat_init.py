@@ -1,4 +1,6 @@
-"""The splatted field through an array: the posterior of the array's vectors, and what follows from it."""
+"""The splatted field through an array: the posterior of the array's vectors,
+and what follows from it.
+"""
 
 from dataclasses import replace
 
@@ -24,7 +26,9 @@ COUNT = "model.field.count=64"
 
 def _trained(data, fold, folder, *overrides: str, steps: int = 10):
     factory = build(
-        compose("logger=none", "model.effects.array=true", "model.effects.residual=false", *overrides).model
+        compose(
+            "logger=none", "model.effects.array=true", "model.effects.residual=false", *overrides
+        ).model
     )
     method = factory.create_for(data)
     method.fit(data, fold, short(folder, steps, 16, validate_every=steps))
@@ -51,7 +55,10 @@ def process(trained):
     kernel = choose_kernel(found.vectors, places, images, matrix, site.wavelength, partner).kernel
     vectors = align_by_likelihood(found.vectors, places, partner, kernel)
     rows, queries = torch.from_numpy(places), torch.from_numpy(data.tx[fold.test])
-    inverse, cross = np.linalg.inv(kernel.gram(rows).numpy()), kernel.correlations(queries, rows).numpy()
+    inverse, cross = (
+        np.linalg.inv(kernel.gram(rows).numpy()),
+        kernel.correlations(queries, rows).numpy(),
+    )
     return cross @ inverse @ vectors, 1 - np.einsum("ij,ij->i", cross @ inverse, cross)
 
 
@@ -65,7 +72,9 @@ def test_the_field_is_the_posterior_of_the_vectors(trained, process):
     # One phase is common to all vectors and known to nobody.
     turn = np.vdot(vectors, mean) / abs(np.vdot(vectors, mean))
     assert np.linalg.norm(vectors * turn - mean) < 2e-3 * np.linalg.norm(mean)
-    np.testing.assert_allclose(model.unknown_shares(batch.tx, batch.rx).numpy(), variance, atol=1e-4)
+    np.testing.assert_allclose(
+        model.unknown_shares(batch.tx, batch.rx).numpy(), variance, atol=1e-4
+    )
 
 
 @pytest.mark.slow
@@ -75,7 +84,11 @@ def test_spectra_are_of_the_known_and_the_unknown_share(trained, process):
     mean, variance = process
     background = torch.from_numpy(data.targets(fold.train).numpy().mean(0))
     known = spectra(data.site, torch.from_numpy(mean)).square()
-    wanted = (known + torch.from_numpy(variance)[:, None, None] * background.square()).sqrt().clamp(max=1)
+    wanted = (
+        (known + torch.from_numpy(variance)[:, None, None] * background.square())
+        .sqrt()
+        .clamp(max=1)
+    )
     torch.testing.assert_close(said.mean.double(), wanted, atol=2e-3, rtol=0)
     assert (said.mean - batch.target).square().mean() < 0.01 * batch.target.square().mean()
 
@@ -119,15 +132,21 @@ def test_silent_gaussians_are_no_division_by_zero(known_campaign, trained, tmp_p
 
 
 @pytest.mark.slow
-def test_a_number_of_gaussians_that_changes_nothing_was_swept_without_a_word(known_campaign, tmp_path):
+def test_a_number_of_gaussians_that_changes_nothing_was_swept_without_a_word(
+    known_campaign, tmp_path
+):
     """100 and 500 of them gave the same figures: more than an array needs span the same vectors."""
     data, fold = known_campaign[0], Fold(np.arange(40), np.arange(0), np.arange(40, 60))
     few, more, many = (
         _trained(data, fold, tmp_path, f"model.field.count={n}", steps=0) for n in (20, 40, 160)
     )
     query = Query(*_ends(data, fold.test))
-    torch.testing.assert_close(more.predict(query).mean, many.predict(query).mean, rtol=0, atol=2e-3)
-    assert "through 40 Gaussians (32 or more give the same answers), no gradient steps" in more.description
+    torch.testing.assert_close(
+        more.predict(query).mean, many.predict(query).mean, rtol=0, atol=2e-3
+    )
+    assert (
+        "through 40 Gaussians (32 or more give the same answers), no gradient steps"
+    ) in more.description
     assert "alike" not in few.description
 
 
@@ -136,7 +155,9 @@ def test_a_closed_form_that_cannot_be_is_refused(known_campaign, tmp_path):
     fold = Fold(np.arange(20), np.arange(20, 24), np.arange(24, 30))
     for setting in ("emission.hidden=4", "attenuation.inverse_distance=true"):
         with pytest.raises(ValueError, match=r"asks for networks|solves a linear read-out"):
-            _trained(data, fold, tmp_path, "init=vectors", "model.field.count=20", f"model.{setting}")
+            _trained(
+                data, fold, tmp_path, "init=vectors", "model.field.count=20", f"model.{setting}"
+            )
 
 
 def _ends(data, rows):

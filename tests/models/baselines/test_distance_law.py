@@ -1,4 +1,6 @@
-"""The distance law against what made the powers: exponent, floor, outliers, unknown places, moving ends."""
+"""The distance law against what made the powers: exponent, floor, outliers, unknown places,
+moving ends.
+"""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -29,7 +31,9 @@ from gsparc.training.context import FitContext
 STILL = np.array([3.0, -8.0, 6.0])
 
 
-def rows_of(count: int = 300, exponent: float = 2.7, floor: float = 0.0, noise: float = 3.0) -> PowerRows:
+def rows_of(
+    count: int = 300, exponent: float = 2.7, floor: float = 0.0, noise: float = 3.0
+) -> PowerRows:
     rng = np.random.default_rng(0)
     places = np.c_[rng.uniform(-40, 40, (count, 2)), np.full(count, 1.5)]
     far = np.maximum(np.linalg.norm(places - STILL, axis=1), floor)
@@ -55,7 +59,9 @@ def test_the_law_is_found():
 
 def test_the_floor_is_found():
     law = fit_law(rows_of(2000, exponent=4.0, floor=20.0, noise=1.0), STILL)
-    assert law.floor == pytest.approx(20.0, rel=0.25) and law.exponent == pytest.approx(4.0, abs=0.4)
+    assert law.floor == pytest.approx(20.0, rel=0.25) and law.exponent == pytest.approx(
+        4.0, abs=0.4
+    )
 
 
 def test_outliers_bend_little():
@@ -69,7 +75,10 @@ def test_outliers_bend_little():
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_few_rows_give_a_usual_law(count):
     law = fit_law(rows_of().subset(np.arange(count)), STILL)
-    assert EXPONENTS[0] <= law.exponent <= EXPONENTS[1] and np.isfinite([law.level, law_variance(law)]).all()
+    assert (
+        EXPONENTS[0] <= law.exponent <= EXPONENTS[1]
+        and np.isfinite([law.level, law_variance(law)]).all()
+    )
 
 
 def test_the_density_has_mass_one_and_its_variance():
@@ -78,7 +87,9 @@ def test_the_density_has_mass_one_and_its_variance():
 
     ends = [-40, -3, 3, 40]
     for power, expected in ((0, 1.0), (2, VARIANCE)):
-        parts = [quad(lambda z, power=power: z**power * density(z), a, b)[0] for a, b in pairwise(ends)]
+        parts = [
+            quad(lambda z, power=power: z**power * density(z), a, b)[0] for a, b in pairwise(ends)
+        ]
         assert sum(parts) == pytest.approx(expected, rel=1e-6)
     for z in (-7.0, -3.0, -1.0, 0.5, 3.0, 5.0):
         below = sum(quad(density, a, min(b, z))[0] for a, b in pairwise(ends) if a < z)
@@ -121,7 +132,9 @@ def test_both_ends_move():
     rng = np.random.default_rng(0)
     ends = rng.uniform(-30, 30, (200, 6))
     far = np.linalg.norm(ends[:, :3] - ends[:, 3:], axis=1)
-    law = fit_law(PowerRows(ends, -30 - 22 * np.log10(far) + rng.standard_normal(200), far < 0), None)
+    law = fit_law(
+        PowerRows(ends, -30 - 22 * np.log10(far) + rng.standard_normal(200), far < 0), None
+    )
     assert law.place is None and law.exponent == pytest.approx(2.2, abs=0.15)
     mean = law.mean(torch.from_numpy(ends)).numpy()
     assert np.allclose(mean, law.mean(torch.from_numpy(ends[:, [3, 4, 5, 0, 1, 2]])).numpy())
@@ -138,5 +151,7 @@ def test_powers_were_flat_nearer_than_the_nearest_row():
     every = rows_of(2000, exponent=3.3, noise=1.0)
     apart = np.linalg.norm(every.places - STILL, axis=1)
     law = fit_law(every.subset(np.flatnonzero(apart > np.quantile(apart, 0.3))), STILL)
-    near = every.subset(np.flatnonzero((apart > apart.max() / 20) & (apart < np.quantile(apart, 0.1))))
+    near = every.subset(
+        np.flatnonzero((apart > apart.max() / 20) & (apart < np.quantile(apart, 0.1)))
+    )
     assert np.abs(near.decibels - law.mean(torch.from_numpy(near.places)).numpy()).mean() < 2.0

@@ -27,7 +27,9 @@ def test_chosen_kernel_is_a_minimum(campaign):
     places = torch.from_numpy(data.moving)
     at = {
         step: left_out_density(
-            [(Kernel.from_length(kernel.length * step, kernel.noise).gram(places), scores)], 288, False
+            [(Kernel.from_length(kernel.length * step, kernel.noise).gram(places), scores)],
+            288,
+            False,
         )[0]
         for step in (0.8, 1.0, 1.25)
     }
@@ -66,8 +68,12 @@ def test_the_strongest_components_leave_out_a_stated_share(campaign, folds, tmp_
     assert len(whole.with_strongest(0.0).axes) == len(whole.axes)
 
 
-def test_a_query_of_an_averaged_process_read_every_pixel_of_its_components(campaign, folds, tmp_path):
-    """Smooth images are told by few rows and columns: their numbers are read, thinned pixels too."""
+def test_a_query_of_an_averaged_process_read_every_pixel_of_its_components(
+    campaign, folds, tmp_path
+):
+    """Smooth images are told by few rows and columns: their numbers are read,
+    thinned pixels too.
+    """
     data, fold = campaign("spectrum", 40), folds(40).folds[0]
     row, column = np.ogrid[:12, :24]
     waves = [np.cos(np.pi * k * row / 12) * np.sin(np.pi * k * column / 12 + k) for k in (1, 2, 3)]
@@ -83,7 +89,8 @@ def test_a_query_of_an_averaged_process_read_every_pixel_of_its_components(campa
     again.restore(data.site, less.state())
     assert again.mean_at(batch).equal(other)
     thin = [
-        each.reduce({"stride": 2, "confidence": False}, {}).inner.predict(batch) for each in (whole, less)
+        each.reduce({"stride": 2, "confidence": False}, {}).inner.predict(batch)
+        for each in (whole, less)
     ]
     torch.testing.assert_close(thin[1].mean, thin[0].mean, atol=0.02, rtol=0)
 
@@ -95,7 +102,9 @@ def test_prediction_and_variance_are_scikit_learns(campaign, folds, tmp_path):
     rows = np.concatenate([fold.train, fold.val])
     k = gp.scores.prior.kernel
     target = data.target[rows].reshape(len(rows), -1).view(np.float32)
-    short, long = (ConstantKernel(k.amplitude * one.share) * Matern(one.length, nu=1.5) for one in k.signals)
+    short, long = (
+        ConstantKernel(k.amplitude * one.share) * Matern(one.length, nu=1.5) for one in k.signals
+    )
     shape = short + long + WhiteKernel(k.amplitude * k.noise)
     library = GaussianProcessRegressor(shape, optimizer=None, alpha=0).fit(
         data.moving[rows], target - target.mean(0)
@@ -106,7 +115,9 @@ def test_prediction_and_variance_are_scikit_learns(campaign, folds, tmp_path):
     expected = torch.from_numpy(mean + target.mean(0)).float().view(-1, 4, 3, 2)
     assert torch.allclose(torch.view_as_real(found.mean), expected, atol=1e-4)
     # A complex entry holds two real numbers.
-    assert torch.allclose(found.variance, torch.from_numpy(2 * deviation[:, 0] ** 2).float(), rtol=1e-3)
+    assert torch.allclose(
+        found.variance, torch.from_numpy(2 * deviation[:, 0] ** 2).float(), rtol=1e-3
+    )
 
 
 def test_few_components_say_so(campaign, folds, tmp_path):

@@ -41,7 +41,9 @@ def test_idw_weighs_by_inverse_squared_distance(campaign, folds, tmp_path):
     method.fit(data, fold, FitContext(tmp_path))
     found = method.predict(Query(torch.tensor([[1.0, 0, 0]]), data.batch(np.arange(1)).rx)).mean
     decibels = 10 * np.log10(data.target[:2, 0])
-    assert 10 * torch.log10(found)[0, 0] == pytest.approx((4 * decibels[0] + decibels[1]) / 5, rel=1e-4)
+    assert 10 * torch.log10(found)[0, 0] == pytest.approx(
+        (4 * decibels[0] + decibels[1]) / 5, rel=1e-4
+    )
     with pytest.raises(ValueError, match="neighbours"):
         InverseDistance(neighbours=0)
 
@@ -62,7 +64,9 @@ def test_entries_never_measured_do_not_leak(campaign, folds, tmp_path, name):
     results = []
     for rubbish in (0.0, 1e6):
         target = np.where(mask, data.target, np.complex64(rubbish))
-        masked = Measurements(data.site, data.tx, data.rx_position, data.rx_rotation, target, mask=mask)
+        masked = Measurements(
+            data.site, data.tx, data.rx_position, data.rx_rotation, target, mask=mask
+        )
         batch = masked.batch(fold.test)
         results.append(fitted(name, masked, fold, tmp_path).predict(batch).mean)
     assert torch.equal(*results)
@@ -74,7 +78,9 @@ def test_kriging_lends_its_pivots_to_no_one(campaign, folds, tmp_path, monkeypat
     method = fitted("kriging", data, folds(len(data)).folds[0], tmp_path)
     seen = []
     solve = kriging.lu_solve
-    monkeypatch.setattr(kriging, "lu_solve", lambda pair, right: seen.append(pair[1]) or solve(pair, right))
+    monkeypatch.setattr(
+        kriging, "lu_solve", lambda pair, right: seen.append(pair[1]) or solve(pair, right)
+    )
     method.predict(data.batch(np.arange(3)))
     assert len(seen) == 1 and not np.shares_memory(seen[0], method.system[1])
 
@@ -84,13 +90,20 @@ def test_kriging_of_many_rows_asked_for_all_memory(tmp_path, monkeypatch):
     monkeypatch.setattr(kriging, "WHOLE", 30)
     monkeypatch.setattr(kriging, "NEAREST", 20)
     places = np.random.default_rng(0).uniform(0, 9, (80, 3))
-    data = from_arrays({"rx_position": places, "tx_position": np.zeros(3), "rssi_db": -40 - places[:, 0]})
+    data = from_arrays(
+        {"rx_position": places, "tx_position": np.zeros(3), "rssi_db": -40 - places[:, 0]}
+    )
     method = kriging.Kriging()
-    report = method.fit(data, Fold(np.arange(60), np.arange(60, 70), np.arange(70, 80)), FitContext(tmp_path))
+    report = method.fit(
+        data, Fold(np.arange(60), np.arange(60, 70), np.arange(70, 80)), FitContext(tmp_path)
+    )
     assert method.system is None and method.label == "kriging (nearest 20)"
     assert "of 70 places each query's nearest 20" in report.notes[0]
     error = (
-        10 * torch.log10(method.predict(data.batch(np.arange(70, 80))).mean * data.site.target_scale)[:, 0]
+        10
+        * torch.log10(method.predict(data.batch(np.arange(70, 80))).mean * data.site.target_scale)[
+            :, 0
+        ]
     )
     assert (error + 40 + torch.from_numpy(places[70:, 0]).float()).abs().max() < 1.5
 
@@ -109,10 +122,16 @@ def field(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(0)
     places = np.concatenate([rng.uniform(0, 30, (count, 2)), np.ones((count, 1))], 1)
     level = 6 * np.sin(places[:, 0] / 3) + 4 * np.cos(places[:, 1] / 4)
-    return places, (level + rng.normal(0, 0.5, count)).astype(np.float32)[:, None], places[:40] + 0.1
+    return (
+        places,
+        (level + rng.normal(0, 0.5, count)).astype(np.float32)[:, None],
+        places[:40] + 0.1,
+    )
 
 
-def krige(places: np.ndarray, decibels: np.ndarray, queries: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def krige(
+    places: np.ndarray, decibels: np.ndarray, queries: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     method = Kriging()
     method.positions, method.values, method.channels = places, decibels, None
     method.variogram = Variogram(0.25, 25.0, 5.0)
@@ -132,14 +151,21 @@ def test_nearest_places_screen_the_others(monkeypatch):
 
 def test_two_places_have_no_variogram():
     """Their one distance is more than half the extent: no quantile of nothing could be taken."""
-    found = kriging.fit_variogram(np.array([[0.0, 0, 0], [3.0, 4, 0]]), np.array([[-60.0], [-70.0]]))
+    found = kriging.fit_variogram(
+        np.array([[0.0, 0, 0], [3.0, 4, 0]]), np.array([[-60.0], [-70.0]])
+    )
     assert (found.nugget, found.range) == (0.0, 2.5) and found.sill > 0
 
 
 def test_few_places_printed_a_warning_of_a_library():
-    """`OptimizeWarning: Covariance of the parameters could not be estimated`, which nobody had asked for."""
+    """`OptimizeWarning: Covariance of the parameters could not be estimated`,
+    which nobody had asked for.
+    """
     rng = np.random.default_rng(0)
-    places, levels = np.c_[rng.uniform(0, 50, (4, 2)), np.zeros(4)], np.round(2 * rng.normal(size=(4, 1)))
+    places, levels = (
+        np.c_[rng.uniform(0, 50, (4, 2)), np.zeros(4)],
+        np.round(2 * rng.normal(size=(4, 1))),
+    )
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert kriging.fit_variogram(places, levels).sill >= 0

@@ -1,4 +1,6 @@
-"""Spectra of one array at several carriers: paths that all share, what carriers tell of each other."""
+"""Spectra of one array at several carriers: paths that all share,
+what carriers tell of each other.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -55,10 +57,14 @@ def fitted(room):
 
 @pytest.mark.parametrize("turn", [0, 30])
 def test_mirrors_were_found_beyond_their_places_where_beams_overlap(turn):
-    """Of beams without cross terms they are found to a step, along the axes alone until rooms were turned."""
+    """Of beams without cross terms they are found to a step,
+    along the axes alone until rooms were turned.
+    """
     rng, turned = np.random.default_rng(0), torch.eye(3).double()
     lags = SpectrumLags(ELEMENTS, SphereGrid.hemisphere(24, 48), 1.0)
-    places = torch.from_numpy(np.c_[rng.uniform(2, 6, 30), rng.uniform(-3, 3, 30), rng.uniform(0.8, 1.6, 30)])
+    places = torch.from_numpy(
+        np.c_[rng.uniform(2, 6, 30), rng.uniform(-3, 3, 30), rng.uniform(0.8, 1.6, 30)]
+    )
     across, along = np.sin(np.radians(turn)), np.cos(np.radians(turn))
     mirrors = torch.tensor([[-across, along, 0, WALL], [0, 0, 1, CEILING]]).double()
     places[:, :2] = places[:, :2] @ torch.tensor([[along, across], [-across, along]])
@@ -114,7 +120,9 @@ def test_a_stored_method_answers_the_same(room, fitted, tmp_path):
     again.restore(room.site, torch.load(tmp_path / "state.pt", weights_only=True))
     batch = room.batch(LAST)
     for part in ("mean", "variance", "unknown"):
-        torch.testing.assert_close(getattr(again.predict(batch), part), getattr(fitted.predict(batch), part))
+        torch.testing.assert_close(
+            getattr(again.predict(batch), part), getattr(fitted.predict(batch), part)
+        )
     assert again.count_components() == fitted.count_components()
 
 
@@ -125,16 +133,23 @@ def test_a_query_without_a_carrier_is_asked_for_one(fitted):
 
 def test_an_array_that_carriers_see_differently_is_not_one(room):
     assert carriers_obstacle(room.site) is None
-    plain = from_arrays({
-        "tx_position": room.tx, "rx_position": np.zeros(3), "spectrum": room.target,
-        "carrier_hz": room.carrier_hz, "array_position": room.site.array,
-    })  # fmt: skip
+    plain = from_arrays(
+        {
+            "tx_position": room.tx,
+            "rx_position": np.zeros(3),
+            "spectrum": room.target,
+            "carrier_hz": room.carrier_hz,
+            "array_position": room.site.array,
+        }
+    )
     assert carriers_obstacle(plain.site) == "carriers see through different arrays"
     refused("carriers: carriers see through different arrays", fit, CarrierField(), plain, LAST)
 
 
 def test_more_rows_than_a_process_takes_were_refused(room, monkeypatch):
-    """Over 4,000 rows `model=gsparc` ended in an error; whole places all over the site are learned from."""
+    """Over 4,000 rows `model=gsparc` ended in an error;
+    whole places all over the site are learned from.
+    """
     monkeypatch.setattr(method, "MOST_ROWS", 60)
     monkeypatch.setattr(method, "CHOSEN_ON", 30)
     field, none = CarrierField(), np.zeros(0, np.int64)
@@ -147,10 +162,15 @@ def test_more_rows_than_a_process_takes_were_refused(room, monkeypatch):
 
 @pytest.mark.slow
 def test_carriers_that_share_nothing_were_smoothed_over_all(room):
-    """Of carriers with smooth fields of their own: one process over all lost .5 dB to one of each."""
+    """Of carriers with smooth fields of their own:
+    one process over all lost .5 dB to one of each.
+    """
     rng = np.random.default_rng(1)
     waves = rng.normal(size=(CARRIERS, 3, 3)) * 0.7
-    phase = np.einsum("nd,ncd->nc", room.tx, waves[room.station].transpose(0, 2, 1)) + room.station[:, None]
+    phase = (
+        np.einsum("nd,ncd->nc", room.tx, waves[room.station].transpose(0, 2, 1))
+        + room.station[:, None]
+    )
     shapes = rng.uniform(0, 1, (CARRIERS, 3, *room.target.shape[1:]))
     mixed = np.einsum("nc,nchw->nhw", np.cos(phase), shapes[room.station]) / 6 + 0.5
     alone = replace(room, target=mixed.astype(np.float32))
@@ -164,7 +184,9 @@ def test_carriers_that_share_nothing_were_smoothed_over_all(room):
 
 @pytest.mark.slow
 def test_a_carrier_is_asked_for_by_its_frequency(room):
-    """As one held out is answered, another that no station has is: by geometry and nearby carriers."""
+    """As one held out is answered, another that no station has is:
+    by geometry and nearby carriers.
+    """
     test = np.flatnonzero(room.station == 2)
     learned = fit(wrap_per_station(Gsparc(), room), room, test)
     predictor = Predictor(learned, room.site)
@@ -178,17 +200,27 @@ def test_a_carrier_is_asked_for_by_its_frequency(room):
         np.abs(beside - room.target[test[:3]]).mean()
         < np.abs(room.target[test[3:6]] - room.target[test[:3]]).mean()
     )
-    assert (predictor.select_carrier(known * 8).std(tx=at) >= predictor.select_station(2).std(tx=at)).all()
+    assert (
+        predictor.select_carrier(known * 8).std(tx=at) >= predictor.select_station(2).std(tx=at)
+    ).all()
     assert len(predictor.stations) == CARRIERS  # asking adds none
 
 
 def test_a_carrier_of_a_model_that_has_none_is_refused(room):
     few = np.arange(0, len(room), 3)
-    plain = fit(wrap_per_station(GaussianProcess(), room), room, np.setdiff1d(np.arange(len(room)), few))
-    with pytest.raises(ValueError, match="learned each carrier alone; model=carriers answers at others"):
+    plain = fit(
+        wrap_per_station(GaussianProcess(), room), room, np.setdiff1d(np.arange(len(room)), few)
+    )
+    with pytest.raises(
+        ValueError, match="learned each carrier alone; model=carriers answers at others"
+    ):
         Predictor(plain, room.site).select_carrier(7e9)
-    network = fit(wrap_per_station(method_class("wideband")(count=20, max_steps=3), room), room, few)
-    with pytest.raises(ValueError, match="wideband knows its own carriers alone; model=carriers answers"):
+    network = fit(
+        wrap_per_station(method_class("wideband")(count=20, max_steps=3), room), room, few
+    )
+    with pytest.raises(
+        ValueError, match="wideband knows its own carriers alone; model=carriers answers"
+    ):
         Predictor(network, room.site).select_carrier(7e9)
     for wrong in (0.0, np.nan, -1e9):
         refused("a frequency above 0", Predictor(plain, room.site).select_carrier, wrong)

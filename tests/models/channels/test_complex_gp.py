@@ -65,7 +65,9 @@ def test_many_rows_are_told_by_the_nearest(dense, monkeypatch):
 
 
 def test_places_visited_again_hid_all_others_from_the_nearest_rows(monkeypatch):
-    """From 6,001 rows on the nearest hundred were visits of one place: NMSE .31 for .07 with fewer."""
+    """From 6,001 rows on the nearest hundred were visits of one place:
+    NMSE .31 for .07 with fewer.
+    """
     monkeypatch.setattr(complex_gp, "NEAREST", 24)
     rng = np.random.default_rng(0)
     place, asked = (np.column_stack([rng.uniform(0, 0.4, (n, 2)), np.ones(n)]) for n in (50, 40))
@@ -118,13 +120,17 @@ def test_runs_are_brought_together(dense, runs):
         for each in (dense[2], method, ignored)
     )
     assert known < 1.5 * one < 0.5 * other, (one, known, other)
-    assert notes[1].startswith("complex_gp: factors of runs, relative to run 5: 5: 1 at 0 degrees, 6: ")
+    assert notes[1].startswith(
+        "complex_gp: factors of runs, relative to run 5: 5: 1 at 0 degrees, 6: "
+    )
     ratio = method.runs.look_up(torch.tensor([5, 6, 7])).numpy() / FACTORS
     assert np.abs(np.angle(ratio)).max() < 0.1 and np.abs(np.log(np.abs(ratio))).max() < 0.3
 
 
 def test_rows_of_other_runs_were_scored_in_the_phase_of_the_largest(runs):
-    """A right prediction of a row in another run's phase was an error of up to four times its power."""
+    """A right prediction of a row in another run's phase was an error of up
+    to four times its power.
+    """
     _, spread, fold, method, _ = runs
     batch = spread.batch(fold.test)
     here = method.predict(batch).mean
@@ -163,7 +169,12 @@ def test_channels_without_noise():
     tones, still = 5.18e9 + 312500.0 * np.arange(-26, 26), np.array([1.0, 1.0, 2.5])
     array = np.c_[np.zeros(4), (np.arange(4) - 1.5) * 0.029, np.zeros(4)]
     far = np.linalg.norm(place[:, None] + array - still, axis=-1)[..., None]
-    arrays = {"rx_position": place, "tx_position": still, "array_position": array, "frequency_hz": tones}
+    arrays = {
+        "rx_position": place,
+        "tx_position": still,
+        "array_position": array,
+        "frequency_hz": tones,
+    }
     data = from_arrays(
         {**arrays, "csi": np.exp(-2j * np.pi * tones * far / 299792458.0) / far}, {"name": "ofdm"}
     )

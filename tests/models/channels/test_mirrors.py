@@ -1,4 +1,6 @@
-"""Mirror planes that several static ends share: found by all, and of use to one that was never heard."""
+"""Mirror planes that several static ends share: found by all,
+and of use to one that was never heard.
+"""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -36,7 +38,11 @@ def _channels(ends, places, walls, *, turned=0.0, noise=0.03, seed=0):
     channel = np.zeros((len(places), len(ends)), complex)
     for number, end in enumerate(ends):
         for wall, gain in ((None, 1.0), *((wall, -0.63) for wall in walls)):
-            at = end if wall is None else reflect(torch.from_numpy(end), torch.from_numpy(wall)).numpy()
+            at = (
+                end
+                if wall is None
+                else reflect(torch.from_numpy(end), torch.from_numpy(wall)).numpy()
+            )
             away = np.linalg.norm(places - at, axis=1)
             channel[:, number] += gain * np.exp(-1j * K * away) / away
         channel[:, number] *= np.exp(1j * turned * rng.standard_normal())
@@ -59,7 +65,9 @@ def _data(end, place, channel, carrier=299792458.0 / WAVELENGTH):
 
 def _bare(data):
     """Groups, and a direct wave in a diffuse field."""
-    groups = tuple(normalise_power(group) for group in group_channels(data, np.arange(len(data)), True))
+    groups = tuple(
+        normalise_power(group) for group in group_channels(data, np.arange(len(data)), True)
+    )
     frame = Frame(torch.from_numpy(data.moving).mean(0), 20.0, 2.0, 0.8, torch.zeros(3).double())
     power = torch.tensor([0.3, 0.5, 0.02, 0.01], dtype=torch.float64)
     terms = Isotropic(frame, power[:1]), Direct(frame, power[1:3]), Noise(frame, power[3:])
@@ -76,7 +84,8 @@ def test_a_probe_gains_what_the_likelihood_rises():
         for wave, gain in zip(waves, probe.likelihood_gain(waves, level), strict=True):
             more = covariance + level * wave[:, None] * wave.conj()[None]
             fits = [
-                (group.target.mH @ torch.linalg.solve(c, group.target)).real.sum() for c in (covariance, more)
+                (group.target.mH @ torch.linalg.solve(c, group.target)).real.sum()
+                for c in (covariance, more)
             ]
             sizes = [torch.linalg.slogdet(c)[1] for c in (covariance, more)]
             rise = (fits[0] - fits[1]) / probe.scale + sizes[0] - sizes[1]
@@ -107,7 +116,10 @@ def test_no_wall_is_kept_where_there_is_none():
 def test_a_plane_between_an_end_and_the_places_mirrors_nothing():
     plane = torch.tensor([[1.0, 0.0, 0.0, 0.5], [0.0, 1.0, 0.0, 3.0]], dtype=torch.float64)
     (group, *_), prior = _bare(_data(*_site([WALL], ends=1)))
-    frame, slot = replace(prior.frame, middle=torch.zeros(3).double()), replace(group.slot, end=plane[0, :3])
+    frame, slot = (
+        replace(prior.frame, middle=torch.zeros(3).double()),
+        replace(group.slot, end=plane[0, :3]),
+    )
     waves = Images.from_planes(frame, plane).waves(replace(group, slot=slot))
     assert waves.abs().sum(1).bool().tolist() == [False, True]
 

@@ -29,12 +29,16 @@ def line(count=60, seed=0):
     length = np.array([[4.0], [6.5], [9.0]]) + np.array([[0.9], [-0.4], [0.2]]) * along
     channel = (np.exp(-2j * np.pi * length[..., None] / 3e8 * TONES) / length[..., None]).sum(0)
     own = np.exp(
-        2j * np.pi * (rng.random((count, 1)) + rng.uniform(0, 5e-8, (count, 1)) * (TONES - TONES[0]))
+        2j
+        * np.pi
+        * (rng.random((count, 1)) + rng.uniform(0, 5e-8, (count, 1)) * (TONES - TONES[0]))
     )
     place = np.c_[along, np.zeros((count, 2))]
     arrays = {"rx_position": place, "tx_position": np.array([0.0, 3.0, 1.0]), "frequency_hz": TONES}
     data = from_arrays({**arrays, "csi": (channel * own)[:, None].astype(np.complex64)})
-    return replace(data, site=replace(data.site, unknown_factor="phase+delay", phase_reference="neighbours"))
+    return replace(
+        data, site=replace(data.site, unknown_factor="phase+delay", phase_reference="neighbours")
+    )
 
 
 def fit(method, data, train, test, split=None):
@@ -67,7 +71,9 @@ def test_neighbours_are_told_whatever_phases_their_rows_have():
 @pytest.mark.parametrize("tones", [1, 16])
 def test_rows_of_unknown_tones_are_turned_by_their_phase(tones):
     data, test = line(), np.arange(0, 60, 7)
-    one = replace(data, target=data.target[..., :tones], site=replace(data.site, subcarriers_hz=None))
+    one = replace(
+        data, target=data.target[..., :tones], site=replace(data.site, subcarriers_hz=None)
+    )
     method = fit(TurnedNeighbours(), one, np.setdiff1d(np.arange(60), test), test)
     assert method.predict(one.batch(test)).mean.shape == (len(test), 1, tones)
 
@@ -93,7 +99,9 @@ def test_the_mean_keeps_its_phase_and_gains_power_where_little_is_known():
 @pytest.mark.slow
 @pytest.mark.parametrize("transmitter", [0, 1])
 def test_the_default_lost_to_its_nearest_rows_out_of_sight(transmitter):
-    """In squares of 50 cm the process missed .65 and .41 of the power, eight rows turned .51 and .23."""
+    """In squares of 50 cm the process missed .65 and .41 of the power,
+    eight rows turned .51 and .23.
+    """
     given, channel = packets.robot(transmitter, 0, "nlos")
     logged = packets.logged(channel, given["frequency_hz"], 0)
     data = packets.measurements(given, logged)

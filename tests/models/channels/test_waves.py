@@ -25,7 +25,15 @@ from gsparc.models.channels.kernels import (
     spread_directions,
 )
 from gsparc.models.channels.prior import ChannelPrior
-from gsparc.models.channels.terms import Direct, Directions, Drift, Images, Isotropic, Leakage, Noise
+from gsparc.models.channels.terms import (
+    Direct,
+    Directions,
+    Drift,
+    Images,
+    Isotropic,
+    Leakage,
+    Noise,
+)
 from gsparc.models.channels.terms.term import ChannelTerm, Frame
 from gsparc.ops import Pose
 from gsparc.processes.left_out import rows_of_groups
@@ -38,7 +46,9 @@ END = np.array([0.4, -0.3, 1.5])
 
 
 def _sent(count=90, *, seed=0, direct=1.0, leakage=0.5, diffuse=0.0, noise=0.05, side=0.6, end=END):
-    """Receivers in a flat patch, a transmitter at `END`: direct wave, leakage, plane waves and noise."""
+    """Receivers in a flat patch, a transmitter at `END`: direct wave, leakage,
+    plane waves and noise.
+    """
     rng = np.random.default_rng(seed)
     place = np.c_[rng.uniform(0, side, (count, 2)), np.full(count, 0.2)]
     away = np.linalg.norm(place - end, axis=1)
@@ -54,9 +64,14 @@ def _sent(count=90, *, seed=0, direct=1.0, leakage=0.5, diffuse=0.0, noise=0.05,
 def _prior(data, *, correlated=False, mirrors=1, angles=4, envelope=0.4):
     """Every term."""
     frame = Frame(
-        torch.from_numpy(data.moving).mean(0), 20.0, envelope, 0.3, torch.tensor([0.01, -0.02, 0.0]).double()
+        torch.from_numpy(data.moving).mean(0),
+        20.0,
+        envelope,
+        0.3,
+        torch.tensor([0.01, -0.02, 0.0]).double(),
     )
-    planes = torch.tensor([[0.1, 0.0, 1.0, -0.7]], dtype=torch.float64)[:mirrors]  # beneath everything
+    # Beneath everything
+    planes = torch.tensor([[0.1, 0.0, 1.0, -0.7]], dtype=torch.float64)[:mirrors]
     sizes = [1, angles, 1, 2, 2 * mirrors, 1, 2 * correlated]
     power = torch.rand(sum(sizes), dtype=torch.float64, generator=torch.manual_seed(0)) + 0.2
     isotropic, unequal, leakage, direct, images, noise, drift = power.split(sizes)
@@ -107,14 +122,19 @@ def test_one_direction_is_the_mean_of_plane_waves_and_all_are_the_isotropic_fiel
     step = torch.randn(200, 3, dtype=torch.float64) * 0.2
     distance = step.norm(dim=1)
     found = torch.stack(
-        [directional_correlation((K * distance) ** 2, K * step @ u, 8.0) for u in fibonacci_sphere(96)]
+        [
+            directional_correlation((K * distance) ** 2, K * step @ u, 8.0)
+            for u in fibonacci_sphere(96)
+        ]
     ).mean(0)
     torch.testing.assert_close(found.real, torch.sinc(distance * K / np.pi), atol=2e-3, rtol=0)
     assert found.imag.abs().max() < 2e-3
     direction = torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
     step, waves = torch.randn(50, 3, dtype=torch.float64) * 0.1, fibonacci_sphere(40_000)
     weight = torch.softmax(6.0 * waves @ direction, 0)
-    expected = torch.polar(torch.ones(()).double(), K * step @ waves.T) @ weight.to(torch.complex128)
+    expected = torch.polar(torch.ones(()).double(), K * step @ waves.T) @ weight.to(
+        torch.complex128
+    )
     found = directional_correlation((K * step.norm(dim=1)) ** 2, K * step @ direction, 6.0)
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
 
@@ -123,7 +143,10 @@ def test_flat_places_get_a_half_sphere():
     flat = torch.from_numpy(_sent().moving)
     half = spread_directions(flat, K, 12)
     assert len(half) == 12 and abs(half[:, 2].sign().sum()) == 12
-    assert abs(spread_directions(torch.randn(30, 3, dtype=torch.float64), K, 12)[:, 2].sign().sum()) < 12
+    assert (
+        abs(spread_directions(torch.randn(30, 3, dtype=torch.float64), K, 12)[:, 2].sign().sum())
+        < 12
+    )
 
 
 def test_slopes_of_the_evidence_and_what_compression_costs():
@@ -137,17 +160,24 @@ def test_slopes_of_the_evidence_and_what_compression_costs():
     slope = evidence.power_gradient(part, power, at)
     for number in range(len(power)):
         found = [
-            evidence.solve_group(part, power * torch.exp(step * torch.eye(len(power)).double()[number])).nll
+            evidence.solve_group(
+                part, power * torch.exp(step * torch.eye(len(power)).double()[number])
+            ).nll
             for step in (1e-5, -1e-5)
         ]
-        assert float(slope[number]) == pytest.approx((found[0] - found[1]) / 2e-5, rel=1e-4, abs=1e-4)
+        assert float(slope[number]) == pytest.approx(
+            (found[0] - found[1]) / 2e-5, rel=1e-4, abs=1e-4
+        )
     group = groups[0]
     whole = prior.signal_covariances(groups)[0] + prior.disturbance(group)
     fit = (group.target.conj() * torch.linalg.solve(whole, group.target)).real.mean()
     expected = float(len(group) * fit.log() + torch.logdet(whole).real)
     assert at.nll == pytest.approx(expected, abs=1.0)
     cell = number_cells_by_bisection(group.places.numpy(), 3)
-    (error,), inverse = evidence.left_out_errors(part, power, [rows_of_groups(cell)]), torch.linalg.inv(whole)
+    (error,), inverse = (
+        evidence.left_out_errors(part, power, [rows_of_groups(cell)]),
+        torch.linalg.inv(whole),
+    )
     mine = torch.from_numpy(np.flatnonzero(cell == 2))
     own = torch.linalg.solve(inverse[mine[:, None], mine], (inverse @ group.target)[mine])
     assert (error[mine] - own).abs().max() < 0.03 * own.abs().max()
@@ -174,7 +204,9 @@ def test_a_term_that_says_its_covariance_alone_is_learned_and_answers():
     for more in ((), (_Tilt(frame, 0.2 * one),)):
         prior = ChannelPrior((Isotropic(frame, one), *more, Noise(frame, 0.01 * one)))
         prior, _ = evidence.fit_powers(evidence.compress_groups(groups, prior), prior, 0.0)
-        errors.append(answer_error(conditioned(prior, data, np.arange(40)), data, np.arange(40, 60)))
+        errors.append(
+            answer_error(conditioned(prior, data, np.arange(40)), data, np.arange(40, 60))
+        )
     assert errors[1] < 0.5 * errors[0]
     assert prior[_Tilt].power > 10 * prior[Isotropic].power
 
@@ -195,7 +227,9 @@ def test_left_out_is_what_refitting_gives(correlated):
         scale = field.weights[0].scale / again.weights[0].scale
         # A row's drift is also that of rows before and after it, which no query's is.
         near = 0.1 if correlated else 1e-3
-        torch.testing.assert_close(found.variance[0] * scale, left.variance[row], rtol=near, atol=1e-6)
+        torch.testing.assert_close(
+            found.variance[0] * scale, left.variance[row], rtol=near, atol=1e-6
+        )
 
 
 @pytest.mark.parametrize("noise", [0.1, 1e-9])
@@ -224,7 +258,9 @@ def test_directions_in_blocks_are_those_at_once(monkeypatch):
 
 
 def test_leakage_and_direct_wave_are_found_where_they_are():
-    without, _ = fitted_to(ChannelField(), _sent(90, direct=0.0, leakage=0.0, diffuse=1.0), np.arange(90))
+    without, _ = fitted_to(
+        ChannelField(), _sent(90, direct=0.0, leakage=0.0, diffuse=1.0), np.arange(90)
+    )
     assert "direct" not in without.terms
     data = _sent(120, diffuse=0.3)
     field, notes = fitted_to(ChannelField(ChannelSettings(directions=False)), data, np.arange(60))
@@ -289,5 +325,7 @@ def test_the_one_station_at_an_unknown_place_was_nobody(campaign):
     here = np.array([[1.0, 2, 3], [np.nan] * 3])
     site = replace(campaign("csi", 8, "tx").site, stations=Stations(here, ("known", "unknown")))
     asked = torch.from_numpy(np.concatenate([here[::-1], here[:1] + 1]))
-    ends = Ends.from_query(site, Query(asked, Pose(torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3))))
+    ends = Ends.from_query(
+        site, Query(asked, Pose(torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3)))
+    )
     assert ends.station.tolist() == [1, 0, NOBODY]

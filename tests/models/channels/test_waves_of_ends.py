@@ -31,7 +31,9 @@ QUICK = ChannelSettings(tied=12, narrow=5.0, knots=4, angles=8, rows=60)
 
 
 def _ceiling(ends=6, count=80, *, seed=0, turned=0.4, shift=(0.0, 0.0, 0.0), runs=None):
-    """A transmitter in a flat patch, antennas above it: direct wave, leakage, waves mostly from the ends."""
+    """A transmitter in a flat patch, antennas above it: direct wave, leakage,
+    waves mostly from the ends.
+    """
     rng = np.random.default_rng(seed)
     place = np.c_[rng.uniform(0, 0.7, (count, 2)), np.full(count, 0.2)]
     end = np.c_[rng.uniform(-1, 2, (ends, 2)), np.full(ends, 1.8)]
@@ -46,7 +48,12 @@ def _ceiling(ends=6, count=80, *, seed=0, turned=0.4, shift=(0.0, 0.0, 0.0), run
     channel += 0.05 * (rng.standard_normal((count, ends, 2)) @ [1, 1j])
     if runs is not None:
         channel[runs == 1] *= np.exp(0.9j)
-    arrays = {"tx_position": place, "station_position": end, "csi": channel, "carrier_hz": np.array(2.4e9)}
+    arrays = {
+        "tx_position": place,
+        "station_position": end,
+        "csi": channel,
+        "carrier_hz": np.array(2.4e9),
+    }
     run = {} if runs is None else {"run": runs}
     return from_arrays({**arrays, **run, "frequency_hz": np.array([2.4e9])})
 
@@ -58,7 +65,9 @@ def _tied(data, rows):
     towards = torch.tensor([1.0, 0.2, -0.5, 0.0]).double()
     prior = ChannelPrior(()).with_terms(
         Isotropic(frame, power[:1]),
-        Directions(frame, power[1:9], angles=fibonacci_sphere(16)[:8], concentration=5.0, towards=towards),
+        Directions(
+            frame, power[1:9], angles=fibonacci_sphere(16)[:8], concentration=5.0, towards=towards
+        ),
         Leakage(frame, power[9:10]),
         Direct(frame, power[10:12]),
         Noise(frame, power[12:]),
@@ -70,9 +79,12 @@ def test_knots_add_up_and_mirrored_directions_count_alike():
     half, zero = fibonacci_sphere(800), torch.zeros(3, dtype=torch.float64)
     half = half[half[:, 2] > 0]
     term = Directions(
-        Frame(zero, 10.0, 1.0, 1.0, zero), torch.ones(len(half)).double(), angles=half, concentration=8.0,
+        Frame(zero, 10.0, 1.0, 1.0, zero),
+        torch.ones(len(half)).double(),
+        angles=half,
+        concentration=8.0,
         towards=torch.zeros(5).double(),
-    )  # fmt: skip
+    )
     ends = torch.tensor([[1.0, 0.5, 2.0], [1.0, 0.5, -2.0]], dtype=torch.float64)
     found = term.knot_weights([Slot(0, (0,), (0,), end, zero, K) for end in ends])
     torch.testing.assert_close(found.sum(-1), torch.ones(2, len(half)).double())

@@ -52,7 +52,10 @@ def test_few_receivers_are_enough_with_directions():
 def test_a_search_starts_from_sources_where_rays_meet():
     data, _, sources = directed(60)
     rows = np.arange(60)
-    fold, still = Fold(rows, rows[:0], rows[:0]), torch.from_numpy(data.site.static_position).double()
+    fold, still = (
+        Fold(rows, rows[:0], rows[:0]),
+        torch.from_numpy(data.site.static_position).double(),
+    )
     method = fitted(data, fold)[0]
     found = method.points_and_amplitudes()
     for order, expected in ((3, torch.from_numpy(sources)), (0, still[None])):
@@ -60,7 +63,9 @@ def test_a_search_starts_from_sources_where_rays_meet():
         start = Search(
             rows_of_measurements(data, rows, 100, 0), still, settings, 0, lambda: False, found
         ).scene.sources
-        assert len(start) == len(expected) and float(torch.cdist(expected, start).amin(1).max()) < 0.02
+        assert (
+            len(start) == len(expected) and float(torch.cdist(expected, start).amin(1).max()) < 0.02
+        )
     context, init = FitContext(beside={"rays": method}), InitSettings()
     assert torch.equal(CANDIDATES["sources"](init, True, context).start[0], found[0])
     assert CANDIDATES["sources"](init, True, FitContext()).start is None
@@ -97,7 +102,8 @@ def test_rows_left_out_are_predicted_as_by_a_fit_without_the_receiver():
     shared *= given.kernel.correlation(rows.position[kept], rows.position[kept])
     shared.diagonal().add_(given.kernel.noise + 1e-5)
     probability = (
-        spherical_waves(rows.select_rows(out), given.positions.points) * given.visibility.left_out[k].float()
+        spherical_waves(rows.select_rows(out), given.positions.points)
+        * given.visibility.left_out[k].float()
     )
     cross = (probability * given.power) @ waves[kept].mH
     cross *= given.kernel.correlation(rows.position[out], rows.position[kept])
@@ -128,7 +134,9 @@ def test_paths_sum_to_the_prediction(pillar):
     torch.testing.assert_close(gain.sum(-1), want.mean[:, :, 0], atol=1e-6, rtol=1e-4)
 
 
-@pytest.mark.parametrize("degrees", [1.0, *(pytest.param(d, marks=pytest.mark.slow) for d in (0.2, 3.0))])
+@pytest.mark.parametrize(
+    "degrees", [1.0, *(pytest.param(d, marks=pytest.mark.slow) for d in (0.2, 3.0))]
+)
 def test_direction_errors_are_estimated_and_positions_refined_by_phase(degrees):
     """Directions taken as exact left NMSE 0.08, 0.45 and 0.70."""
     data, fold, sources = directed(60, pillar=True)
@@ -158,18 +166,24 @@ def test_a_channel_restores_a_missed_ray():
     rates = RayErrorRates.from_rays(rays)
     assert rates.missed == 0.2  # a quarter, clipped at first
     probability = torch.full((20, 4), 0.75)
-    flip = entries_to_flip(rays, rates.log_odds_seen(rays, probability), left, torch.full((20,), 1e-3), one)
+    flip = entries_to_flip(
+        rays, rates.log_odds_seen(rays, probability), left, torch.full((20,), 1e-3), one
+    )
     assert torch.equal(flip, (truth - rays).bool())
     estimated = RayErrorRates.from_visibility(rays, truth)
     assert abs(estimated.missed - 0.25) < 1e-6 and estimated.spurious == 1e-3
     # no neighbour sees it and the residual is zero: noise adds no visibility
-    quiet = entries_to_flip(rays, rates.log_odds_seen(rays, 0 * probability), 0 * left, torch.ones(20), one)
+    quiet = entries_to_flip(
+        rays, rates.log_odds_seen(rays, 0 * probability), 0 * left, torch.ones(20), one
+    )
     assert not bool(quiet[rays == 0].any())
 
 
 @pytest.mark.parametrize("seen", [0.0, 1.0])
 def test_where_every_ray_was_wrong_the_odds_divided_by_zero(seen):
-    """One channel of 80 dB too much hides all sources from all receivers: a share of one has no odds."""
+    """One channel of 80 dB too much hides all sources from all receivers:
+    a share of one has no odds.
+    """
     rays, truth = torch.full((4, 2), 1 - seen), torch.full((4, 2), seen)
     assert torch.isfinite(
         RayErrorRates.from_visibility(rays, truth).log_odds_seen(rays, 0.5 * torch.ones(4, 2))
@@ -193,7 +207,10 @@ def _random_rays(data):
     [
         (_random_rays, "do not intersect"),
         (lambda data: replace(data, directions=None), "needs directions of arrival"),
-        (lambda data: replace(data, directions=[d[:0] for d in data.directions]), "do not intersect"),
+        (
+            lambda data: replace(data, directions=[d[:0] for d in data.directions]),
+            "do not intersect",
+        ),
         (lambda data: replace(data, target=0 * data.target), "every training channel is zero"),
     ],
 )
@@ -209,7 +226,9 @@ def test_hard_cases_stay_finite_and_no_worse_than_nothing(case):
     if case == "huge":
         data = replace(data, target=1e15 * data.target)
     elif case == "half see nobody":
-        data = replace(data, directions=[d[: len(d) * (i % 2)] for i, d in enumerate(data.directions)])
+        data = replace(
+            data, directions=[d[: len(d) * (i % 2)] for i, d in enumerate(data.directions)]
+        )
     else:
         data = replace(data, rx_position=np.concatenate([sources[:1], data.rx_position[1:]]))
     method, _ = fitted(data, fold)
@@ -240,7 +259,9 @@ def test_visibility_that_was_switched_off_was_learned_all_the_same(pillar):
     blind = ImageSources(*alone)
     notes = blind.fit(data, fold, FitContext()).notes
     assert method.terms == ("phase", "visibility") and blind.effects == "phase"
-    assert "visibility" not in notes[0] and error(blind, data, fold.test) > 2 * error(method, data, fold.test)
+    assert "visibility" not in notes[0] and error(blind, data, fold.test) > 2 * error(
+        method, data, fold.test
+    )
 
 
 def test_the_log_counted_the_sources_of_a_fit_before_the_last(pillar, caplog, monkeypatch):

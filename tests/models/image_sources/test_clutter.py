@@ -1,4 +1,6 @@
-"""Paths, boxes and patches against the exact simulator and brute force; then learned in small rooms."""
+"""Paths, boxes and patches against the exact simulator and brute force;
+then learned in small rooms.
+"""
 
 import math
 import time
@@ -42,13 +44,17 @@ def _sequences(order: int) -> tuple:
 
 def _scene(clutter: Clutter, order: int = 1) -> SourceScene:
     sequences, law = _sequences(order), KernelVisibility(0.95, 0.6, 1.5)
-    return SourceScene(TRANSMITTER, WALLS, sequences, torch.zeros(len(sequences)), -4.0, law, clutter)
+    return SourceScene(
+        TRANSMITTER, WALLS, sequences, torch.zeros(len(sequences)), -4.0, law, clutter
+    )
 
 
 def _rows(count: int, seed: int = 0) -> Rows:
     position = torch.from_numpy(np.random.default_rng(seed).uniform(0.1, 0.9, (count, 3))) * SIZE
     frequency = torch.full((count,), 2.4e9, dtype=torch.float64)
-    return Rows(position, frequency, torch.zeros(count, 1, dtype=torch.complex64), torch.arange(count))
+    return Rows(
+        position, frequency, torch.zeros(count, 1, dtype=torch.complex64), torch.arange(count)
+    )
 
 
 def _room() -> torch.Tensor:
@@ -76,7 +82,9 @@ def test_a_patch_reflects_inside_only_and_hides_what_is_behind():
     above_middle = [2.5, 1.9, 1.0]
     above_beside = [3.9, 2.9, 0.8]  # the reflection would lie beyond the edge
     under = [2.4, 1.8, 0.2]
-    seen = scene.visible_share(torch.tensor([above_middle, above_beside, under], dtype=torch.float64))
+    seen = scene.visible_share(
+        torch.tensor([above_middle, above_beside, under], dtype=torch.float64)
+    )
     assert (seen[:, 1] > 0.5).tolist() == [True, False, False]
     assert (seen[:, 0] > 0.5).tolist() == [True, True, False]
 
@@ -143,7 +151,9 @@ def _beside_a_table(count: int) -> tuple[UnexplainedRows, Clutter]:
     """What walls leave unexplained of rows in a room with a table, and the table."""
     planes, clutter = _table()
     sequences = (*_sequences(1), (6,), (6, 5), (2, 6))
-    true = SourceScene(TRANSMITTER, planes, sequences, torch.zeros(len(sequences)), -4.0, clutter=clutter)
+    true = SourceScene(
+        TRANSMITTER, planes, sequences, torch.zeros(len(sequences)), -4.0, clutter=clutter
+    )
     rows = _truth(true, _rows(count))
     return _unexplained(rows, _bare()), clutter
 
@@ -213,14 +223,18 @@ def test_a_late_search_keeps_clutter_and_a_cancelled_one_ends():
 def test_an_infinite_mirror_becomes_finite():
     planes, clutter = _table()
     sequences = (*_sequences(1), (6,), (6, 5), (2, 6))
-    true = SourceScene(TRANSMITTER, planes, sequences, torch.zeros(10), -4.0, KernelVisibility(0.95), clutter)
+    true = SourceScene(
+        TRANSMITTER, planes, sequences, torch.zeros(10), -4.0, KernelVisibility(0.95), clutter
+    )
     rows = _truth(true, _rows(250))
     start = phased(replace(true, clutter=Clutter.empty()), torch.zeros(10))
     left = _unexplained(rows, start)
     patch, score = find_patch(left, 6)
     assert score > 10
     learned, told = (
-        visible_share(left.paths.select_sequences([7]), Clutter(clutter.boxes, each[None], (6,)), planes)
+        visible_share(
+            left.paths.select_sequences([7]), Clutter(clutter.boxes, each[None], (6,)), planes
+        )
         > 0.5
         for each in (patch, clutter.patches[0])
     )

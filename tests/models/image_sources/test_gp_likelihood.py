@@ -1,4 +1,6 @@
-"""The two processes against brute force: covariance, leave-one-out, gradients, and each against the other."""
+"""The two processes against brute force: covariance, leave-one-out, gradients,
+and each against the other.
+"""
 
 import pytest
 import torch
@@ -49,7 +51,9 @@ def test_covariance_by_the_formula():
         correlation = scene.visibility.correlation(rows.position, source)
         wave = waves[:, k] * scene.log_amplitude[k].exp()
         expected = expected + wave[:, None] * wave.conj() * correlation
-    torch.testing.assert_close(GainPosterior(rows, scene).covariance, expected, rtol=1e-5, atol=1e-5)
+    torch.testing.assert_close(
+        GainPosterior(rows, scene).covariance, expected, rtol=1e-5, atol=1e-5
+    )
 
 
 def test_without_a_source_is_the_scene_less_that_source_and_its_plane():
@@ -76,7 +80,9 @@ def test_left_out_by_refitting_without_the_receiver(quadrature):
 @pytest.mark.parametrize("make", [_scene, _phased])
 def test_slopes_of_the_likelihood_which_refining_raises(make):
     rows, scene = _rows(), make()
-    seen = torch.stack([scene.visibility.correlation(rows.places, source) for source in scene.sources])
+    seen = torch.stack(
+        [scene.visibility.correlation(rows.places, source) for source in scene.sources]
+    )
     values = [scene.transmitter, *scene.planes.split((3, 1), 1), scene.log_amplitude]
     values += [torch.tensor(scene.log_noise)]
     values += [] if scene.phase is None else [scene.phase]
@@ -91,7 +97,9 @@ def test_slopes_of_the_likelihood_which_refining_raises(make):
                 moved[i].view(-1)[j] += sign * step
                 ends.append(refine._cost_and_gradient(rows, scene, moved, seen)[0])
             numeric = (ends[0] - ends[1]) / (2 * step)
-            assert gradient[i].reshape(-1)[j].item() == pytest.approx(numeric, rel=0.05, abs=0.15), (i, j)
+            assert gradient[i].reshape(-1)[j].item() == pytest.approx(
+                numeric, rel=0.05, abs=0.15
+            ), (i, j)
     assert GainPosterior(rows, refine.refine_scene(rows, scene, 8)).nll < nll
 
 
@@ -116,7 +124,9 @@ def test_variance_is_that_of_the_joint_gaussian():
 
 @pytest.mark.parametrize("extent", [5.0, 500.0, 20_000.0])
 def test_visibility_of_a_wide_site_is_a_covariance(extent):
-    """Expanded squares of places in float32: off by 0.2 of 1 and no covariance in a site of 20 km."""
+    """Expanded squares of places in float32:
+    off by 0.2 of 1 and no covariance in a site of 20 km.
+    """
     draws = torch.Generator().manual_seed(0)
     places = (torch.rand(200, 3, generator=draws, dtype=torch.float64) - 0.5) * extent
     places[100:] = places[:100] + 0.01 * torch.randn(100, 3, generator=draws, dtype=torch.float64)
@@ -126,5 +136,6 @@ def test_visibility_of_a_wide_site_is_a_covariance(extent):
     squared = (rays[:, None] - rays).square().sum(-1) / law.angle**2
     squared = squared + (places[:, None] - places).square().sum(-1) / law.length**2
     exact = law.constant + (1 - law.constant) * matern32_of_squares(squared)
-    assert found.dtype == torch.float32 and (found - exact).abs().max() < 1e-5  # 1 at the same place
+    # 1 at the same place
+    assert found.dtype == torch.float32 and (found - exact).abs().max() < 1e-5
     assert torch.linalg.eigvalsh(found.double()).min() > -1e-5

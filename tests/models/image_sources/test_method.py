@@ -63,7 +63,9 @@ def test_first_order_images_are_found_and_the_channel_extrapolates(small):
 def test_rows_factored_in_float32_answered_otherwise_on_other_machines(small):
     """By up to 3e-4 of the deviation."""
     query, members = small[3].query, [member.in_float64 for member in small[3].members]
-    exact = torch.cat([one.dual_weights.sum(1) * one.scene.phase_factors[:, None] for one in members])
+    exact = torch.cat(
+        [one.dual_weights.sum(1) * one.scene.phase_factors[:, None] for one in members]
+    )
     constant = members[0].scene.visibility.constant
     known = torch.view_as_real(exact).flatten(1)[:, None] * constant
     assert (query.level - known).abs().max() < 1e-7 * known.abs().max()
@@ -81,7 +83,9 @@ def test_variance_is_of_the_size_of_the_error(small):
 
 
 def test_paths_sum_to_the_prediction(small, tmp_path):
-    """Gains, delays and directions are what `predict` adds up; the loudest comes from the transmitter."""
+    """Gains, delays and directions are what `predict` adds up;
+    the loudest comes from the transmitter.
+    """
     _, data, fold, method, _ = small
     checkpoint.save(tmp_path / "m.ckpt", method)
     predictor = load(tmp_path / "m.ckpt")
@@ -107,7 +111,10 @@ def test_a_reflection_that_two_solutions_found_was_two_paths(small):
     predictor, world = Predictor(model, data.site), data.moving[fold.test[:5]] + data.site.origin
     channel, found = predictor.csi(rx=world), predictor.paths(rx=world)
     assert (
-        found.direction.shape[1] == found.gain.shape[2] == found.delay_s.shape[2] == method.count_components()
+        found.direction.shape[1]
+        == found.gain.shape[2]
+        == found.delay_s.shape[2]
+        == method.count_components()
     )
     summed = found.channel(data.site.subcarriers_hz)
     assert np.abs(summed - channel).max() < 1e-3 * np.abs(channel).max()
@@ -120,7 +127,9 @@ def test_objects_mirror_the_transmitter_into_its_images(small):
     end = scene.transmitter + method.frame.middle
     for sequence, place in zip(scene.sequences, scene.sources, strict=True):
         if len(sequence) == 1:
-            assert torch.allclose(reflect(end, planes[sequence[0]]), place + method.frame.middle, atol=1e-6)
+            assert torch.allclose(
+                reflect(end, planes[sequence[0]]), place + method.frame.middle, atol=1e-6
+            )
 
 
 def test_without_a_query_there_was_an_error(small):
@@ -154,7 +163,10 @@ def test_two_searches_at_the_noise_floor_are_enough(tmp_path):
 def test_known_array_elements_are_receivers_of_their_own(tmp_path):
     array = np.array([[0.0, 0.0, 0.0], [0.06, 0.0, 0.0], [0.0, 0.06, 0.0]])
     _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=1, array=array)
-    assert rows_of_measurements(data, fold.train, 10_000, 0).target.shape == (3 * len(fold.train), 1)
+    assert rows_of_measurements(data, fold.train, 10_000, 0).target.shape == (
+        3 * len(fold.train),
+        1,
+    )
     method, _ = fitted(data, fold, tmp_path, clutter=False)
     assert _predicted(method, data, fold.test).mean.shape == (len(fold.test), 3, 1)
     assert error(method, data, fold.test) < 0.03
@@ -167,7 +179,9 @@ def test_tones_not_measured_are_predicted_by_delay(tmp_path):
     mask = np.zeros(data.target.shape, bool)
     mask[..., ::4] = True
     known = replace(data, mask=mask)
-    assert set(rows_of_measurements(known, fold.train, 1000, 0).frequency.tolist()) <= set(frequency[::4])
+    assert set(rows_of_measurements(known, fold.train, 1000, 0).frequency.tolist()) <= set(
+        frequency[::4]
+    )
     method, _ = fitted(known, fold, tmp_path, clutter=False)
     prediction = _predicted(method, data, fold.test).mean.numpy()
     assert nmse(prediction[..., 1::4], data.targets(fold.test).numpy()[..., 1::4]) < 0.02
@@ -184,12 +198,22 @@ def test_gather_keeps_to_its_limit_and_spreads_over_the_band():
 
 
 def test_spectra_and_zero_channels_are_refused_in_one_line(tmp_path):
-    """Of zero channels the library's sequences about a matrix that is not positive definite came."""
+    """Of zero channels the library's sequences about a matrix
+    that is not positive definite came.
+    """
     fold = Fold(np.arange(30), np.arange(30, 36), np.arange(36, 48))
-    refused("needs complex channels", ImageSourceGP().fit, invent("spectrum"), fold, FitContext(tmp_path))
+    refused(
+        "needs complex channels",
+        ImageSourceGP().fit,
+        invent("spectrum"),
+        fold,
+        FitContext(tmp_path),
+    )
     refused("not fitted", ImageSourceGP().state)
     _, data, fold = shoebox(40, size=(3.0, 2.5, 2.2), max_order=1)
-    silent = replace(data, target=np.where(np.arange(40)[:, None, None] == fold.test[0], data.target, 0))
+    silent = replace(
+        data, target=np.where(np.arange(40)[:, None, None] == fold.test[0], data.target, 0)
+    )
     refused("every training channel is zero", fitted, silent, fold, tmp_path)
 
 
@@ -217,18 +241,23 @@ def test_scatterers_are_found_beside_images(tmp_path):
     places = (method.members[0].scene.sources + method.frame.middle).numpy() + data.site.origin
     images = told.images.mirror_points(told.tx[0])[told.images.order == 1]
     for wanted, within in ((true, 0.1), (images, 0.3)):
-        assert (np.linalg.norm(wanted[:, None] - places[None], axis=-1).min(1) < within * WAVELENGTH).all()
+        assert (
+            np.linalg.norm(wanted[:, None] - places[None], axis=-1).min(1) < within * WAVELENGTH
+        ).all()
     assert error(method, data, fold.test) < 0.01
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "offsets", [*(pytest.param(one, marks=pytest.mark.rare) for one in ("none", "phase")), "phase_timing"]
+    "offsets",
+    [*(pytest.param(one, marks=pytest.mark.rare) for one in ("none", "phase")), "phase_timing"],
 )
 def test_sources_are_found_through_unknown_offsets_that_are_estimated(offsets, tmp_path):
     """After one free complex number per sample: unseen snapshots have unknown phases too."""
     rng, tones = np.random.default_rng(0), 2.4e9 + np.arange(16) * 5e6
-    _, data, fold = shoebox(150, size=(3.0, 2.5, 2.2), max_order=1, frequency_hz=tones, reflection=-0.5)
+    _, data, fold = shoebox(
+        150, size=(3.0, 2.5, 2.2), max_order=1, frequency_hz=tones, reflection=-0.5
+    )
     delay = rng.uniform(-20e-9, 20e-9, (150, 1)) * (offsets == "phase_timing")
     turn = rng.uniform(-np.pi, np.pi, (150, 1)) - 2 * np.pi * delay * (tones - data.site.carrier_hz)
     seen = replace(data, target=(data.target * np.exp(1j * turn)[:, None]).astype(np.complex64))

@@ -1,4 +1,6 @@
-"""A transmitter that moves before several antennas: all share the sources, each has its own images."""
+"""A transmitter that moves before several antennas: all share the sources,
+each has its own images.
+"""
 
 import logging
 import time
@@ -41,7 +43,9 @@ def _channels(places, antennas, tones):
 
 
 def _uplink(count=100, antennas=4, tones=None, rotation=None, noise=1e-3, seed=0):
-    """A transmitter at `count` places before a static array half a wavelength apart along its x axis."""
+    """A transmitter at `count` places before a static array half a wavelength apart along its x
+    axis.
+    """
     rng = np.random.default_rng(seed)
     tones = np.array([CARRIER]) if tones is None else tones
     places = rng.uniform([0.2, 0.2, 0.6], [SIZE[0] - 0.2, SIZE[1] - 0.2, 1.6], (count, 3))
@@ -51,9 +55,13 @@ def _uplink(count=100, antennas=4, tones=None, rotation=None, noise=1e-3, seed=0
     power = noise * (np.abs(channels) ** 2).mean()
     channels = channels + np.sqrt(power / 2) * (rng.standard_normal((*channels.shape, 2)) @ [1, 1j])
     arrays = {
-        "tx_position": places, "rx_position": CENTRE, "rx_rotation": rotation, "array_position": array,
-        "csi": channels, "frequency_hz": tones,
-    }  # fmt: skip
+        "tx_position": places,
+        "rx_position": CENTRE,
+        "rx_rotation": rotation,
+        "array_position": array,
+        "csi": channels,
+        "frequency_hz": tones,
+    }
     data = from_arrays(arrays, {"name": "uplink"})
     return data, fold_of(data, seed=seed)
 
@@ -134,7 +142,9 @@ def test_gradient_by_planes_and_position_is_that_of_the_likelihood():
 def test_quick_scores_of_an_array_are_those_without_a_covariance():
     rows, scene = _rows_and_scene()
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(1)).double() + 3
-    spread = reflect(rows.static_ends(scene.transmitter)[:, None], bisector(scene.transmitter, points))
+    spread = reflect(
+        rows.static_ends(scene.transmitter)[:, None], bisector(scene.transmitter, points)
+    )
     waves = spherical_waves(rows, spread)
     slow = (waves.mH @ rows.target).abs().square().sum(1) / waves.abs().square().sum(0)
     torch.testing.assert_close(rough_gains(rows, spread, rows.target), slow, rtol=1e-2, atol=1e-2)
@@ -170,7 +180,9 @@ def test_antennas_with_phases_of_their_own(tmp_path):
 
 def test_antennas_of_unknown_places_are_outputs_of_their_own():
     data, fold = _uplink(30, antennas=2)
-    rows = rows_of_measurements(replace(data, site=replace(data.site, array=None)), fold.train, 1000, 0)
+    rows = rows_of_measurements(
+        replace(data, site=replace(data.site, array=None)), fold.train, 1000, 0
+    )
     assert rows.target.shape == (len(fold.train), 2) and rows.array is None
 
 

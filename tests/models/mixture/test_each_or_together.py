@@ -41,7 +41,9 @@ def test_stations_that_nobody_heard_are_answered_by_what_all_share():
 
 
 def test_channels_of_42_antennas_were_learned_one_after_another(tmp_path, monkeypatch, caplog):
-    """Over 30 minutes, where one of all took 29 s and had half the error; plain methods stay as they were."""
+    """Over 30 minutes, where one of all took 29 s and had half the error;
+    plain methods stay as they were.
+    """
     caplog.set_level("INFO", "gsparc")
     channels = np.exp(-2j * np.pi * 9.2e8 / 3e8 * distances(30))
     data = heard(30, csi=channels, frequency_hz=np.array(9.2e8))

@@ -22,7 +22,9 @@ def test_sources_of_few_rows_lost_a_decibel_to_the_process():
     spoilt.mean = spoilt.mean + 0.3
     fold = Fold(few, np.arange(24, 40), np.arange(40, 60))
     cut = cut_folds(data, fold, None, 3, 0)
-    assert weigh_members({"bearings": spoilt, "process": good}, data, fold.val, cut) == {"process": 1.0}
+    assert weigh_members({"bearings": spoilt, "process": good}, data, fold.val, cut) == {
+        "process": 1.0
+    }
 
 
 class Said(ClosedForm):
@@ -38,7 +40,9 @@ class Said(ClosedForm):
 
 
 def test_what_members_disagree_about_was_in_no_left_out_variance():
-    """It is in that of predictions: weights and places were judged by variances that were too small."""
+    """It is in that of predictions: weights and places were judged by variances
+    that were too small.
+    """
     both = Channels()
     both.members, both.weights = [Said(1.0), Said(3.0)], (0.5, 0.5)
     left = both.left_out()

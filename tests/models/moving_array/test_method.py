@@ -1,4 +1,6 @@
-"""The moving-array model on exact rooms: it must find the image sources and render them from anywhere."""
+"""The moving-array model on exact rooms:
+it must find the image sources and render them from anywhere.
+"""
 
 import dataclasses
 
@@ -100,7 +102,9 @@ def test_left_out_rows_are_about_as_wrong_as_new_ones(data, field):
 
 @pytest.mark.slow
 def test_the_strong_images_are_found(data):
-    """The transmitter and images in the near walls, from pictures alone; the far ones are 14 dB weaker."""
+    """The transmitter and images in the near walls, from pictures alone;
+    the far ones are 14 dB weaker.
+    """
     site = data.site
     space = SpectrumLags(site.array, site.grid, site.wavelength)
     power = torch.from_numpy(data.target[:60].astype(np.float32) / 255) ** 2
@@ -123,7 +127,9 @@ def test_an_effort_multiplies_the_steps_of_a_search(data, split, tmp_path, monke
     monkeypatch.setattr("gsparc.models.moving_array.method.find_sources", found)
     for effort in (0.5, 2.0):
         with pytest.raises(StopIteration):
-            MovingArrayField(search=SEARCH).fit(data, split.folds[0], FitContext(tmp_path, effort=effort))
+            MovingArrayField(search=SEARCH).fit(
+                data, split.folds[0], FitContext(tmp_path, effort=effort)
+            )
     assert steps == [SEARCH.steps / 2, 2 * SEARCH.steps]
 
 
@@ -131,7 +137,10 @@ def test_it_beats_the_process_on_images_and_states_its_error(data, split, fitted
     rival = GaussianProcess()
     rival.fit(data, split.folds[0], FitContext(tmp_path))
     ours, theirs = (score_methods((m,), data, split, "test") for m in (fitted, rival))
-    assert ours.figures()["psnr_db"] > theirs.figures()["psnr_db"] + 0.5 and fitted.count_components() > 5
+    assert (
+        ours.figures()["psnr_db"] > theirs.figures()["psnr_db"] + 0.5
+        and fitted.count_components() > 5
+    )
     assert 0.4 < ours.variance.mean() / ours.samples["mse"].mean() < 2.5
     assert ours.confidence.min() > 0 and ours.confidence.max() < 1
     near = data.batch(split.folds[0].train[:8])
@@ -170,7 +179,9 @@ def test_unusable_data_are_refused(data, fold, fitted, tmp_path):
     turned = data.rx_rotation.copy()
     turned[3] = np.diag([-1.0, -1.0, 1.0])
     with pytest.raises(ValueError, match="one orientation"):
-        MovingArrayField().fit(dataclasses.replace(data, rx_rotation=turned), fold, FitContext(tmp_path))
+        MovingArrayField().fit(
+            dataclasses.replace(data, rx_rotation=turned), fold, FitContext(tmp_path)
+        )
     noise = np.random.default_rng(0).integers(0, 255, data.target.shape).astype(np.uint8)
     with pytest.raises(ValueError, match="cannot have measured"):
         MovingArrayField().fit(dataclasses.replace(data, target=noise), fold, FitContext(tmp_path))

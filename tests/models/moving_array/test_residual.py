@@ -2,7 +2,11 @@ import numpy as np
 import torch
 from distances import far
 
-from gsparc.models.moving_array.residual import energies_and_axes, error_and_likeliest_kernel, fit_residual
+from gsparc.models.moving_array.residual import (
+    energies_and_axes,
+    error_and_likeliest_kernel,
+    fit_residual,
+)
 from gsparc.processes.kernel import Kernel
 
 KERNEL = Kernel.from_length(2.0, 0.05)
@@ -43,15 +47,22 @@ def test_axes_are_spared_that_predictions_do_not_need():
 def test_without_axes_the_mean_remains_and_the_kernel_of_smooth_rows_is_found():
     places, values = rows()
     residual, predicted = fit_residual(KERNEL, places, values, 0)
-    torch.testing.assert_close(residual.coefficients(far(places[:2], places)), values.mean(0).expand(2, 30))
+    torch.testing.assert_close(
+        residual.coefficients(far(places[:2], places)), values.mean(0).expand(2, 30)
+    )
     assert predicted.shape == values.shape
     error, kernel = error_and_likeliest_kernel(places, values)
-    assert error < 0.2 * float((values - values.mean(0)).square().sum(1).mean()) and kernel.noise < 0.1
+    assert (
+        error < 0.2 * float((values - values.mean(0)).square().sum(1).mean()) and kernel.noise < 0.1
+    )
 
 
 def test_axes_are_the_same_from_either_side():
     values = np.random.default_rng(0).normal(size=(12, 30)) * np.linspace(1, 3, 12)[:, None]
-    one, two = energies_and_axes(values, 5), energies_and_axes(np.vstack([values, np.zeros((30, 30))]), 5)
+    one, two = (
+        energies_and_axes(values, 5),
+        energies_and_axes(np.vstack([values, np.zeros((30, 30))]), 5),
+    )
     np.testing.assert_allclose(one[0], two[0])
     np.testing.assert_allclose(abs((one[1] * two[1]).sum(1)), 1)
     np.testing.assert_allclose(one[1] @ one[1].T, np.eye(5), atol=1e-12)

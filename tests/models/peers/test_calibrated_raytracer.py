@@ -1,4 +1,6 @@
-"""Materials learned in a known scene; tracing is slow, and skipped with its remedy without Sionna."""
+"""Materials learned in a known scene; tracing is slow,
+and skipped with its remedy without Sionna.
+"""
 
 import json
 from dataclasses import asdict
@@ -29,7 +31,9 @@ from gsparc.training.context import FitContext
 
 STATION = np.array([-2.5, 0.0, 3.0])
 CARRIER_HZ = 3.5e9
-PLAIN = Effects(diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2)
+PLAIN = Effects(
+    diffraction=False, edge_diffraction=False, diffuse=False, polarisation=False, depth=2
+)
 TRUE = Material(4.0, 0.2)
 GAIN_DB = 17.0
 ALL = np.arange(60)
@@ -63,13 +67,22 @@ def test_gain_and_scale_are_the_likeliest():
     gain, scale = fit_gain_and_scale(missed)
     least = student_loss(gain - missed, scale)[0]
     assert gain == pytest.approx(7, abs=0.8) and scale == pytest.approx(3, rel=0.2)
-    for other in ((gain + 0.1, scale), (gain - 0.1, scale), (gain, scale * 1.03), (gain, scale / 1.03)):
+    for other in (
+        (gain + 0.1, scale),
+        (gain - 0.1, scale),
+        (gain, scale * 1.03),
+        (gain, scale / 1.03),
+    ):
         assert student_loss(other[0] - missed, other[1])[0] > least
 
 
-@pytest.mark.parametrize("scene, words", [
-    (None, "name no scene of triangles; say model.scene="), ("nowhere.osm", "nowhere.osm is not here"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "scene, words",
+    [
+        (None, "name no scene of triangles; say model.scene="),
+        ("nowhere.osm", "nowhere.osm is not here"),
+    ],
+)
 def test_where_no_scene_is_known_it_says_so_in_one_line(scene, words):
     method = CalibratedRayTracer(scene=scene)
     error = refused(words, method.fit, measurements(np.ones(60)), FOLD, FitContext())
@@ -91,7 +104,9 @@ def test_without_the_ray_tracer_it_says_what_to_install(monkeypatch):
     assert "\n" not in str(raised.value)
 
 
-@pytest.mark.parametrize("settings", [{"start": "glass"}, {"steps": -1}, {"depth": 9}, {"samples": 0}])
+@pytest.mark.parametrize(
+    "settings", [{"start": "glass"}, {"steps": -1}, {"depth": 9}, {"samples": 0}]
+)
 def test_settings_that_cannot_be_are_refused(settings):
     with pytest.raises(ValueError):
         CalibratedRayTracer(**settings)
@@ -145,14 +160,20 @@ def test_it_predicts_where_nobody_measured_and_is_stored(wall, tmp_path):
     for steps in (0, 60):
         method = CalibratedRayTracer(steps=steps, **settings)
         assert method.fit(data, FOLD, FitContext()).seconds > 0
-        said_db, true_db = (10 * torch.log10(v[:, 0]) for v in (method.predict(test).mean, test.target))
+        said_db, true_db = (
+            10 * torch.log10(v[:, 0]) for v in (method.predict(test).mean, test.target)
+        )
         error[steps] = float((said_db - true_db).square().mean().sqrt())
     assert error[60] < 0.3 and error[60] < 0.5 * error[0]
-    config = "model: {_target_: gsparc.models.peers.calibrated_raytracer.CalibratedRayTracer, depth: 2, "
+    config = (
+        "model: {_target_: gsparc.models.peers.calibrated_raytracer.CalibratedRayTracer, depth: 2, "
+    )
     config += "diffraction: false, samples: 20000, batch: 100}"
     checkpoint.save(tmp_path / "model.ckpt", method, config)
     again, _ = loading.load(tmp_path / "model.ckpt")
-    torch.testing.assert_close(again.predict(test).mean, method.predict(test).mean, rtol=1e-4, atol=0)
+    torch.testing.assert_close(
+        again.predict(test).mean, method.predict(test).mean, rtol=1e-4, atol=0
+    )
 
 
 @pytest.mark.slow
@@ -167,5 +188,7 @@ def test_channels_are_predicted_up_to_one_factor(wall):
     method = CalibratedRayTracer(depth=2, diffraction=False, samples=20_000, batch=100)
     method.fit(data, FOLD, FitContext())
     test = data.batch(FOLD.test)
-    missed = (method.predict(test).mean - test.target).abs().square().sum() / test.target.abs().square().sum()
+    missed = (
+        method.predict(test).mean - test.target
+    ).abs().square().sum() / test.target.abs().square().sum()
     assert missed < 0.05

@@ -43,8 +43,11 @@ def test_gsrf_lets_opposite_phases_cancel(tmp_path):
     method = fitted("gsrf", data, fold, tmp_path, count=2, max_steps=1, degree=1, order=1)
     net = method.network
     with torch.no_grad():
-        net.field.means[:] = torch.as_tensor(data.rx_position[0]) + torch.tensor([[0, 0, 2.0], [0, 0, 2.001]])
-        net.field.opacity_logits[:] = torch.tensor([0.0, 8.0])  # 0.5 of the first, the rest of the second
+        net.field.means[:] = torch.as_tensor(data.rx_position[0]) + torch.tensor(
+            [[0, 0, 2.0], [0, 0, 2.001]]
+        )
+        # 0.5 of the first, the rest of the second
+        net.field.opacity_logits[:] = torch.tensor([0.0, 8.0])
         net.coefficients[:] = 0
         net.coefficients[0, 0, 0] = 1.0
     batch, brightest = data.batch(fold.test[:1]), []
@@ -55,11 +58,26 @@ def test_gsrf_lets_opposite_phases_cancel(tmp_path):
     assert brightest[1] < 0.35 * brightest[0]
 
 
-@pytest.mark.parametrize(("name", "settings", "share"), [
-    ("gsrf", {"count": 60, "max_steps": 150, "rate": 8e-3}, 0.75),
-    pytest.param("nerf2", {"width": 32, "depth": 4, "samples": 12, "rays": 512, "octaves": 2,
-                 "max_steps": 800, "rate": 5e-3}, 0.75, marks=pytest.mark.slow),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "settings", "share"),
+    [
+        ("gsrf", {"count": 60, "max_steps": 150, "rate": 8e-3}, 0.75),
+        pytest.param(
+            "nerf2",
+            {
+                "width": 32,
+                "depth": 4,
+                "samples": 12,
+                "rays": 512,
+                "octaves": 2,
+                "max_steps": 800,
+                "rate": 5e-3,
+            },
+            0.75,
+            marks=pytest.mark.slow,
+        ),
+    ],
+)
 def test_lobes_that_come_and_go_are_learned(tmp_path, name, settings, share):
     data, fold = lobes(tmp_path)
     known = error(fitted("mean", data, fold, tmp_path), data, fold.test)
@@ -69,23 +87,33 @@ def test_lobes_that_come_and_go_are_learned(tmp_path, name, settings, share):
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "share"), [("swiftwrf", 0.05), ("wrfgs", 0.15)])
 def test_deformed_gaussians_follow_what_moves(tmp_path, name, share):
-    """A few Gaussians are enough when they move along; standing still they would show the mean picture."""
+    """A few Gaussians are enough when they move along;
+    standing still they would show the mean picture.
+    """
     data, fold = wandering()
     known = error(fitted("mean", data, fold, tmp_path), data, fold.test)
-    method = fitted(name, data, fold, tmp_path, count=40, max_steps=150, batch_size=8, rate=8e-3, octaves=1)
+    method = fitted(
+        name, data, fold, tmp_path, count=40, max_steps=150, batch_size=8, rate=8e-3, octaves=1
+    )
     assert error(method, data, fold.test) < share * known
 
 
 @pytest.mark.slow
 def test_a_carrier_that_nothing_was_learned_from_is_between_its_neighbours(tmp_path):
-    """Lobes that come and go with the carrier: a network that did not read it would show their mean."""
+    """Lobes that come and go with the carrier:
+    a network that did not read it would show their mean.
+    """
     carrier = np.array([1.0, 2.0, 4.0, 8.0, 16.0])
     place = np.random.default_rng(0).uniform([-1, -1, 1], [1, 1, 3], (24, 3))
     towards = SphereGrid.hemisphere(12, 24).directions().numpy()
     lobes = np.exp(8 * (np.stack([towards @ axis for axis in np.eye(3)[:2]], -1) - 1))  # (H, W, 2)
     octave = np.tile(np.log2(carrier) / 4, len(place))
     spectrum = (lobes @ np.stack([octave, 1 - octave])).transpose(2, 0, 1).astype(np.float32)
-    arrays = {"tx_position": np.repeat(place, 5, axis=0), "rx_position": np.zeros(3), "spectrum": spectrum}
+    arrays = {
+        "tx_position": np.repeat(place, 5, axis=0),
+        "rx_position": np.zeros(3),
+        "spectrum": spectrum,
+    }
     data = from_arrays({**arrays, "carrier_hz": np.tile(carrier, len(place)) * 1e9})
     rows = np.arange(len(data))
     fold = Fold(rows[rows % 5 != 1], rows[:0], rows[rows % 5 == 1])
@@ -118,7 +146,9 @@ def test_ngrf_shows_its_waves_through_an_array(tmp_path):
 
 
 def test_rays_that_meet_by_chance_are_no_virtual_transmitter():
-    """Of 126 in a conference room 100 had fewer than five rays, some of them taken from the true ones."""
+    """Of 126 in a conference room 100 had fewer than five rays,
+    some of them taken from the true ones.
+    """
     data, _, sources = room(60, directions=True)
     rays = [d.astype(float) for d in data.directions]
     for i in (0, np.linalg.norm(data.rx_position[1:] - data.rx_position[0], axis=1).argmin() + 1):
@@ -135,7 +165,9 @@ def test_rays_that_meet_by_chance_are_no_virtual_transmitter():
 def test_newrf_asks_the_neighbours_how_many_paths_there_are(tmp_path):
     """A query had as many as training receivers have on average."""
     data, fold, _ = room(40, directions=True)
-    net = fitted("newrf", data, fold, tmp_path, width=8, samples=8, max_steps=1, neighbours=3).network
+    net = fitted(
+        "newrf", data, fold, tmp_path, width=8, samples=8, max_steps=1, neighbours=3
+    ).network
     votes = torch.zeros(6, 6)
     votes[:3, 0] = votes[3:, 1:] = votes[0, 1] = 1  # one of the first three sees another
     places = torch.eye(3)[:1] * torch.tensor([0.0, 0.1, 0.2, 9.0, 9.1, 9.2])[:, None]
@@ -154,19 +186,30 @@ def test_newrf_opaque_samples_give_no_nan(tmp_path):
     loss = method.network.loss(batch, torch.Generator().manual_seed(0))
     loss.backward()
     assert torch.isfinite(loss)
-    assert all(torch.isfinite(p.grad).all() for p in method.network.parameters() if p.grad is not None)
+    assert all(
+        torch.isfinite(p.grad).all() for p in method.network.parameters() if p.grad is not None
+    )
 
 
 @pytest.mark.slow
 def test_newrf_predicts_where_no_direction_was_measured(tmp_path):
     data, fold, _ = room(80, directions=True)
-    settings = {"width": 48, "depth": 3, "octaves": 3, "samples": 24, "max_steps": 250, "rate": 4e-3}
+    settings = {
+        "width": 48,
+        "depth": 3,
+        "octaves": 3,
+        "samples": 24,
+        "max_steps": 250,
+        "rate": 4e-3,
+    }
     method = fitted("newrf", data, fold, tmp_path, **settings)
     where = data.batch(fold.test)
     plain = error(fitted("gp", data, fold, tmp_path), data, fold.test)
     assert error(method, data, fold.test) < 0.3 * min(plain, 1.0)
     moved = Pose(where.rx.position + 0.5, where.rx.rotation)
-    assert not torch.allclose(method.predict(where).mean, method.predict(Query(where.tx, moved)).mean)
+    assert not torch.allclose(
+        method.predict(where).mean, method.predict(Query(where.tx, moved)).mean
+    )
 
 
 def test_kriging_knows_how_far_shadows_reach(tmp_path):
@@ -194,7 +237,9 @@ def test_kriging_maps_the_power_of_channels(tmp_path, campaign, folds):
     said = method.predict(batch).mean
     assert said.shape == batch.target.shape and said.is_complex()
     rows = data.batch(fold.train)  # at a measured place the map is the measurement, less the nugget
-    method.variogram = type(method.variogram)(0.0, method.variogram.variance, method.variogram.range)
+    method.variogram = type(method.variogram)(
+        0.0, method.variogram.variance, method.variogram.range
+    )
     method._factor_system()
     there = method.predict(rows).mean
     assert torch.allclose(there, rows.target, atol=1e-2 * float(rows.target.abs().max()))

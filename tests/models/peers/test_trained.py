@@ -1,4 +1,6 @@
-"""What every peer trained by gradient keeps to: its steps, its kinds, its checkpoint, the test rows."""
+"""What every peer trained by gradient keeps to: its steps, its kinds, its checkpoint,
+the test rows.
+"""
 
 import signal
 from dataclasses import replace
@@ -27,9 +29,15 @@ from gsparc.runs.experiment.folds import build_callbacks
 from gsparc.training.context import FitContext
 from gsparc.training.effort import Effort
 
-SMALL = {"gsrf": {"count": 40}, "wrfgs": {"count": 40}, "swiftwrf": {"count": 40}, "ngrf": {"count": 20},
-         "wideband": {"count": 20},
-         "newrf": {"width": 16, "samples": 8}, "nerf2": {"width": 16, "samples": 8, "rays": 64}}  # fmt: skip
+SMALL = {
+    "gsrf": {"count": 40},
+    "wrfgs": {"count": 40},
+    "swiftwrf": {"count": 40},
+    "ngrf": {"count": 20},
+    "wideband": {"count": 20},
+    "newrf": {"width": 16, "samples": 8},
+    "nerf2": {"width": 16, "samples": 8, "rays": 64},
+}
 
 
 def brief(name: str, **more):
@@ -71,14 +79,21 @@ class Cut(L.Callback):
 
 
 def test_peers_had_loops_of_their_own(tmp_path):
-    """Options of the Trainer, callbacks and loggers did nothing, and an interrupted one could not go on."""
+    """Options of the Trainer, callbacks and loggers did nothing,
+    and an interrupted one could not go on.
+    """
     torch.set_num_threads(1)
     data, fold = lobes(tmp_path)
 
     def taught(folder, *more, **given):
-        method, trainer = brief("nerf2", max_steps=99), partial(DEFAULTS, max_steps=30, log_every_n_steps=10)
+        method, trainer = (
+            brief("nerf2", max_steps=99),
+            partial(DEFAULTS, max_steps=30, log_every_n_steps=10),
+        )
         callbacks = [*build_callbacks(compose("model=nerf2").callbacks), *more]
-        context = FitContext(tmp_path / folder, trainer=trainer, callbacks=lambda: callbacks, **given)
+        context = FitContext(
+            tmp_path / folder, trainer=trainer, callbacks=lambda: callbacks, **given
+        )
         return method, method.fit(data, fold, context)
 
     counted, logger = Cut(), CSVLogger(tmp_path, "log")
@@ -95,11 +110,19 @@ def test_peers_had_loops_of_their_own(tmp_path):
     for name, value in whole.fitted().state_dict().items():
         assert torch.equal(value, goes_on.fitted().state_dict()[name]), name
     other = Fold(fold.train[1:], fold.val, fold.test)
-    refused("was trained with other rows", brief("nerf2").fit, data, other, FitContext(tmp_path, resume=last))
+    refused(
+        "was trained with other rows",
+        brief("nerf2").fit,
+        data,
+        other,
+        FitContext(tmp_path, resume=last),
+    )
 
 
 def test_a_station_that_an_interrupted_run_had_not_begun_was_refused(tmp_path):
-    """Of ten carriers eight were trained before a kill: the ninth had no folder, `no such checkpoint`."""
+    """Of ten carriers eight were trained before a kill: the ninth had no folder,
+    `no such checkpoint`.
+    """
     data, fold = lobes(tmp_path)
     context = FitContext(
         tmp_path / "station8", resume=tmp_path / "station8", trainer=partial(DEFAULTS, max_steps=2)
@@ -123,7 +146,9 @@ def test_a_published_method_may_watch_validation_rows(tmp_path):
         assert torch.equal(value, again.fitted().state_dict()[name]), name
 
 
-def test_a_fit_that_may_write_nowhere_left_a_checkpoint_in_the_working_directory(tmp_path, monkeypatch):
+def test_a_fit_that_may_write_nowhere_left_a_checkpoint_in_the_working_directory(
+    tmp_path, monkeypatch
+):
     data, fold = lobes(tmp_path)
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
@@ -150,7 +175,9 @@ def test_a_loss_that_is_not_finite_stops_training(tmp_path):
         brief("ngrf").fit(data, fold, FitContext(tmp_path))
 
 
-@pytest.mark.parametrize(("name", "kind"), [("gsrf", "spectrum"), ("gsrf", "csi"), ("wrfgs", "spectrum")])
+@pytest.mark.parametrize(
+    ("name", "kind"), [("gsrf", "spectrum"), ("gsrf", "csi"), ("wrfgs", "spectrum")]
+)
 def test_a_peer_shows_its_gaussians_and_what_they_emit(tmp_path, name, kind):
     data, fold = lobes(tmp_path) if kind == "spectrum" else room(40, directions=True)[:2]
     method = brief(name)

@@ -41,11 +41,15 @@ def fitted(data):
 
 
 def error_db(method, batch) -> float:
-    return float((10 * torch.log10(method.predict(batch).mean / batch.target)).square().mean().sqrt())
+    return float(
+        (10 * torch.log10(method.predict(batch).mean / batch.target)).square().mean().sqrt()
+    )
 
 
 def test_gains_of_nodes_were_shadows_of_links(tmp_path):
-    """A mesh had 2.9 dB where noise is 1 dB: each link was told by links with both ends near alone."""
+    """A mesh had 2.9 dB where noise is 1 dB:
+    each link was told by links with both ends near alone.
+    """
     method, batch = fitted(mesh(3.0))
     kernel = method.powers.kernel
     assert [type(term) for term in kernel.signals] == [Shadowing, EndShadowing, EndShadowing]
@@ -85,7 +89,9 @@ def test_covariance_is_of_one_end_with_slopes(other):
     moved = places.detach().clone()
     moved[:, :3] += 1.0 if other else 0.0
     moved[:, 3:] += 0.0 if other else 1.0
-    torch.testing.assert_close(term.covariance(moved, moved), term.covariance(places, places).detach())
+    torch.testing.assert_close(
+        term.covariance(moved, moved), term.covariance(places, places).detach()
+    )
     kernel = Kernel((Shadowing(1.0, 0.5), term, WhiteNoise(0.1)))
     again = kernel.with_values(kernel.parameters())
     torch.testing.assert_close(again.gram(moved), kernel.gram(moved))

@@ -1,4 +1,6 @@
-"""The field of powers: the plain process without Gaussians, known walls, rows left out, slopes, state."""
+"""The field of powers: the plain process without Gaussians, known walls, rows left out, slopes,
+state.
+"""
 
 import copy
 import math
@@ -20,17 +22,24 @@ TOWN_WALL = "walls: [{corners_m: [[25, 18, 0], [25, 45, 0], [25, 45, 12], [25, 1
 
 
 def town(count: int, walls: bool = True, seed: int = 0) -> Measurements:
-    """A square before a station: a law, a wall of 15 dB, 2 dB of shadowing over 5 m, 1 dB of noise."""
+    """A square before a station: a law, a wall of 15 dB, 2 dB of shadowing over 5 m,
+    1 dB of noise.
+    """
     rng = np.random.default_rng(seed)
     places = np.c_[rng.uniform(10, 50, count), rng.uniform(0, 40, count), np.full(count, 1.5)]
     decibels = -30 - 25 * np.log10(np.linalg.norm(places - STATION, axis=1))
     if walls:
-        height = 20 + (places[:, 1] - 20) * (25 - 5) / (places[:, 0] - 5)  # where a path crosses x = 25 m
+        # Where a path crosses x = 25 m
+        height = 20 + (places[:, 1] - 20) * (25 - 5) / (places[:, 0] - 5)
         decibels = decibels - 15.0 * ((places[:, 0] > 25) & (height > 18))
     waves = rng.normal(size=(3, 100)) / 5
-    decibels += 2 * np.cos(places @ waves + rng.uniform(0, 2 * np.pi, 100)) @ rng.normal(size=100) / 7
+    decibels += (
+        2 * np.cos(places @ waves + rng.uniform(0, 2 * np.pi, 100)) @ rng.normal(size=100) / 7
+    )
     decibels += rng.standard_normal(count)
-    return from_arrays({"rx_position": places, "tx_position": STATION, "rssi_db": decibels}, {"name": "town"})
+    return from_arrays(
+        {"rx_position": places, "tx_position": STATION, "rssi_db": decibels}, {"name": "town"}
+    )
 
 
 def db(power: torch.Tensor) -> np.ndarray:
@@ -55,10 +64,14 @@ def test_settings_are_chosen_on_rows_that_no_clock_counts():
 
 
 def test_two_rows_behind_known_walls_were_known_to_a_thousandth_of_a_decibel(tmp_path):
-    """A distance law goes through both: variances of 7e-9 dB^2 at places that were missed by 8 dB."""
+    """A distance law goes through both: variances of 7e-9 dB^2 at places
+    that were missed by 8 dB.
+    """
     (tmp_path / "town.yaml").write_text(TOWN_WALL, encoding="utf-8")
     data = town(40)
-    field, notes = fitted_to(PowerField(walls=read_walls(tmp_path / "town.yaml")), data, np.arange(2))
+    field, notes = fitted_to(
+        PowerField(walls=read_walls(tmp_path / "town.yaml")), data, np.arange(2)
+    )
     told = field.predict(data.batch(np.arange(2, 40)))
     spread = told.variance.sqrt() / told.mean[:, 0] * 10 / math.log(10)
     assert float(spread.min()) > 1.0 and "a constant, with fewer than 8 rows" in notes[0]
@@ -72,7 +85,9 @@ def test_known_walls_tell_more_than_few_rows_find(rows, tmp_path):
     errors = []
     for walls in (read_walls(tmp_path / "town.yaml"), None):
         field, _ = fitted_to(PowerField(walls=walls), data, rows)
-        errors.append(float(np.sqrt(np.mean((db(field.predict(batch).mean) - db(batch.target)) ** 2))))
+        errors.append(
+            float(np.sqrt(np.mean((db(field.predict(batch).mean) - db(batch.target)) ** 2)))
+        )
     assert errors[0] < 0.75 * errors[1], errors
 
 

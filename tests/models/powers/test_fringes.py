@@ -1,4 +1,6 @@
-"""Coherent waves from powers alone: the fit, its worth beside a process, and the field with both."""
+"""Coherent waves from powers alone: the fit, its worth beside a process,
+and the field with both.
+"""
 
 import numpy as np
 import pytest
@@ -56,7 +58,9 @@ def test_fringes_predict_better_than_the_process_alone(interfering):
 
 @pytest.mark.slow
 def test_fringes_were_judged_beside_a_process_of_some_rows(monkeypatch):
-    """A plane of 16,000 rows: 42 % between rows for waves, 2.16 dB, where the process alone has 2.07."""
+    """A plane of 16,000 rows: 42 % between rows for waves, 2.16 dB,
+    where the process alone has 2.07.
+    """
     monkeypatch.setattr("gsparc.models.powers.fringes.MOST_ROWS", 150)
     monkeypatch.setattr("gsparc.models.powers.fringes.ROWS_PER_WAVE", 1)
     data = plane(400)
@@ -86,7 +90,8 @@ def test_rows_are_predicted_by_solutions_that_never_saw_them(interfering):
     batch = data.batch(np.arange(400))
     seen = db(field.predict(batch).mean) - db(batch.target)
     alone = field.powers.left_out(field.at)[0].numpy().reshape(-1) - db(data.targets(found.rows))
-    # A search's waves differ by rounding from processor to processor: 5 % better here, 5 % worse there.
+    # A search's waves differ by rounding from processor to processor: 5 % better here,
+    # 5 % worse there.
     errors = [np.mean(one**2) for one in (seen, error, alone)]
     assert errors[0] < 0.8 * errors[1] and errors[1] < 1.1 * errors[2], errors
 
@@ -119,4 +124,6 @@ def test_what_is_sampled():
 def test_a_blend_goes_from_rows_to_groups_to_nothing():
     distance = torch.tensor([0.0, 0.15, 0.3, 1.5, 5.0])
     share, factor = Blend((0.1, 0.2), (0.2, 0.6), (0.9, 0.7)).share_and_inflation(distance, 1.0)
-    assert np.allclose(share, [0.2, 0.4, 0.6, 0.3, 0.0]) and np.allclose(factor, [0.9, 0.8, 0.7, 0.85, 1.0])
+    assert np.allclose(share, [0.2, 0.4, 0.6, 0.3, 0.0]) and np.allclose(
+        factor, [0.9, 0.8, 0.7, 0.85, 1.0]
+    )

@@ -1,4 +1,6 @@
-"""The mean of processes of powers, by squares of floor left out: its shares, variance, state and slopes."""
+"""The mean of processes of powers, by squares of floor left out: its shares, variance,
+state and slopes.
+"""
 
 from dataclasses import replace
 
@@ -36,9 +38,13 @@ def station(number: int, rows: int, seed: int) -> Measurements:
 def walks(count: int = 160, silent: float = 0.0) -> Measurements:
     """Five streets of a town, shadowing over 30 m, and what is too weak unheard."""
     rng = np.random.default_rng(6)
-    places = np.c_[rng.uniform(0, 400, count), 80.0 * rng.integers(0, 5, count), np.full(count, 1.5)]
+    places = np.c_[
+        rng.uniform(0, 400, count), 80.0 * rng.integers(0, 5, count), np.full(count, 1.5)
+    ]
     still, waves = np.array([150.0, 130.0, 20.0]), rng.normal(size=(3, 100)) / 30
-    decibels = -30 - 28 * np.log10(np.linalg.norm(places - still, axis=1)) + rng.standard_normal(count)
+    decibels = (
+        -30 - 28 * np.log10(np.linalg.norm(places - still, axis=1)) + rng.standard_normal(count)
+    )
     decibels += 4 * np.cos(places @ waves + rng.uniform(0, 2 * np.pi, 100)).sum(1) / 7
     arrays = {"rx_position": places, "tx_position": still, "rssi_db": decibels}
     data = from_arrays(arrays, {"name": "streets"})
@@ -75,7 +81,9 @@ def errors_db(number: int, rows: int, seed: int, split: SplitSettings) -> tuple[
 
 @pytest.mark.slow
 def test_one_process_of_neighbours_was_trusted_in_squares_that_nobody_walked():
-    """7.24 dB in squares of 300 m where ordinary kriging has 6.31: the likeliest process was taken alone."""
+    """7.24 dB in squares of 300 m where ordinary kriging has 6.31:
+    the likeliest process was taken alone.
+    """
     own, alone = errors_db(7, 300, 106, SplitSettings("blocks", side_m=300.0, seed=1))
     assert own < 0.96 * alone, (own, alone)
 
@@ -93,7 +101,9 @@ def test_a_mixture_is_the_mean_of_its_members(silent):
     field = fitted(data, np.arange(140))
     process, batch = field.powers, data.batch(np.arange(140, 160))
     assert process is not None and len(process.members) > 1
-    assert np.isclose(sum(share for share, _ in process.members), 1) and process.members[0][0] >= 0.3
+    assert (
+        np.isclose(sum(share for share, _ in process.members), 1) and process.members[0][0] >= 0.3
+    )
     places = batch.places(data.site)
     mean, variance, unknown = process.answer(places)
     parts = [(share, *one.answer(places)) for share, one in process.members]

@@ -42,17 +42,24 @@ def town(count: int = 160) -> dict[str, np.ndarray]:
     rng = np.random.default_rng(0)
     at = np.c_[rng.uniform(345, 400, count), rng.uniform(-180, -20, count), np.full(count, 1.5)]
     way = at - STILL
-    # The left and right edges are met first and last where a path is not too steep, else the long ones.
+    # The left and right edges are met first and last where a path is not too steep,
+    # else the long ones.
     enter = np.maximum(10 / way[:, 0], 0)
     leave = np.minimum(40 / way[:, 0], 20 / np.maximum(abs(way[:, 1]), 1e-9))
     inside = np.maximum(leave - enter, 0) * np.linalg.norm(way, axis=1)
-    level = -30 - 25 * np.log10(np.linalg.norm(way, axis=1)) - 0.4 * inside + rng.normal(0, 1, count)
+    level = (
+        -30 - 25 * np.log10(np.linalg.norm(way, axis=1)) - 0.4 * inside + rng.normal(0, 1, count)
+    )
     return {"rx": at, "rssi": level, "inside": inside}
 
 
 def test_the_length_inside_a_polygon_is_that_of_its_clipped_path(trees):
     data = town()
-    found = trees(GROVE).columns(torch.from_numpy(np.c_[data["rx"], np.tile(STILL, (160, 1))]))[:, 0].numpy()
+    found = (
+        trees(GROVE)
+        .columns(torch.from_numpy(np.c_[data["rx"], np.tile(STILL, (160, 1))]))[:, 0]
+        .numpy()
+    )
     np.testing.assert_allclose(found, data["inside"], atol=1e-9)
 
 
@@ -73,14 +80,19 @@ def test_a_term_of_ones_own_is_learned_stored_and_read(trees, tmp_path):
 
 
 def test_each_of_several_stations_has_the_term_of_paths_to_it(trees, caplog):
-    """`model=gsparc` and several stations refused terms, which had to be told where the other end stood."""
+    """`model=gsparc` and several stations refused terms,
+    which had to be told where the other end stood.
+    """
     data = town(60)
     powers = np.c_[data["rssi"], data["rssi"]]
     where = np.array([STILL, [300.0, -100.0, 50.0]])
     caplog.set_level("INFO")
     groves = [trees(GROVE), trees([[x + 32, y] for x, y in GROVE])]
     given = gsparc.fit(rx=data["rx"], rssi=powers, station_position=where, terms=groves)
-    assert all(f"Trees {k}: " in caplog.text for k in (1, 2)) and caplog.text.count("(of 2 stations") == 2
+    assert (
+        all(f"Trees {k}: " in caplog.text for k in (1, 2))
+        and caplog.text.count("(of 2 stations") == 2
+    )
     copies = dict(given.method)
     assert len(copies) == 2
     for number, copy in copies.items():
@@ -92,7 +104,8 @@ def test_each_of_several_stations_has_the_term_of_paths_to_it(trees, caplog):
 def test_stations_say_one_weight_of_all():
     """Of twelve stations each said its own in a line of its own."""
     rng = np.random.default_rng(0)
-    told = rng.normal(-3.0, np.hypot(0.5, 1.0), 12)  # 1 dB between stations beside what each is unsure of
+    # 1 dB between stations beside what each is unsure of
+    told = rng.normal(-3.0, np.hypot(0.5, 1.0), 12)
     numbers = [np.array([[weight], [0.5], [0.0], [5.0]]) for weight in told]
     alone = [own_terms.LearnedWeights.from_numbers("Wood", one) for one in numbers]
     (line,) = set(own_terms.pool_station_weights(["a law", *alone]).values())
@@ -108,11 +121,15 @@ def test_a_prior_in_decibels_is_a_setting_of_the_term(trees):
     known = {"rx": data["rx"], "tx": STILL, "rssi": data["rssi"], "model": "powers"}
     told = gsparc.fit(**known, terms=[trees(GROVE, (-0.4, 1e-4))]).method.member.trend.more[0]
     assert told.weight_prior[0] == -0.4 and told.weight_prior[1] * told.unit == pytest.approx(1e-4)
-    refused(r"Trees\.prior_db=3: say \[mean, deviation\]", gsparc.fit, **known, terms=[trees(GROVE, 3)])
+    refused(
+        r"Trees\.prior_db=3: say \[mean, deviation\]", gsparc.fit, **known, terms=[trees(GROVE, 3)]
+    )
 
 
 def test_a_term_behind_which_all_rows_lie_was_surely_nothing():
-    """The level took what all rows lose, and 0 +- .6 was said of 3 dB a unit; columns are centred now."""
+    """The level took what all rows lose, and 0 +- .6 was said of 3 dB a unit;
+    columns are centred now.
+    """
 
     class Band(term.Columns):
         def columns(self, places):
@@ -128,12 +145,16 @@ def test_a_term_behind_which_all_rows_lie_was_surely_nothing():
 
 def test_a_term_needs_both_ends_and_powers(trees):
     data = town(40)
-    with pytest.raises(ValueError, match="finite numbers are needed, but the place of the end that stands"):
+    with pytest.raises(
+        ValueError, match="finite numbers are needed, but the place of the end that stands"
+    ):
         gsparc.fit(rx=data["rx"], rssi=data["rssi"], terms=trees(GROVE))
     with pytest.raises(ValueError, match=r"model\.terms are of received powers"):
         csi = np.ones((40, 1, 1), complex)
         gsparc.fit(rx=data["rx"], tx=STILL, csi=csi, frequency_hz=[1e9], terms=trees(GROVE))
-    with pytest.raises(ValueError, match=r"model\.terms are of received powers; the target is spectrum"):
+    with pytest.raises(
+        ValueError, match=r"model\.terms are of received powers; the target is spectrum"
+    ):
         images = np.random.default_rng(0).uniform(size=(40, 8, 16))
         gsparc.fit(tx=data["rx"], rx=STILL, spectrum=images, terms=trees(GROVE))
 
@@ -142,14 +163,23 @@ def test_a_term_of_a_notebook_was_stored_without_a_word(trees, monkeypatch, capl
     monkeypatch.setattr(trees, "__module__", "__main__")
     assert own_terms.to_terms(trees(GROVE))
     assert "Trees is of a notebook or script" in caplog.text
-    refused(r"'__main__\.Gone' is of a notebook or script: define it here", stored.find_kind, "__main__.Gone")
+    refused(
+        r"'__main__\.Gone' is of a notebook or script: define it here",
+        stored.find_kind,
+        "__main__.Gone",
+    )
 
 
 def test_a_term_that_cannot_be_imported_was_an_empty_error():
     """Hydra said `Error loading 'nowhere.Trees':` and no more."""
     said = r"nowhere\.Trees cannot be imported \(ModuleNotFoundError: No module named 'nowhere'\)"
     with pytest.raises(ValueError, match=said):
-        build({"_target_": "gsparc.models.mixture.methods.Powers", "terms": [{"_target_": "nowhere.Trees"}]})
+        build(
+            {
+                "_target_": "gsparc.models.mixture.methods.Powers",
+                "terms": [{"_target_": "nowhere.Trees"}],
+            }
+        )
 
 
 def test_columns_of_another_shape_are_refused_by_the_name_of_their_term(trees):
@@ -159,7 +189,9 @@ def test_columns_of_another_shape_are_refused_by_the_name_of_their_term(trees):
 
     data = town(40)
     own = {"terms": Flat(GROVE)}  # one alone needs no list
-    with pytest.raises(ValueError, match=r"Flat.columns gave \(40,\); \(40, Q\) finite numbers are needed"):
+    with pytest.raises(
+        ValueError, match=r"Flat.columns gave \(40,\); \(40, Q\) finite numbers are needed"
+    ):
         gsparc.fit(rx=data["rx"], tx=STILL, rssi=data["rssi"], model="powers", settings=own)
 
     class Arrays(trees):
@@ -188,7 +220,9 @@ def test_terms_of_the_command_line_are_learned_said_and_stored(trees, tmp_path):
     grove = f"model.terms=[{{_target_: trees.Trees, corners: {GROVE}}}]".replace(" ", "")
     folder = tmp_path / "run"
     settings = [f"dataset.file={file}", f"hydra.run.dir={folder}", "baselines=[]", "logger=none"]
-    answer = knock(COMMANDS["train"].run, "gsparc train", ["dataset=own", "model=gsparc", *settings, grove])
+    answer = knock(
+        COMMANDS["train"].run, "gsparc train", ["dataset=own", "model=gsparc", *settings, grove]
+    )
     assert answer.status == 0, answer
     log = (folder / "train.log").read_text()
     said = re.search(r"Trees: (\S+) \+- (\S+)", log)
@@ -211,10 +245,16 @@ def test_opening_a_checkpoint_runs_nothing_that_its_terms_name(tmp_path):
     assert not made.exists()
 
 
-@pytest.mark.parametrize(("model", "terms", "says"), [
-    ("kriging", [], "settings: model='kriging' has no 'terms'"), ("powers", [3], "3 is not a gsparc"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("model", "terms", "says"),
+    [
+        ("kriging", [], "settings: model='kriging' has no 'terms'"),
+        ("powers", [3], "3 is not a gsparc"),
+    ],
+)
 def test_a_setting_that_the_model_lacks_is_named(model, terms, says):
     data = town(40)
     with pytest.raises(ValueError, match=says):
-        gsparc.fit(rx=data["rx"], tx=STILL, rssi=data["rssi"], model=model, settings={"terms": terms})
+        gsparc.fit(
+            rx=data["rx"], tx=STILL, rssi=data["rssi"], model=model, settings={"terms": terms}
+        )

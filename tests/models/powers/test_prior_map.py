@@ -50,7 +50,9 @@ def rasters(tmp_path):
     how = {"width": len(AXIS), "height": len(AXIS), "dtype": "float64", "driver": "GTiff"}
     for name, towns in (("right", (1,)), ("wrong", (7,)), ("two", (7, 1))):
         at = from_origin(0, 700, 10, 10)
-        with rasterio.open(tmp_path / f"{name}.tif", "w", count=len(towns), transform=at, **how) as file:
+        with rasterio.open(
+            tmp_path / f"{name}.tif", "w", count=len(towns), transform=at, **how
+        ) as file:
             for band, town in enumerate(towns, 1):
                 file.write(planned(squares, town).reshape(len(AXIS), -1)[::-1], band)
                 if len(towns) > 1:
@@ -59,16 +61,36 @@ def rasters(tmp_path):
 
 
 def raster(
-    path, level, unit="", scale=1.0, offset=0.0, nodata=None, width=None, dtype="float64", names=("",)
+    path,
+    level,
+    unit="",
+    scale=1.0,
+    offset=0.0,
+    nodata=None,
+    width=None,
+    dtype="float64",
+    names=("",),
 ):
-    """A GeoTIFF of levels (M,) [dB] on the squares of the town, stored as (level - offset) / scale."""
+    """A GeoTIFF of levels (M,) [dB] on the squares of the town, stored as (level - offset)
+    / scale.
+    """
     stored = (level.reshape(len(AXIS), -1)[::-1, :width] - offset) / scale
-    how = {"height": len(AXIS), "width": stored.shape[1], "dtype": dtype, "driver": "GTiff", "nodata": nodata}
-    with rasterio.open(path, "w", count=len(names), transform=from_origin(0, 700, 10, 10), **how) as file:
+    how = {
+        "height": len(AXIS),
+        "width": stored.shape[1],
+        "dtype": dtype,
+        "driver": "GTiff",
+        "nodata": nodata,
+    }
+    with rasterio.open(
+        path, "w", count=len(names), transform=from_origin(0, 700, 10, 10), **how
+    ) as file:
         for band, name in enumerate(names, 1):
             file.write(stored.astype(dtype), band)
             file.set_band_description(band, name)
-        file.scales, file.offsets, file.units = ([one] * len(names) for one in (scale, offset, unit))
+        file.scales, file.offsets, file.units = (
+            [one] * len(names) for one in (scale, offset, unit)
+        )
     return path
 
 
@@ -82,14 +104,18 @@ def miss(model, asked):
 
 def fit(rows, prior=None, **more):
     settings = {} if prior is None else {"prior": prior}
-    return gsparc.fit(**{"rx": rows, "tx": POST, "rssi": measured(rows), "settings": settings, **more})
+    return gsparc.fit(
+        **{"rx": rows, "tx": POST, "rssi": measured(rows), "settings": settings, **more}
+    )
 
 
 @pytest.mark.parametrize("count", [10, 40])
 def test_a_map_helps_where_it_is_right_and_is_left_out_where_it_is_not(rasters, count):
     rows, asked = draw(count, 103), draw(400, 4)
     found = [fit(rows, one and rasters / f"{one}.tif") for one in (None, "right", "wrong")]
-    error = [np.sqrt(np.mean((one.rssi(rx=asked)[:, 0] - measured(asked, 1)) ** 2)) for one in found]
+    error = [
+        np.sqrt(np.mean((one.rssi(rx=asked)[:, 0] - measured(asked, 1)) ** 2)) for one in found
+    ]
     assert error[1] < 0.7 * error[0] and error[2] < 1.05 * error[0], error
 
 
@@ -99,11 +125,15 @@ def test_a_map_helps_where_it_is_right_and_is_left_out_where_it_is_not(rasters, 
     ids=["scale", "offset", "dBW", "mW"],
 )
 def test_a_raster_is_read_by_its_own_scale_offset_and_unit(tmp_path, stored):
-    """Tags of bands were not read: levels a hundred times as large, and milliwatts, were taken for levels."""
+    """Tags of bands were not read: levels a hundred times as large, and milliwatts,
+    were taken for levels.
+    """
     level = planned(SQUARES)
     kept = {"dBW": level - 30, "mW": 10 ** (level / 10)}.get(stored.get("unit"), level)
     rows = draw(30, 3)
-    data = from_arrays({"rx_position": rows, "tx_position": np.array(POST), "rssi_db": measured(rows)})
+    data = from_arrays(
+        {"rx_position": rows, "tx_position": np.array(POST), "rssi_db": measured(rows)}
+    )
     found = read_prior_levels(raster(tmp_path / "map.tif", kept, **stored), data)[1]
     np.testing.assert_allclose(np.sort(found), np.sort(level), atol=0.01)
     height = raster(tmp_path / "height.tif", level, unit="m")
@@ -125,12 +155,14 @@ def test_marks_that_no_tag_names_are_no_levels(tmp_path, mark, caplog):
 def test_outside_the_area_of_a_map_it_is_its_own_law_of_distance(tmp_path):
     """Half of the town had the levels of the other half's edge, and was worse than no map."""
     rows, asked = draw(40, 103), draw(400, 4)
-    assert miss(fit(rows, raster(tmp_path / "half.tif", planned(SQUARES), width=35)), asked) < 0.95 * miss(
-        fit(rows), asked
-    )
+    assert miss(
+        fit(rows, raster(tmp_path / "half.tif", planned(SQUARES), width=35)), asked
+    ) < 0.95 * miss(fit(rows), asked)
     still, inner = np.array(POST), SQUARES[SQUARES[:, 0] < 350]
     found = PriorMap.from_levels(inner, -30 * np.log10(np.linalg.norm(inner, axis=1)), still)
-    at = torch.tensor([[300.0, 300.0, 1], [600.0, 300.0, 1]], dtype=torch.float64, requires_grad=True)
+    at = torch.tensor(
+        [[300.0, 300.0, 1], [600.0, 300.0, 1]], dtype=torch.float64, requires_grad=True
+    )
     near, far = found.columns(at)[:, 0]
     assert float(near - far) == pytest.approx(
         30 * np.log10(600**2 + 300**2) / 2 - 30 * np.log10(300 * 2**0.5), abs=0.1
@@ -150,14 +182,20 @@ def test_outside_the_area_of_a_map_it_is_its_own_law_of_distance(tmp_path):
 def test_a_map_whose_levels_rise_otherwise_than_rows_is_said(tmp_path, caplog, levels, says):
     rows = draw(40, 103)
     model = fit(rows, raster(tmp_path / "map.tif", levels(planned(SQUARES))))
-    assert any(re.search(says, record.message) for record in caplog.records if record.levelname == "WARNING")
+    assert any(
+        re.search(says, record.message)
+        for record in caplog.records
+        if record.levelname == "WARNING"
+    )
     assert miss(model, draw(400, 4)) < 1.01 * miss(fit(rows), draw(400, 4))
     caplog.clear()
     fit(rows, raster(tmp_path / "map.tif", planned(SQUARES)))
     assert "model.prior" not in caplog.text
 
 
-def test_a_map_that_does_not_pay_at_rows_left_out_is_said_and_leaves_nothing_behind(rasters, caplog):
+def test_a_map_that_does_not_pay_at_rows_left_out_is_said_and_leaves_nothing_behind(
+    rasters, caplog
+):
     """Kernels were those of a map that was left out, and nobody said that it was."""
     rows, asked = draw(40, 103), draw(50, 4)
     found = fit(rows, rasters / "wrong.tif").rssi(rx=asked)
@@ -190,11 +228,20 @@ def test_a_model_keeps_the_map_that_it_was_given(rasters):
 
 def test_of_a_large_map_what_lies_about_the_rows_is_kept(tmp_path):
     at = from_origin(-30_000, 30_000, 50, 50)
-    how = {"width": 1200, "height": 1200, "count": 1, "dtype": "float32", "driver": "GTiff", "transform": at}
+    how = {
+        "width": 1200,
+        "height": 1200,
+        "count": 1,
+        "dtype": "float32",
+        "driver": "GTiff",
+        "transform": at,
+    }
     with rasterio.open(tmp_path / "land.tif", "w", **how) as file:
         file.write(np.random.default_rng(0).normal(-90, 5, (1200, 1200)).astype("float32"), 1)
     rows = draw(30, 3)
-    data = from_arrays({"rx_position": rows, "tx_position": np.array(POST), "rssi_db": measured(rows)})
+    data = from_arrays(
+        {"rx_position": rows, "tx_position": np.array(POST), "rssi_db": measured(rows)}
+    )
     points, level = read_prior_levels(tmp_path / "land.tif", data)
     assert len(level) < 40**2 and points.min() > -650 and points.max() < 1350
 
@@ -205,7 +252,10 @@ def test_each_station_has_the_band_of_its_name(rasters, caplog):
     posts = {"station_position": np.array([POST, POST])}
     refused(r"prior=.*two\.tif: of b, a, not of c", fit, rows, rasters / "two.tif", **both, **posts)
     found = fit(rows, rasters / "two.tif", **{**both, "station_name": ["a", "b"]}, **posts)
-    own = [any(isinstance(one.term, PriorMap) for one in copy.member.trend.more) for _, copy in found.method]
+    own = [
+        any(isinstance(one.term, PriorMap) for one in copy.member.trend.more)
+        for _, copy in found.method
+    ]
     assert own == [True, False]  # what was measured is of the town in a's band
 
 
@@ -232,7 +282,13 @@ def test_maps_that_cannot_be_meant_are_refused(rasters):
     refused(r"model\.prior=none\.tif: no such file", fit, rows, "none.tif")
     refused(r"draw it first, gsparc map ckpt=a\.ckpt", fit, rows, "a.ckpt")
     far = rows + np.array([5000.0, 0, 0])
-    refused(r"it is of x 5 to 695, .* all rows lie elsewhere: x 5\d\d\d", fit, far, path, rssi=measured(rows))
+    refused(
+        r"it is of x 5 to 695, .* all rows lie elsewhere: x 5\d\d\d",
+        fit,
+        far,
+        path,
+        rssi=measured(rows),
+    )
     channels = {"rssi": None, "csi": np.ones(30) + 0j, "frequency_hz": 1e9}
     refused(r"model\.prior is of received powers", fit, rows, path, **channels)
 
@@ -257,7 +313,13 @@ def test_a_map_of_one_end_means_nothing_where_both_move(rasters, caplog):
 def network_rasters(path, level, names):
     """A raster of each cell of a network."""
     side = round(len(level) ** 0.5)
-    how = {"width": side, "height": side, "dtype": "float64", "driver": "GTiff", "count": len(names)}
+    how = {
+        "width": side,
+        "height": side,
+        "dtype": "float64",
+        "driver": "GTiff",
+        "count": len(names),
+    }
     with rasterio.open(path, "w", transform=from_origin(0, 2500, 125, 125), **how) as file:
         file.write(level[:, : len(names)].T.reshape(-1, side, side)[:, ::-1])
         file.descriptions = [name and f"power_db {name}" for name in names]
@@ -279,7 +341,9 @@ def test_a_network_has_a_map_of_a_cell_or_of_a_site(tmp_path):
     assert under.table[0, 0] == NO_AZIMUTH and torch.equal(under.table[1:], network.table[1:])
     at = torch.tensor([[1000.0, 900, 1.5]]) - torch.from_numpy(data.site.origin)
     still = torch.from_numpy(data.site.stations.position)
-    places = [torch.cat([at[0], still[t], torch.tensor([float(t)])])[None].double() for t in range(4)]
+    places = [
+        torch.cat([at[0], still[t], torch.tensor([float(t)])])[None].double() for t in range(4)
+    ]
     known = [float(under.known_mean(place)) for place in places]
     far = [float((place[0, :3] - place[0, 3:6]).norm()) for place in places]
     level = float(found.maps[1][2].columns(at)[0, 0])
@@ -288,7 +352,11 @@ def test_a_network_has_a_map_of_a_cell_or_of_a_site(tmp_path):
     named = network_rasters(tmp_path / "none.tif", one.truth, ["x", "y"])
     refused("of x, y, not of", NetworkMaps.from_file, named, data)
     assert Powers(prior=path).why_not(data) is None
-    both = {"rx_position": draw(4, 1), "station_position": [POST, POST], "rssi_db": np.full((4, 2), -60.0)}
+    both = {
+        "rx_position": draw(4, 1),
+        "station_position": [POST, POST],
+        "rssi_db": np.full((4, 2), -60.0),
+    }
     assert "say stations=each" in Powers(prior=path).why_not(from_arrays(both))
 
 
@@ -304,7 +372,10 @@ def by_pci():
     """A network whose drive speaks of PCIs, and whose list of names, and its levels."""
     one = draw_network(1, 0, 60, NET_SQUARES)
     labels = [f"{t // 3}-{t % 3}" for t in range(30)]
-    names = {"station_label": np.array(labels), "station_name": np.array([f"{300 + t}" for t in range(30)])}
+    names = {
+        "station_label": np.array(labels),
+        "station_name": np.array([f"{300 + t}" for t in range(30)]),
+    }
     return from_arrays(one.arrays(6) | names), one.truth
 
 
@@ -335,8 +406,10 @@ def test_one_map_without_a_name_was_taken_for_that_of_every_cell(tmp_path, raste
     data, level = by_pci
     refused(
         r"one map of no station's name, .* best server .*power_db NAME",
-        NetworkMaps.from_file, network_rasters(tmp_path / "best.tif", level, [""]), data,
-    )  # fmt: skip
+        NetworkMaps.from_file,
+        network_rasters(tmp_path / "best.tif", level, [""]),
+        data,
+    )
     rows = draw(12, 103)
     both = {"rssi": np.c_[measured(rows), measured(rows)], "tx": None, "station_name": ["a", "c"]}
     posts = {"station_position": np.array([POST, POST])}
@@ -386,7 +459,9 @@ def test_maps_of_a_networks_cells_help_and_those_of_another_do_not(tmp_path, cap
 def test_a_map_of_a_station_at_an_unknown_place_was_written_and_never_read(rasters, count):
     """Its place, NaN, stood in the state."""
     rows, asked, path = draw(30, 3), draw(20, 4), rasters / "model.ckpt"
-    names = {"station": np.arange(30) % 2, "station_name": np.array(["a", "b"])} if count == 2 else {}
+    names = (
+        {"station": np.arange(30) % 2, "station_name": np.array(["a", "b"])} if count == 2 else {}
+    )
     unknown = {"tx": None, "station_position": np.full((2, 3), np.nan) if names else None}
     file = "two" if names else "right"
     found = fit(rows, rasters / f"{file}.tif", model="powers", save=path, **names, **unknown)

@@ -12,7 +12,12 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.kriging import Kriging
-from gsparc.models.powers.settings import LEAST_SILENT, KernelCandidate, _select_doubtful, process_and_notes
+from gsparc.models.powers.settings import (
+    LEAST_SILENT,
+    KernelCandidate,
+    _select_doubtful,
+    process_and_notes,
+)
 from gsparc.models.reduced import with_reduction
 from gsparc.models.target_rows import power_rows
 from gsparc.ops import Pose
@@ -24,7 +29,9 @@ from gsparc.training.context import FitContext
 from tests.models.powers.test_mixture import station
 
 
-def town(count: int, exponent: float = 3.0, shadowing_db: float = 4.0, seed: int = 0) -> Measurements:
+def town(
+    count: int, exponent: float = 3.0, shadowing_db: float = 4.0, seed: int = 0
+) -> Measurements:
     """A square kilometre about a station; shadowing over 60 m, 1 dB of noise."""
     rng = np.random.default_rng(seed)
     places = np.c_[rng.uniform(0, 1000, (count, 2)), np.full(count, 1.5)]
@@ -32,7 +39,9 @@ def town(count: int, exponent: float = 3.0, shadowing_db: float = 4.0, seed: int
     shadow = np.cos(places @ waves + rng.uniform(0, 2 * np.pi, 200)) @ rng.normal(size=200) / 10
     decibels = -30 - 10 * exponent * np.log10(np.linalg.norm(places - station, axis=1))
     decibels += shadowing_db * shadow + rng.standard_normal(count)
-    return from_arrays({"rx_position": places, "tx_position": station, "rssi_db": decibels}, {"name": "town"})
+    return from_arrays(
+        {"rx_position": places, "tx_position": station, "rssi_db": decibels}, {"name": "town"}
+    )
 
 
 def fit(method, data: Measurements, known: int):
@@ -61,7 +70,9 @@ def test_of_silent_rows_those_in_doubt_are_weighed():
 
 
 def test_few_rows_do_not_choose_a_process_that_varies_far_more_than_they_do():
-    """97 rows of a measured station chose 2 km and next to no noise: up to 63 dBm where nobody measured."""
+    """97 rows of a measured station chose 2 km and next to no noise:
+    up to 63 dBm where nobody measured.
+    """
     with np.load(real("real/powder-rss-462mhz.npz")) as stored:
         number = stored["station"].tolist().index("law73-nuc2-b210")
     data = station(number, 97, 9)
@@ -85,10 +96,13 @@ def test_the_mean_is_chosen_by_likelihood_and_by_name():
 
 def test_beyond_the_measured_places_the_law_goes_on():
     data = town(300)
-    near = np.argsort(np.linalg.norm(data.moving - data.site.static_position, axis=1), kind="stable")
+    near = np.argsort(
+        np.linalg.norm(data.moving - data.site.static_position, axis=1), kind="stable"
+    )
     data = replace(data, rx_position=data.rx_position[near], target=data.target[near])
     errors = [
-        error_db(m, fit(m, data, 150)[0]) for m in (GaussianProcess(), GaussianProcess(mean="constant"))
+        error_db(m, fit(m, data, 150)[0])
+        for m in (GaussianProcess(), GaussianProcess(mean="constant"))
     ]
     assert errors[0] < 0.8 * errors[1], errors
 
@@ -121,7 +135,9 @@ def test_five_thousand_rows(make):
 
 
 def test_a_law_is_known_among_the_rows_and_nothing_far_from_them():
-    """The share of the prior's variance was 0.03 a kilometre away: that of the law grows without end."""
+    """The share of the prior's variance was 0.03 a kilometre away:
+    that of the law grows without end.
+    """
     data = town(160, shadowing_db=0.5)
     method = GaussianProcess()
     batch, _ = fit(method, data, 120)
@@ -133,13 +149,18 @@ def test_a_law_is_known_among_the_rows_and_nothing_far_from_them():
 
 
 def test_a_constant_was_taken_where_a_distance_law_was_there_to_be_had():
-    """Rows at nearly one distance tell the two means hardly apart; 2 km farther the constant stayed."""
+    """Rows at nearly one distance tell the two means hardly apart;
+    2 km farther the constant stayed.
+    """
     rng = np.random.default_rng(0)
     places = np.c_[rng.uniform(-100, 100, 80), rng.uniform(380, 420, 80), np.full(80, 1.5)]
     station, waves = np.array([0.0, 0.0, 20.0]), rng.normal(size=(2, 100)) / 40
     shadow = np.cos(places[:, :2] @ waves + rng.uniform(0, 2 * np.pi, 100)).sum(axis=1) / 7
     decibels = (
-        -30 - 30 * np.log10(np.linalg.norm(places - station, axis=1)) + 3 * shadow + rng.normal(size=80)
+        -30
+        - 30 * np.log10(np.linalg.norm(places - station, axis=1))
+        + 3 * shadow
+        + rng.normal(size=80)
     )
     arrays = {"rx_position": places, "tx_position": station, "rssi_db": decibels}
     data = from_arrays(arrays, {"name": "street"})
@@ -152,7 +173,9 @@ def test_a_constant_was_taken_where_a_distance_law_was_there_to_be_had():
 
 @pytest.mark.slow
 def test_settings_of_many_rows_come_from_near_rows_too():
-    """Chosen on 1,000 of 3,300 rows of a city alone, short lengths were missed: 1 % behind in three draws."""
+    """Chosen on 1,000 of 3,300 rows of a city alone, short lengths were missed:
+    1 % behind in three draws.
+    """
     rng = np.random.default_rng(0)
     first = np.c_[rng.uniform(0, 1000, (800, 2)), np.full(800, 1.5)]
     places = np.concatenate([first, first + rng.normal(0, 2, first.shape) * (1, 1, 0)])
@@ -167,12 +190,16 @@ def test_settings_of_many_rows_come_from_near_rows_too():
 
 
 def test_rows_within_centimetres_said_infinite_powers_a_kilometre_away():
-    """The slope of a law was free by the spread of the rows' distances, here a hundredth of a decade."""
+    """The slope of a law was free by the spread of the rows' distances,
+    here a hundredth of a decade.
+    """
     rng = np.random.default_rng(3)
     places = np.repeat([[0.0, 0.70, 0.6], [0.1, 0.72, -0.6]], 4, axis=0)
     decibels = np.repeat([-68.6, -66.4], 4) + 0.3 * rng.standard_normal(8)
     still = np.array([-1.0, -0.7, 0.0])
-    data = from_arrays({"rx_position": places, "tx_position": still, "rssi_db": decibels}, {"name": "shelf"})
+    data = from_arrays(
+        {"rx_position": places, "tx_position": still, "rssi_db": decibels}, {"name": "shelf"}
+    )
     for mean in ("auto", "distance"):
         process, _ = process_and_notes(power_rows(data, np.arange(8)), data.site, mean=mean)
         far = torch.eye(3, dtype=torch.float64) * 1000.0

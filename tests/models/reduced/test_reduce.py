@@ -1,4 +1,6 @@
-"""Each kind of model spares what it says, stays near itself when little is spared, and is left as it was."""
+"""Each kind of model spares what it says, stays near itself when little is spared,
+and is left as it was.
+"""
 
 from __future__ import annotations
 
@@ -93,7 +95,9 @@ def test_confidence_that_is_spared_is_not_computed(field):
 
 @pytest.fixture(scope="module")
 def through_array(tmp_path_factory) -> Case:
-    data = load({"name": "rfid_sim", "count": 48, "root": str(tmp_path_factory.mktemp("sim")), "seed": 0})
+    data = load(
+        {"name": "rfid_sim", "count": 48, "root": str(tmp_path_factory.mktemp("sim")), "seed": 0}
+    )
     return Case.fit(ArrayField(FieldSettings(count=64)), data)
 
 
@@ -113,13 +117,19 @@ def test_an_array_spares_pixels_and_its_confidence(through_array):
     coarse = through_array.less(stride=3, confidence=False)
     assert through_array.away(coarse) < 0.05 and through_array.answer(coarse).confidence is None
     wide, whole = through_array.answer(through_array.less(stride=2)), through_array.answer()
-    torch.testing.assert_close(wide.mean[:, ::2, ::2], whole.mean[:, ::2, ::2], atol=1e-5, rtol=1e-4)
-    assert torch.equal(wide.confidence, whole.confidence) and torch.equal(wide.variance, whole.variance)
+    torch.testing.assert_close(
+        wide.mean[:, ::2, ::2], whole.mean[:, ::2, ::2], atol=1e-5, rtol=1e-4
+    )
+    assert torch.equal(wide.confidence, whole.confidence) and torch.equal(
+        wide.variance, whole.variance
+    )
 
 
 def test_a_process_of_sources_spares_searches_and_its_variance(tmp_path):
     data = load({"name": "own", "file": str(channels(tmp_path / "own.npz", rows=60, shape="S"))})
-    case = Case.fit(ImageSourceGP(searches=2, search_rows=40, max_sources=4, clutter=False), data, 3)
+    case = Case.fit(
+        ImageSourceGP(searches=2, search_rows=40, max_sources=4, clutter=False), data, 3
+    )
     silent = case.less(confidence=False)
     assert case.away(silent) < 1e-9 and case.answer(silent).variance is None
     one = case.less(searches=1)

@@ -12,7 +12,13 @@ from gsparc.models.splat.auto_settings import Choices, apply_choices, resolve_au
 def open_settings(hidden: int = 0, **more) -> ModelSettings:
     emission = EmissionSettings(
         EncodingSettings("auto"),
-        **{"hidden": hidden, "activation": "auto", "init_bias": "auto", "log_distance": False, **more},
+        **{
+            "hidden": hidden,
+            "activation": "auto",
+            "init_bias": "auto",
+            "log_distance": False,
+            **more,
+        },
     )
     return ModelSettings(field=FieldSettings(placement="auto"), emission=emission)
 
@@ -34,7 +40,9 @@ def test_what_auto_becomes(campaign, kind, static_end, hidden, want):
     assert choices == want
     done = apply_choices(open_settings(hidden), choices)
     found = (done.emission.encoding.kind, done.emission.activation, done.emission.init_bias)
-    assert found == (want.encoding, want.activation, want.init_bias) and done.field.placement != "auto"
+    assert (
+        found == (want.encoding, want.activation, want.init_bias) and done.field.placement != "auto"
+    )
     assert [n.split("=")[0] for n in notes][:3] == ["encoding.kind", "init", "activation"]
     assert all("auto -> " in note and ": " in note for note in notes)
     if (kind, static_end) == ("spectrum", "tx"):

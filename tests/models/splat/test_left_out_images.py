@@ -35,7 +35,10 @@ def test_the_process_has_not_seen_what_lies_within_the_gap(left):
         assert np.allclose(found[g, c], wanted, atol=1e-6)
     assert np.isnan(found[2]).all()  # nothing lies beyond 5 m
     assert len(left.beside_process(None)[0]) == 3
-    assert len(replace(left, gaps=left.gaps[2:], predicted=left.predicted[2:]).beside_process(None)[0]) == 0
+    assert (
+        len(replace(left, gaps=left.gaps[2:], predicted=left.predicted[2:]).beside_process(None)[0])
+        == 0
+    )
 
 
 def test_the_gap_is_as_wide_as_held_out_rows_are_far(left):

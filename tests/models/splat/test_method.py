@@ -16,7 +16,9 @@ from gsparc.ops import Pose
 
 
 def learned(file, *more: str) -> LearnedField:
-    return build(compose(*brief(file, *more)).model).create_for(load_data({"name": "own", "file": str(file)}))
+    return build(compose(*brief(file, *more)).model).create_for(
+        load_data({"name": "own", "file": str(file)})
+    )
 
 
 def fitted(file, run_dir, *more: str, steps: int = 15, every: int | None = None):
@@ -73,7 +75,9 @@ def test_a_static_receiver_is_frozen_and_another_pose_and_an_edit_are_seen(still
 
 @pytest.mark.parametrize("cut", ["last.ckpt", "refit/last.ckpt"])
 def test_a_run_on_a_single_tone_can_be_resumed(tmp_path, cut):
-    """`loaded state dict has a different number of parameter groups`: its delays are not learned."""
+    """`loaded state dict has a different number of parameter groups`:
+    its delays are not learned.
+    """
     file = channels(tmp_path / "own.npz", shape="S")
     method, data, fold = fitted(file, tmp_path, every=5)
     resumed = learned(file)
@@ -93,7 +97,9 @@ def test_refit_learns_from_validation_rows_too_and_keeps_a_learned_confidence(tm
         said = method.predict(batch)
         seen[refit] = float((said.mean - batch.target).square().mean()), said.confidence
     if start == "auto":  # what is unknown in closed form is known of these rows after
-        assert seen["true"][0] < 0.8 * seen["false"][0] and (seen["true"][1] > seen["false"][1]).all()
+        assert (
+            seen["true"][0] < 0.8 * seen["false"][0] and (seen["true"][1] > seen["false"][1]).all()
+        )
     else:
         assert torch.equal(seen["true"][1], seen["false"][1])
 
@@ -115,7 +121,9 @@ def test_a_closed_form_start_that_cannot_be_says_what_it_needs(tmp_path):
 
 
 def test_few_validation_rows_chose_steps(tmp_path):
-    """Two rows tell by chance: a closed-form start is the answer, a field of steps has a third held out."""
+    """Two rows tell by chance: a closed-form start is the answer,
+    a field of steps has a third held out.
+    """
     file = spectra(tmp_path / "own.npz", rows=30)
     method, _, fold = fitted(file, tmp_path, "model.keep_best=true")
     assert len(fold.val) < 8 and method.steps == 0

@@ -65,7 +65,10 @@ def test_the_program_s_field_differs_from_the_text_s(tmp_path):
     file = spectra(tmp_path / "own.npz")
     text, _ = prepared(file)
     code, data = prepared(file, "model.field.spacing=3", paper="gsparc_code")
-    assert text.settings.attenuation.inverse_distance and not code.settings.attenuation.inverse_distance
+    assert (
+        text.settings.attenuation.inverse_distance
+        and not code.settings.attenuation.inverse_distance
+    )
     assert (text.settings.emission.hidden, code.settings.emission.hidden) == (16, 32)
     assert code.init.name == "grid"
     assert code.describe_fit(data, Effort(), 7) == "7 gradient steps from init=grid"

@@ -36,7 +36,8 @@ def test_runs_with_phases_of_their_own_were_weighed_without_them(tmp_path):
     batch = data.batch(rows)
     assert torch.allclose(again.predict(batch).mean, method.predict(batch).mean, atol=1e-5)
     turned = method.predict(batch).mean / method.predict(Query(batch.tx, batch.rx)).mean
-    assert len(np.unique(np.round(np.angle(turned.flatten().numpy()), 3))) == 5  # a phase for each run
+    # A phase for each run
+    assert len(np.unique(np.round(np.angle(turned.flatten().numpy()), 3))) == 5
 
 
 class Turned(Method):
@@ -61,7 +62,8 @@ def test_runs_that_were_not_learned_from_are_scored_after_their_best_phase():
     method = Turned(data, 1.0)
     assert score_methods([method], data, split).figures()["nmse"] < 1e-10
     known = score_methods([method], data, split, "train").figures()["nmse"]
-    assert known == pytest.approx(abs(np.exp(1j) - 1) ** 2, rel=1e-4)  # a known run's phase is to be known
+    # A known run's phase is to be known
+    assert known == pytest.approx(abs(np.exp(1j) - 1) ** 2, rel=1e-4)
 
 
 def test_aligned_channels_are_restored():
@@ -70,6 +72,8 @@ def test_aligned_channels_are_restored():
     runs = RunFactors(np.arange(5), factors)
     aligned = runs.remove_factors(data)
     assert aligned.run is None and RunFactors.has_several_runs(data, np.arange(30))
-    found = runs.apply_factors(Prediction(aligned.targets(np.arange(30))), torch.from_numpy(data.run))
+    found = runs.apply_factors(
+        Prediction(aligned.targets(np.arange(30))), torch.from_numpy(data.run)
+    )
     assert torch.allclose(found.mean, data.targets(np.arange(30)), atol=1e-6)
     assert runs.look_up(torch.tensor([7])).item() == 1  # nothing is known of that one

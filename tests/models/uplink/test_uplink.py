@@ -87,7 +87,9 @@ def test_gsparc_took_a_map_of_places_where_an_uplink_was_heard() -> None:
 
 
 def test_phase_and_timing_of_a_snapshot_go_through(fitted) -> None:
-    """Whatever turns the uplink turns the prediction: offsets are the snapshot's, not the model's."""
+    """Whatever turns the uplink turns the prediction: offsets are the snapshot's,
+    not the model's.
+    """
     method, data = fitted
     batch = data.batch(fold().test[:4])
     plain = method.predict(batch).mean
@@ -98,7 +100,9 @@ def test_phase_and_timing_of_a_snapshot_go_through(fitted) -> None:
     assert (turned - expected).abs().square().sum() < 1e-2 * expected.abs().square().sum()
 
 
-def test_confidence_is_larger_where_errors_are_smaller_also_on_a_narrow_grid_of_one_antenna(fitted) -> None:
+def test_confidence_is_larger_where_errors_are_smaller_also_on_a_narrow_grid_of_one_antenna(
+    fitted,
+) -> None:
     """Pieces of the downlink are in fades that the whole never is in: expected errors follow."""
     method, data = fitted
     batch = data.batch(np.concatenate([fold().val, fold().test]))
@@ -126,7 +130,9 @@ def test_ridge_with_a_dead_antenna_leaves_it_silent(inputs) -> None:
 
 
 def test_eight_antennas_in_a_row_that_do_not_state_their_noise(tmp_path) -> None:
-    """The release's own layout: a line has one direction cosine, and noise is read off empty delays."""
+    """The release's own layout: a line has one direction cosine,
+    and noise is read off empty delays.
+    """
     for name in ("csidata.npy", "base-station.yml"):
         (tmp_path / name).write_bytes((folder() / name).read_bytes())
     text = (tmp_path / "base-station.yml").read_text()
@@ -149,14 +155,19 @@ def test_columns_are_the_slopes_and_their_inner_products() -> None:
         direction, delay = direction + moved[:2], delay + moved[2]
         exact = Aperture(aperture.places.double(), aperture.tones.double())
         return (
-            antenna_responses(direction, exact)[..., None] * tone_responses(delay, exact)[:, :, None]
+            antenna_responses(direction, exact)[..., None]
+            * tone_responses(delay, exact)[:, :, None]
         ).flatten(2)[0]
 
     step = 1e-6
-    slopes = [(atoms(step * row) - atoms(-step * row)) / (2 * step) for row in torch.eye(3).double()]
+    slopes = [
+        (atoms(step * row) - atoms(-step * row)) / (2 * step) for row in torch.eye(3).double()
+    ]
     flat = torch.cat([atoms(torch.zeros(3).double()), *slopes])
     columns = SourceColumns.from_sources(three.direction, three.delay, aperture)
-    assert torch.allclose(columns.gram()[0], (flat.conj() @ flat.T).to(torch.complex64), rtol=1e-3, atol=2.0)
+    assert torch.allclose(
+        columns.gram()[0], (flat.conj() @ flat.T).to(torch.complex64), rtol=1e-3, atol=2.0
+    )
     snapshot = three.channels(aperture)
     wanted = flat.conj() @ snapshot.flatten().to(flat.dtype)
     assert torch.allclose(
@@ -165,12 +176,16 @@ def test_columns_are_the_slopes_and_their_inner_products() -> None:
 
 
 def test_posterior_tells_the_error_of_the_other_band() -> None:
-    """Posterior variance equals the mean squared error over noise, in the other band and on one antenna."""
+    """Posterior variance equals the mean squared error over noise,
+    in the other band and on one antenna.
+    """
     aperture, truth = _aperture(), _three()
     count, noise = 200, 0.05
     generator = torch.Generator().manual_seed(0)
     heard = truth.channels(aperture).expand(count, -1, -1)
-    heard = heard + noise**0.5 * torch.randn(heard.shape, dtype=torch.complex64, generator=generator)
+    heard = heard + noise**0.5 * torch.randn(
+        heard.shape, dtype=torch.complex64, generator=generator
+    )
     search = SourceSearch(aperture, SearchSettings(rounds=3, picks=1, final=4, leakage=1e-6))
     found, _ = search(heard, torch.full((count,), noise))
     other = replace(aperture, tones=aperture.tones + 27)

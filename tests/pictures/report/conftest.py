@@ -30,30 +30,60 @@ def invent(
     value = psnr + draw.normal(0, 2, rows)
     value += psnr - value.mean()
     samples = {
-        "fold": [0] * rows, "row": list(range(rows)), "name": [f"spectrum/{i:05d}.png" for i in range(rows)],
-        "x_m": draw.normal(size=rows), "y_m": draw.normal(size=rows), "z_m": draw.normal(size=rows),
-        "confidence": (value - value.min()) / np.ptp(value), "variance": [""] * rows,
-        "ssim": 0.9 + 0 * value, "ssim_gauss": 0.92 + 0 * value, "psnr_db": value, "mse": 10 ** (-value / 10),
+        "fold": [0] * rows,
+        "row": list(range(rows)),
+        "name": [f"spectrum/{i:05d}.png" for i in range(rows)],
+        "x_m": draw.normal(size=rows),
+        "y_m": draw.normal(size=rows),
+        "z_m": draw.normal(size=rows),
+        "confidence": (value - value.min()) / np.ptp(value),
+        "variance": [""] * rows,
+        "ssim": 0.9 + 0 * value,
+        "ssim_gauss": 0.92 + 0 * value,
+        "psnr_db": value,
+        "mse": 10 ** (-value / 10),
         "baseline/gp/psnr_db": value - 0.5,
-    }  # fmt: skip
+    }
     write_table(folder / "per_sample.csv", samples, zip(*samples.values(), strict=True))
     facts = {
-        "dataset/kind": "spectrum", "dataset/name": "toy", "dataset/sha256": "d" * 64,
+        "dataset/kind": "spectrum",
+        "dataset/name": "toy",
+        "dataset/sha256": "d" * 64,
         "dataset/stand_in": None,
-        "split/name": "random", "split/sha256": "s" * 64, "split/train": train, "split/val": 10,
+        "split/name": "random",
+        "split/sha256": "s" * 64,
+        "split/train": train,
+        "split/val": 10,
         "split/test": rows,
-        "split/folds": 1, "model/name": name, "model/effects": effects, "model/num_gaussians": 500,
+        "split/folds": 1,
+        "model/name": name,
+        "model/effects": effects,
+        "model/num_gaussians": 500,
         "seed": seed,
-        "test/psnr_db": psnr, "test/ssim": 0.9, "test/ssim_gauss": 0.92,
+        "test/psnr_db": psnr,
+        "test/ssim": 0.9,
+        "test/ssim_gauss": 0.92,
         "test/mse": float(samples["mse"].mean()),
-        "time/train_s": seconds, "time/render_ms_p50": ms, "time/render_ms_p95": 2 * ms,
-        "time/render_ms_batch64": ms / 4, "memory/peak_mb": 800.0, "machine/load": 0.7, "machine/threads": 1,
-        "machine/cpu": "a processor", "git": "c" * 40,
-        "baseline/gp/psnr_db": 28.9, "baseline/gp/ssim": 0.9, "baseline/gp/ssim_gauss": 0.91,
+        "time/train_s": seconds,
+        "time/render_ms_p50": ms,
+        "time/render_ms_p95": 2 * ms,
+        "time/render_ms_batch64": ms / 4,
+        "memory/peak_mb": 800.0,
+        "machine/load": 0.7,
+        "machine/threads": 1,
+        "machine/cpu": "a processor",
+        "git": "c" * 40,
+        "baseline/gp/psnr_db": 28.9,
+        "baseline/gp/ssim": 0.9,
+        "baseline/gp/ssim_gauss": 0.91,
         "baseline/gp/mse": 0.01,
-        "baseline/gp/train_s": 0.1, "baseline/gp/render_ms_p50": 0.7, "baseline/gp/render_ms_p95": 0.9,
-        "baseline/mean/psnr_db": 15.0, "baseline/mean/render_ms_p50": 0.03, "baseline/mean/train_s": 0.001,
-    }  # fmt: skip
+        "baseline/gp/train_s": 0.1,
+        "baseline/gp/render_ms_p50": 0.7,
+        "baseline/gp/render_ms_p95": 0.9,
+        "baseline/mean/psnr_db": 15.0,
+        "baseline/mean/render_ms_p50": 0.03,
+        "baseline/mean/train_s": 0.001,
+    }
     (folder / "summary.json").write_text(json.dumps(facts))
     Image.fromarray((255 * draw.random((40, 60, 3))).astype(np.uint8)).save(folder / "test.png")
     if overrides:
@@ -75,7 +105,15 @@ def invent_three(folder: Path) -> list[Path]:
     return [
         invent(folder / "a0", seed=0, psnr=28.0, overrides=(*said, "seed=0")),
         invent(folder / "a1", seed=1, psnr=28.4, overrides=(*said, "seed=1")),
-        invent(folder / "b0", psnr=29.5, seconds=130, ms=0.2, effects="array", overrides=other, train=50),
+        invent(
+            folder / "b0",
+            psnr=29.5,
+            seconds=130,
+            ms=0.2,
+            effects="array",
+            overrides=other,
+            train=50,
+        ),
     ]
 
 

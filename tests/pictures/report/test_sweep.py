@@ -41,7 +41,9 @@ def test_a_failure_is_said_once_and_kept_and_the_sweep_goes_on(tmp_path, caplog)
     screen = ConsoleHandler(stream=shown)
     for record in caplog.records:
         screen.handle(record)
-    assert shown.getvalue() == f"error: job {tmp_path.name} (seed=3) failed, others go on: no such file\n"
+    assert shown.getvalue() == (
+        f"error: job {tmp_path.name} (seed=3) failed, others go on: no such file\n"
+    )
     assert "second line" in caplog.text  # in the job's own log
 
 
@@ -89,7 +91,9 @@ def test_seeds_of_a_split_that_draw_no_test_rows_were_not_warned_of(run_dir, tmp
 def test_jobs_named_after_a_path_still_end_in_a_table(three, tmp_path):
     """A path among the overrides puts a job's folder some levels down."""
     (tmp_path / "0_file-").mkdir()
-    for number, run in enumerate(sorted(path for path in tmp_path.iterdir() if path.name != "0_file-")):
+    for number, run in enumerate(
+        sorted(path for path in tmp_path.iterdir() if path.name != "0_file-")
+    ):
         run.rename(tmp_path / "0_file-" / str(number))
     SweepReport(retime=False).on_multirun_end(of_sweep(tmp_path))
     assert (tmp_path / "sweep.csv").is_file()
@@ -108,12 +112,19 @@ def test_a_sweep_with_a_failed_job_ends_with_status_1(three, tmp_path, capsys):
 def test_a_real_sweep_times_its_models_alone_after_a_failure(tmp_path):
     file = spectra(tmp_path / "own.npz")
     settings = brief(file, "trainer.max_steps=4", "model.field.count=40,-1")
-    command = [sys.executable, "train.py", "-m", *[s for s in settings if s != "model.field.count=40"]]
+    command = [
+        sys.executable,
+        "train.py",
+        "-m",
+        *[s for s in settings if s != "model.field.count=40"],
+    ]
     sweep = tmp_path / "sweep"
     done = subprocess.run(
         [*command, f"hydra.sweep.dir={sweep}", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
-        cwd=ROOT, capture_output=True, text=True,
-    )  # fmt: skip
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 1, done.stderr
     assert done.stdout.count("failed, others go on") == 1 and "error: failed" not in done.stdout
     assert "1 jobs failed" in done.stdout
@@ -124,7 +135,9 @@ def test_a_real_sweep_times_its_models_alone_after_a_failure(tmp_path):
 
 def test_settings_that_change_nothing_were_tabled_as_if_they_were_compared():
     def of(setting, seed, value, hidden):
-        return setting, SimpleNamespace(facts={"seed": seed, "test/nmse": value, "time/train_s": hidden})
+        return setting, SimpleNamespace(
+            facts={"seed": seed, "test/nmse": value, "time/train_s": hidden}
+        )
 
     rows = [
         of("a", 0, 0.1, 1),

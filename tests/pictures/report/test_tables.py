@@ -22,18 +22,25 @@ def cells(table, row: int) -> dict:
 
 def test_runs_are_found_in_a_sweep_and_named_by_what_differs(three):
     rows = own_rows(frame(three[0].parent))
-    assert [run.folder.name for run in rows.run] == ["a0", "a1", "b0"] and list(rows.seed) == [0, 1, 0]
+    assert [run.folder.name for run in rows.run] == ["a0", "a1", "b0"] and list(rows.seed) == [
+        0,
+        1,
+        0,
+    ]
     settings = ["gsparc emission.hidden=8"] * 2 + ["gsparc emission.hidden=64"]
     assert list(own_rows(short_settings(rows)).setting) == settings
     assert {*own_rows(short_settings(rows[:2])).setting} == {"gsparc"}
     assert list(tables.groups_of(rows)) == settings[1:]
 
 
-@pytest.mark.parametrize(("folder", "text", "message"), [
-    ("absent", None, "absent: no such directory"),
-    ("empty", None, "empty: no run in it"),
-    ("damaged", "{", "summary.json: cannot be read as a summary"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("folder", "text", "message"),
+    [
+        ("absent", None, "absent: no such directory"),
+        ("empty", None, "empty: no run in it"),
+        ("damaged", "{", "summary.json: cannot be read as a summary"),
+    ],
+)
 def test_a_directory_without_a_run_is_named(folder, text, message, tmp_path):
     if folder != "absent":
         (tmp_path / folder).mkdir()
@@ -52,7 +59,9 @@ def test_results_have_accuracy_beside_time_memory_and_origin(three):
     assert row["commit"] == "c" * 8 and row["s simulated"] is None
     assert cells(table, 2)["points measured"] == 60
     named = [r[0] for r in table.rows]
-    assert named[3:] == ["mean (baseline)", "gp (baseline)"] and cells(table, 4)["query ms p50"] == 0.7
+    assert (
+        named[3:] == ["mean (baseline)", "gp (baseline)"] and cells(table, 4)["query ms p50"] == 0.7
+    )
 
 
 def test_seeds_are_put_together_with_their_spread(three):
@@ -77,7 +86,8 @@ def test_the_worst_receivers_are_the_worst(three):
     table = tables.table_of_worst(runs)
     values = [row[4] for row in table.rows]
     assert values == sorted(samples["psnr_db"])[:3]
-    assert table.rows[0][5] == pytest.approx(values[0] - 0.5)  # the Gaussian process at the same place
+    # The Gaussian process at the same place
+    assert table.rows[0][5] == pytest.approx(values[0] - 0.5)
     del samples["baseline/gp/psnr_db"]  # powers have no such column: it was left empty
     assert "gp there" not in [column.name for column in tables.table_of_worst(runs).columns]
 
@@ -103,7 +113,9 @@ def test_labels_of_sweeps_lost_true_and_false_on_the_console():
     columns = [Column("method and setting", ""), *(Column(f"figure {n} dB") for n in range(8))]
     console = Console(width=100, record=True, file=io.StringIO(), soft_wrap=True)
     console.print(Table("", columns, [[one, *[Interval(1.0, 0.5, 1.5)] * 8] for one in settings]))
-    first = "".join(line.split("│")[1].strip() for line in console.export_text().splitlines() if "│" in line)
+    first = "".join(
+        line.split("│")[1].strip() for line in console.export_text().splitlines() if "│" in line
+    )
     assert all(one.replace(" ", "") in first.replace(" ", "") for one in settings)
 
 
@@ -120,16 +132,22 @@ def test_settings_of_several_models_were_told_for_each(tmp_path):
 def test_a_report_of_lists_left_out_the_figure_that_decides(tmp_path):
     """Beside its table of listed rows a remark named the better baseline by all rows."""
     figures = {"rmse_db": 4.6, "mae_db": 3.0, "rmse_db_with_silent": 2.2}
-    run = Run(tmp_path, {"dataset/kind": "rssi", **{f"test/{name}": v for name, v in figures.items()}})
+    run = Run(
+        tmp_path, {"dataset/kind": "rssi", **{f"test/{name}": v for name, v in figures.items()}}
+    )
     shown = cells(tables.table_of_results(frame_of_runs([run])), 0)
     assert list(shown)[2:5] == ["RMSE dB, silent too", "RMSE dB", "MAE dB"]
     assert shown["RMSE dB, silent too"].value == 2.2
 
 
 def test_draws_of_a_split_were_settings_beside_the_baselines_of_the_first(run_dir, tmp_path):
-    """One row of gp, of draw 0, stood beside three of gsparc; nothing was pooled over `split.seed`."""
+    """One row of gp, of draw 0, stood beside three of gsparc;
+    nothing was pooled over `split.seed`.
+    """
     for draw, (own, gp) in enumerate([(29.0, 28.9), (28.0, 28.2), (30.0, 29.4)]):
-        folder = run_dir(tmp_path / str(draw), psnr=own, overrides=("dataset=rfid", f"split.seed={draw}"))
+        folder = run_dir(
+            tmp_path / str(draw), psnr=own, overrides=("dataset=rfid", f"split.seed={draw}")
+        )
         facts = json.loads((folder / "summary.json").read_text())
         facts |= {"split/sha256": f"{draw}" * 64, "baseline/gp/psnr_db": gp}
         (folder / "summary.json").write_text(json.dumps(facts))
@@ -156,10 +174,15 @@ def test_draws_of_a_split_were_settings_beside_the_baselines_of_the_first(run_di
 
 
 def test_copies_of_one_split_counted_as_draws(run_dir, tmp_path):
-    """`split.seed` moved validation rows alone where a release names the test rows: ± 0.00 over 3 draws."""
+    """`split.seed` moved validation rows alone where a release names the test rows:
+    ± 0.00 over 3 draws.
+    """
     for draw in range(3):
         file = run_dir(tmp_path / str(draw), overrides=(f"split.seed={draw}",)) / "summary.json"
-        facts = json.loads(file.read_text()) | {"split/sha256": f"{draw}" * 64, "split/test_sha256": "t"}
+        facts = json.loads(file.read_text()) | {
+            "split/sha256": f"{draw}" * 64,
+            "split/test_sha256": "t",
+        }
         file.write_text(json.dumps(facts))
     runs = short_settings(frame(tmp_path))
     pooled = tables.table_of_seeds(runs)
@@ -172,7 +195,10 @@ def test_copies_of_one_split_counted_as_draws(run_dir, tmp_path):
 
 
 def test_a_sweep_of_seeds_did_not_say_that_the_split_is_one(three):
-    assert "on the same test rows: split.seed draws others" in tables.table_of_seeds(frame(*three)).note
+    assert (
+        "on the same test rows: split.seed draws others"
+        in tables.table_of_seeds(frame(*three)).note
+    )
 
 
 def test_one_model_had_two_latencies_and_a_note_in_the_report_alone(three):
@@ -185,13 +211,22 @@ def sweep_of(run_dir, folder, levels):
     """Runs of two settings, on and off, with a seed for each pair of levels [dB]."""
     for seed, pair in enumerate(levels):
         for word, level in zip(("on", "off"), pair, strict=True):
-            run_dir(folder / f"{word}{seed}", seed=seed, psnr=level, overrides=(f"x={word}", f"seed={seed}"))
+            run_dir(
+                folder / f"{word}{seed}",
+                seed=seed,
+                psnr=level,
+                overrides=(f"x={word}", f"seed={seed}"),
+            )
     return short_settings(frame(folder))
 
 
 def test_an_ablation_by_multirun_had_no_paired_difference(run_dir, tmp_path):
-    """Two means with their least and largest stood side by side; the rows and seeds of both are the same."""
-    (lead,) = tables.table_of_leads(sweep_of(run_dir, tmp_path / "a", [(29.0, 28.7), (30.0, 29.9)])).rows
+    """Two means with their least and largest stood side by side;
+    the rows and seeds of both are the same.
+    """
+    (lead,) = tables.table_of_leads(
+        sweep_of(run_dir, tmp_path / "a", [(29.0, 28.7), (30.0, 29.9)])
+    ).rows
     first, other = lead[1], lead[0]
     assert (other, first) == ("gsparc x=on", "gsparc x=off") and lead[3:] == ["2 seeds", "no"]
     assert lead[2].value == pytest.approx(0.2) and lead[2].error == pytest.approx(0.1)
@@ -209,7 +244,9 @@ def test_settings_were_told_apart_without_a_word_on_the_seed_that_they_share(run
 
 
 def test_a_method_without_chance_had_differences_without_error(run_dir, tmp_path):
-    """Three seeds of a closed form are one fit: its difference is known as well as its test rows tell it."""
+    """Three seeds of a closed form are one fit:
+    its difference is known as well as its test rows tell it.
+    """
     runs = sweep_of(run_dir, tmp_path, [(29.0, 28.7)] * 3)
     for row in own_rows(runs).itertuples():
         change = np.repeat([0.1, 0.0], 12)  # on half of the rows

@@ -18,20 +18,33 @@ METHODS = {
 COUNTED = (1, 0.3), (0, 1)  # efforts and seeds
 
 
-def problem(dataset: str, split: str = "random", kind: str = "spectrum", **others) -> SimpleNamespace:
-    own = {"draw": None, "stations": False, "scene": False, "network": False, "name": f"{dataset}/{split}"}
+def problem(
+    dataset: str, split: str = "random", kind: str = "spectrum", **others
+) -> SimpleNamespace:
+    own = {
+        "draw": None,
+        "stations": False,
+        "scene": False,
+        "network": False,
+        "name": f"{dataset}/{split}",
+    }
     return SimpleNamespace(dataset=dataset, split=split, kind=kind, **(own | others))
 
 
 def names(*only: str, kind: str = "spectrum") -> list[str]:
-    return [str(cell) for _, cell in plan_cells([problem("rfid", kind=kind)], METHODS, *COUNTED, only)]
+    return [
+        str(cell) for _, cell in plan_cells([problem("rfid", kind=kind)], METHODS, *COUNTED, only)
+    ]
 
 
 def test_a_whole_table_comes_before_further_efforts_and_seeds():
     assert names() == [
-        "rfid/random/gp/any/any", "rfid/random/fast/1/0", "rfid/random/fast/0.3/0",
-        "rfid/random/fast/1/1", "rfid/random/fast/0.3/1",
-    ]  # fmt: skip
+        "rfid/random/gp/any/any",
+        "rfid/random/fast/1/0",
+        "rfid/random/fast/0.3/0",
+        "rfid/random/fast/1/1",
+        "rfid/random/fast/0.3/1",
+    ]
     assert "rfid/random/waves/1/1" in names(kind="csi")
 
 
@@ -39,18 +52,24 @@ def test_every_room_has_its_first_table_before_any_has_a_second():
     rooms = [problem("a"), problem("b")]
     found = [str(cell) for _, cell in plan_cells(rooms, METHODS, [1], [0, 1])]
     assert found == [
-        "a/random/gp/any/any", "b/random/gp/any/any", "a/random/fast/1/0", "b/random/fast/1/0",
-        "a/random/fast/1/1", "b/random/fast/1/1",
-    ]  # fmt: skip
+        "a/random/gp/any/any",
+        "b/random/gp/any/any",
+        "a/random/fast/1/0",
+        "b/random/fast/1/0",
+        "a/random/fast/1/1",
+        "b/random/fast/1/1",
+    ]
 
 
 def test_a_draw_of_a_split_is_the_seed_of_every_method():
     draws = [problem("a", "blocks", draw=n) for n in range(2)]
     found = [(p.draw, str(cell)) for p, cell in plan_cells(draws, METHODS, [1], [5, 6])]
     assert found == [
-        (0, "a/blocks/gp/any/0"), (1, "a/blocks/gp/any/1"),
-        (0, "a/blocks/fast/1/0"), (1, "a/blocks/fast/1/1"),
-    ]  # fmt: skip
+        (0, "a/blocks/gp/any/0"),
+        (1, "a/blocks/gp/any/1"),
+        (0, "a/blocks/fast/1/0"),
+        (1, "a/blocks/fast/1/1"),
+    ]
 
 
 @pytest.mark.parametrize("needed", ["stations", "scene"])
@@ -67,7 +86,9 @@ def test_only_filters_and_a_pattern_of_nothing_is_an_error():
 
 def test_only_may_name_a_part():
     settings = {"only": "quick", "parts": {"quick": ["rfid/*"]}}
-    assert wanted_cells(settings) == ["rfid/*"] and wanted_cells({"only": ["a/*"], "parts": {}}) == ["a/*"]
+    assert wanted_cells(settings) == ["rfid/*"] and wanted_cells(
+        {"only": ["a/*"], "parts": {}}
+    ) == ["a/*"]
     refused(
         r"only=slow: a list of patterns, or the name of a part \(quick\)",
         wanted_cells,
@@ -81,7 +102,10 @@ def test_methods_take_part_where_they_are_said_to_and_tell_what_they_read():
     assert list(methods) == ["own"], "an entry of null is left out"
     wanted = [problem("rfid"), problem("rfid", "grouped"), problem("newrf")]
     cells = [cell for _, cell in plan_cells(wanted, methods, [1], [0])]
-    assert [(cell.dataset, cell.given) for cell in cells] == [("rfid", "walls"), ("rfid", "directions")]
+    assert [(cell.dataset, cell.given) for cell in cells] == [
+        ("rfid", "walls"),
+        ("rfid", "directions"),
+    ]
 
 
 @pytest.mark.slow
@@ -97,15 +121,30 @@ def test_every_method_of_the_default_comparison_composes():
 
 def test_one_model_of_a_network_was_fitted_under_four_names():
     """Sectors are learned together whatever `gsparc_together`, `gaussians`, `residual` ask for."""
-    methods = read_entries("methods", Contender, OmegaConf.to_container(compose(config="compare"))["methods"])
+    methods = read_entries(
+        "methods", Contender, OmegaConf.to_container(compose(config="compare"))["methods"]
+    )
     network = problem("city", kind="rssi", stations=True, network=True)
     there = {cell.method for _, cell in plan_cells([network], methods, [1], [0])}
     assert "gsparc" in there and not there & {"gsparc_together", "gaussians", "residual"}
 
 
-@pytest.mark.parametrize(("group", "of", "entry", "message"), [
-    ("methods", Contender, {"chose": ["model=gp"]}, r"methods\.x\.chose: no such setting; there are choose"),
-    ("splits", SplitChoice, {"draw": 3}, r"splits\.x\.draw: no such setting; there are choose, datasets"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("group", "of", "entry", "message"),
+    [
+        (
+            "methods",
+            Contender,
+            {"chose": ["model=gp"]},
+            r"methods\.x\.chose: no such setting; there are choose",
+        ),
+        (
+            "splits",
+            SplitChoice,
+            {"draw": 3},
+            r"splits\.x\.draw: no such setting; there are choose, datasets",
+        ),
+    ],
+)
 def test_a_wrong_entry_is_named(group, of, entry, message):
     refused(message, read_entries, group, of, {"x": entry})

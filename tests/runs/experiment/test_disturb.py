@@ -20,7 +20,9 @@ def test_positions_move_where_asked_and_by_what_was_asked():
 def test_directions_turn_by_what_was_asked_and_nothing_else():
     data, _, _ = directed(40)
     there = add_direction_errors(data, 2.0, seed=0)
-    angle = np.linalg.norm(np.concatenate(there.directions) - np.concatenate(data.directions), axis=1)
+    angle = np.linalg.norm(
+        np.concatenate(there.directions) - np.concatenate(data.directions), axis=1
+    )
     assert abs(np.degrees(np.sqrt(np.mean(angle**2) / 2)) - 2) < 0.2
     assert there.target is data.target and there.rx_position is data.rx_position
     few = add_direction_errors(data, 0.0, seed=0, missing=0.5)

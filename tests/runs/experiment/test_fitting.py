@@ -17,7 +17,9 @@ from gsparc.runs.ledger import run_once
 
 @pytest.fixture
 def problem(campaign, folds):
-    return Problem("own", "random", ("dataset=own", "split=random"), campaign("spectrum", 20), folds(20), "d")
+    return Problem(
+        "own", "random", ("dataset=own", "split=random"), campaign("spectrum", 20), folds(20), "d"
+    )
 
 
 def test_a_cell_whose_model_is_gone_is_not_timed(tmp_path):
@@ -41,7 +43,8 @@ def prepared(problem, folder, model="gsparc", effort=0.5, seed=0, settings=None,
         # The first seed of gsparc stood for all three: a spread of 0.00.
         [{"model": "gsparc", "seed": seed} for seed in range(3)],
         [{"model": "moving_array", "seed": seed} for seed in range(3)],
-        # These settings stand beside the model's: a table of batches of 4 showed cells of batches of 16.
+        # These settings stand beside the model's:
+        # a table of batches of 4 showed cells of batches of 16.
         [{}, {"settings": {"batch_size": 4}}],
         [{}, {"choose": ("init_from=model.ckpt",)}],
     ],
@@ -58,7 +61,9 @@ def test_a_cell_of_another_program_is_named_by_its_commit(tmp_path, problem):
     one = prepared(problem, tmp_path, "mean")
     assert one.folder == tmp_path / "own" / "random" / "mean" / "0.5" / "0"
     run_once(
-        one.folder, one.state, lambda left: write_summary(one.folder / "summary.json", {"git": "0123456789"})
+        one.folder,
+        one.state,
+        lambda left: write_summary(one.folder / "summary.json", {"git": "0123456789"}),
     )
     assert one.row()["earlier"] == ""
     record = json.loads((one.folder / "job.json").read_text())
@@ -73,7 +78,9 @@ def test_a_full_disk_ends_a_comparison(problem, tmp_path):
 
     def full(one, left):
         tried.append(one)
-        raise CheckpointError("m.ckpt: cannot be written") from OSError(errno.ENOSPC, "No space left")
+        raise CheckpointError("m.ckpt: cannot be written") from OSError(
+            errno.ENOSPC, "No space left"
+        )
 
     cells = [prepared(problem, tmp_path, method) for method in ("mean", "gp")]
     with pytest.raises(CheckpointError, match="cannot be written"):
@@ -84,7 +91,8 @@ def test_a_full_disk_ends_a_comparison(problem, tmp_path):
 @pytest.mark.parametrize(
     ("pattern", "rfid", "newrf"),
     [
-        ("*/gp/*", True, True),  # one star stands for dataset and split: rooms were left out without a word
+        # One star stands for dataset and split: rooms were left out without a word
+        ("*/gp/*", True, True),
         ("newrf/*", False, True),
         ("new*/60/0", False, True),
         ("rfid/random/gp/any/any", True, False),

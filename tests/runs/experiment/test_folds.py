@@ -11,7 +11,9 @@ from gsparc.training.context import FitContext
 
 
 @pytest.mark.slow
-def test_folds_that_are_fitted_elsewhere_have_the_same_figures(campaign, folds, tmp_path, elsewhere):
+def test_folds_that_are_fitted_elsewhere_have_the_same_figures(
+    campaign, folds, tmp_path, elsewhere
+):
     torch.set_num_threads(1)
     data, split = campaign("spectrum", 40), folds(40, 3)
     kept = []

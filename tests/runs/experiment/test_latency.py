@@ -47,23 +47,34 @@ def test_each_speed_has_rounds_of_its_own(campaign, folds, monkeypatch, tmp_path
     fast = replace(runner.FAST, rounds=12)
     found = runner.time_queries(files, campaign("spectrum", 20), folds(20), fast)
     assert list(found) == list(WAITS)
-    assert {name: one["rounds"] for name, one in found.items()} == {"quick": 12, "slow": 5, "endless": 1}
+    assert {name: one["rounds"] for name, one in found.items()} == {
+        "quick": 12,
+        "slow": 5,
+        "endless": 1,
+    }
     assert found["slow"]["query_ms"] == pytest.approx(200, abs=1) and found["quick"]["query_ms"] < 1
     assert all(len(tx) == 1 for tx in made["quick"].asked)
-    assert len({tuple(tx[0].tolist()) for tx in made["quick"].asked}) == 5, "another test position each time"
+    assert len({tuple(tx[0].tolist()) for tx in made["quick"].asked}) == 5, (
+        "another test position each time"
+    )
 
 
-def test_a_sweep_of_a_method_that_reads_an_uplink_ended_without_its_table(tmp_path, monkeypatch, caplog):
-    """It answers at no places, so that it cannot be timed again; the sweep's report was lost for that."""
+def test_a_sweep_of_a_method_that_reads_an_uplink_ended_without_its_table(
+    tmp_path, monkeypatch, caplog
+):
+    """It answers at no places, so that it cannot be timed again;
+    the sweep's report was lost for that.
+    """
 
     def refuse(number):
         raise ValueError("uplink: reads a fresh uplink, and positions alone are none")
 
     opened = SimpleNamespace(
-        stored=[SimpleNamespace(extra={})], predictor=SimpleNamespace(cycle_places=lambda places: refuse),
+        stored=[SimpleNamespace(extra={})],
+        predictor=SimpleNamespace(cycle_places=lambda places: refuse),
         split=SimpleNamespace(folds=[Fold(*[np.arange(3)] * 3)]),
         data=SimpleNamespace(moving=np.zeros((3, 3))),
-    )  # fmt: skip
+    )
     monkeypatch.setattr(runner, "open_files", lambda files: opened)
     facts = {"model/name": "uplink", "test/nmse": 0.1, "dataset/kind": "csi", "split/sha256": "s"}
     (tmp_path / "summary.json").write_text(json.dumps(facts | {"time/train_s": 1.0}))

@@ -1,4 +1,6 @@
-"""Settings that no part of a fit follows are named: each method declares the groups that it reads."""
+"""Settings that no part of a fit follows are named:
+each method declares the groups that it reads.
+"""
 
 from functools import cache
 from pathlib import Path
@@ -41,7 +43,9 @@ def file_of(world: str) -> Path:
 
 
 def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
-    """Names of options without effect, and answers at the test rows, after what `train` does until then."""
+    """Names of options without effect, and answers at the test rows,
+    after what `train` does until then.
+    """
     given = ["dataset=own", f"dataset.file='{file_of(world)}'", "logger=none", *overrides]
     with initialize_config_module("gsparc.conf", version_base="1.3"):
         whole = hydra.compose("train", overrides=given, return_hydra_config=True)
@@ -59,26 +63,43 @@ def fitted(world: str, *overrides: str) -> tuple[set[str], torch.Tensor]:
 
 
 TRAINING = {
-    "trainer.val_check_interval": 2, "callbacks.densify.min_gaussians": 5, "callbacks.reset.ceiling": 0.02,
+    "trainer.val_check_interval": 2,
+    "callbacks.densify.min_gaussians": 5,
+    "callbacks.reset.ceiling": 0.02,
     "dataset.batch_size": 7,
-}  # fmt: skip
+}
 OF_RUN = {"effort": 0.4, "stations": "each", "split.test_fraction": 0.25, **TRAINING}
 FIELD = {
-    "trainer.max_steps": 4, "model.field.count": 40, "model.attenuation.gain": 3.0,
-    "model.raster.low_pass": 0.2, "model.loss.ssim_weight": 0.3, "model.optimizer.emission": 0.01,
-    "model.confidence.alpha": 0.2, "model.refit": "false",
-}  # fmt: skip
+    "trainer.max_steps": 4,
+    "model.field.count": 40,
+    "model.attenuation.gain": 3.0,
+    "model.raster.low_pass": 0.2,
+    "model.loss.ssim_weight": 0.3,
+    "model.optimizer.emission": 0.01,
+    "model.confidence.alpha": 0.2,
+    "model.refit": "false",
+}
 INIT = {"init.searches": 2}
 ALONE = set(OF_RUN) - {"split.test_fraction"}  # what a plain method of one station leaves
 RENDERED = TRAINING | FIELD
 PEERS = ("gsrf", "wrfgs", "swiftwrf", "nerf2")
 LARGER = {  # values to perturb options by
-    "trainer.val_check_interval": 3, "callbacks.densify.min_gaussians": 8, "callbacks.reset.ceiling": 0.04,
-    "dataset.batch_size": 5, "effort": 0.5, "trainer.max_steps": 3, "model.field.count": 30,
-    "model.attenuation.gain": 2.5, "model.raster.low_pass": 0.5, "model.loss.ssim_weight": 0.1,
-    "model.optimizer.emission": 0.02, "model.confidence.alpha": 0.4, "model.refit": "true",
-    "stations": "auto", "init": "rays",
-}  # fmt: skip
+    "trainer.val_check_interval": 3,
+    "callbacks.densify.min_gaussians": 8,
+    "callbacks.reset.ceiling": 0.04,
+    "dataset.batch_size": 5,
+    "effort": 0.5,
+    "trainer.max_steps": 3,
+    "model.field.count": 30,
+    "model.attenuation.gain": 2.5,
+    "model.raster.low_pass": 0.5,
+    "model.loss.ssim_weight": 0.1,
+    "model.optimizer.emission": 0.02,
+    "model.confidence.alpha": 0.4,
+    "model.refit": "true",
+    "stations": "auto",
+    "init": "rays",
+}
 Case = tuple[str, str, dict, set]
 FAST: list[Case] = [
     ("power", "gp", OF_RUN | {"model.mean": "constant"}, ALONE),
@@ -86,14 +107,25 @@ FAST: list[Case] = [
     ("power", "gsparc", RENDERED | INIT, set(RENDERED)),
 ]
 CASES: list[Case] = [
-    *((world, "idw", OF_RUN | {"model.neighbours": 4}, ALONE) for world in WORLDS if world != "stations"),
+    *(
+        (world, "idw", OF_RUN | {"model.neighbours": 4}, ALONE)
+        for world in WORLDS
+        if world != "stations"
+    ),
     ("stations", "gp", OF_RUN, ALONE - {"stations"}),
     ("tone", "complex_gp", OF_RUN | {"init": "vectors"}, ALONE | {"init"}),
-    *((world, "splat", RENDERED, set()) for world in ("array", "moving", "image", "antennas", "power")),
+    *(
+        (world, "splat", RENDERED, set())
+        for world in ("array", "moving", "image", "antennas", "power")
+    ),
     *((world, "gsparc", RENDERED | INIT, set()) for world in ("array", "image")),
     ("stations", "gsparc", RENDERED, set(RENDERED)),
     ("array", "array", TRAINING | {"model.field.count": 40}, set(TRAINING)),
-    *((w, m, TRAINING | {"model.max_steps": 2}, set(TRAINING)) for w in ("array", "image") for m in PEERS),
+    *(
+        (w, m, TRAINING | {"model.max_steps": 2}, set(TRAINING))
+        for w in ("array", "image")
+        for m in PEERS
+    ),
     ("array", "ngrf", TRAINING | {"model.max_steps": 2}, set(TRAINING)),
 ]
 
@@ -140,16 +172,28 @@ def warned(caplog, about: str = "without effect") -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("world", "given", "unused", "reason"), [
-    ("image", "model=nearest trainer.max_steps=1200", {"trainer.max_steps"},
-     "(nearest takes no gradient steps here: model=splat does)"),
-    ("image", "model=nearest seed=1", set(), ""),
-    ("power", "model=gsparc model.steps=7", {"model.steps"}, "model.steps=7 (gsparc does not use it here)"),
-    ("array", "model=gsparc init=vectors model.steps=0", set(), ""),
-    ("tone", "model=gsparc model.field.count=0", set(), ""),
-    ("power", "model=gsparc model.effects.phase=false", set(), ""),
-    ("image", "model=gsparc model.effects.residual=false trainer.max_steps=1", set(), ""),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("world", "given", "unused", "reason"),
+    [
+        (
+            "image",
+            "model=nearest trainer.max_steps=1200",
+            {"trainer.max_steps"},
+            "(nearest takes no gradient steps here: model=splat does)",
+        ),
+        ("image", "model=nearest seed=1", set(), ""),
+        (
+            "power",
+            "model=gsparc model.steps=7",
+            {"model.steps"},
+            "model.steps=7 (gsparc does not use it here)",
+        ),
+        ("array", "model=gsparc init=vectors model.steps=0", set(), ""),
+        ("tone", "model=gsparc model.field.count=0", set(), ""),
+        ("power", "model=gsparc model.effects.phase=false", set(), ""),
+        ("image", "model=gsparc model.effects.residual=false trainer.max_steps=1", set(), ""),
+    ],
+)
 def test_what_decides_nothing_here_is_named_with_why(world, given, unused, reason, caplog):
     assert fitted(world, *given.split())[0] == unused
     lines = warned(caplog)
@@ -160,7 +204,9 @@ def test_what_decides_nothing_here_is_named_with_why(world, given, unused, reaso
 def test_an_initialiser_of_another_kind_of_site_is_named(caplog):
     """`init=vectors` of powers tried what powers have, without a word."""
     fitted("power", "model=gsparc", "init=vectors")
-    assert warned(caplog, "init=vectors") == ["init=vectors has no effect here: what is tried is powers"]
+    assert warned(caplog, "init=vectors") == [
+        "init=vectors has no effect here: what is tried is powers"
+    ]
 
 
 def test_steps_of_the_trainer_win_over_the_models_with_a_word(caplog):
@@ -173,15 +219,16 @@ def test_steps_of_the_trainer_win_over_the_models_with_a_word(caplog):
 
 @pytest.mark.slow
 def test_hidden_units_beside_a_process_with_all_the_weight(caplog):
-    """It was exactly the Gaussian process, printed as hidden=16; then hidden=16 "without effect", which cost
-    the start in closed form and .3 dB.
+    """It was exactly the Gaussian process, printed as hidden=16; then hidden=16 "without effect",
+    which cost the start in closed form and .3 dB.
     """
     given = "model=gsparc", "trainer.max_steps=2", "model.field.count=20"
     plain = fitted("image", *given)[1]
     unused, answers = fitted("image", *given, "model.emission.hidden=16")
     assert not unused and torch.equal(answers, plain)
     said = (
-        "a plain process has all the weight, Gaussians (init=uniform, encoding=fourier, activation=sigmoid, "
+        "a plain process has all the weight, Gaussians (init=uniform, encoding=fourier, "
+        "activation=sigmoid, "
     )
     assert caplog.messages[-1].startswith(f"{said}steps=2) none: model=splat is the field alone")
 
@@ -189,7 +236,11 @@ def test_hidden_units_beside_a_process_with_all_the_weight(caplog):
 @pytest.mark.parametrize("none", ["model.steps=0", "trainer.max_steps=0"])
 def test_callbacks_of_a_training_without_steps(none, caplog):
     """The log listed callbacks for "at most 0 steps"; the number that asks for none is followed."""
-    given = "callbacks.densify.start=0.2", "callbacks=early_stopping", "trainer.max_time=00:00:01:00"
+    given = (
+        "callbacks.densify.start=0.2",
+        "callbacks=early_stopping",
+        "trainer.max_time=00:00:01:00",
+    )
     unused, _ = fitted("array", "model=gsparc", none, *given)
     assert unused == {"callbacks.densify.start", "callbacks", "trainer.max_time"}
 
@@ -204,7 +255,13 @@ def test_residual_false_left_a_moving_array_its_residual():
 @pytest.mark.slow
 def test_copies_by_station_of_other_processes_name_their_settings():
     """Stations fitted by joblib: everything was named, as nothing was read in this process."""
-    given = "model=idw", "stations=each", "model.neighbours=4", "model.power=1.0", "trainer.max_steps=3"
+    given = (
+        "model=idw",
+        "stations=each",
+        "model.neighbours=4",
+        "model.power=1.0",
+        "trainer.max_steps=3",
+    )
     executor.use_engine(Engine("joblib", 2))
     try:
         assert fitted("stations", *given)[0] == {"trainer.max_steps"}
@@ -215,7 +272,9 @@ def test_copies_by_station_of_other_processes_name_their_settings():
 def test_phases_of_snapshots_mean_nothing_to_powers():
     """`model.loss.snapshot=phase` of powers ended in an IndexError."""
     given = "model=splat", "model.field.count=20", "trainer.max_steps=1"
-    plain, turned = (fitted("power", *given, *more)[1] for more in ((), ("model.loss.snapshot=phase",)))
+    plain, turned = (
+        fitted("power", *given, *more)[1] for more in ((), ("model.loss.snapshot=phase",))
+    )
     assert torch.equal(plain, turned)
 
 
@@ -230,7 +289,11 @@ def test_a_distance_law_of_gaussians_means_nothing_to_powers(caplog):
 
 
 def test_hidden_units_that_cost_the_start_in_closed_form_were_said_to_have_no_effect(caplog):
-    """So were steps and the number of Gaussians, without which the process may not have all the weight."""
+    """So were steps and the number of Gaussians,
+    without which the process may not have all the weight.
+    """
     given = "model=gsparc", "model.steps=0", "model.field.count=20", "model.emission.hidden=16"
     assert not fitted("array", *given)[0] and not warned(caplog)
-    assert "Gaussians (init=sphere, encoding=fourier, activation=sigmoid, steps=0) none" in caplog.text
+    assert (
+        "Gaussians (init=sphere, encoding=fourier, activation=sigmoid, steps=0) none"
+    ) in caplog.text

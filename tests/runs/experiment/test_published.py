@@ -33,7 +33,10 @@ def test_rows_of_the_same_test_rows_stand_beside_a_new_method(file):
         ("gsrf", 20.5),
     ]
     assert "| gsrf* |" in markdown([effort], "mine")
-    assert len(beside_published(averages([filled("mine", 31.0, split="other")]), read_published(file))) == 1
+    assert (
+        len(beside_published(averages([filled("mine", 31.0, split="other")]), read_published(file)))
+        == 1
+    )
 
 
 def test_rows_beside_were_left_out_of_the_quickest_and_their_efforts_had_tables(file):
@@ -43,7 +46,9 @@ def test_rows_beside_were_left_out_of_the_quickest_and_their_efforts_had_tables(
     tables = split_by_problem(beside_published(averages([filled("gp", 29.2)]), published))
     assert [list(table.effort.dropna()) for table in tables] == [[1.0]]
     page = markdown(tables, "gsparc")
-    assert "fastest within 0.5 dB of the best: gsrf, 0.5 ms a query" in page and "*: a row of beside=" in page
+    assert (
+        "fastest within 0.5 dB of the best: gsrf, 0.5 ms a query"
+    ) in page and "*: a row of beside=" in page
     tables = split_by_problem(beside_published(averages([filled("mine", 29.2, 0, 3.0)]), published))
     assert [list(table.method) for table in tables] == [["mine", "gsrf"]]
 
@@ -64,5 +69,9 @@ def test_a_table_of_an_older_program_lacks_a_column(file):
 
 def test_a_file_that_is_no_table_is_named(tmp_path, file):
     (tmp_path / "other.csv").write_text("a,b\n1,2\n")
-    refused("other.csv: no compare.csv: it has no column dataset", read_published, tmp_path / "other.csv")
+    refused(
+        "other.csv: no compare.csv: it has no column dataset",
+        read_published,
+        tmp_path / "other.csv",
+    )
     refused("absent.csv: cannot be read", read_published, tmp_path / "absent.csv")

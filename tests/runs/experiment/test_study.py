@@ -37,7 +37,11 @@ def fit(job: Job, left: str | None) -> None:
     facts = {f"test/{name}": value for name, value in figures.items()} | {
         "dataset/kind": job.data.site.scored
     }
-    times = {"time/train_s": 1.0 + job.config.seed, "time/train_cpu_s": 1.0, "seed": job.config.seed}
+    times = {
+        "time/train_s": 1.0 + job.config.seed,
+        "time/train_cpu_s": 1.0,
+        "seed": job.config.seed,
+    }
     write_summary(job.folder / "summary.json", facts | times | {"model/name": job.config.model})
     assert main_figure(facts)
 
@@ -54,7 +58,9 @@ def run(folder, names, conditions=AS_IT_IS, rounds=1, data=None, split=None):
 def test_what_cannot_be_is_left_out_and_every_round_has_another_seed_once(tmp_path, caplog):
     caplog.set_level("INFO")
     rows, fits = run(tmp_path, ["mean", "impossible", "gp"], rounds=2, split=divide(48, 2))
-    assert list(rows.variant) == ["mean", "gp"] and "impossible, round 1 is left out: " in caplog.text
+    assert (
+        list(rows.variant) == ["mean", "gp"] and "impossible, round 1 is left out: " in caplog.text
+    )
     assert list(fits.seed) == [3, 3, 4, 4] and list(rows.train_s) == [4.5, 4.5]
     assert rows.spread[0] == 0 and rows.rows[0] == 24 and (rows.query_ms > 0).all()
     caplog.clear()
@@ -72,8 +78,11 @@ def test_errors_cost_an_interpolator_and_not_the_mean(tmp_path):
     for what in ("query", "train"):
         assert value["gp", what, 0.3] < value["gp", "none", 0.0] - 1
         assert abs(value["mean", what, 0.3] - value["mean", "none", 0.0]) < 1e-6
-    clean, asked = (next(r for r in rows.itertuples() if r.what == what) for what in ("none", "query"))
-    assert (clean.train_s, clean.query_ms) == (asked.train_s, asked.query_ms)  # trained and timed once
+    clean, asked = (
+        next(r for r in rows.itertuples() if r.what == what) for what in ("none", "query")
+    )
+    # Trained and timed once
+    assert (clean.train_s, clean.query_ms) == (asked.train_s, asked.query_ms)
 
 
 def test_more_measurements_are_better_and_are_counted(tmp_path):

@@ -19,10 +19,12 @@ from gsparc.runs.experiment.table import (
 )
 
 FOUND = [
-    filled("gp", 30.0), *(filled("gsparc", 29.0 + s, s, 1.0) for s in (0.0, 1.0)),
+    filled("gp", 30.0),
+    *(filled("gsparc", 29.0 + s, s, 1.0) for s in (0.0, 1.0)),
     *(filled("gsrf", 20.0 + s, s, 1.0, **{"machine/load": 3.0}) for s in (0.0, 2.0)),
-    filled("gsrf", 25.0, 0, 3.0), filled("gp", 31.0, split="grouped"),
-]  # fmt: skip
+    filled("gsrf", 25.0, 0, 3.0),
+    filled("gp", 31.0, split="grouped"),
+]
 TIMED = pd.DataFrame(
     [["rfid", "random", "gp", 2.0, 3.0, 1.5], ["rfid", "random", "gsparc", 0.5, 0.6, 0.4]],
     columns=runner.TIMED,
@@ -48,21 +50,27 @@ def test_a_column_of_single_seeds_told_nothing():
 
 
 def test_draws_are_paired_with_the_best_and_have_standard_errors():
-    """The spread over draws is of the rows: what two methods differ by on the same rows is known better."""
+    """The spread over draws is of the rows: what two methods differ by
+    on the same rows is known better.
+    """
     facts = {"test/interval/coverage_90": 0.8, "test/outage/brier": 0.0125}
     how = {"kind": "rssi", "split": "drawn", **facts}
     found = drawn("gp", 5.0, 7.0, 9.0, **how) + drawn("idw", 6.0, 8.1, 10.2, **how)
     (block,) = split_by_problem(averages(found))
     gp, idw = block.itertuples()
     assert (gp.method, gp.behind_db, idw.behind_db) == ("gp", 0.0, pytest.approx(1.1))
-    assert idw.behind_error_db == pytest.approx(0.1 / 3**0.5) and gp.spread_db == pytest.approx(2 / 3**0.5)
+    assert idw.behind_error_db == pytest.approx(0.1 / 3**0.5) and gp.spread_db == pytest.approx(
+        2 / 3**0.5
+    )
     page = markdown([block], "gsparc")
     assert "3 draws (± standard error of the mean)" in page and "| 1.10 ± 0.06 |" in page
     assert "| 0.80 |" in page
     assert "| outage, Brier score |" in page and "| 0.0125 |" in page
     assert "simple baseline wins" not in page, "there are no others"
     (said, *_) = remarks(block, "gsparc")
-    assert "; 1.10 ± 0.06 dB better than idw (standard error over the same 3 draws): significant" in said
+    assert (
+        "; 1.10 ± 0.06 dB better than idw (standard error over the same 3 draws): significant"
+    ) in said
 
 
 def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path, monkeypatch):
@@ -114,16 +122,27 @@ def test_how_a_method_approximates_stands_behind_its_name():
     labels = ["gp (Vecchia 30)", "gp", "gp (Vecchia 30)"]
     found = [filled("gp", 30.0, i, 1.0, **{"model/label": label}) for i, label in enumerate(labels)]
     (block,) = split_by_problem(averages(found))
-    assert list(block.label) == [" (Vecchia 30)"] and "gp (Vecchia 30)" in markdown([block], "gsparc")
+    assert list(block.label) == [" (Vecchia 30)"] and ("gp (Vecchia 30)") in markdown(
+        [block], "gsparc"
+    )
 
 
 def test_lists_were_compared_by_their_listed_rows_alone():
-    """kriging was first by these, while the pages and `train` name the figure with unlisted rows."""
+    """kriging was first by these, while the pages and `train` name the figure
+    with unlisted rows.
+    """
     errors = (("kriging", 4.6, 5.2), ("gsparc", 4.9, 4.2))
-    found = [filled(m, e, 0, kind="rssi", **{"test/rmse_db_with_silent": silent}) for m, e, silent in errors]
+    found = [
+        filled(m, e, 0, kind="rssi", **{"test/rmse_db_with_silent": silent})
+        for m, e, silent in errors
+    ]
     (block,) = split_by_problem(averages(found))
     first = next(block.itertuples())
-    assert (first.method, first.figure, first.second_figure) == ("gsparc", "rmse_db_with_silent", "rmse_db")
+    assert (first.method, first.figure, first.second_figure) == (
+        "gsparc",
+        "rmse_db_with_silent",
+        "rmse_db",
+    )
 
 
 def test_a_comparison_of_lists_ended_in_a_key_error(tmp_path):
@@ -131,22 +150,31 @@ def test_a_comparison_of_lists_ended_in_a_key_error(tmp_path):
     facts = {"test/rmse_db_with_silent": 4.2, "test/reduced_chi2": 25.0}
     found = averages([filled("gp", 5.0, 0, 1.0, kind="rssi", **facts)])
     page = markdown(split_by_problem(found), "gsparc")
-    assert "| RMSE dB, silent too (less is better) |" in page and "gp, RMSE dB, silent too 4.20" in page
+    assert (
+        "| RMSE dB, silent too (less is better) |" in page
+        and ("gp, RMSE dB, silent too 4.20") in page
+    )
     assert "std of gp is 5 times too small" in page and "gsparc map" in page
     draw_efforts(found, tmp_path / "compare.png", "gsparc")
 
 
 def test_the_first_was_named_without_saying_how_sure_that_is(tmp_path):
-    """A remark named a winner by .1 dB on 32 spectra, whose difference to the second is known to .2."""
+    """A remark named a winner by .1 dB on 32 spectra,
+    whose difference to the second is known to .2.
+    """
     ahead = np.array([1.0, 3.0, 2.0, 2.0])
     cells = []
     for method, level in (("gp", 28.0 + ahead), ("idw", np.full(4, 28.0))):
         (tmp_path / method).mkdir()
-        pd.DataFrame({"row": range(4), "psnr_db": level}).to_csv(tmp_path / method / "per_sample.csv")
+        pd.DataFrame({"row": range(4), "psnr_db": level}).to_csv(
+            tmp_path / method / "per_sample.csv"
+        )
         cells.append(filled(method, level.mean(), folder=tmp_path / method))
     (block,) = split_by_problem(averages(cells))
     (said, *_) = remarks(block, "gsparc")
-    assert "; 2.00 ± 0.41 dB better than idw (standard error over the same 4 test rows): significant" in said
+    assert (
+        "; 2.00 ± 0.41 dB better than idw (standard error over the same 4 test rows): significant"
+    ) in said
 
 
 @pytest.mark.parametrize("figure", ["psnr_db", "ssim", "mse", "mae", "nmse", "rmse_db"])
@@ -198,19 +226,24 @@ def test_a_simple_baseline_won_by_chance():
         "gp is 0.30 ± 1.01 (standard error) dB better over 3 draws" in said
     )
     assert (
-        "0.15 ± 0.51 dB better than nearest (standard error over the same 3 draws): not significant" in said
+        "0.15 ± 0.51 dB better than nearest (standard error over the same 3 draws): not "
+        "significant" in said
     )
     assert "wins" not in said and "beats" not in said
 
 
 def test_the_csv_file_had_other_signs_than_the_console():
-    """`score_db` was +13.76 dB where the console had -13.76; `seeds` were draws, a spread was an error."""
+    """`score_db` was +13.76 dB where the console had -13.76; `seeds` were draws,
+    a spread was an error.
+    """
     draws = drawn("gp", 5.0, 6.0, 7.0, kind="rssi", split="drawn")
     seeds = [filled("gsparc", 5.0 + seed, seed, 1.0, kind="rssi") for seed in range(2)]
     gp, gsparc = pd.DataFrame(columns_of_csv(averages([*draws, *seeds]))).itertuples()
     assert (gp.score_db, gp.draws, gp.seeds) == (6.0, 3, 1)
     assert gp.score_error_db == pytest.approx(1 / 3**0.5) and np.isnan(gp.score_std_db)
-    assert (gsparc.score_db, gsparc.draws, gsparc.seeds) == (5.5, 1, 2) and np.isnan(gsparc.score_error_db)
+    assert (gsparc.score_db, gsparc.draws, gsparc.seeds) == (5.5, 1, 2) and np.isnan(
+        gsparc.score_error_db
+    )
 
 
 def test_what_methods_were_given_besides_places_was_not_said():
@@ -220,7 +253,9 @@ def test_what_methods_were_given_besides_places_was_not_said():
 
 
 def test_draws_with_the_same_test_rows_had_a_standard_error():
-    """`split=random, draws: 3` of a release that names its test rows gave three copies of one split."""
+    """`split=random, draws: 3` of a release that names its test rows gave three copies of one
+    split.
+    """
     found = drawn("gp", 30.0, 31.0, 32.0, **{"split/test_sha256": "t"})
     (block,) = split_by_problem(averages(found))
     (row,) = block.itertuples()
@@ -232,16 +267,26 @@ def test_draws_with_the_same_test_rows_had_a_standard_error():
 def test_the_last_of_three_was_bold_in_a_comparison():
     """`ours` was, 14 dB behind; README has in bold what is best and told apart."""
     behind = {"gsparc": 0.0, "gp": 1.0, "complex_gp": 14.0}.items()
-    cells = [c for name, by in behind for c in drawn(name, *(30 - by - n * (1 + by / 50) for n in range(3)))]
+    cells = [
+        c
+        for name, by in behind
+        for c in drawn(name, *(30 - by - n * (1 + by / 50) for n in range(3)))
+    ]
     (block,) = split_by_problem(averages(cells))
     page = markdown([block], "complex_gp")
-    assert "| **gsparc** |" in page and "| complex_gp (ours) |" in page and page.count("**gsparc**") == 1
+    assert (
+        "| **gsparc** |" in page
+        and "| complex_gp (ours) |" in page
+        and page.count("**gsparc**") == 1
+    )
     (alone,) = split_by_problem(averages(cells[:3]))
     assert "**" not in markdown([alone], "gsparc")
 
 
 def test_the_lead_of_the_first_had_no_verdict():
-    """`6.20 ± 1.27 dB before newrf (standard error over the same 3 draws)` left the reader to compute t."""
+    """`6.20 ± 1.27 dB before newrf (standard error over the same 3 draws)` left the reader to
+    compute t.
+    """
     leads = ((6.0, 5.9, 6.1), "significant"), ((2.0, 0.1, 0.9), "not significant")
     for gains, verdict in leads:
         cells = drawn("gp", 30.0, 30.0, 30.0) + drawn("gsparc", *(30.0 + gain for gain in gains))

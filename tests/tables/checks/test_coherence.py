@@ -26,7 +26,9 @@ def test_packets_of_a_robot_are_told_with_and_without_its_runs(layout, labelled)
         logged = packets.measurements(given, packets.logged(channel, tones, 0))
         assert estimate_coherence(logged).unknown_factor == "phase+delay"
         turned = packets.logged(channel, 0 * tones, 0)
-        assert estimate_coherence(packets.measurements(given, turned)).unknown_factor.startswith("phase")
+        assert estimate_coherence(packets.measurements(given, turned)).unknown_factor.startswith(
+            "phase"
+        )
         if not labelled:  # millimetres apart
             louder = packets.measurements(given, packets.logged(channel, tones, 0, 6.0))
             assert estimate_coherence(louder).unknown_factor == "phase+delay+gain"
@@ -35,13 +37,17 @@ def test_packets_of_a_robot_are_told_with_and_without_its_runs(layout, labelled)
 def waves(seed, noise=0.0, spacing=0.03):
     """Ten plane waves at 20 tones along a grid of 12 x 12 places."""
     draw, tones = np.random.default_rng(seed), 2.4e9 + 1e6 * np.arange(20)
-    places = np.c_[np.stack(np.meshgrid(*2 * [spacing * np.arange(12)]), -1).reshape(-1, 2), np.ones(144)]
+    places = np.c_[
+        np.stack(np.meshgrid(*2 * [spacing * np.arange(12)]), -1).reshape(-1, 2), np.ones(144)
+    ]
     towards = draw.standard_normal((10, 3))
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     path = places @ towards.T + draw.uniform(5, 30, 10)
     gain = draw.standard_normal(10) + 1j * draw.standard_normal(10)
     channel = (gain * np.exp(-2j * np.pi / 299792458 * path[:, None] * tones[:, None])).sum(-1)
-    channel += noise * (draw.standard_normal(channel.shape) + 1j * draw.standard_normal(channel.shape))
+    channel += noise * (
+        draw.standard_normal(channel.shape) + 1j * draw.standard_normal(channel.shape)
+    )
     station = np.array([9.0, 9, 3])
     given = {"rx_position": places, "tx_position": station, "csi": channel, "frequency_hz": tones}
     return interpret(Raw(given, {}), "waves").data
@@ -82,7 +88,9 @@ def test_a_gain_for_each_packet_was_told_from_fifteen_pairs_that_fade():
     found = {}
     for pairs in (15, 300):
         draw, tones = np.random.default_rng(5), 5e9 + 1e6 * np.arange(30)
-        places = np.repeat(np.c_[7.0 * np.arange(pairs), np.zeros(pairs), np.ones(pairs)], 2, axis=0)
+        places = np.repeat(
+            np.c_[7.0 * np.arange(pairs), np.zeros(pairs), np.ones(pairs)], 2, axis=0
+        )
         places[1::2, 0] += 0.002
         shape = draw.standard_normal((pairs, 30)) + 1j * draw.standard_normal((pairs, 30))
         level = 10 ** (draw.normal(0, 3.0, (2 * pairs, 1)) / 20)
@@ -92,7 +100,10 @@ def test_a_gain_for_each_packet_was_told_from_fifteen_pairs_that_fade():
             Raw({**given, "csi": np.repeat(shape, 2, axis=0) * level * turned}, {}), "pairs"
         ).data
         found[pairs] = estimate_coherence(data).unknown_factor
-    assert found == {15: "phase", 300: "phase+delay+gain"} or found == {15: "phase", 300: "phase+gain"}
+    assert found == {15: "phase", 300: "phase+delay+gain"} or found == {
+        15: "phase",
+        300: "phase+gain",
+    }
 
 
 @pytest.mark.parametrize("shape", [(1, 8), (4, 1), (1, 1)])
@@ -108,9 +119,10 @@ def test_rows_of_one_place_that_do_not_agree_were_good(shape, noise, told):
     channel = (1 + 2 * rng.random((21, 1, 1))) * draw(21)
     turn = np.exp(2j * np.pi * rng.random((len(place), 1, 1)))
     given = {
-        "rx_position": where[place], "tx_position": np.array([3.0, 3, 2]),
+        "rx_position": where[place],
+        "tx_position": np.array([3.0, 3, 2]),
         "csi": (channel[place] + noise * draw(len(place))) * turn,
         "frequency_hz": 2.4e9 + 1e6 * np.arange(shape[1]),
-    }  # fmt: skip
+    }
     found = place_warnings(interpret(Raw(given), "packets").data)
     assert [text.startswith("rows at one place differ by ") for text in found] == [True] * told

@@ -1,4 +1,6 @@
-"""What a column says of levels is found in them: transmitters, devices, numbers; nothing of chance."""
+"""What a column says of levels is found in them: transmitters, devices, numbers;
+nothing of chance.
+"""
 
 import shlex
 import subprocess
@@ -16,27 +18,37 @@ from gsparc.tables.checks.column_effects import LevelsAtPlaces, find_effects
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
-    "head, kind", [("node", "transmitter"), ("hop", "transmitter"), ("phone", "device"), ("power", "number")]
+    "head, kind",
+    [("node", "transmitter"), ("hop", "transmitter"), ("phone", "device"), ("power", "number")],
 )
 def test_what_a_column_does_is_named_and_nothing_else(seed, head, kind):
     place, level, columns = truths(seed, head)
     links = LevelsAtPlaces(place, np.zeros(ROWS, int), level)
     texts = {name: np.array([f"{value:g}" for value in values]) for name, values in columns.items()}
-    assert [(one.head, one.kind) for one in find_effects(links, np.arange(ROWS), texts)] == [(head, kind)]
+    assert [(one.head, one.kind) for one in find_effects(links, np.arange(ROWS), texts)] == [
+        (head, kind)
+    ]
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_thirty_transmitters_of_one_name_were_no_two(seed):
     """Of seven rows each, whose constants cost more than they explained."""
     (place, level), which = fields(seed, 30), np.random.default_rng(seed).integers(0, 30, ROWS)
-    links = LevelsAtPlaces(place[:200], np.zeros(200, int), level[np.arange(200), which[:200]].round())
-    texts = {"node": which.astype(str), "port": np.random.default_rng(9).integers(0, 30, ROWS).astype(str)}
+    links = LevelsAtPlaces(
+        place[:200], np.zeros(200, int), level[np.arange(200), which[:200]].round()
+    )
+    texts = {
+        "node": which.astype(str),
+        "port": np.random.default_rng(9).integers(0, 30, ROWS).astype(str),
+    }
     assert [(one.head, one.kind) for one in find_effects(links, np.arange(200), texts)] == [
         ("node", "transmitter")
     ]
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(s, marks=pytest.mark.slow) for s in range(2, 6))])
+@pytest.mark.parametrize(
+    "seed", [0, 1, *(pytest.param(s, marks=pytest.mark.slow) for s in range(2, 6))]
+)
 def test_columns_of_chance_and_qualities_say_nothing(seed):
     place, level, columns = truths(seed, "")
     links = LevelsAtPlaces(place, np.zeros(ROWS, int), level)
@@ -47,14 +59,18 @@ def test_columns_of_chance_and_qualities_say_nothing(seed):
 @pytest.mark.slow
 @pytest.mark.parametrize("head", ["node", "phone", "power"])
 def test_the_advice_of_a_message_works_as_written(tmp_path, head):
-    """As a shell takes it, in `check`: the message is gone, and nothing else is said of the column."""
+    """As a shell takes it, in `check`: the message is gone,
+    and nothing else is said of the column.
+    """
     place, level, columns = truths(1, head)
     columns["tx_power"] = columns.get("power")
     head = head.replace("power", "tx_power")
     path = tmp_path / "log.csv"
     table = {"x": place[:, 0], "y": place[:, 1], "rssi_dbm": level, head: columns[head]}
     pd.DataFrame(table).to_csv(path, index=False)
-    said = [note for note in read_any(path).notes if f"column '{head}' is not used and explains" in note]
+    said = [
+        note for note in read_any(path).notes if f"column '{head}' is not used and explains" in note
+    ]
     assert len(said) == 1, said
     words = shlex.split(said[0].partition("? ")[2])[:1]
     assert words[0].startswith("dataset.columns.")

@@ -1,4 +1,6 @@
-"""What is constant over rows is named; tones and antennas of channels are learned from and scored nowhere."""
+"""What is constant over rows is named; tones and antennas of channels are learned from
+and scored nowhere.
+"""
 
 from pathlib import Path
 
@@ -29,7 +31,12 @@ def channels(seed: int = 0) -> dict[str, np.ndarray]:
     far = np.linalg.norm(at[:, None] - rng.uniform(3, 6, (2 * ANTENNAS, 3)), axis=2)
     waves = np.exp(-2j * np.pi / 0.125 * far[..., None] * tones / tones[0]) / far[..., None]
     csi = waves[:, :ANTENNAS] + 0.3 * waves[:, ANTENNAS:]
-    return {"rx_position": at, "tx_position": np.array([5.0, 5, 2]), "csi": csi, "frequency_hz": tones}
+    return {
+        "rx_position": at,
+        "tx_position": np.array([5.0, 5, 2]),
+        "csi": csi,
+        "frequency_hz": tones,
+    }
 
 
 def spoilt(junk: complex, seed: int = 0) -> dict[str, np.ndarray]:
@@ -57,7 +64,9 @@ def figures(name, data):
 @pytest.mark.parametrize("junk", [0, 30 + 20j, 1e-9])
 @pytest.mark.parametrize("name", ["mean", "idw", "gp", "complex_gp"])
 def test_null_tones_were_most_of_every_figure(name, junk):
-    """Eight tones 30 dB above the others, constant, gave an NMSE of .0039 where the others had .107."""
+    """Eight tones 30 dB above the others, constant,
+    gave an NMSE of .0039 where the others had .107.
+    """
     arrays = channels()
     reading = interpret(Raw(spoilt(junk)), "nulls")
     (note,) = [note for note in reading.notes if isinstance(note, Caution)]
@@ -71,8 +80,12 @@ def test_null_tones_were_most_of_every_figure(name, junk):
 
 def test_channels_are_answered_in_the_shape_of_the_file():
     arrays = spoilt(30)
-    predictor = fit(arrays["rx_position"], model="nearest", **{k: arrays[k] for k in ("csi", "frequency_hz")},
-                    tx=arrays["tx_position"])  # fmt: skip
+    predictor = fit(
+        arrays["rx_position"],
+        model="nearest",
+        **{k: arrays[k] for k in ("csi", "frequency_hz")},
+        tx=arrays["tx_position"],
+    )
     told = predictor.csi(rx=arrays["rx_position"])
     assert told.shape == arrays["csi"].shape
     assert (np.isnan(told) == (NULLS | DEAD[:, None])).all()
@@ -109,7 +122,10 @@ def test_dark_pixels_and_stuck_stations_are_named_and_kept():
     assert reading.data.mask is None
     levels = -60 - 5 * rng.random((ROWS, 3))
     levels[:, 2] = -62.5
-    posts = {"station_position": rng.uniform(0, 5, (3, 3)), "station_name": np.array(["a", "b", "stuck"])}
+    posts = {
+        "station_position": rng.uniform(0, 5, (3, 3)),
+        "station_name": np.array(["a", "b", "stuck"]),
+    }
     reading = interpret(Raw({"rx_position": at, "rssi_db": levels} | posts), "levels")
     (note,) = [note for note in reading.notes if isinstance(note, Caution)]
     assert note == "all rows of station stuck are the same: are they measurements?"

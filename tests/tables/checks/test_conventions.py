@@ -1,4 +1,6 @@
-"""Files that follow other conventions than the schema's: named, and mended by the setting that is named."""
+"""Files that follow other conventions than the schema's: named,
+and mended by the setting that is named.
+"""
 
 import re
 from pathlib import Path
@@ -24,7 +26,10 @@ def channels(
     frequency = 2.44e9 + (np.arange(tones) - tones // 2) * band / tones
     numbers = np.stack(np.meshgrid(*map(np.arange, antennas), indexing="ij"), -1).reshape(-1, 2)
     array = np.column_stack([numbers, 0 * numbers[:, 0]]) * 0.06
-    place, still = rng.uniform([0.5, 0.5, 0.8], [7.5, 5.5, 1.8], (ROWS, 3)), np.array([3.0, 2.0, 2.6])
+    place, still = (
+        rng.uniform([0.5, 0.5, 0.8], [7.5, 5.5, 1.8], (ROWS, 3)),
+        np.array([3.0, 2.0, 2.6]),
+    )
     sources = [(1.0, place), (-0.4, place * [-1, 1, 1]), (-0.3, place * [1, -1, 1])]
     csi = 0.0
     for gain, source in sources:
@@ -67,14 +72,19 @@ OF_CSI = {
     "reverse_antennas": (LONG, lambda a: {"csi": a["csi"][:, ::-1]}),
     "exchange_axes": (LONG, lambda a: {"csi": a["csi"].swapaxes(1, 2)}),
     "array_mm": (SQUARE, lambda a: {"array_position": a["array_position"] * 1000}),
-    "array_wavelengths": (SQUARE,
-        lambda a: {"array_position": a["array_position"] * a["frequency_hz"].mean() / LIGHT}),
-}  # fmt: skip
+    "array_wavelengths": (
+        SQUARE,
+        lambda a: {"array_position": a["array_position"] * a["frequency_hz"].mean() / LIGHT},
+    ),
+}
 OF_SPECTRA = {
-    "zenith": lambda v: v[:, ::-1], "clockwise": lambda v: np.roll(v[:, :, ::-1], 1, axis=2),
-    "azimuth_180": lambda v: np.roll(v, 18, axis=2), "azimuth_north": lambda v: np.roll(v, -9, axis=2),
-    "transposed": lambda v: v.swapaxes(1, 2), "decibels": lambda v: 10 * np.log10(1 + 1000 * v),
-}  # fmt: skip
+    "zenith": lambda v: v[:, ::-1],
+    "clockwise": lambda v: np.roll(v[:, :, ::-1], 1, axis=2),
+    "azimuth_180": lambda v: np.roll(v, 18, axis=2),
+    "azimuth_north": lambda v: np.roll(v, -9, axis=2),
+    "transposed": lambda v: v.swapaxes(1, 2),
+    "decibels": lambda v: 10 * np.log10(1 + 1000 * v),
+}
 
 
 def settings(warnings: list[str]) -> list[str]:
@@ -123,7 +133,9 @@ def test_what_rows_do_not_tell_apart_is_said():
     clean = channels()
     turns = np.exp(2j * np.pi * np.random.default_rng(0).random(ROWS))[:, None, None]
     (said,) = convention_warnings(from_arrays(clean | {"csi": (clean["csi"] * turns).conj()}))
-    assert "dataset.conjugate=true or dataset.reverse_tones=true, which these rows do not tell apart" in said
+    assert (
+        "dataset.conjugate=true or dataset.reverse_tones=true, which these rows do not tell apart"
+    ) in said
 
 
 @pytest.mark.parametrize("setting", ["zenith", "array_mm", "exchange_axes"])
@@ -132,7 +144,9 @@ def test_a_convention_that_cannot_be_is_refused(tmp_path, setting, refused):
 
 
 def test_tones_before_antennas_were_refused_without_what_to_say(tmp_path):
-    """`frequency_hz: expected shape () or (K,), here () or (2,), found (16,)`, with `exchange_axes`, too."""
+    """`frequency_hz: expected shape () or (K,), here () or (2,), found (16,)`,
+    with `exchange_axes`, too.
+    """
     clean = channels()
     turned = clean | {
         "csi": clean["csi"].swapaxes(1, 2),
@@ -148,10 +162,15 @@ def test_tones_before_antennas_were_refused_without_what_to_say(tmp_path):
 
 def test_offsets_beside_a_carrier_were_refused():
     clean = channels()
-    offsets = clean | {"frequency_hz": clean["frequency_hz"] - 2.44e9, "carrier_hz": np.array(2.44e9)}
+    offsets = clean | {
+        "frequency_hz": clean["frequency_hz"] - 2.44e9,
+        "carrier_hz": np.array(2.44e9),
+    }
     np.testing.assert_allclose(from_arrays(offsets).site.subcarriers_hz, clean["frequency_hz"])
     with pytest.raises(DataError, match="not MHz"):
-        from_arrays(clean | {"frequency_hz": clean["frequency_hz"] / 1e6, "carrier_hz": np.array(2.44e9)})
+        from_arrays(
+            clean | {"frequency_hz": clean["frequency_hz"] / 1e6, "carrier_hz": np.array(2.44e9)}
+        )
 
 
 def test_real_files_are_sound_and_conjugated_channels_are_not():

@@ -11,13 +11,19 @@ from gsparc.tables.raw import Raw
 def reading(**change: np.ndarray) -> Reading:
     rng = np.random.default_rng(0)
     arrays = {
-        "latitude": rng.uniform(48.1, 48.12, 40), "longitude": rng.uniform(11.5, 11.53, 40),
-        "rx_height": np.array(1.5), "rssi_db": rng.uniform(-90, -60, 40), "station": np.arange(40) % 2,
-        "station_latitude": np.array([48.11, 48.12]), "station_longitude": np.array([11.52, 11.51]),
+        "latitude": rng.uniform(48.1, 48.12, 40),
+        "longitude": rng.uniform(11.5, 11.53, 40),
+        "rx_height": np.array(1.5),
+        "rssi_db": rng.uniform(-90, -60, 40),
+        "station": np.arange(40) % 2,
+        "station_latitude": np.array([48.11, 48.12]),
+        "station_longitude": np.array([11.52, 11.51]),
         "station_height": np.array(30.0),
-    }  # fmt: skip
+    }
     arrays |= change
-    return interpret(Raw({name: array for name, array in arrays.items() if array is not None}), "drive")
+    return interpret(
+        Raw({name: array for name, array in arrays.items() if array is not None}), "drive"
+    )
 
 
 def test_stations_in_reach_are_not_spoken_of():
@@ -29,31 +35,44 @@ def test_stations_in_reach_are_not_spoken_of():
 def test_stations_thousands_of_kilometres_from_all_rows_were_good(refused):
     """Rows with latitude and longitude swapped, 5,285 km from their stations."""
     there = reading()
-    rows = {"latitude": there.data.rx_position[:, 0] * 0 + 11.5, "longitude": np.linspace(48.1, 48.12, 40)}
+    rows = {
+        "latitude": there.data.rx_position[:, 0] * 0 + 11.5,
+        "longitude": np.linspace(48.1, 48.12, 40),
+    }
     for change in (
         rows,
         {"station_latitude": np.array([11.52, 11.51]), "station_longitude": np.full(2, 48.1)},
     ):
         refused(r"km from all rows.*are latitude and longitude swapped\?", reading, **change)
     with pytest.raises(DataError, match=r"km from all rows.*in one system and unit\?"):
-        reading(**rows, station_longitude=np.array([11.52, -60.0]), station_latitude=np.full(2, 48.0))
+        reading(
+            **rows, station_longitude=np.array([11.52, -60.0]), station_latitude=np.full(2, 48.0)
+        )
     (said,) = [
-        note for note in reading(station_latitude=np.array([49.2, 48.1])).notes if "static end" in note
+        note
+        for note in reading(station_latitude=np.array([49.2, 48.1])).notes
+        if "static end" in note
     ]
     assert "120" in said and "km from all rows" in said
 
 
 def test_utm_rows_and_stations():
     rng = np.random.default_rng(1)
-    metres = dict.fromkeys(("latitude", "longitude", "station_latitude", "station_longitude", "rx_height"))
+    metres = dict.fromkeys(
+        ("latitude", "longitude", "station_latitude", "station_longitude", "rx_height")
+    )
     metres["station_height"] = None
-    rows = np.column_stack([rng.uniform(691e3, 692e3, 40), rng.uniform(5334e3, 5335e3, 40), np.full(40, 1.5)])
+    rows = np.column_stack(
+        [rng.uniform(691e3, 692e3, 40), rng.uniform(5334e3, 5335e3, 40), np.full(40, 1.5)]
+    )
     posts = np.array([[691.5e3, 5334.5e3, 30.0], [691.2e3, 5334.1e3, 25.0]])
     good = reading(**metres, rx_position=rows, station_position=posts)
     assert not any("static end" in note for note in good.notes)
     with pytest.raises(DataError, match=r"are x and y swapped\?"):
         reading(**metres, rx_position=rows, station_position=posts[:, [1, 0, 2]])
-    with pytest.raises(DataError, match=r"km from all rows, which reach over .* in one system and unit"):
+    with pytest.raises(
+        DataError, match=r"km from all rows, which reach over .* in one system and unit"
+    ):
         reading(**metres, rx_position=rows - [691e3, 5334e3, 0], station_position=posts)
 
 
@@ -69,5 +88,7 @@ def test_stations_below_the_ground_are_named():
 
 
 def test_heights_of_stations_in_kilometres_are_named():
-    (said,) = [note for note in reading(station_height=np.array(0.025)).notes if "static ends" in note]
+    (said,) = [
+        note for note in reading(station_height=np.array(0.025)).notes if "static ends" in note
+    ]
     assert said == "static ends at heights of 0.025 m at most: in kilometres?"

@@ -62,7 +62,10 @@ def said(level: float) -> str:
 
 def told(levels: np.ndarray, **more: object) -> list[str]:
     """What is said of levels (n, T) of stations."""
-    place, posts = np.random.default_rng(0).uniform(0, 99, (len(levels), 3)), 50 * np.eye(levels.shape[1], 3)
+    place, posts = (
+        np.random.default_rng(0).uniform(0, 99, (len(levels), 3)),
+        50 * np.eye(levels.shape[1], 3),
+    )
     arrays = {"rx_position": place, "station_position": posts, "rssi_db": levels}
     return floor_warnings(link_levels(from_arrays(arrays | more)))
 
@@ -77,7 +80,9 @@ def test_the_advice_on_a_floor_did_nothing_and_was_given_again(seed):
 
 
 def test_a_stated_floor_was_called_too_low():
-    """Who followed the advice was told of the next station and of a higher level; one not stated is named."""
+    """Who followed the advice was told of the next station and of a higher level;
+    one not stated is named.
+    """
     levels = np.stack([noisy(drive(seed), 0.8, seed) for seed in range(2)], 1)
     low = np.quantile(levels, 0.1, axis=0)
     assert len(told(levels)) == 1 and told(levels, sensitivity_db=np.array(low.max())) == []
@@ -88,7 +93,9 @@ def test_a_stated_floor_was_called_too_low():
 def test_the_advice_on_a_floor_was_refused_for_files_of_arrays():
     """`dataset.columns` goes with tables alone; marks named it, too."""
     (line,) = told(noisy(drive(0), 0.8, 0)[:, None])
-    assert "; sensitivity_db=-110.49 in the file (of a table dataset.columns.sensitivity_db=-110.49" in line
+    assert (
+        "; sensitivity_db=-110.49 in the file (of a table dataset.columns.sensitivity_db=-110.49"
+    ) in line
 
 
 def lists(seed: int) -> np.ndarray:
@@ -115,19 +122,26 @@ def test_no_wolf_without_a_floor(kind):
 
 
 def test_a_citys_noise_was_learned_as_signal_without_a_word():
-    """Of three stations 60 to 86 % of the levels are the receiver's noise; a hall's sensors have none."""
+    """Of three stations 60 to 86 % of the levels are the receiver's noise;
+    a hall's sensors have none.
+    """
 
     def said(name: str) -> list[str]:
         with np.load(real(f"real/{name}.npz")) as stored:
-            place, post = (np.c_[stored[k], np.zeros((len(stored[k]), 3 - stored[k].shape[1]))]
-                           for k in ("mobile_position", "station_position"))  # fmt: skip
+            place, post = (
+                np.c_[stored[k], np.zeros((len(stored[k]), 3 - stored[k].shape[1]))]
+                for k in ("mobile_position", "station_position")
+            )
             arrays = {"tx_position": place, "station_position": post, "rssi_db": stored["rssi_db"]}
             names = stored["station"] if "station" in stored else np.arange(len(post)).astype(str)
             levels = link_levels(from_arrays(arrays | {"station_name": names}))
             return floor_warnings(levels)
 
     (line,) = said("powder-rss-462mhz")
-    for part in ("not heard? 60% of the levels of station bookstore-nuc2-b210 below -90.63 dB, 86% of",
-                 "68% of the levels of station ebc-nuc1-b210", "sensitivity_db=-88.89, or"):  # fmt: skip
+    for part in (
+        "not heard? 60% of the levels of station bookstore-nuc2-b210 below -90.63 dB, 86% of",
+        "68% of the levels of station ebc-nuc1-b210",
+        "sensitivity_db=-88.89, or",
+    ):
         assert part in line
     assert line.count("% of the levels") == 4 and said("ble-hall-1") == said("ble-hall-2") == []

@@ -38,13 +38,20 @@ def test_a_list_of_sites_about_another_origin_was_good(seed):
 
 
 def runs(moves: bool) -> list[str]:
-    """Warnings of powers of one transmitter on three days, which stood elsewhere on each where it `moves`."""
+    """Warnings of powers of one transmitter on three days,
+    which stood elsewhere on each where it `moves`.
+    """
     place, level = fields(0, 3)
     run = np.arange(len(place)) % 3
     level = np.where(moves, level[np.arange(len(place)), run], level[:, 0])
     level = level + np.random.default_rng(0).normal(0, 2, len(place))
     heights = np.full(len(place), 1.5)
-    arrays = {"rx_position": np.c_[place, heights], "tx_position": np.ones(3), "rssi_db": level, "run": run}
+    arrays = {
+        "rx_position": np.c_[place, heights],
+        "tx_position": np.ones(3),
+        "rssi_db": level,
+        "run": run,
+    }
     return run_warnings(from_arrays(arrays))
 
 
@@ -59,7 +66,9 @@ def test_one_site_of_many_in_kilometres_was_good():
     for one in range(10):
         thousandths = np.where(np.arange(10) == one, 1e-3, 1.0)[:, None] * [1, 1, 0] + [0, 0, 1]
         said = moved(levels, lambda sites, by=thousandths: sites * by)
-        found += len(said) == 1 and said[0].endswith("a place a thousand times as far: is it in kilometres?")
+        found += len(said) == 1 and said[0].endswith(
+            "a place a thousand times as far: is it in kilometres?"
+        )
     assert found >= 5
 
 

@@ -30,7 +30,9 @@ def test_places_of_another_measure_are_named_and_the_setting_mends_them(name):
         found += len(said) == 1 and f"dataset.{name}=true" in said[0]
         mended = interpret(apply_settings(raw, **{name: True}), "file").data
         assert not convention_warnings(mended)
-        np.testing.assert_allclose(mended.moving + mended.site.origin, right["rx_position"][:, :3], atol=1e-9)
+        np.testing.assert_allclose(
+            mended.moving + mended.site.origin, right["rx_position"][:, :3], atol=1e-9
+        )
     assert found >= 3
 
 

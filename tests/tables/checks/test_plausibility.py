@@ -17,7 +17,9 @@ from gsparc.tables.own import from_arrays
 
 
 def walk(seed, count=600, step=8.0):
-    """Places (n, 2) [m] of a walk, its levels (n,) [dB] with correlated shadowing, and the station (2,)."""
+    """Places (n, 2) [m] of a walk, its levels (n,) [dB] with correlated shadowing,
+    and the station (2,).
+    """
     rng = np.random.default_rng(seed)
     heading = np.cumsum(rng.normal(0, 0.25, count))
     place = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], 1) * step, axis=0)
@@ -32,10 +34,15 @@ def as_links(position, level_db, names, station_position=None) -> LinkLevels:
     """Links of a wide table: places (S, d), levels (S, T), stations (T, d)."""
     rows, count = level_db.shape
     return LinkLevels(
-        np.repeat(position, count, axis=0), np.tile(np.arange(count), rows), level_db.reshape(-1),
-        [f"row {i // count}" for i in range(rows * count)], np.repeat(np.arange(rows), count), names, names,
+        np.repeat(position, count, axis=0),
+        np.tile(np.arange(count), rows),
+        level_db.reshape(-1),
+        [f"row {i // count}" for i in range(rows * count)],
+        np.repeat(np.arange(rows), count),
+        names,
+        names,
         station_position,
-    )  # fmt: skip
+    )
 
 
 def warnings_of(levels: LinkLevels | None):
@@ -46,7 +53,9 @@ def warnings_of(levels: LinkLevels | None):
 def room(seed=0, count=100):
     rng = np.random.default_rng(seed)
     place = rng.uniform([0, 0, 0.5], [6, 5, 2], (count, 3))
-    return place, -40 - 20 * np.log10(np.linalg.norm(place - [3, 2, 2.5], axis=1)) + rng.normal(0, 1, count)
+    return place, -40 - 20 * np.log10(np.linalg.norm(place - [3, 2, 2.5], axis=1)) + rng.normal(
+        0, 1, count
+    )
 
 
 def test_a_sound_room_raises_none():
@@ -55,7 +64,9 @@ def test_a_sound_room_raises_none():
 
 
 def measured_at(place):
-    return from_arrays({"rx_position": place, "tx_position": np.median(place, axis=0), "rssi_db": room()[1]})
+    return from_arrays(
+        {"rx_position": place, "tx_position": np.median(place, axis=0), "rssi_db": room()[1]}
+    )
 
 
 @pytest.mark.parametrize(
@@ -64,7 +75,10 @@ def measured_at(place):
         (lambda p: np.round(p * [600, 600, 1]), "whole numbers up to"),
         (lambda p: p * [1, 1, 1000], "heights differ by"),
         (lambda p: p / 1000, "if these are kilometres"),
-        (lambda p: p * [300, 300, 1] + 30e3 * np.outer(np.arange(len(p)) % 2, [1, 0, 0]), "reach over"),
+        (
+            lambda p: p * [300, 300, 1] + 30e3 * np.outer(np.arange(len(p)) % 2, [1, 0, 0]),
+            "reach over",
+        ),
         (lambda p: np.array([40.76, -111.8, 0]) + p / 1e3, "degrees? then give"),
         (lambda p: p, None),
         (lambda p: p + np.array([4e5, 5e6, 100]), None),  # UTM
@@ -82,7 +96,8 @@ def test_units_of_positions(position, said):
     [
         ([-74.0, -74.1], [40.7, 40.8], "Antarctic"),
         ([80.2, 80.3], [13.0, 13.1], "Arctic"),
-        (np.radians([48.1, 48.2]), np.radians([11.5, 11.6]), "at sea: radians?"),  # was 57 times too small
+        # Was 57 times too small
+        (np.radians([48.1, 48.2]), np.radians([11.5, 11.6]), "at sea: radians?"),
     ],
 )
 def test_degrees(latitude, longitude, said):
@@ -94,13 +109,16 @@ def test_sound_degrees():
     assert plausibility.degree_warnings(np.array([40.7, -33.9]), np.array([-111.8, 151.2])) == []
 
 
-@pytest.mark.parametrize("level, said", [
-    (lambda v: 10 ** (v / 10), "or linear (give it as rssi"),
-    (lambda v: -v + 40, "losses (store minus them; dataset.columns.rssi_db=HEAD*-1), per cent"),
-    (lambda v: np.round((v + 100) / 2), "an index, or linear"),
-    (lambda v: np.where(np.arange(len(v)) == 3, 80, v), "1 levels above 60 dBm, up to 80"),
-    (lambda v: v * 0 - 3, "all levels are -3 dB"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "level, said",
+    [
+        (lambda v: 10 ** (v / 10), "or linear (give it as rssi"),
+        (lambda v: -v + 40, "losses (store minus them; dataset.columns.rssi_db=HEAD*-1), per cent"),
+        (lambda v: np.round((v + 100) / 2), "an index, or linear"),
+        (lambda v: np.where(np.arange(len(v)) == 3, 80, v), "1 levels above 60 dBm, up to 80"),
+        (lambda v: v * 0 - 3, "all levels are -3 dB"),
+    ],
+)
 def test_levels(level, said):
     found = plausibility.level_warnings(level(room()[1]))
     assert len(found) == 1 and said in found[0], found
@@ -117,7 +135,8 @@ def test_a_fix_that_stands_still_while_levels_change_is_named():
     there[60:180] = place[60]
     (found,) = plausibility.still_warnings(as_links(there, level[:, None], ["a"]))
     assert "row 60 to row 179: one place for 120 rows, while levels change by" in found
-    waits = np.random.default_rng(0).normal(-70, 6, len(place))  # who waits there hears fading, no way
+    # Who waits there hears fading, no way
+    waits = np.random.default_rng(0).normal(-70, 6, len(place))
     assert not plausibility.still_warnings(as_links(there, waits[:, None], ["a"]))
     assert not plausibility.still_warnings(as_links(place, level[:, None], ["a"]))
 
@@ -138,7 +157,9 @@ def test_two_steps_are_found():
     thrice[400:800] += 14
     steps = detect_level_steps(np.tile(place, (3, 1)), thrice, station)
     assert [abs(s.first - at) <= 3 for s, at in zip(steps, (400, 800), strict=True)] == [True, True]
-    assert steps[0].change_db == pytest.approx(14, abs=1) and steps[1].change_db == pytest.approx(-14, abs=1)
+    assert steps[0].change_db == pytest.approx(14, abs=1) and steps[1].change_db == pytest.approx(
+        -14, abs=1
+    )
 
 
 def test_no_wolf_on_thirty_sound_walks():
@@ -149,7 +170,10 @@ def test_no_wolf_on_thirty_sound_walks():
 def test_steps_of_little_input():
     place, level, station = walk(0)
     assert detect_level_steps(place[:50], level[:50], station) == ()
-    assert detect_level_steps(np.zeros((600, 2)), level) == () and detect_level_steps(place, level * 0) == ()
+    assert (
+        detect_level_steps(np.zeros((600, 2)), level) == ()
+        and detect_level_steps(place, level * 0) == ()
+    )
     assert detect_level_steps(place, np.full(600, np.nan)) == ()
 
 
@@ -163,7 +187,10 @@ def test_outages_and_what_was_not_heard():
     # What to do comes first: it was the third of three warnings, in words that no command took.
     assert found[0].startswith("not heard? then say dataset.absent=silent: ")
     assert "180 levels are missing of station b, beside the weakest ones" in found[0]
-    off = "no level in the 60 rows from row 100 to row 159 of station a: off, or not listed;"  # "an outage"
+    off = (
+        "no level in the 60 rows from row 100 to row 159 of station a: off, or not "
+        "listed;"
+    )  # "an outage"
     assert found[1].startswith(off)
     assert found[2].startswith("6 single levels missing of station c") and len(found) == 3
     assert plausibility.gap_warnings(as_links(place[:4], np.full((4, 1), np.nan), ["a"])) == [
@@ -174,12 +201,19 @@ def test_outages_and_what_was_not_heard():
 def campus(stations=slice(None)) -> LinkLevels:
     """Links of some of twelve stations."""
     with np.load(real("real/powder-rss-462mhz.npz")) as stored:
-        level, names = stored["rssi_db"][:, stations].astype(float), stored["station"][stations].tolist()
-        return as_links(stored["mobile_position"], level, names, stored["station_position"][stations])
+        level, names = (
+            stored["rssi_db"][:, stations].astype(float),
+            stored["station"][stations].tolist(),
+        )
+        return as_links(
+            stored["mobile_position"], level, names, stored["station_position"][stations]
+        )
 
 
 def test_a_real_station_that_lost_its_gain():
-    """One of four changes: 17 dB more from row 350 on, 19 dB less from row 1461 on, after it was off."""
+    """One of four changes: 17 dB more from row 350 on, 19 dB less from row 1461 on,
+    after it was off.
+    """
     some = campus(slice(5, 9))
     found = plausibility.step_warnings(some, plausibility.find_level_steps(some))
     # Two lines proposed [350] and [1461], of which the later setting replaces the first.
@@ -191,9 +225,12 @@ def test_a_real_station_that_lost_its_gain():
 def test_real_outages_are_not_taken_for_silence():
     found = plausibility.gap_warnings(campus())
     assert sum("off, or not listed" in line for line in found) == 8
-    assert any("the 811 rows from row 351 to row 1161 of stations bookstore" in line for line in found)
     assert any(
-        "the 1162 rows from row 0 to row 1161 of station cnode-ustar-dd-b210" in line for line in found
+        "the 811 rows from row 351 to row 1161 of stations bookstore" in line for line in found
+    )
+    assert any(
+        "the 1162 rows from row 0 to row 1161 of station cnode-ustar-dd-b210" in line
+        for line in found
     )
     assert not any("sensitivity_db" in line for line in found)
 
@@ -202,7 +239,9 @@ def test_a_station_for_each_place_is_no_outage_of_the_others():
     place, level, station = walk(0, 60)
     links = {"rx_position": np.column_stack([place, np.ones(60)]), "station": np.arange(60) % 2}
     posts = np.array([[*station, 5.0], [0.0, 0, 5]])
-    assert not warnings_of(link_levels(from_arrays({**links, "station_position": posts, "rssi_db": level})))
+    assert not warnings_of(
+        link_levels(from_arrays({**links, "station_position": posts, "rssi_db": level}))
+    )
 
 
 def test_the_setting_of_a_level_step_named_no_row_of_a_table(tmp_path):
@@ -211,7 +250,8 @@ def test_the_setting_of_a_level_step_named_no_row_of_a_table(tmp_path):
     place, other = place + 1e-3 * np.arange(200)[:, None], walk(3, 400)[1]
     place, level = np.concatenate([place, place + 0.5]), np.concatenate([level, level + 20])
     text = "# a remark\nx,y,A,B\n" + "".join(
-        f"{x:.2f},{y:.2f},{a:.2f},{b:.2f}\n" for (x, y), a, b in zip(place, level, other, strict=True)
+        f"{x:.2f},{y:.2f},{a:.2f},{b:.2f}\n"
+        for (x, y), a, b in zip(place, level, other, strict=True)
     )
     posts = f"name,x,y\nA,{station[0]:.1f},{station[1]:.1f}\nB,0,0\n"
     (tmp_path / "walk.csv").write_text(text)
@@ -231,17 +271,24 @@ def test_the_setting_of_a_level_step_named_no_row_of_a_table(tmp_path):
 
 
 def test_warnings_and_rows_had_other_names_of_a_cell_than_the_rest():
-    """`station 150: row 7` of `W03-2 (150)`; the setting that a warning gives takes the short one."""
+    """`station 150: row 7` of `W03-2 (150)`;
+    the setting that a warning gives takes the short one.
+    """
     place, level, station = walk(4, 200)
     place, level = np.concatenate([place, place + 0.5]), np.concatenate([level, level + 20])
     links = {
         "rx_position": np.c_[place, np.ones(400)],
         "station_position": np.array([[*station, 9], [0, 0, 9]]),
     }
-    labels = {"station_name": np.array(["150", "212"]), "station_label": np.array(["W03-2", "W03-3"])}
+    labels = {
+        "station_name": np.array(["150", "212"]),
+        "station_label": np.array(["W03-2", "W03-3"]),
+    }
     data = from_arrays({**links, **labels, "rssi_db": np.c_[level, level[::-1].copy()]})
     warnings = warnings_of(link_levels(data))
-    assert any(w.startswith("station W03-2 (150) rises") and "level_steps={150:[" in w for w in warnings)
+    assert any(
+        w.startswith("station W03-2 (150) rises") and "level_steps={150:[" in w for w in warnings
+    )
     assert data.row_names[:2] == ["row 0, station W03-2 (150)", "row 0, station W03-3 (212)"]
 
 
@@ -283,7 +330,9 @@ def test_all_rows_of_a_station_at_one_place_are_named():
     still = np.flatnonzero((place == place[40]).all(1)).tolist() + list(range(41, 60))
     place[still], levels[still, 1] = place[40], np.linspace(-90, -60, 20)
     (said,) = plausibility.still_warnings(as_links(place, levels, ["a", "b"]))
-    assert said.startswith("all rows of station b are at one place, while levels change by up to 30 dB")
+    assert said.startswith(
+        "all rows of station b are at one place, while levels change by up to 30 dB"
+    )
 
 
 @pytest.mark.parametrize("other", ["kilometres", "degrees"])
@@ -293,8 +342,12 @@ def test_some_places_in_another_unit_are_named(other):
     mixed = place / 1e3 if other == "kilometres" else [11.5, 48.1] + place / 111e3
     rows = np.c_[np.where(half[:, None], mixed, place), np.ones(80)]
     found = unit_warnings(from_arrays({"rx_position": rows, "rssi_db": rng.normal(-80, 5, 80)}))
-    assert any("40 of 80 places lie within" in line and f"in {other}?" in line for line in found), found
-    whole = from_arrays({"rx_position": np.c_[place, np.ones(80)], "rssi_db": rng.normal(-80, 5, 80)})
+    assert any("40 of 80 places lie within" in line and f"in {other}?" in line for line in found), (
+        found
+    )
+    whole = from_arrays(
+        {"rx_position": np.c_[place, np.ones(80)], "rssi_db": rng.normal(-80, 5, 80)}
+    )
     assert not unit_warnings(whole)
 
 
@@ -336,7 +389,9 @@ def test_carriers_that_no_link_has_are_named(factor):
 def test_all_levels_in_another_unit_were_good(factor, says):
     """-80 dBm as -.8, or as -262."""
     place, level = room()
-    data = from_arrays({"rx_position": place, "tx_position": np.zeros(3), "rssi_db": (level - 40) * factor})
+    data = from_arrays(
+        {"rx_position": place, "tx_position": np.zeros(3), "rssi_db": (level - 40) * factor}
+    )
     found = unit_warnings(data) + plausibility.level_warnings((level - 40) * factor)
     assert any(says in line for line in found), found
 

@@ -1,4 +1,6 @@
-"""The split that `gsparc check` proposes can be cut, and asks about holes wider than the places are apart."""
+"""The split that `gsparc check` proposes can be cut,
+and asks about holes wider than the places are apart.
+"""
 
 import numpy as np
 from invented import divide, invent
@@ -16,7 +18,11 @@ from gsparc.tables.own import load_own, write_own
 def powers(file, places):
     write_own(
         file,
-        {"rx_position": places, "tx_position": np.zeros(3), "rssi_db": np.linspace(-80, -40, len(places))},
+        {
+            "rx_position": places,
+            "tx_position": np.zeros(3),
+            "rssi_db": np.linspace(-80, -40, len(places)),
+        },
     )
     return load_own(file)
 
@@ -28,14 +34,17 @@ def test_squares_are_a_tenth_of_the_site_or_several_neighbours_wide(tmp_path):
     assert 0.15 < len(held_out_block_rows(data, 30.0)) / 400 < 0.5
     assert "split=blocks split.side_m=30 " in propose_split(data)
     sparse = powers(
-        tmp_path / "b.npz", np.array([[x, y, 1.0] for x in range(0, 60, 10) for y in range(0, 60, 10)])
+        tmp_path / "b.npz",
+        np.array([[x, y, 1.0] for x in range(0, 60, 10) for y in range(0, 60, 10)]),
     )
     assert propose_side(sparse) is None and "too few places" in propose_split(sparse)
 
 
 def test_copies_of_places_were_neighbours_at_no_distance(tmp_path):
     """Seen from above as well: squares of floor of places at two heights had no least side."""
-    places = np.array([[x, y, z] for x in range(0, 60, 10) for y in range(0, 60, 10) for z in (1.0, 2.0)])
+    places = np.array(
+        [[x, y, z] for x in range(0, 60, 10) for y in range(0, 60, 10) for z in (1.0, 2.0)]
+    )
     assert spacing_words(np.repeat(places[::2], 3, axis=0), None).startswith(
         "the nearest other place is 10 m"
     )
@@ -43,16 +52,22 @@ def test_copies_of_places_were_neighbours_at_no_distance(tmp_path):
 
 
 def test_of_several_carriers_it_was_not_said_whose_wavelengths_are_counted():
-    places, far = np.array([[0.0, 0, 0], [3.0, 0, 0]]), "the nearest other place is 3 m away (median)"
+    places, far = (
+        np.array([[0.0, 0, 0], [3.0, 0, 0]]),
+        ("the nearest other place is 3 m away (median)"),
+    )
     assert (
-        spacing_words(places, np.array([3e9, 1e9])) == f"{far}, 10 wavelengths of the lowest carrier, 1 GHz"
+        spacing_words(places, np.array([3e9, 1e9])) == f"{far}, 10 wavelengths of the lowest "
+        "carrier, 1 GHz"
     )
     assert spacing_words(places, np.array([1e9])) == f"{far}, 10 wavelengths"
     assert spacing_words(places, np.array([np.nan])) == far
 
 
 def test_one_place_alone_has_no_squares(tmp_path):
-    data = powers(tmp_path / "a.npz", np.tile([1.0, 2.0, 3.0], (5, 1)) + [[0, 0, 0.1 * i] for i in range(5)])
+    data = powers(
+        tmp_path / "a.npz", np.tile([1.0, 2.0, 3.0], (5, 1)) + [[0, 0, 0.1 * i] for i in range(5)]
+    )
     assert propose_side(data) is None
 
 

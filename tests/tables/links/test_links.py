@@ -1,4 +1,6 @@
-"""Stations, both ends moving, missing and censored powers: what a file may say, and what it becomes."""
+"""Stations, both ends moving, missing and censored powers: what a file may say,
+and what it becomes.
+"""
 
 import re
 
@@ -18,20 +20,30 @@ RNG = np.random.default_rng(0)
 WALK = RNG.uniform(0, 20, (PLACES, 3))
 POSTS = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])
 LEVELS = RNG.uniform(-90, -40, (PLACES, STATIONS))
-LONG = {"tx_position": np.repeat(WALK, STATIONS, axis=0), "station": np.tile(np.arange(STATIONS), PLACES)}
+LONG = {
+    "tx_position": np.repeat(WALK, STATIONS, axis=0),
+    "station": np.tile(np.arange(STATIONS), PLACES),
+}
 
 
 def town(**changes):
     """Powers of a walking transmitter at three stations, one column for each."""
     arrays = {
-        "tx_position": WALK, "station_position": POSTS, "station_name": np.array(["north", "east", "roof"]),
+        "tx_position": WALK,
+        "station_position": POSTS,
+        "station_name": np.array(["north", "east", "roof"]),
         "rssi_db": LEVELS,
-    }  # fmt: skip
+    }
     return {k: np.asarray(v) for k, v in {**arrays, **changes}.items() if v is not None}
 
 
 def degrees(latitude, longitude, **changes):
-    places = {"tx_position": None, "station_position": None, "latitude": latitude, "longitude": longitude}
+    places = {
+        "tx_position": None,
+        "station_position": None,
+        "latitude": latitude,
+        "longitude": longitude,
+    }
     return town(**{**places, **changes})
 
 
@@ -42,9 +54,15 @@ def read(arrays):
 def test_a_wide_file_is_a_row_for_each_link():
     data = read(town()).data
     assert len(data) == PLACES * STATIONS and data.site.static_end == "rx"
-    assert data.site.stations.name == ("north", "east", "roof") and data.site.static_position is None
+    assert (
+        data.site.stations.name == ("north", "east", "roof") and data.site.static_position is None
+    )
     link = 4 * STATIONS + 2
-    assert data.station[link] == 2 and data.place[link] == 4 and data.row_names[link] == "row 4, station roof"
+    assert (
+        data.station[link] == 2
+        and data.place[link] == 4
+        and data.row_names[link] == "row 4, station roof"
+    )
     np.testing.assert_allclose(data.tx[link] + data.site.origin, WALK[4])
     np.testing.assert_allclose(data.rx_position[link] + data.site.origin, POSTS[2])
     np.testing.assert_allclose(
@@ -57,7 +75,9 @@ def test_three_access_points_by_their_positions_alone():
     rows = 60
     which = np.arange(rows) % 3
     walk = RNG.uniform(0, 20, (rows, 3))
-    found = read({"rx_position": walk, "tx_position": POSTS[which], "rssi_db": RNG.uniform(-80, -40, rows)})
+    found = read(
+        {"rx_position": walk, "tx_position": POSTS[which], "rssi_db": RNG.uniform(-80, -40, rows)}
+    )
     assert len(found.data.site.stations) == 3 and found.data.site.static_end == "tx"
     assert any("taken as 3 stations" in note for note in found.notes)
 
@@ -91,7 +111,9 @@ def test_powers_below_the_sensitivity_are_kept_as_that():
 
 
 def test_levels_below_the_sensitivity_were_refused():
-    """Noise that a receiver reports is no signal; a station without a level was refused beside them."""
+    """Noise that a receiver reports is no signal;
+    a station without a level was refused beside them.
+    """
     holes = np.where(LEVELS < -80, np.nan, LEVELS)
     told = {"station_position": POSTS, "sensitivity_db": np.array([-80.0, np.nan, -80.0])}
     for station, arrays in ((1, town(rssi_db=holes, **told)), (None, town(sensitivity_db=-80.0))):
@@ -99,16 +121,24 @@ def test_levels_below_the_sensitivity_were_refused():
         silent = (LEVELS < -80) & (np.arange(STATIONS) != station)
         assert (found.data.censored > 0).sum() == silent.sum()
         assert (found.data.mask[:, 0] == (found.data.censored == 0)).all()
-        level = 10 * np.log10(found.data.target[found.data.censored > 0] * found.data.site.target_scale)
+        level = 10 * np.log10(
+            found.data.target[found.data.censored > 0] * found.data.site.target_scale
+        )
         np.testing.assert_allclose(level, -80, atol=1e-3)
-    assert any("levels lie below sensitivity_db: taken as not heard; has it the" in n for n in found.notes)
+    assert any(
+        "levels lie below sensitivity_db: taken as not heard; has it the" in n for n in found.notes
+    )
 
 
 def test_a_sensitivity_far_below_all_powers_is_said():
-    """A level of -399 dB, true or not, drew the process hundreds of decibels below all that was heard."""
+    """A level of -399 dB, true or not, drew the process hundreds
+    of decibels below all that was heard.
+    """
     holes = np.where(LEVELS < -80, np.nan, LEVELS)
     (said,) = [
-        n for n in read(town(rssi_db=holes, sensitivity_db=-399.0)).notes if "is it the receiver's" in n
+        n
+        for n in read(town(rssi_db=holes, sensitivity_db=-399.0)).notes
+        if "is it the receiver's" in n
     ]
     assert said.startswith("sensitivity_db=-399 is 320 dB below") and "\n" not in said
     assert not any("receiver's" in n for n in read(town(rssi_db=holes, sensitivity_db=-80.0)).notes)
@@ -128,41 +158,69 @@ def test_the_files_own_split_names_rows_of_the_file():
 
 
 def test_carriers_that_could_be_of_rows_or_stations_were_taken_without_a_word():
-    three = town(**{k: v[:3] for k, v in town().items() if isinstance(v, np.ndarray) and len(v) == PLACES})
+    three = town(
+        **{k: v[:3] for k, v in town().items() if isinstance(v, np.ndarray) and len(v) == PLACES}
+    )
     found = read({**three, "carrier_hz": np.array([4e8, 5e8, 6e8])})
     assert any("carrier_hz: as many values as rows and as stations" in note for note in found.notes)
 
 
 SPOILT = {
-    "station out of range": (town(station=np.full(PLACES, 3), rssi_db=LEVELS[:, 0]), "row 0 is of station 3"),
-    "station by name": (town(station=np.full(PLACES, "roof"), rssi_db=LEVELS[:, 0]), "whole numbers"),
-    "columns": (town(rssi_db=LEVELS[:, :2]), r"expected shape \(S, 3, ...\), a column for each station"),
+    "station out of range": (
+        town(station=np.full(PLACES, 3), rssi_db=LEVELS[:, 0]),
+        "row 0 is of station 3",
+    ),
+    "station by name": (
+        town(station=np.full(PLACES, "roof"), rssi_db=LEVELS[:, 0]),
+        "whole numbers",
+    ),
+    "columns": (
+        town(rssi_db=LEVELS[:, :2]),
+        r"expected shape \(S, 3, ...\), a column for each station",
+    ),
     "names": (town(station_name=np.array(["a", "a", "b"])), "'a' twice"),
-    "fewer names": (town(station_name=np.array(["a", "b"])), r"station_name: expected shape \(T,\)"),
+    "fewer names": (
+        town(station_name=np.array(["a", "b"])),
+        r"station_name: expected shape \(T,\)",
+    ),
     "nan station": (town(station_position=POSTS * [1, np.nan, 1]), "station_position, row 0"),
     "no height": (town(tx_position=WALK[:, :2]), "two coordinates; expected .* as tx_height"),
     "height of 3-D": (town(tx_height=1.5), "tx_height: given, but tx_position has three"),
     "both ends and stations": (town(rx_position=WALK), "found rx_position and tx_position"),
     "no end": (town(tx_position=None), "of the end that moves; found neither"),
-    "no table": (town(station_position=None, station=np.zeros(PLACES, int)), "without station_position"),
+    "no table": (
+        town(station_position=None, station=np.zeros(PLACES, int)),
+        "without station_position",
+    ),
     "all missing": (town(rssi_db=LEVELS * np.nan), "nothing was measured"),
     "all below the level": (town(sensitivity_db=-20.0), "nothing was heard in any row"),
-    "level of channels": (town(rssi_db=None, rssi=LEVELS**2, sensitivity_db=-80.0), "goes with rssi_db"),
+    "level of channels": (
+        town(rssi_db=None, rssi=LEVELS**2, sensitivity_db=-80.0),
+        "goes with rssi_db",
+    ),
     "level of 1e9": (town(sensitivity_db=1e9), "expected dB between -400 and 400"),
     "turned transmitters": (
-        town(tx_position=None, rx_position=WALK, station_orientation=np.eye(4)[:3]), "are not turned",
+        town(tx_position=None, rx_position=WALK, station_orientation=np.eye(4)[:3]),
+        "are not turned",
     ),
     "orientation": (town(station_orientation=np.ones((3, 4))), "north = .*: expected a quaternion"),
     "mask of another shape": (town(mask=np.ones(PLACES, bool)), "mask: expected shape"),
-    "NaN under a mask": (town(rssi_db=LEVELS * np.nan, mask=np.ones_like(LEVELS, bool)), "not finite"),
+    "NaN under a mask": (
+        town(rssi_db=LEVELS * np.nan, mask=np.ones_like(LEVELS, bool)),
+        "not finite",
+    ),
     "carriers in MHz": (town(carrier_hz=np.array([460.0, 461, 462])), r"expected Hz"),
     "latitude alone": (town(tx_position=None, latitude=np.full(PLACES, 40.0)), "given alone"),
-    "beyond the pole": (degrees(np.full(PLACES, 140.0), np.full(PLACES, 4.0)), "row 0: latitude 140"),
+    "beyond the pole": (
+        degrees(np.full(PLACES, 140.0), np.full(PLACES, 4.0)),
+        "row 0: latitude 140",
+    ),
     "counts of degrees": (degrees(WALK[:, 0], WALK[1:, 1]), "here .10,., found .9,"),
     "metres beside degrees": (
-        degrees(WALK[:, 0], WALK[:, 1], station_position=POSTS), "in metres beside places in degrees",
+        degrees(WALK[:, 0], WALK[:, 1], station_position=POSTS),
+        "in metres beside places in degrees",
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", SPOILT)
@@ -174,7 +232,10 @@ def test_what_is_wrong_is_one_line(refused, case):
 def test_degrees_become_metres_and_back():
     north = 40.76 + RNG.uniform(0, 0.01, PLACES)
     east = -111.84 + RNG.uniform(0, 0.01, PLACES)
-    posts = {"station_latitude": np.array([40.76, 40.77, 40.765]), "station_longitude": np.full(3, -111.835)}
+    posts = {
+        "station_latitude": np.array([40.76, 40.77, 40.765]),
+        "station_longitude": np.full(3, -111.835),
+    }
     found = read(degrees(north, east, tx_height=1.5, **posts))
     data = found.data
     world = data.tx[::STATIONS, :2] + data.site.origin[:2]
@@ -201,9 +262,11 @@ OF_ROWS = [
         },
         "rssi_db, row 7: not finite",
     ),
-    (town(**LONG, rssi_db=changed(LEVELS.reshape(-1), (17, np.inf))),
-        "rssi_db, row 17, station roof: not finite"),
-]  # fmt: skip
+    (
+        town(**LONG, rssi_db=changed(LEVELS.reshape(-1), (17, np.inf))),
+        "rssi_db, row 17, station roof: not finite",
+    ),
+]
 
 
 @pytest.mark.parametrize(("arrays", "says"), OF_ROWS)
@@ -222,13 +285,19 @@ def test_rows_keep_their_numbers_when_a_part_is_taken():
 def test_a_level_for_each_station_was_refused_where_stations_have_two_carriers():
     levels_db = np.where(LEVELS < -80, np.nan, LEVELS)
     carriers = np.where(np.arange(PLACES) % 2, 1e9, 2e9)
-    data = read(town(rssi_db=levels_db, carrier_hz=carriers, sensitivity_db=np.array([-80.0, -81, -82]))).data
+    data = read(
+        town(rssi_db=levels_db, carrier_hz=carriers, sensitivity_db=np.array([-80.0, -81, -82]))
+    ).data
     assert len(data.site.stations) == 2 * STATIONS and data.censored.any()
     assert data.site.stations.name[:2] == ("north at 1000 MHz", "north at 2000 MHz")
     assert data.site.stations.carrier_hz[data.station[-1]] == 1e9
     level_db = 10 * np.log10(data.target[:, 0].astype(float) * data.site.target_scale)
-    expected = [{"n": -80.0, "e": -81.0, "r": -82.0}[data.site.stations.name[t][0]] for t in data.station]
-    np.testing.assert_allclose(level_db[data.censored > 0], np.array(expected)[data.censored > 0], atol=1e-3)
+    expected = [
+        {"n": -80.0, "e": -81.0, "r": -82.0}[data.site.stations.name[t][0]] for t in data.station
+    ]
+    np.testing.assert_allclose(
+        level_db[data.censored > 0], np.array(expected)[data.censored > 0], atol=1e-3
+    )
 
 
 def test_powers_of_zero_were_learned_as_300_dB_below():
@@ -236,7 +305,9 @@ def test_powers_of_zero_were_learned_as_300_dB_below():
     powers = np.where(LEVELS < -80, 0.0, 10 ** (LEVELS / 10))
     found = read({**town(rssi_db=None), "rssi": powers})
     assert (found.data.censored == 1).sum() == (powers == 0).sum() > 0
-    assert f"{(powers == 0).sum()} of {powers.size} powers were not heard: below" in " ".join(found.notes)
+    assert (f"{(powers == 0).sum()} of {powers.size} powers were not heard: below") in " ".join(
+        found.notes
+    )
     bounds = 10 * np.log10(
         found.data.target[found.data.censored == 1].astype(float) * found.data.site.target_scale
     )
@@ -246,7 +317,11 @@ def test_powers_of_zero_were_learned_as_300_dB_below():
 
 def test_nothing_heard_in_any_row_was_zero_everywhere(refused):
     """It said that every measured value is zero."""
-    arrays = {"rx_position": np.eye(3) * 4, "rssi_db": np.full(3, np.nan), "sensitivity_db": np.array(-100.0)}
+    arrays = {
+        "rx_position": np.eye(3) * 4,
+        "rssi_db": np.full(3, np.nan),
+        "sensitivity_db": np.array(-100.0),
+    }
     refused("rssi_db: nothing was heard in any row", read, arrays)
 
 
@@ -261,12 +336,18 @@ def test_rows_that_tell_nothing_were_refused(what):
     else:
         spectra[3] = 0
     found = interpret(Raw(arrays, {}), "own")
-    assert len(found.data) == PLACES - 1 and any("1 of 10 values are missing" in note for note in found.notes)
+    assert len(found.data) == PLACES - 1 and any(
+        "1 of 10 values are missing" in note for note in found.notes
+    )
     assert np.allclose(found.data.tx + found.data.site.origin, np.delete(WALK, 3, 0))
 
 
 def test_one_station_in_degrees_needed_a_column():
-    degrees = {"latitude": 48 + WALK[:, 1] / 1e5, "longitude": 9 + WALK[:, 0] / 1e5, "tx_height": WALK[:, 2]}
+    degrees = {
+        "latitude": 48 + WALK[:, 1] / 1e5,
+        "longitude": 9 + WALK[:, 0] / 1e5,
+        "tx_height": WALK[:, 2],
+    }
     mast = {
         "station_latitude": np.array([48.0]),
         "station_longitude": np.array([9.0]),
@@ -276,14 +357,19 @@ def test_one_station_in_degrees_needed_a_column():
     assert len(found.data) == PLACES and len(found.data.site.stations) == 1
 
 
-@pytest.mark.parametrize("said", [{"not_heard": "none"}, {"not_heard": [-999, "x"]}, {"absent": "silnt"}])
+@pytest.mark.parametrize(
+    "said", [{"not_heard": "none"}, {"not_heard": [-999, "x"]}, {"absent": "silnt"}]
+)
 def test_what_is_said_of_unheard_powers_was_not_checked(said):
-    """An attribute of text was a traceback; a mark that is no level, or a mistyped word, counted as none."""
+    """An attribute of text was a traceback; a mark that is no level, or a mistyped word,
+    counted as none.
+    """
     with pytest.raises(SettingError, match=f"dataset.{next(iter(said))}="):
         interpret(Raw(town(), said), "town.npz")
     levels = np.where(np.arange(PLACES) < 4, -np.inf, LEVELS[:, 0])
     marked = Raw(
-        town(rssi_db=levels, station_position=POSTS[:1], station_name=None), {"not_heard": [-np.inf]}
+        town(rssi_db=levels, station_position=POSTS[:1], station_name=None),
+        {"not_heard": [-np.inf]},
     )
     assert (interpret(marked, "town.npz").data.censored == 1).sum() == 4
 
@@ -291,19 +377,45 @@ def test_what_is_said_of_unheard_powers_was_not_checked(said):
 def test_whole_numbers_beside_a_sensitivity_were_a_traceback():
     whole = LEVELS.round().astype(np.int64)
     data = read(town(rssi_db=whole, sensitivity_db=np.array(-99.0))).data
-    assert np.allclose(10 * np.log10(data.target[:, 0] * data.site.target_scale), whole.ravel(), atol=1e-4)
+    assert np.allclose(
+        10 * np.log10(data.target[:, 0] * data.site.target_scale), whole.ravel(), atol=1e-4
+    )
 
 
 FORMS = {  # arrays and attributes, and what is said of them
-    "stations of two counts": (degrees(*(WALK[:, :2] / 1e4 + 40).T, rx_height=1.0,
-        station_latitude=POSTS[:, 0], station_longitude=POSTS[:2, 0]), {}, "station_longitude: expected"),
-    "no levels": (town(rssi_db=np.array(3.0)), {}, r"rssi_db: expected shape \(S,\) or \(S, T\), found \(\)"),
+    "stations of two counts": (
+        degrees(
+            *(WALK[:, :2] / 1e4 + 40).T,
+            rx_height=1.0,
+            station_latitude=POSTS[:, 0],
+            station_longitude=POSTS[:2, 0],
+        ),
+        {},
+        "station_longitude: expected",
+    ),
+    "no levels": (
+        town(rssi_db=np.array(3.0)),
+        {},
+        r"rssi_db: expected shape \(S,\) or \(S, T\), found \(\)",
+    ),
     "text": (town(rssi_db=LEVELS.astype(str)), {}, "rssi_db: expected real numbers"),
-    "times as places": (town(tx_position=WALK.astype("M8[s]")), {}, "tx_position: expected real numbers"),
+    "times as places": (
+        town(tx_position=WALK.astype("M8[s]")),
+        {},
+        "tx_position: expected real numbers",
+    ),
     "a name of two": (town(), {"name": np.array([1.0, 2.0])}, "name: a list; expected text"),
-    "a measurement of two": (town(), {"measurement": np.array(["rssi", "csi"])}, "names no measurement"),
-    "transposed powers": (town(), {"conventions": "transposed"}, "transposed: rows as azimuths, columns as"),
-}  # fmt: skip
+    "a measurement of two": (
+        town(),
+        {"measurement": np.array(["rssi", "csi"])},
+        "names no measurement",
+    ),
+    "transposed powers": (
+        town(),
+        {"conventions": "transposed"},
+        "transposed: rows as azimuths, columns as",
+    ),
+}
 
 
 @pytest.mark.parametrize("case", FORMS)
@@ -333,7 +445,9 @@ def test_a_level_of_0_far_above_all_others_was_the_strongest(count, stations):
 
 
 def test_a_carrier_per_row_was_refused_without_a_list_of_stations():
-    """One receiver whose rows are at two carriers is a station at each; rows of a place stay together."""
+    """One receiver whose rows are at two carriers is a station at each;
+    rows of a place stay together.
+    """
     places = np.repeat(np.random.default_rng(0).uniform(0, 5, (12, 3)), 2, axis=0)
     spectra = np.random.default_rng(1).uniform(0, 1, (24, 12, 24))
     arrays = {"tx_position": places, "rx_position": np.zeros(3), "spectrum": spectra}

@@ -15,9 +15,12 @@ def wide(**more: np.ndarray) -> Raw:
     rssi = rng.normal(-60, 5, (12, 2))
     rssi[3, 1] = np.nan
     arrays = {
-        "rx_position": rng.uniform(0, 9, (12, 3)), "station_position": np.array([[0.0, 0, 3], [9, 9, 3]]),
-        "station_name": np.array(["a", "b"]), "rssi_db": rssi, **more,
-    }  # fmt: skip
+        "rx_position": rng.uniform(0, 9, (12, 3)),
+        "station_position": np.array([[0.0, 0, 3], [9, 9, 3]]),
+        "station_name": np.array(["a", "b"]),
+        "rssi_db": rssi,
+        **more,
+    }
     return Raw(arrays, {}, {})
 
 
@@ -45,27 +48,42 @@ def test_rows_after_a_step_are_another_stations(who):
 def test_a_part_stays_censored_where_it_heard_nothing_and_only_there():
     """Columns filled up with NaN would be rows where nothing was heard."""
     data = parted(wide(sensitivity_db=np.array(-90.0)), {"b": (5,)})
-    assert data.censored.sum() == 1 and data.site.stations.name[data.station[data.censored > 0][0]] == "b"
+    assert (
+        data.censored.sum() == 1
+        and data.site.stations.name[data.station[data.censored > 0][0]] == "b"
+    )
 
 
 def test_rows_of_a_long_file_and_its_parts_by_the_stations_name():
     raw = wide()
     arrays = {k: v for k, v in raw.arrays.items() if k != "rssi_db"}
-    long = Raw({**arrays, "station": np.arange(12) % 2, "rssi_db": raw.arrays["rssi_db"][:, 0]}, {}, {})
+    long = Raw(
+        {**arrays, "station": np.arange(12) % 2, "rssi_db": raw.arrays["rssi_db"][:, 0]}, {}, {}
+    )
     assert parted(long, {"b": (6,)}).station.tolist() == [0, 1, 0, 1, 0, 1, 0, 2, 0, 2, 0, 2]
     kept = parted(long, {"b": (6,)}, stations=["b"])
-    assert kept.site.stations.name == ("b", "b from row 6") and kept.station.tolist() == [0, 0, 0, 1, 1, 1]
+    assert kept.site.stations.name == ("b", "b from row 6") and kept.station.tolist() == [
+        0,
+        0,
+        0,
+        1,
+        1,
+        1,
+    ]
 
 
 def unplaced() -> Raw:
     return Raw({"rx_position": np.eye(4)[:, :3], "tx_position": np.ones(3), "rssi_db": np.zeros(4)})
 
 
-@pytest.mark.parametrize(("make", "steps", "says"), [
-    (wide, {"c": (5,)}, "no station c in file"),
-    (wide, {"b": (12,)}, "expected a row between 1 and 11"),
-    (wide, {"b": (0,)}, "expected a row between 1 and 11"),
-    (unplaced, {"b": (2,)}, "has no stations"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("make", "steps", "says"),
+    [
+        (wide, {"c": (5,)}, "no station c in file"),
+        (wide, {"b": (12,)}, "expected a row between 1 and 11"),
+        (wide, {"b": (0,)}, "expected a row between 1 and 11"),
+        (unplaced, {"b": (2,)}, "has no stations"),
+    ],
+)
 def test_a_step_that_cannot_be_is_one_line(refused, make, steps, says):
     refused(says, parted, make(), steps)

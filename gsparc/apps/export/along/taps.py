@@ -1,4 +1,6 @@
-"""Tapped delay lines along a trajectory: a model's channels as taps at whole samples, and their Doppler."""
+"""Tapped delay lines along a trajectory: a model's channels as taps at whole samples,
+and their Doppler.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         if len(self.time_s) < 2 or (np.diff(self.time_s) <= 0).any():
-            raise ValueError("a trajectory needs two rows or more, each later than the one before (time_s)")
+            raise ValueError(
+                "a trajectory needs two rows or more, each later than the one before (time_s)"
+            )
 
     def places_at(self, time_s: np.ndarray) -> np.ndarray:
         """Return places (m, 3) at times (m,)."""
@@ -46,13 +50,18 @@ class Trajectory:
 
         Four or more.
         """
-        fastest = float((np.linalg.norm(np.diff(self.place, axis=0), axis=1) / np.diff(self.time_s)).max())
-        longest = float(self.time_s[-1] - self.time_s[0]) * fastest / wavelength  # were it always that fast
+        fastest = float(
+            (np.linalg.norm(np.diff(self.place, axis=0), axis=1) / np.diff(self.time_s)).max()
+        )
+        # Were it always that fast
+        longest = float(self.time_s[-1] - self.time_s[0]) * fastest / wavelength
         # Four at least: a cubic spline needs them.
         count = max(int(np.ceil(longest * PER_WAVE)) + 1, 4)
         if count > MOST:
             far = f"the trajectory is {longest:.0f} wavelengths long"
-            raise ValueError(f"{far}, at most {MOST // PER_WAVE} are exported at once; take a part of it")
+            raise ValueError(
+                f"{far}, at most {MOST // PER_WAVE} are exported at once; take a part of it"
+            )
         return np.linspace(self.time_s[0], self.time_s[-1], count)
 
 
@@ -60,7 +69,8 @@ class Trajectory:
 class TappedDelayLine:
     """Taps at instants so close that those between can be interpolated.
 
-    The channel at f is the sum over l of `gain exp(-j 2 pi (f - carrier_hz) (first + l) / rate_hz)`.
+    The channel at f is the sum over l of
+    `gain exp(-j 2 pi (f - carrier_hz) (first + l) / rate_hz)`.
 
     Attributes:
         time_s: (T,) float64 [s].
@@ -88,7 +98,9 @@ class TappedDelayLine:
         return np.angle(turned) / (2 * np.pi * (self.time_s[1] - self.time_s[0]))
 
 
-def write_taps(predictor: Predictor, way: Trajectory, how: Mapping[str, Any], file: Path) -> dict[str, Any]:
+def write_taps(
+    predictor: Predictor, way: Trajectory, how: Mapping[str, Any], file: Path
+) -> dict[str, Any]:
     """Write taps, delays and Doppler to `file`, an npz.
 
     Args:
@@ -111,13 +123,20 @@ def write_taps(predictor: Predictor, way: Trajectory, how: Mapping[str, Any], fi
     # 1e-30 is -300 dB: no residual at all has no decibels.
     error_db, worst = to_decibels(np.maximum([line.residual, line.worst], 1e-30))
     return {
-        "taps/count": line.gain.shape[2], "taps/rate_hz": line.rate_hz, "taps/residual_db": float(error_db),
-        "taps/worst_db": float(worst), "taps/early_s": delay_s[0],
-    }  # fmt: skip
+        "taps/count": line.gain.shape[2],
+        "taps/rate_hz": line.rate_hz,
+        "taps/residual_db": float(error_db),
+        "taps/worst_db": float(worst),
+        "taps/early_s": delay_s[0],
+    }
 
 
 def fit_taps(
-    predictor: Predictor, way: Trajectory, taps: int, rate_hz: float | None = None, antennas: int = 1
+    predictor: Predictor,
+    way: Trajectory,
+    taps: int,
+    rate_hz: float | None = None,
+    antennas: int = 1,
 ) -> TappedDelayLine:
     """Fit taps of a model's channels along a trajectory, by least squares over the band.
 
@@ -139,7 +158,10 @@ def fit_taps(
     if rate_hz is None and len(tones) == 1:
         raise ValueError(f"rate_hz= is needed: {site.name} was measured at one frequency")
     # The band where all tones are in use; with gaps it is too narrow, which is refused below.
-    rate_hz, carrier = rate_hz or float(np.diff(np.sort(tones)).min() * len(tones)), float(tones.mean())
+    rate_hz, carrier = (
+        rate_hz or float(np.diff(np.sort(tones)).min() * len(tones)),
+        float(tones.mean()),
+    )
     time_s = way.instants(LIGHT / carrier)
     places = way.places_at(time_s)
 
@@ -150,7 +172,9 @@ def fit_taps(
         return answer[:, measured.any((0, 2))][:, :antennas, measured.any((0, 1))]
 
     if np.ptp(tones) > rate_hz:
-        raise ValueError(f"rate_hz={rate_hz:g}: the tones span {np.ptp(tones) / 1e6:g} MHz; give more")
+        raise ValueError(
+            f"rate_hz={rate_hz:g}: the tones span {np.ptp(tones) / 1e6:g} MHz; give more"
+        )
     # No more taps than equations, of which each tone is one.
     taps, turns = min(taps, len(tones)), (tones - carrier) / rate_hz
     first = _first(ask(places[:: max(len(places) // CHUNK, 1)][:CHUNK]), turns, taps)
@@ -177,13 +201,20 @@ def _atoms(turns: np.ndarray, first: int, taps: int) -> tuple[np.ndarray, np.nda
 
 
 def _first(channel: np.ndarray, turns: np.ndarray, taps: int) -> int:
-    """Delay [samples] from which taps hold most of channels (B, A, K); below 0 where that is nearer."""
+    """Delay [samples] from which taps hold most of channels (B, A, K);
+    below 0 where that is nearer.
+    """
     rows = channel.reshape(-1, channel.shape[-1])[:FITTED]
     if len(turns) == 1:
         return 0
-    period = int(np.clip(round(1 / np.diff(np.sort(turns)).min()), taps, 8192))  # then delays come again
-    profile = np.square(np.abs(rows @ np.exp(2j * np.pi * turns[:, None] * np.arange(period)))).sum(0)
-    energy = np.convolve(np.concatenate([profile, profile])[: period + taps - 1], np.ones(taps), "valid")
+    # Then delays come again
+    period = int(np.clip(round(1 / np.diff(np.sort(turns)).min()), taps, 8192))
+    profile = np.square(np.abs(rows @ np.exp(2j * np.pi * turns[:, None] * np.arange(period)))).sum(
+        0
+    )
+    energy = np.convolve(
+        np.concatenate([profile, profile])[: period + taps - 1], np.ones(taps), "valid"
+    )
     middle = int(energy.argmax())
 
     def residual(first: int) -> float:

@@ -1,4 +1,6 @@
-"""A compiled field's file: named arrays, a version and a checksum; read by `ops/csrc/field/blob.cpp`."""
+"""A compiled field's file: named arrays, a version and a checksum;
+read by `ops/csrc/field/blob.cpp`.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,8 @@ class Form:
     """One of the forms that are compiled.
 
     Attributes:
-        kind: 1 an array's spectrum, 2 a frozen image, 3 sources, 4 a process of powers, 5 a mean of such.
+        kind: 1 an array's spectrum, 2 a frozen image, 3 sources, 4 a process of powers, 5 a mean of
+            such.
         numbers: sizes and parameters, in the order in which the form's constructor reads them.
         arrays: by name, contiguous, of a type in `TYPES`.
         predictor: answers as the form does, for its error; None: the model itself does.
@@ -35,9 +38,14 @@ class Form:
 
 
 def pack_form(form: Form, origin: np.ndarray, error: float = 0.0, worst: float = 0.0) -> bytes:
-    """Return the file's bytes; places are from `origin` (3,) [m], errors are those of `CompiledForm`."""
+    """Return the file's bytes; places are from `origin` (3,) [m],
+    errors are those of `CompiledForm`.
+    """
     numbers = np.array([form.kind, error, worst, *origin, *form.numbers], np.float64)
-    arrays = {"numbers": numbers, **{name: value for name, value in form.arrays.items() if value.size}}
+    arrays = {
+        "numbers": numbers,
+        **{name: value for name, value in form.arrays.items() if value.size},
+    }
     at = HEAD.size + SECTION.size * len(arrays)
     table, body = [], []
     for name, value in arrays.items():

@@ -25,10 +25,13 @@ def compile_sources(method: ImageSourceGP, site: Site, query: EnsembleMeans) -> 
     outputs, wide = query.level.shape[2] // 2, -(-rows // LANES) * LANES
     weight = torch.repeat_interleave(method.weights, torch.tensor(query.counts))[:, None, None]
     array, moving = static_array(site, method.frame.antennas), np.zeros((1, 3))
-    # The pose of a receiver turns its array with it; a transmitter's array stands in the site's frame.
+    # The pose of a receiver turns its array with it;
+    # a transmitter's array stands in the site's frame.
     if site.moving_end == "rx":
         turned = torch.from_numpy(np.asarray(rotation, np.float32)).double()[None]
-        moving = antenna_positions(site, torch.zeros(1, 3).double(), turned, method.frame.antennas)[0].numpy()
+        moving = antenna_positions(site, torch.zeros(1, 3).double(), turned, method.frame.antennas)[
+            0
+        ].numpy()
     images = query.sources[None]
     if array is not None:
         images = images + torch.einsum("kij,ej->eki", query.orientations, torch.from_numpy(array))
@@ -44,14 +47,20 @@ def compile_sources(method: ImageSourceGP, site: Site, query: EnsembleMeans) -> 
     combs = [(tones[0], step, len(tones))] if even else [(tone, 0.0, 1) for tone in tones]
     factors = (method.frame.scale * site.target_scale / method.factors).numpy().astype(np.complex64)
     arrays = {
-        "middle": method.frame.middle.double().numpy(), "moving": moving.astype(np.float64),
-        "sources": query.sources.double().numpy(), "images": images.double().numpy(),
+        "middle": method.frame.middle.double().numpy(),
+        "moving": moving.astype(np.float64),
+        "sources": query.sources.double().numpy(),
+        "images": images.double().numpy(),
         "offsets": np.zeros(0) if array is None else array.astype(np.float64),
-        "combs": np.array(combs, np.float64), "by_angle": query.by_angle.flatten().float().numpy(),
-        "by_length": query.by_length.flatten().float().numpy(), "places": padded(query.places.T, BEYOND),
-        "towards": padded(query.towards), "level": (query.level * weight)[:, 0].numpy(),
-        "weights": padded((query.weights * weight).mT), "factors": factors.view(np.float32),
-    }  # fmt: skip
+        "combs": np.array(combs, np.float64),
+        "by_angle": query.by_angle.flatten().float().numpy(),
+        "by_length": query.by_length.flatten().float().numpy(),
+        "places": padded(query.places.T, BEYOND),
+        "towards": padded(query.towards),
+        "level": (query.level * weight)[:, 0].numpy(),
+        "weights": padded((query.weights * weight).mT),
+        "factors": factors.view(np.float32),
+    }
     still_ends = 1 if array is None else len(array)
     numbers = [count, rows, outputs, len(moving), still_ends, len(combs), method.frame.carrier_hz]
     return Form(3, [float(number) for number in numbers], arrays)

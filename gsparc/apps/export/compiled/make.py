@@ -1,4 +1,6 @@
-"""Which compiled form a model is, exactly or distilled, and how far its answers are from the model's."""
+"""Which compiled form a model is, exactly or distilled,
+and how far its answers are from the model's.
+"""
 
 from __future__ import annotations
 
@@ -52,13 +54,14 @@ class CompiledForm:
 # As `gsparc evaluate` has them.
 FIGURES: dict[Kind, str] = {"spectrum": "MSE", "csi": "NMSE", "rssi": "RMSE dB"}
 NEAREST = 1e-3  # of the way to the other end: where the largest errors are looked for
-FAR_SHARE, FARTHEST = 8, 300.0  # one far place for so many; widths of the box that are away, at most
+# One far place for so many; widths of the box that are away, at most
+FAR_SHARE, FARTHEST = 8, 300.0
 SILENT = 1e-6  # of the model's power: more than 60 dB below are 60
 
 
 def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> CompiledForm:
-    """Return the form of a model of one station, its error measured at `count` random places, and a quarter
-    more near the other end, where powers are largest.
+    """Return the form of a model of one station, its error measured at `count` random places, and a
+    quarter more near the other end, where powers are largest.
 
     Raises:
         ValueError: no form answers as this model does, or it is of several stations.
@@ -68,17 +71,22 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
         raise ValueError(f"station= is needed, one of {', '.join(site.every_station.name)}")
     if site.paired and not site.target.is_level:
         advice = "take a model of powers, or one end that stands still"
-        raise ValueError(f"to=c: channels and spectra of two moving ends have no compiled form; {advice}")
+        raise ValueError(
+            f"to=c: channels and spectra of two moving ends have no compiled form; {advice}"
+        )
     # An exact form is not measured: its error is that of rounding to float32.
     exact = compile_exactly(method, site)
     if exact is not None:
         return CompiledForm(exact, 0.0, 0.0, f"{_NAMES[exact.kind]}, exactly")
     form = distil_form(predictor, seed)
     assert form.predictor is not None
-    # Other seeds than that of the places distilled from, or the error would be that of known places.
+    # Other seeds than that of the places distilled from,
+    # or the error would be that of known places.
     near = near_places(site, max(1, count // 4), seed + 2)
     places = np.concatenate([random_places(site, count, seed + 1), near])
-    parts = [_squares(form.predictor, predictor, places[i : i + 64]) for i in range(0, len(places), 64)]
+    parts = [
+        _squares(form.predictor, predictor, places[i : i + 64]) for i in range(0, len(places), 64)
+    ]
     squared, power = np.concatenate(parts, axis=1)
     # The worst may be near the station, the mean is over random places alone.
     found = np.array([squared[:count].mean(), squared.max()])
@@ -98,20 +106,32 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
 
 
 def _squares(form: Predictor, model: Predictor, places: np.ndarray) -> np.ndarray:
-    """Mean square of errors, and of the model's answers, of each local place (2, n), see `FIGURES`."""
+    """Mean square of errors, and of the model's answers, of each local place (2, n),
+    see `FIGURES`.
+    """
     answers, whole = (ask_model(one, places).reshape(len(places), -1) for one in (form, model))
     if model.site.target.is_level:
         # A power of 0 has no decibels; 1e-30 is far below any receiver's noise.
         whole = np.maximum(whole, 1e-30)
         answers, whole = to_decibels(np.maximum(answers / whole, SILENT)), np.zeros_like(whole)
-    squared, power = (np.square(np.abs(one).astype(np.float64)).mean(1) for one in (answers - whole, whole))
+    squared, power = (
+        np.square(np.abs(one).astype(np.float64)).mean(1) for one in (answers - whole, whole)
+    )
     return np.stack([squared, power])
 
 
-_NAMES = dict(enumerate((
-    "an array's spectrum", "a frozen image", "a sum of sources", "a process of powers",
-    "a mean of processes of powers",
-), 1))  # fmt: skip
+_NAMES = dict(
+    enumerate(
+        (
+            "an array's spectrum",
+            "a frozen image",
+            "a sum of sources",
+            "a process of powers",
+            "a mean of processes of powers",
+        ),
+        1,
+    )
+)
 
 
 def compile_exactly(method: Method, site: Site) -> Form | None:
@@ -146,8 +166,8 @@ def _rendered(method: LearnedField, site: Site) -> Form | None:
 
 
 def distil_form(predictor: Predictor, seed: int) -> Form:
-    """Return a form near a model: its array's part alone, or sources or a process of powers given its answers
-    at random places.
+    """Return a form near a model: its array's part alone, or sources or a process of powers given
+    its answers at random places.
 
     Raises:
         ValueError: channels that are not made of sources, or spectra that are not rendered.
@@ -158,7 +178,9 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
     if alone is not None and own_form is not None:
         return replace(own_form, predictor=Predictor(alone, site))
     if site.target.is_image:
-        raise ValueError(f"{method.name}: of spectra only rendered Gaussians can be compiled (model=gsparc)")
+        raise ValueError(
+            f"{method.name}: of spectra only rendered Gaussians can be compiled (model=gsparc)"
+        )
     sources = _sources_of(method) if site.target.is_complex else None
     places = random_places(site, ANSWERED[site.kind], seed)
     if sources is None:  # the law of distance that goes on outside the box
@@ -166,7 +188,8 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
     data = sample_model(predictor, places)
     if sources is not None:
         return _sources_given(sources, data)
-    # All rows are learned from: a model's answers have no noise that validation would guard against.
+    # All rows are learned from: a model's answers have no noise
+    # that validation would guard against.
     process = GaussianProcess()
     process.condition(data, np.arange(len(data)))
     form = compile_exactly(process, site)
@@ -180,7 +203,10 @@ def _sources_of(method: Method) -> ImageSourceGP:
     for _, one in sorted(parts, key=lambda part: -part[0]):
         if isinstance(one, ImageSourceGP):
             return one
-    fault = "channels that are no sum of image sources have no compiled form (model=image_source_gp has)"
+    fault = (
+        "channels that are no sum of image sources have no compiled form "
+        "(model=image_source_gp has)"
+    )
     raise ValueError(f"{method.name}: {fault}")
 
 
@@ -210,7 +236,9 @@ def random_places(site: Site, count: int, seed: int) -> np.ndarray:
 
 
 def far_places(site: Site, count: int, seed: int) -> np.ndarray:
-    """Return places like `random_places`, moved away from the middle, evenly in the logarithm of how much."""
+    """Return places like `random_places`, moved away from the middle,
+    evenly in the logarithm of how much.
+    """
     places, middle = random_places(site, count, seed + 3), site.moving_box.mean(axis=0)
     away = FARTHEST ** np.random.default_rng(seed + 3).uniform(size=(count, 1))
     flat = np.tile([1, 1, 0], places.shape[1] // 3).astype(bool)  # heights stay
@@ -245,6 +273,9 @@ def sample_model(predictor: Predictor, places: np.ndarray) -> Measurements:
     ends = {end: np.broadcast_to(still, (count, 3)) for end in ("tx", "rx")} | moving
     rotation = np.eye(3) if site.rx_rotation is None else site.rx_rotation
     return Measurements(
-        site, ends["tx"].astype(np.float64), ends["rx"].astype(np.float64),
-        np.broadcast_to(rotation, (count, 3, 3)), ask_model(predictor, places) / site.target_scale,
-    )  # fmt: skip
+        site,
+        ends["tx"].astype(np.float64),
+        ends["rx"].astype(np.float64),
+        np.broadcast_to(rotation, (count, 3, 3)),
+        ask_model(predictor, places) / site.target_scale,
+    )

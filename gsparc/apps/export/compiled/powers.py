@@ -29,7 +29,9 @@ def compile_powers(process: PowerProcess, scale: float) -> Form | None:
     """
     if process.others:
         weights, alone = zip(*process.members, strict=True)
-        files = [pack_form(form, np.zeros(3)) for one in alone if (form := compile_powers(one, scale))]
+        files = [
+            pack_form(form, np.zeros(3)) for one in alone if (form := compile_powers(one, scale))
+        ]
         named = {f"member{i}": np.frombuffer(file, np.int64) for i, file in enumerate(files)}
         # As many as `kMost` of ops/csrc/field/mixture.h.
         fits = len(files) == len(weights) <= LANES
@@ -42,7 +44,8 @@ def compile_powers(process: PowerProcess, scale: float) -> Form | None:
     nearest = posterior._vecchia if isinstance(posterior, Exact) else posterior
     columns = posterior._trend_columns
     if isinstance(posterior, Exact):
-        # Exact: one product with weights. Nearest: each query solves its own small system of `values`.
+        # Exact: one product with weights. Nearest:
+        # each query solves its own small system of `values`.
         values, weighed = posterior.weights[:, 0], columns.T @ posterior.weights
         noise = kernel.noise + posterior.extra
     else:
@@ -60,26 +63,58 @@ def compile_powers(process: PowerProcess, scale: float) -> Form | None:
         root = whole[np.tril_indices(count)]
     law, lengths, shares = trend.law, [*signed, 1.0][:2], [*kernel.shares, 0.0][:2]
     # Without a law a constant stands for it: exponent 0, floor 1.
-    about = [trend.level, 0.0, 1.0] if law is None else [law.level, law.exponent, max(law.floor, TINY_M)]
+    about = (
+        [trend.level, 0.0, 1.0]
+        if law is None
+        else [law.level, law.exponent, max(law.floor, TINY_M)]
+    )
     beside = np.full((places.shape[1], -(-count // LANES) * LANES), BEYOND)
     beside[:, :count] = places[order].T
     arrays = {
-        "places": places[order], "columns": beside if every else np.zeros(0),
+        "places": places[order],
+        "columns": beside if every else np.zeros(0),
         # JITTER as the process itself adds it before its Cholesky factor.
-        "extra": noise.numpy()[order] + JITTER, "values": values.double().numpy()[order],
-        "slopes": columns.numpy()[order], "weighed": weighed.numpy(), "unsure": unsure, "root": root,
-        "still": np.array([] if law is None else law.place or [], np.float64), "sets": sets, "boxes": boxes,
-    }  # fmt: skip
+        "extra": noise.numpy()[order] + JITTER,
+        "values": values.double().numpy()[order],
+        "slopes": columns.numpy()[order],
+        "weighed": weighed.numpy(),
+        "unsure": unsure,
+        "root": root,
+        "still": np.array([] if law is None else law.place or [], np.float64),
+        "sets": sets,
+        "boxes": boxes,
+    }
     numbers = [
-        places.shape[1], count, sets[:, 1].sum(), len(sets), columns.shape[1], every, nearest is None, every,
-        law is not None, len(signed), shares[0], lengths[0], shares[1], lengths[1], kernel.noise,
-        kernel.amplitude, process.heard, process._trend_reach, *about, trend.middle, trend.spread, scale,
-    ]  # fmt: skip
+        places.shape[1],
+        count,
+        sets[:, 1].sum(),
+        len(sets),
+        columns.shape[1],
+        every,
+        nearest is None,
+        every,
+        law is not None,
+        len(signed),
+        shares[0],
+        lengths[0],
+        shares[1],
+        lengths[1],
+        kernel.noise,
+        kernel.amplitude,
+        process.heard,
+        process._trend_reach,
+        *about,
+        trend.middle,
+        trend.spread,
+        scale,
+    ]
     return Form(4, [float(number) for number in numbers], arrays)
 
 
 def _trees(near: Neighbourhood, most: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Order of the rows (n,), rows, neighbours and depth of each set (S, 3), and boxes of all nodes."""
+    """Order of the rows (n,), rows, neighbours and depth of each set (S, 3),
+    and boxes of all nodes.
+    """
     order, sets, boxes = [], [], []
     for rows, neighbours in near.split_by_density(most):
         # Depth such that leaves have about LEAF rows.
@@ -92,7 +127,9 @@ def _trees(near: Neighbourhood, most: int) -> tuple[np.ndarray, np.ndarray, np.n
 
 
 def _tree(places: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:
-    """Order (n,) of places (n, D) [m] in 2^depth leaves of equal share, boxes (nodes, 2, D), root first."""
+    """Order (n,) of places (n, D) [m] in 2^depth leaves of equal share, boxes (nodes, 2, D),
+    root first.
+    """
     order, count, boxes = np.arange(len(places)), len(places), []
     for level in range(depth + 1):
         for node in range(1 << level):

@@ -21,21 +21,39 @@ def compile_array(model: GaussianModel, frozen: FrozenArray) -> Form | None:
     pairs, *rest = frozen.renderer.tables
     square, sizes = frozen.renderer.square, [len(table) for table in rest]
     numbers = [
-        *encoding.anchors.shape[::-1], encoding.width, *matern_mixture(encoding.length, encoding.kernel),
-        frozen.offset.numel() // 2 - 1, square.shape[0], rest[1].shape[1], *[*sizes, 0, 0][:4],
-    ]  # fmt: skip
+        *encoding.anchors.shape[::-1],
+        encoding.width,
+        *matern_mixture(encoding.length, encoding.kernel),
+        frozen.offset.numel() // 2 - 1,
+        square.shape[0],
+        rest[1].shape[1],
+        *[*sizes, 0, 0][:4],
+    ]
     names = ("table0", "wave0", "table1", "wave1")
     arrays = {
-        "at": encoding.anchors, "whitening": encoding.whitening, "weights": frozen.weights,
-        "offset": frozen.offset, "pairs": pairs, "square": square, **dict(zip(names, rest, strict=False)),
-    }  # fmt: skip
-    return Form(1, numbers, {name: value.detach().float().numpy() for name, value in arrays.items()})
+        "at": encoding.anchors,
+        "whitening": encoding.whitening,
+        "weights": frozen.weights,
+        "offset": frozen.offset,
+        "pairs": pairs,
+        "square": square,
+        **dict(zip(names, rest, strict=False)),
+    }
+    return Form(
+        1, numbers, {name: value.detach().float().numpy() for name, value in arrays.items()}
+    )
 
 
 def compile_view(frozen: FrozenView) -> Form | None:
-    """Return the form of Gaussians before a static receiver; None of networks of other than similarities."""
+    """Return the form of Gaussians before a static receiver;
+    None of networks of other than similarities.
+    """
     model = frozen.visible
-    emission, encoding, attenuation = model.emission, model.emission.encoding, model.settings.attenuation
+    emission, encoding, attenuation = (
+        model.emission,
+        model.emission.encoding,
+        model.settings.attenuation,
+    )
     settings = emission.settings
     # Only the processor's plan holds blocks of pixels as the file does.
     if encoding.settings.kind != "kernel" or settings.hidden or frozen.plan.backend != "cpu":
@@ -46,25 +64,40 @@ def compile_view(frozen: FrozenView) -> Form | None:
     means = model.gaussians.means.detach().numpy()
     needed = settings.log_distance or attenuation.inverse_distance
     numbers = [
-        *encoding.anchors.shape[::-1], encoding.width, *matern_mixture(encoding.length, encoding.kernel),
-        len(means), height, width, ACTIVATIONS[settings.activation], settings.log_distance,
-        attenuation.inverse_distance, model.tells_unknown, float(model.log_gain.detach().exp()),
+        *encoding.anchors.shape[::-1],
+        encoding.width,
+        *matern_mixture(encoding.length, encoding.kernel),
+        len(means),
+        height,
+        width,
+        ACTIVATIONS[settings.activation],
+        settings.log_distance,
+        attenuation.inverse_distance,
+        model.tells_unknown,
+        float(model.log_gain.detach().exp()),
         # Squared here once, since the library compares squared distances.
-        attenuation.d_min**2, 1 / model.d_ref**2,
-    ]  # fmt: skip
+        attenuation.d_min**2,
+        1 / model.d_ref**2,
+    ]
     arrays = {
-        "at": encoding.anchors.double().numpy(), "whitening": encoding.whitening.double().numpy(),
+        "at": encoding.anchors.double().numpy(),
+        "whitening": encoding.whitening.double().numpy(),
         "weights": emission.weight2.detach()[:, :, 0].T.float().numpy(),
-        "offset": emission.bias2.detach()[:, 0].numpy(), "means": means if needed else means[:0],
-        "starts": starts, "ranks": ranks, "blocks": blocks,
-    }  # fmt: skip
+        "offset": emission.bias2.detach()[:, 0].numpy(),
+        "means": means if needed else means[:0],
+        "starts": starts,
+        "ranks": ranks,
+        "blocks": blocks,
+    }
     return Form(2, [float(number) for number in numbers], arrays)
 
 
 def _widened(
     starts: np.ndarray, ranks: np.ndarray, weights: np.ndarray, width: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Blocks of 4 x 4 pixels of this machine's, which may be narrower: the rest of each is then empty."""
+    """Blocks of 4 x 4 pixels of this machine's, which may be narrower:
+    the rest of each is then empty.
+    """
     columns = weights.shape[1] // ROWS
     if columns == COLUMNS:
         return starts, ranks, weights

@@ -28,14 +28,21 @@ def draw_floor(api: Any, scene: DrawnScene) -> float:
     side *= next(n for n in (5, 2, 1) if n * side <= wide / 5)
     middle = np.array([*frame.middle[:2], scene.ground])
     api.add_grid(
-        "/grid", 1.4 * EXTENT, 1.4 * EXTENT, cell_size=side * frame.scale,
-        section_size=5 * side * frame.scale, position=frame.to_drawn(middle), shadow_opacity=0.0,
-    )  # fmt: skip
+        "/grid",
+        1.4 * EXTENT,
+        1.4 * EXTENT,
+        cell_size=side * frame.scale,
+        section_size=5 * side * frame.scale,
+        position=frame.to_drawn(middle),
+        shadow_opacity=0.0,
+    )
     return float(side)
 
 
 def set_first_view(camera: Any, aside: float = ASIDE, up: float = 0.0) -> None:
-    """Look at the site from the south and above, `aside` widths past its middle and `up` above it."""
+    """Look at the site from the south and above,
+    `aside` widths past its middle and `up` above it.
+    """
     past = np.array([aside, 0.0, up])
     camera.position = tuple(EXTENT * (np.array(ABOVE) + past))
     camera.look_at = tuple(EXTENT * past)

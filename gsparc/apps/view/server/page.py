@@ -1,4 +1,6 @@
-"""A scene as one HTML file that opens without a server, with a recorded walk of the end that moves."""
+"""A scene as one HTML file that opens without a server,
+with a recorded walk of the end that moves.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,10 @@ LEAST = 4  # of each station
 PAUSE_S = 0.6  # at each
 UP = 0.17  # widths that the camera looks above the middle, for the panel that stands behind
 LIMITS = (
-    "A saved scene: nothing is computed here. Drag to turn it, scroll to come nearer; the bar at the bottom "
-    "plays {steps} recorded places of the {end}{stations}. To drag it anywhere or to lift the plane: "
+    "A saved scene: nothing is computed here. Drag to turn it, scroll to come nearer; the bar at "
+    "the bottom "
+    "plays {steps} recorded places of the {end}{stations}. To drag it anywhere or to lift the "
+    "plane: "
     "gsparc view ckpt=FILE."
 )
 
@@ -40,7 +44,8 @@ def render_page(view: SiteView, steps: int = STEPS) -> str:
         view: the model; its stations are shown one after another, as many as get `LEAST` places.
         steps: places of the walk.
     """
-    with contextlib.redirect_stdout(io.StringIO()):  # viser's banner, of a server that nobody is to visit
+    # viser's banner, of a server that nobody is to visit
+    with contextlib.redirect_stdout(io.StringIO()):
         server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
         try:
             text, notes = _recorded(server, view, steps)
@@ -68,9 +73,13 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
             legends += more
         sphere, extent = view.sphere(name), view.extent(name)
         for place in walk_places(view, name, steps // len(names)):
-            answer = predict_answer(viewed.predictor_of(name), {**view.initial_places(name), moving: place})
+            answer = predict_answer(
+                viewed.predictor_of(name), {**view.initial_places(name), moving: place}
+            )
             dot.position = scene.frame.to_drawn(place)
-            label.text = (f"{name}: " if len(names) > 1 else "") + summarise_answer(answer, view.unit)
+            label.text = (f"{name}: " if len(names) > 1 else "") + summarise_answer(
+                answer, view.unit
+            )
             parts: list[Part] = list(draw_rays(answer, extent) or ())
             legends += [PATHS] if parts else []
             if sphere is not None and answer.spectrum is not None and "rx" in answer.ends:
@@ -83,10 +92,16 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
             count += 1
     which = ""
     if len(viewed.stations) > 1:
-        which = f", for {len(names)} of {len(viewed.stations)} stations ({', '.join(map(str, names))})"
+        which = (
+            f", for {len(names)} of {len(viewed.stations)} stations ({', '.join(map(str, names))})"
+        )
         some = len(names) < len(viewed.stations)
         which += "; station=NAME shows another" if some else ", one after another"
-    notes = [*scene.notes, f"grid: {side:g} m", LIMITS.format(steps=count, end=ENDS[moving], stations=which)]
+    notes = [
+        *scene.notes,
+        f"grid: {side:g} m",
+        LIMITS.format(steps=count, end=ENDS[moving], stations=which),
+    ]
     title = scene.title if len(names) == 1 else scene.title.removesuffix(f": {names[0]}")
     return recorder.as_html(), _side_panel(replace(scene, title=title), notes, legends)
 
@@ -94,7 +109,9 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
 def _still(
     api: Any, view: SiteView, name: str | None, before: dict[str, Any]
 ) -> tuple[dict[str, Any], list[Legend]]:
-    """Draw what stands still of a station in place of the nodes `before`; its nodes, and their colours."""
+    """Draw what stands still of a station in place of the nodes `before`; its nodes,
+    and their colours.
+    """
     one = view.station(name)
     scene = one.scene
     nodes = draw_scene(api, scene, before)
@@ -115,14 +132,17 @@ def _upright(image: np.ndarray, middle: np.ndarray, extent: float) -> PlacedPict
     wide = 1.05 * extent
     tall = wide * image.shape[0] / image.shape[1]
     corner = middle + np.array([-0.5 * wide, 0.8 * extent, 0.18 * extent + tall])
-    return PlacedPicture("panel", corner, np.array([wide, 0.0, 0.0]), np.array([0.0, 0.0, -tall]), image)
+    return PlacedPicture(
+        "panel", corner, np.array([wide, 0.0, 0.0]), np.array([0.0, 0.0, -tall]), image
+    )
 
 
 def _side_panel(scene: DrawnScene, notes: list[str], legends: list[Legend]) -> str:
     title = html.escape(scene.title)
     lines = "".join(f"<p style='margin:.3em .6em'>{html.escape(line)}</p>" for line in notes)
     return (
-        "<details open style='position:fixed;top:8px;left:8px;z-index:1000;width:250px;background:#fffe;"
+        "<details open "
+        "style='position:fixed;top:8px;left:8px;z-index:1000;width:250px;background:#fffe;"
         "border:1px solid #bbb;border-radius:6px;font:13px/1.35 system-ui,sans-serif;color:#222'>"
         f"<summary style='margin:.4em .6em;font-weight:600;cursor:pointer'>{title}</summary>"
         f"{legend_html(legends, scene.parts)}{lines}</details>"

@@ -39,7 +39,9 @@ class PageServer:
             self.server = viser.ViserServer(host=host, port=port, label="gsparc", verbose=False)
         except OSError as error:
             self.work.close()
-            raise DataError(f"host={host} port={port}: cannot listen there ({error.strerror})") from None
+            raise DataError(
+                f"host={host} port={port}: cannot listen there ({error.strerror})"
+            ) from None
         self.server.scene.set_up_direction("+z")
         self.server.on_client_connect(self._came)
         self.server.on_client_disconnect(self._went)

@@ -37,7 +37,9 @@ class Session:
         self.site = view.viewed.site
         self.station = self.chosen_station = view.viewed.stations[0]
         self.one = view.station(self.station)
-        self.places = {end: np.asarray(at, float) for end, at in view.initial_places(self.station).items()}
+        self.places = {
+            end: np.asarray(at, float) for end, at in view.initial_places(self.station).items()
+        }
         self.plane: Plane | None = None
         self.visited: list[np.ndarray] = []  # weak places of it, one after another
         self.power: Legend | None = None  # of the plane, where it is predicted
@@ -63,7 +65,8 @@ class Session:
         api.set_up_direction("+z")
         self.nodes = draw_scene(api, self.scene, self.nodes)
         self.cell = draw_floor(api, self.scene)
-        if self.sphere is not None:  # about the middle of the frame, moved to the receiver with every answer
+        # About the middle of the frame, moved to the receiver with every answer
+        if self.sphere is not None:
             around = self.scene.frame.middle + self.sphere.offsets
             dots = Points(SPHERE, around, np.zeros(around.shape, np.uint8), self.sphere.size)
             self.nodes[SPHERE] = dots.draw(api, self.scene.frame)
@@ -71,10 +74,15 @@ class Session:
     def _add_gizmos(self) -> None:
         for end, place in self.places.items():
             gizmo = self.client.scene.add_transform_controls(
-                f"/{end}", scale=0.2 * EXTENT, disable_rotations=True, depth_test=False,
+                f"/{end}",
+                scale=0.2 * EXTENT,
+                disable_rotations=True,
+                depth_test=False,
                 position=self.scene.frame.to_drawn(place),
-            )  # fmt: skip
-            self.client.scene.add_icosphere(f"/{end}/dot", radius=0.014 * EXTENT, color=(214, 39, 40))
+            )
+            self.client.scene.add_icosphere(
+                f"/{end}/dot", radius=0.014 * EXTENT, color=(214, 39, 40)
+            )
             above: Any = {"position": (0, 0, 0.03 * EXTENT), "anchor": "bottom-center"}
             self.client.scene.add_label(f"/{end}/name", ENDS[end], **above)
             gizmo.on_update(self._dragged(end))
@@ -117,11 +125,15 @@ class Session:
                 self.progress = gui.add_markdown("")
                 low, high = self.view.viewed.heights()
                 first = round(self.view.grid.height, 2)
-                self.height = gui.add_slider("height [m]", min(low, first), max(high, first), 0.01, first)
+                self.height = gui.add_slider(
+                    "height [m]", min(low, first), max(high, first), 0.01, first
+                )
                 self._on(self.height, lambda value: self.want_plane())
 
     def _notes(self) -> list[str]:
-        note = "both ends moved: measured points are where the receiver was, wherever its transmitter"
+        note = (
+            "both ends moved: measured points are where the receiver was, wherever its transmitter"
+        )
         if not self.site.paired:
             still = ENDS[self.site.still_end]
             note = f"the {still} stood still when measured: the model knows it there alone"
@@ -180,7 +192,9 @@ class Session:
         self.view.station(value)
         # Meanwhile another may have been chosen: only the last is shown.
         if self.chosen_station == value:
-            self.work.put((self.client.client_id, "station"), partial(self._show_station, value), urgent=True)
+            self.work.put(
+                (self.client.client_id, "station"), partial(self._show_station, value), urgent=True
+            )
 
     # -- what the worker does ----------------------------------------------------------------------
 
@@ -219,9 +233,14 @@ class Session:
 
     def _show(self, answer: Answer) -> None:
         why = explain_level(answer, self.view.viewed.moving[-1], self.one.tree)
-        rays, first = draw_rays(answer, self.view.extent(self.station)) or (), RAYS not in self.nodes
+        rays, first = (
+            draw_rays(answer, self.view.extent(self.station)) or (),
+            RAYS not in self.nodes,
+        )
         with self.client.atomic():
-            self.answer_text.content = answer_markdown(answer, self.view.viewed.moving, why, self.view.unit)
+            self.answer_text.content = answer_markdown(
+                answer, self.view.viewed.moving, why, self.view.unit
+            )
             for end in self.vectors:
                 self.vectors[end].value = tuple(float(v) for v in np.round(answer.ends[end], 3))
             if answer.spectrum is not None and self.sphere is not None and "rx" in answer.ends:
@@ -233,7 +252,9 @@ class Session:
             self._legends()
 
     def _panel_of(self, answer: Answer) -> Iterator[None]:
-        """The picture of an answer, which takes longer than the answer: a drag does not wait for it."""
+        """The picture of an answer, which takes longer than the answer:
+        a drag does not wait for it.
+        """
         image = panel_image(answer, self.site)
         if image is not None and self.picture is None:
             order = self.answer_text.order + 0.1
@@ -245,7 +266,9 @@ class Session:
     def _planes(self) -> Iterator[None]:
         self.power = None
         if self.view.grid is not None and self.laid.value:
-            yield from self._predicted_plane(replace(self.view.grid, height=float(self.height.value)))
+            yield from self._predicted_plane(
+                replace(self.view.grid, height=float(self.height.value))
+            )
         elif PLANE in self.nodes:
             self.nodes.pop(PLANE).remove()
         self._legends()
@@ -274,7 +297,9 @@ class Session:
 
     def _legends(self) -> None:
         legends = self.scene.legends
-        entries = [legends[name] for name in legends if name in self.nodes and self.nodes[name].visible]
+        entries = [
+            legends[name] for name in legends if name in self.nodes and self.nodes[name].visible
+        ]
         entries += [PATHS] if RAYS in self.nodes else []
         entries += [self.power] if PLANE in self.nodes and self.power is not None else []
         self.legend.content = legend_html(entries, self.scene.parts)

@@ -1,7 +1,7 @@
 """Terms of the covariance of channels, one in one file; `gsparc.models.channels.prior` sums them.
 
-A new one says its covariance and variance (`term.ChannelTerm`), is named in `KINDS` to be stored, and is
-tried in `gsparc.models.channels.initial`.
+A new one says its covariance and variance (`term.ChannelTerm`), is named in `KINDS` to be stored,
+and is tried in `gsparc.models.channels.initial`.
 """
 
 from gsparc.models.channels.terms.direct import Direct
@@ -14,4 +14,5 @@ from gsparc.models.channels.terms.noise import Noise
 
 __all__ = ["KINDS", "Direct", "Directions", "Drift", "Images", "Isotropic", "Leakage", "Noise"]
 
-KINDS = (Isotropic, Directions, Leakage, Direct, Images, Noise, Drift)  # in the order of their powers
+# In the order of their powers
+KINDS = (Isotropic, Directions, Leakage, Direct, Images, Noise, Drift)

@@ -1,9 +1,9 @@
 """Covariances in a basis of what places can tell apart, and what likelihoods need of them.
 
-The degrees of freedom of waves over a patch grow with its size in wavelengths (R. A. Kennedy et al.,
-"Intrinsic limits of dimensionality and richness in random multipath fields", IEEE Trans. Signal Process. 55
-(2007)) and are often far fewer than rows; the eigenvectors U of the isotropic field hold all of them, and
-outside of them there is noise alone.
+The degrees of freedom of waves over a patch grow with its size in wavelengths (R. A. Kennedy et
+al., "Intrinsic limits of dimensionality and richness in random multipath fields", IEEE Trans.
+Signal Process. 55 (2007)) and are often far fewer than rows; the eigenvectors U of the isotropic
+field hold all of them, and outside of them there is noise alone.
 """
 
 from __future__ import annotations
@@ -56,7 +56,11 @@ class Basis:
 
     @staticmethod
     def from_matrix(
-        key: tuple[Hashable, ...], places: Tensor, gram: Callable[[], Tensor], noise: float, shared: Cache
+        key: tuple[Hashable, ...],
+        places: Tensor,
+        gram: Callable[[], Tensor],
+        noise: float,
+        shared: Cache,
     ) -> Basis:
         """Return that of a correlation (n, n) float64 beside `noise`, its share."""
         size, vectors = torch.linalg.eigh(gram())
@@ -68,7 +72,9 @@ class Basis:
     def compress_once(self, key: Hashable, matrices: Callable[[], list[Tensor]]) -> Tensor:
         """Return covariances (n, n) in the basis (m, r, r), which equal places and keys share."""
         return get_or_make(
-            self.shared, (*self.key, key), lambda: torch.stack([self.compress(one) for one in matrices()])
+            self.shared,
+            (*self.key, key),
+            lambda: torch.stack([self.compress(one) for one in matrices()]),
         )
 
     def compress(self, matrix: Tensor) -> Tensor:

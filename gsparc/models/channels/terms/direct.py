@@ -28,7 +28,10 @@ class Direct(Spherical):
         """Return the wave (1, n), see `Spherical`; of places (n, 6), from one end to the other."""
         if not has_both_ends(at.places):
             return super().waves(at)
-        middle, wavenumber = first_end(self.frame.middle) - other_end(self.frame.middle), at.slot.wavenumber
+        middle, wavenumber = (
+            first_end(self.frame.middle) - other_end(self.frame.middle),
+            at.slot.wavenumber,
+        )
         away = torch.linalg.vector_norm(middle).clamp_min(2 * math.pi / wavenumber)
         between = first_end(at.places) - other_end(at.places)
         return spherical_wave(between, torch.zeros_like(middle), wavenumber, away)[None]

@@ -1,7 +1,7 @@
 """Waves of unequal power from unequal directions: `E sum_b p_b w_b V_b(d)`.
 
-V_b is the correlation of waves from about one direction, E the Matern-3/2 envelope, and w_b a factor by its
-angle to the static end, 1 where directions are of the room alone.
+V_b is the correlation of waves from about one direction, E the Matern-3/2 envelope, and w_b a
+factor by its angle to the static end, 1 where directions are of the room alone.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ class Directions(ChannelTerm):
     Attributes:
         angles: (M, 3) float64, where waves come from, of powers (M,).
         concentration: of each, that of a von Mises-Fisher density.
-        towards: (J,) float64 logarithms of factors at angles to the static end, evenly from 0 to pi.
+        towards: (J,) float64 logarithms of factors at angles to the static end, evenly from 0 to
+            pi.
     """
 
     name = "directions"
@@ -52,7 +53,10 @@ class Directions(ChannelTerm):
 
         Directions of a half sphere stand for their mirror images as well: the nearer one counts.
         """
-        ends, knots = torch.stack([slot.end for slot in slots]) + self.frame.offset, len(self.towards)
+        ends, knots = (
+            torch.stack([slot.end for slot in slots]) + self.frame.offset,
+            len(self.towards),
+        )
         towards = torch.nn.functional.normalize(ends - self.frame.middle, dim=1)
         cosine = towards @ self.angles.T
         normal = self.angles.mean(0)
@@ -64,8 +68,11 @@ class Directions(ChannelTerm):
         return (1 - (at[..., None] - torch.arange(knots, dtype=torch.float64)).abs()).clamp_min(0)
 
     def correlations(self, angles: Tensor, wavenumber: float, a: Tensor, b: Tensor) -> Tensor:
-        """Return correlations (M, n, m) complex128 of waves from each of `angles` (M, 3), in the envelope."""
-        middle, distance = b[:1], distances(a, b)  # differences of small numbers, wherever the origin is
+        """Return correlations (M, n, m) complex128 of waves from each of `angles` (M, 3),
+        in the envelope.
+        """
+        # Differences of small numbers, wherever the origin is
+        middle, distance = b[:1], distances(a, b)
         before, after = (wavenumber * (angles @ (places - middle).T) for places in (a, b))
         along = before[:, :, None] - after[:, None]
         return directional_correlation((wavenumber * distance).square(), along, self.concentration)
@@ -79,7 +86,9 @@ class Directions(ChannelTerm):
         powers = self.direction_powers([one.slot for one in a]).to(torch.complex128)
         wavenumber, other, parts = a[0].slot.wavenumber, b[0].places, []
         for part in a[0].places.split(max(ENTRIES // (len(other) * len(self.angles)), 1)):
-            each = torch.tensordot(powers, self.correlations(self.angles, wavenumber, part, other), 1)
+            each = torch.tensordot(
+                powers, self.correlations(self.angles, wavenumber, part, other), 1
+            )
             parts.append(each * matern32(distances(part, other), self.frame.envelope))
         whole = torch.cat(parts, 1)
         return whole if len(whole) == len(a) else repeat(whole[0], len(a))
@@ -97,12 +106,16 @@ class Directions(ChannelTerm):
             ones = self.angles.split(1)
             return [self.correlations(one, wavenumber, places, places)[0] * bound for one in ones]
 
-        return basis.compress_once((self.concentration, self.angles.numpy().tobytes()), correlation_matrices)
+        return basis.compress_once(
+            (self.concentration, self.angles.numpy().tobytes()), correlation_matrices
+        )
 
     def design(self, slot: Slot) -> Tensor:
         """Return the knots' weights beside the powers', see `ChannelTerm`."""
         columns = super().design(slot)
-        return torch.cat([columns, self.knot_weights([slot])[0]], 1) if len(self.towards) else columns
+        return (
+            torch.cat([columns, self.knot_weights([slot])[0]], 1) if len(self.towards) else columns
+        )
 
     def parameters(self) -> Tensor:
         """Return logarithms of powers, then of factors (M + J,), see `Term`."""
@@ -118,7 +131,9 @@ class Directions(ChannelTerm):
         return super().bounds() + [(-HIGHEST, HIGHEST)] * len(self.towards)
 
     def penalty(self, parameters: Tensor, shrinkage: float) -> Tensor:
-        """Return that of inverse Gamma powers about their mean and of normal factors, see `ChannelTerm`."""
+        """Return that of inverse Gamma powers about their mean and of normal factors,
+        see `ChannelTerm`.
+        """
         power, towards = parameters[: len(self.power)].exp(), parameters[len(self.power) :]
         ratio = power.mean() / power
         return shrinkage * (ratio - ratio.log()).sum() + TILTED * towards.square().sum()

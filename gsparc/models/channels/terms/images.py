@@ -28,14 +28,18 @@ class Images(Spherical):
 
     def mirror_ends(self, ends: Tensor) -> Tensor:
         """Return images (..., W, 3) [m] of ends (..., 3) where these are said to be."""
-        return images(ends + self.frame.offset, self.planes, [(n,) for n in range(len(self.planes))])
+        return images(
+            ends + self.frame.offset, self.planes, [(n,) for n in range(len(self.planes))]
+        )
 
     def sources(self, slot: Slot) -> Tensor:
         """Return the images (W, 3) [m], see `Spherical`."""
         return self.mirror_ends(slot.end)
 
     def waves(self, at: SlotPlaces) -> Tensor:
-        """Return waves (W, n), see `Spherical`; 0 of planes that have the end and the middle on two sides."""
+        """Return waves (W, n), see `Spherical`; 0 of planes that have the end
+        and the middle on two sides.
+        """
         both = torch.stack([at.slot.end + self.frame.offset, self.frame.middle], 1)
         sides = self.planes[:, :-1] @ both - self.planes[:, -1:]
         # A mirror reflects to the side that it is lit from.

@@ -1,4 +1,6 @@
-"""What does not depend on the place: `R p`, with R a squared exponential that only ends far outside."""
+"""What does not depend on the place: `R p`,
+with R a squared exponential that only ends far outside.
+"""
 
 from __future__ import annotations
 

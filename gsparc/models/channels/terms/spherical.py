@@ -1,6 +1,7 @@
 """Spherical waves: `R sum_n p_n a_n a_n^H + S sum_n s_n a_n a_n^H`.
 
-R and S are squared exponentials of gains: one that only ends far outside, and one of gains that vary.
+R and S are squared exponentials of gains: one that only ends far outside,
+and one of gains that vary.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ class Spherical(ChannelTerm):
     def waves(self, at: SlotPlaces) -> Tensor:
         """Return each wave (W, n) complex128, of size 1 in the middle."""
         sources, wavenumber = self.sources(at.slot), at.slot.wavenumber
-        both = zip(sources, torch.linalg.vector_norm(sources - self.frame.middle, dim=-1), strict=True)
+        both = zip(
+            sources, torch.linalg.vector_norm(sources - self.frame.middle, dim=-1), strict=True
+        )
         return torch.stack([spherical_wave(at.places, one, wavenumber, away) for one, away in both])
 
     @property
@@ -47,9 +50,9 @@ class Spherical(ChannelTerm):
         """Return that of all waves (n, m) complex128, see `Term`."""
         distance, before, after = distances(a.places, b.places), self.waves(a), self.waves(b)
         fixed, varying = ((before.T * power) @ after.conj() for power in self.split_powers)
-        return fixed * squared_exponential(distance, self.frame.reach) + varying * squared_exponential(
-            distance, self.frame.gain
-        )
+        return fixed * squared_exponential(
+            distance, self.frame.reach
+        ) + varying * squared_exponential(distance, self.frame.gain)
 
     def variance(self, a: SlotPlaces) -> Tensor:
         """Return that of all waves (n,), see `ChannelTerm`."""

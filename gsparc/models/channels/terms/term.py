@@ -1,4 +1,6 @@
-"""What every term of channels says: its covariance, and that in a basis of what places tell apart."""
+"""What every term of channels says: its covariance,
+and that in a basis of what places tell apart.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,8 @@ class Frame(Stored):
     """What all terms of a field share.
 
     Attributes:
-        middle: (3,) float64 [m] of the places learned from, where waves have their nominal power; (6,) where
-            both ends move.
+        middle: (3,) float64 [m] of the places learned from, where waves have their nominal power;
+            (6,) where both ends move.
         reach: length of what is fixed [m].
         envelope, gain: lengths [m] of the diffuse field's envelope and of gains.
         offset: (3,) float64 [m] of static ends from where they are said to be.
@@ -88,7 +90,9 @@ class ChannelTerm(Term[SlotPlaces]):
         return [(LOWEST, HIGHEST)] * len(self.power)
 
     def penalty(self, parameters: Tensor, shrinkage: float) -> Tensor:
-        """Return () minus the logarithm of a prior of the parameters, in which `shrinkage` rows count."""
+        """Return () minus the logarithm of a prior of the parameters,
+        in which `shrinkage` rows count.
+        """
         return torch.zeros((), dtype=torch.float64)
 
     @property

@@ -1,8 +1,8 @@
 """Occlusion of path legs by boxes and patches.
 
-A box blocks legs with a chord of more than a few centimetres. A patch is a rectangle on a mirror plane: a
-plane with patches reflects only inside them, and a patch blocks all other legs. Edges are soft, so that they
-can be moved by gradients.
+A box blocks legs with a chord of more than a few centimetres. A patch is a rectangle on a mirror
+plane: a plane with patches reflects only inside them, and a patch blocks all other legs. Edges are
+soft, so that they can be moved by gradients.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from gsparc.models.image_sources.clutter.unfold import EDGE, Legs
 from gsparc.physics.mirror_planes import hesse_form
 
 MARGIN = 0.03  # [m], chord that is not blocked: legs end on the faces that reflect them
-SOFT = 0.02  # [m], width of a soft edge; a leg that ends nearer to a patch is reflected by it, not blocked
+# [m], width of a soft edge; a leg that ends nearer to a patch is reflected by it, not blocked
+SOFT = 0.02
 BOX, PATCH = 6, 4  # numbers of each: coordinates of two corners in space, on a plane
 
 
@@ -56,16 +57,22 @@ class Clutter:
         """Return it with one piece less; boxes count before patches."""
         boxes = [i for i in range(len(self.boxes)) if i != number]
         patches = [i for i in range(len(self.plane)) if i + len(self.boxes) != number]
-        return Clutter(self.boxes[boxes], self.patches[patches], tuple(self.plane[i] for i in patches))
+        return Clutter(
+            self.boxes[boxes], self.patches[patches], tuple(self.plane[i] for i in patches)
+        )
 
     def renumber_planes(self, new: dict[int, int]) -> Clutter:
         """Return it with planes of new indices; patches of planes without one are dropped."""
         patches = [i for i, plane in enumerate(self.plane) if plane in new]
-        return replace(self, patches=self.patches[patches], plane=tuple(new[self.plane[i]] for i in patches))
+        return replace(
+            self, patches=self.patches[patches], plane=tuple(new[self.plane[i]] for i in patches)
+        )
 
 
 def visible_share(paths: Legs, clutter: Clutter, planes: Tensor) -> Tensor:
-    """Return the visible share (K, n) in [0, 1] of each source; differentiable in boxes and patches."""
+    """Return the visible share (K, n) in [0, 1] of each source;
+    differentiable in boxes and patches.
+    """
     return Obstacles(clutter, planes).visible_share(paths)
 
 
@@ -108,7 +115,9 @@ class Obstacles:
         crosses = (above * below < 0) & away[..., :-1] & away[..., 1:]
         share = torch.where(crosses, above / (above - below), 1.0)
         met = [each[..., :-1] + share * each.diff() for each in place]
-        outside = 1 - _share_inside(met, self.patches) * ((crosses | ends_here) & paths.valid[..., None])
+        outside = 1 - _share_inside(met, self.patches) * (
+            (crosses | ends_here) & paths.valid[..., None]
+        )
         passed = torch.where(ends_here, 1.0, outside).movedim(-1, 0).flatten(0, 1).prod(0)
         reflected = 1 - torch.where(ends_here, outside, 1.0).prod(0)
         bounded = self.ends[paths.plane]
@@ -118,13 +127,17 @@ class Obstacles:
 
 
 def share_past_boxes(paths: Legs, boxes: Tensor) -> Tensor:
-    """Return the share (B, K, n) that passes each box, by the chords [m] of legs in it (slab test)."""
+    """Return the share (B, K, n) that passes each box,
+    by the chords [m] of legs in it (slab test).
+    """
     along = paths.end - paths.start
     along = torch.where(along.abs() < EDGE, EDGE, along)
     inverse, length = 1 / along, torch.linalg.vector_norm(along, dim=-1)
     enter, leave = torch.zeros(()), torch.ones(())
     corners = (each[:, None, None, None].unbind(-1) for each in boxes.chunk(2, 1))
-    for start, per_metre, low, high in zip(paths.start.unbind(-1), inverse.unbind(-1), *corners, strict=True):
+    for start, per_metre, low, high in zip(
+        paths.start.unbind(-1), inverse.unbind(-1), *corners, strict=True
+    ):
         one, other = (low - start) * per_metre, (high - start) * per_metre
         enter = torch.maximum(enter, torch.minimum(one, other))
         leave = torch.minimum(leave, torch.maximum(one, other))
@@ -142,7 +155,9 @@ def _share_inside(place: list[Tensor], patches: Tensor) -> Tensor:
     """Patches (Q, 4) against coordinates (1, ...), or (Q, ...), each against its own."""
     u, v = place
     low_u, low_v, high_u, high_v = (each.reshape(-1, *[1] * (u.dim() - 1)) for each in patches.T)
-    inner = torch.minimum(torch.minimum(u - low_u, high_u - u), torch.minimum(v - low_v, high_v - v))
+    inner = torch.minimum(
+        torch.minimum(u - low_u, high_u - u), torch.minimum(v - low_v, high_v - v)
+    )
     return torch.sigmoid(inner / SOFT)
 
 

@@ -1,4 +1,6 @@
-"""Find the box that would explain most of the residual: random candidates, then an evolution strategy."""
+"""Find the box that would explain most of the residual: random candidates,
+then an evolution strategy.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +15,11 @@ from gsparc.physics.draws import draw_in_box, draw_lengths
 
 THINNEST = MARGIN  # [m]: thinner ones block nothing
 SMALLEST, LARGEST = 0.15, 2.0  # [m] sides of random boxes
-TABLES, FLOOR = 0.35, 0.6  # of random boxes: shares that are thin plates, that do not stand on the floor
+# Of random boxes: shares that are thin plates, that do not stand on the floor
+TABLES, FLOOR = 0.35, 0.6
 PARENTS, CHILDREN = 12, 6  # of the evolution strategy; children of each parent and round
-SPREAD, FALL = 0.3, 0.82  # first standard deviation of a mutation [m], and factor from round to round
+# First standard deviation of a mutation [m], and factor from round to round
+SPREAD, FALL = 0.3, 0.82
 HALVED = (4, 8)  # rounds after which only the better half is kept
 STRONGEST = 24  # number of sources that a box is searched with
 
@@ -27,7 +31,9 @@ def maximise_by_evolution(
     generator: torch.Generator,
     rounds: int = 14,
 ) -> tuple[Tensor, float]:
-    """Return the best descendant (d,) of parents (m, d) of a (mu, lambda) strategy, and its score."""
+    """Return the best descendant (d,) of parents (m, d) of a (mu, lambda) strategy,
+    and its score.
+    """
     best, spread = score(parents), SPREAD
     for number in range(rounds):
         born = parents.repeat_interleave(CHILDREN, 0)
@@ -39,7 +45,11 @@ def maximise_by_evolution(
         parents = torch.where(better[:, None], heirs, parents)
         best, spread = torch.maximum(best, scores), spread * FALL
         if number in HALVED:
-            top = best.topk(max(len(best) // 2, 3)).indices if len(best) > 3 else torch.arange(len(best))
+            top = (
+                best.topk(max(len(best) // 2, 3)).indices
+                if len(best) > 3
+                else torch.arange(len(best))
+            )
             parents, best = parents[top], best[top]
     first = int(best.argmax())
     return parents[first], float(best[first])
@@ -57,7 +67,9 @@ def find_occluding_box(unexplained: UnexplainedRows, draws: int = 1000) -> tuple
     few, waves = unexplained.paths.select_sequences(chosen), waves[:, chosen]
 
     def gain_of_boxes(boxes: Tensor) -> Tensor:
-        return unexplained.scorer.gains_of_shares(boxes, lambda part: share_past_boxes(few, part) - 1, waves)
+        return unexplained.scorer.gains_of_shares(
+            boxes, lambda part: share_past_boxes(few, part) - 1, waves
+        )
 
     def clip(boxes: Tensor) -> Tensor:
         return clip_boxes(boxes, unexplained.room)

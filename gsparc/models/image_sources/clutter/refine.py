@@ -1,7 +1,7 @@
 """Joint descent on boxes, patches and amplitudes, with the varying part of the gains held.
 
-Planes and phases move only where they are new: the varying part of the others stays where it was and would
-explain what the moved constant part leaves.
+Planes and phases move only where they are new: the varying part of the others stays where it was
+and would explain what the moved constant part leaves.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from gsparc.models.image_sources.scene import BETAS, SourceScene, spherical_wave
 from gsparc.physics.mirror_planes import images
 
 AMPLITUDE_SPREAD = 0.7  # standard deviation of the sources' log amplitudes about their mean
-# Adam's steps: boxes and patches [m], planes (unit normal, offset [m]), phases [rad], log amplitudes.
+# Adam's steps: boxes and patches [m], planes (unit normal, offset [m]), phases [rad],
+# log amplitudes.
 STEPS = (SOFT, SOFT, 0.003, 0.03, STEP)
 STEP_DECAY = 0.97  # factor of all step sizes from step to step
 
@@ -37,7 +38,9 @@ def refine_with_clutter(
     for step in range(steps + 1):
         boxes, patches, planes, phase, log_amplitude = values
         seen = visible_share(paths, Clutter(boxes, patches, old.plane), scene.planes)
-        waves = spherical_waves(rows, images(rows.static_ends(scene.transmitter), planes, scene.sequences))
+        waves = spherical_waves(
+            rows, images(rows.static_ends(scene.transmitter), planes, scene.sequences)
+        )
         waves = waves * torch.polar(torch.ones(()), phase)
         deviation = (log_amplitude - log_amplitude.mean().detach()) / AMPLITUDE_SPREAD
         cost = residual.nll(seen, log_amplitude, waves) + deviation.square().sum() / 2

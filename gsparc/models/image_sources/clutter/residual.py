@@ -1,8 +1,8 @@
 """Residual of a scene, and the gain of another box, patch or source.
 
 The process of gains of fixed phases with its covariance in two parts: varying gains and noise,
-factored once and held, and the sources' constant gains, a low-rank part that changes with every move of a box
-and is added by the matrix inversion lemma (Rasmussen and Williams, 2006, eq. A.9).
+factored once and held, and the sources' constant gains, a low-rank part that changes with every
+move of a box and is added by the matrix inversion lemma (Rasmussen and Williams, 2006, eq. A.9).
 """
 
 from __future__ import annotations
@@ -15,7 +15,11 @@ import torch
 from torch import Tensor
 
 from gsparc.models.image_sources.clutter.unfold import Legs
-from gsparc.models.image_sources.gp_likelihood import GainPosterior, quadrature_variances, stack_real_imag
+from gsparc.models.image_sources.gp_likelihood import (
+    GainPosterior,
+    quadrature_variances,
+    stack_real_imag,
+)
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import SourceScene
 from gsparc.processes.factor import Factor
@@ -34,7 +38,8 @@ class ClutterLikelihood:
 
     Args:
         rows: R = 1.
-        scene: its clutter attenuates the varying part; callers pass the visible shares of the constant part.
+        scene: its clutter attenuates the varying part; callers pass the visible shares of the
+            constant part.
 
     Attributes:
         scene: as given, constant share and noise chosen by likelihood.
@@ -55,11 +60,17 @@ class ClutterLikelihood:
         del self._cached, self._own
 
     def _gain_covariances(self, scene: SourceScene) -> tuple[Tensor, Tensor]:
-        """Covariances (2 n, 2 n) of gains that vary freely, and of constant gains across their phase."""
+        """Covariances (2 n, 2 n) of gains that vary freely,
+        and of constant gains across their phase.
+        """
         scaled = scene.waves(self.rows) * scene.log_amplitude.exp()
-        varying = GainPosterior(self.rows, replace(scene, visibility=replace(scene.visibility, constant=0.0)))
+        varying = GainPosterior(
+            self.rows, replace(scene, visibility=replace(scene.visibility, constant=0.0))
+        )
         across = stack_real_imag(scaled)[1]
-        return varying.source_gram.matrix, quadrature_variances(scene.quadrature)[1] * (across @ across.T)
+        return varying.source_gram.matrix, quadrature_variances(scene.quadrature)[1] * (
+            across @ across.T
+        )
 
     def _tune_share_and_noise(self, scene: SourceScene) -> SourceScene:
         """Constant share and noise by likelihood, in turn on a grid."""
@@ -83,7 +94,10 @@ class ClutterLikelihood:
                 while 0 <= at < len(CONSTANTS) and (new := nll(CONSTANTS[at], noise)) < best:
                     best, constant, at = new, CONSTANTS[at], at + direction
             for step in (-math.log(TRIED), math.log(TRIED)):
-                while noise + step > math.log(LEAST_NOISE) and (new := nll(constant, noise + step)) < best:
+                while (
+                    noise + step > math.log(LEAST_NOISE)
+                    and (new := nll(constant, noise + step)) < best
+                ):
                     best, noise = new, noise + step
         return replace(scene, visibility=replace(kernel, constant=constant), log_noise=noise)
 
@@ -100,23 +114,34 @@ class ClutterLikelihood:
         return math.sqrt(constant * (1 - quadrature / 2))
 
     # ---- the constant part ----
-    def columns(self, visible_share: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
+    def columns(
+        self, visible_share: Tensor, log_amplitude: Tensor, waves: Tensor | None = None
+    ) -> Tensor:
         """Return constant gains' standard deviations, whitened (2 n, K), for shades (K, n)."""
         scaled = (self.waves if waves is None else waves) * (
             visible_share.T * log_amplitude.exp() * self.share
         )
         return self.root @ torch.cat([scaled.real, scaled.imag])
 
-    def nll(self, visible_share: Tensor, log_amplitude: Tensor, waves: Tensor | None = None) -> Tensor:
+    def nll(
+        self, visible_share: Tensor, log_amplitude: Tensor, waves: Tensor | None = None
+    ) -> Tensor:
         """Return the negative log likelihood (), in nats; differentiable."""
-        return _nll(self.columns(visible_share, log_amplitude, waves), self.white, self._determinant)
+        return _nll(
+            self.columns(visible_share, log_amplitude, waves), self.white, self._determinant
+        )
 
     def make_scorer(self, visible_share: Tensor, log_amplitude: Tensor) -> CandidateScorer:
-        """Return a scorer of candidates, with the constant parts at their posterior means removed."""
+        """Return a scorer of candidates, with the constant parts
+        at their posterior means removed.
+        """
         columns = self.columns(visible_share, log_amplitude)
         inner, seen = _gram_and_product(columns, self.white)
         chol = Factor.from_gram(inner)
-        mean, projection = chol.solve(seen[:, None])[:, 0].float(), chol.whiten(columns.T.double()).float()
+        mean, projection = (
+            chol.solve(seen[:, None])[:, 0].float(),
+            chol.whiten(columns.T.double()).float(),
+        )
         gains = mean * self.share * log_amplitude.exp()
         return CandidateScorer(self.root, projection, self.white - columns @ mean, gains)
 
@@ -143,8 +168,11 @@ class CandidateScorer:
         """Diagonal of K^-1 (n,), mean of both parts."""
         return self.root.square().sum(0).view(2, -1).mean(0)
 
-    def gains_of_shares(self, candidates: Tensor, share: Callable[[Tensor], Tensor], waves: Tensor) -> Tensor:
-        """Return the log likelihood (m,) [nats] that m candidates gain by adding waves times their shares.
+    def gains_of_shares(
+        self, candidates: Tensor, share: Callable[[Tensor], Tensor], waves: Tensor
+    ) -> Tensor:
+        """Return the log likelihood (m,) [nats] that m candidates gain
+        by adding waves times their shares.
 
         Args:
             candidates: (m, ...), taken in blocks of b.
@@ -160,7 +188,9 @@ class CandidateScorer:
         return torch.cat(scores)
 
     def gains_and_multiples(self, change: Tensor) -> tuple[Tensor, Tensor]:
-        """Return nats (M,) float32 that positive multiples (M,) of complex changes (n, M) gain, and these."""
+        """Return nats (M,) float32 that positive multiples (M,) of complex changes (n, M) gain,
+        and these.
+        """
         whitened = self.root @ torch.cat([change.real, change.imag])
         power = whitened.square().sum(0) - (self.projection @ whitened).square().sum(0)
         matched = (self.residual @ whitened).clamp_min(0)
@@ -169,11 +199,14 @@ class CandidateScorer:
         return multiple * matched / 2, multiple
 
     def gains_and_amplitudes(self, waves: Tensor) -> tuple[Tensor, Tensor]:
-        """Return nats (M,) that waves (n, M) of free complex gains would gain, and these gains (M,)."""
+        """Return nats (M,) that waves (n, M) of free complex gains would gain,
+        and these gains (M,).
+        """
         parts = [self.root @ part for part in stack_real_imag(waves)]
         seen = [self.projection @ part for part in parts]
         dot = [
-            [(parts[i] * parts[j]).sum(0) - (seen[i] * seen[j]).sum(0) for j in range(2)] for i in range(2)
+            [(parts[i] * parts[j]).sum(0) - (seen[i] * seen[j]).sum(0) for j in range(2)]
+            for i in range(2)
         ]
         along, across = (self.residual @ part for part in parts)
         determinant = (dot[0][0] * dot[1][1] - dot[0][1].square()).clamp_min(NEGLIGIBLE**2)
@@ -208,13 +241,17 @@ class UnexplainedRows:
 
 
 def _gram_and_product(columns: Tensor, white: Tensor) -> tuple[Tensor, Tensor]:
-    """`I + C^T C` (K, K) and `C^T y` (K,), float64, of whitened columns (2 n, K) and targets (2 n,).
+    """`I + C^T C` (K, K) and `C^T y` (K,), float64, of whitened columns (2 n, K)
+    and targets (2 n,).
 
-    Entries of C^T C are rows over noise, 1e7 where there is hardly any: float32 would round the I away.
+    Entries of C^T C are rows over noise, 1e7 where there is hardly any:
+    float32 would round the I away.
     """
     raise_if_cancelled()
     exact = columns.double()
-    return exact.T @ exact + torch.eye(columns.shape[1], dtype=torch.float64), exact.T @ white.double()
+    return exact.T @ exact + torch.eye(
+        columns.shape[1], dtype=torch.float64
+    ), exact.T @ white.double()
 
 
 def _nll(columns: Tensor, white: Tensor, determinant: float) -> Tensor:

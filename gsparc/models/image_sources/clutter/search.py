@@ -1,4 +1,6 @@
-"""Greedy search for clutter: finite mirrors, occluding boxes and reflections in them, kept by likelihood."""
+"""Greedy search for clutter: finite mirrors, occluding boxes and reflections in them,
+kept by likelihood.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,11 @@ import torch
 from gsparc.models.image_sources.backprojection import select_separated
 from gsparc.models.image_sources.clutter.blocking import BOX, PATCH, visible_share
 from gsparc.models.image_sources.clutter.boxes import clip_boxes, find_occluding_box
-from gsparc.models.image_sources.clutter.finite_mirrors import SmallMirror, find_patch, find_small_mirrors
+from gsparc.models.image_sources.clutter.finite_mirrors import (
+    SmallMirror,
+    find_patch,
+    find_small_mirrors,
+)
 from gsparc.models.image_sources.clutter.refine import refine_with_clutter
 from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, UnexplainedRows
 from gsparc.models.image_sources.gp_likelihood import GainPosterior
@@ -41,8 +47,8 @@ def find_clutter(rows: Rows, scene: SourceScene, generator: torch.Generator) -> 
     """Return the scene with clutter, or unchanged when the likelihood gains too little.
 
     A piece must gain half the logarithm of the number of real observations per parameter:
-    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978). When it is `out_of_steps`, what
-    was found so far is the result.
+    G. Schwarz, "Estimating the dimension of a model", Ann. Statist. 6 (1978). When it is
+    `out_of_steps`, what was found so far is the result.
 
     Args:
         rows: of one output, as many as in a search.
@@ -82,13 +88,16 @@ class _ClutterSearcher:
     def _unexplained_rows(self) -> UnexplainedRows:
         scorer = self.residual.make_scorer(self.visible, self.scene.log_amplitude)
         waves = self.waves * self.visible.T
-        return UnexplainedRows(self.rows, self.scene, scorer, self.paths, waves, self.room, self.generator)
+        return UnexplainedRows(
+            self.rows, self.scene, scorer, self.paths, waves, self.room, self.generator
+        )
 
     def _try_scene(self, scene: SourceScene, parameters: int, refactor: bool = False) -> bool:
-        """Accept a scene after a few steps of descent, when it gains the cost of so many parameters.
+        """Accept a scene after a few steps of descent,
+        when it gains the cost of so many parameters.
 
-        Varying part and noise are those last factored; with `refactor` they are the new scene's, since the
-        old ones would explain what the new scene occludes.
+        Varying part and noise are those last factored; with `refactor` they are the new scene's,
+        since the old ones would explain what the new scene occludes.
         """
         nll, least = self.nll, parameters * self.parameter_cost
 
@@ -126,11 +135,17 @@ class _ClutterSearcher:
                     self._run_round()
                     best = min(best, self.whole, key=lambda b: b[0])
                     log.debug(
-                        "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise %.3f, %s",
-                        epoch, len(self.scene.clutter.boxes), len(self.scene.clutter.patches),
-                        len(self.scene.sequences), self.nll, start, math.exp(self.scene.log_noise),
+                        "epoch %d: %d boxes, %d patches, %d sources, nll %.1f (bare %.1f), noise "
+                        "%.3f, %s",
+                        epoch,
+                        len(self.scene.clutter.boxes),
+                        len(self.scene.clutter.patches),
+                        len(self.scene.sequences),
+                        self.nll,
+                        start,
+                        math.exp(self.scene.log_noise),
                         self.scene.visibility,
-                    )  # fmt: skip
+                    )
                     if self.nll > before - PROGRESS:
                         break
         except Cancelled:
@@ -140,7 +155,13 @@ class _ClutterSearcher:
 
     def _run_round(self) -> None:
         """One round of everything; what each step leaves is `whole`."""
-        for step in (self._try_mirrors, self._try_patches, self._try_boxes, self._try_sequences, self._prune):
+        for step in (
+            self._try_mirrors,
+            self._try_patches,
+            self._try_boxes,
+            self._try_sequences,
+            self._prune,
+        ):
             step()
             self.whole = self.nll, self.scene
 
@@ -165,15 +186,26 @@ class _ClutterSearcher:
         scene, number = self.scene, len(self.scene.planes)
         # Itself, after and before each wall.
         sequences: list[Reflections] = [(number,)]
-        sequences += [(wall, number) for wall in scene.walls] + [(number, wall) for wall in scene.walls]
+        sequences += [(wall, number) for wall in scene.walls] + [
+            (number, wall) for wall in scene.walls
+        ]
         clutter = scene.clutter.add_patch(mirror.patch, number)
-        trial = replace(scene, planes=torch.cat([scene.planes, mirror.plane[None]]), clutter=clutter)
+        trial = replace(
+            scene, planes=torch.cat([scene.planes, mirror.plane[None]]), clutter=clutter
+        )
         return self._add_sequences(trial, sequences, 1.5, MIRROR, len(sequences))
 
     def _add_sequences(
-        self, scene: SourceScene, sequences: list[Reflections], min_score: float, parameters: int, limit: int
+        self,
+        scene: SourceScene,
+        sequences: list[Reflections],
+        min_score: float,
+        parameters: int,
+        limit: int,
     ) -> bool:
-        """Try sequences of at least `min_score` nats, on a scene of so many more parameters of planes."""
+        """Try sequences of at least `min_score` nats,
+        on a scene of so many more parameters of planes.
+        """
         # new patches occlude present sequences, too
         hidden = visible_share(self.paths, scene.clutter, scene.planes)
         scorer = self.residual.make_scorer(hidden, self.scene.log_amplitude)
@@ -211,7 +243,9 @@ class _ClutterSearcher:
             box, score = find_occluding_box(self._unexplained_rows())
             if score < MIN_GAIN:
                 break
-            if not self._try_scene(replace(self.scene, clutter=self.scene.clutter.add_box(box)), BOX):
+            if not self._try_scene(
+                replace(self.scene, clutter=self.scene.clutter.add_box(box)), BOX
+            ):
                 break
 
     def _try_sequences(self) -> None:

@@ -1,8 +1,10 @@
-"""Unfold reflection sequences into straight legs of paths, from receiver to transmitter (image method).
+"""Unfold reflection sequences into straight legs of paths,
+from receiver to transmitter (image method).
 
-The path of sequence (i, j) leaves the receiver towards the image of the whole sequence, meets plane j there,
-continues towards the image of (i,), and so on. Of perpendicular mirrors both orders have the same image;
-which of them a receiver sees follows from where the line to the image meets the planes first.
+The path of sequence (i, j) leaves the receiver towards the image of the whole sequence, meets plane
+j there, continues towards the image of (i,), and so on. Of perpendicular mirrors both orders have
+the same image; which of them a receiver sees follows from where the line
+to the image meets the planes first.
 """
 
 from __future__ import annotations
@@ -16,7 +18,8 @@ from torch import Tensor
 from gsparc.physics.mirror_planes import Reflections, hesse_form, images, reflect
 
 SAME_M = 0.05  # [m], sequences of the same planes whose images are closer are the same source
-EDGE = 1e-6  # tolerance of the intersection of a leg with a plane, and [m] least side of a leg's box
+# Tolerance of the intersection of a leg with a plane, and [m] least side of a leg's box
+EDGE = 1e-6
 PARALLEL = 1e-9  # [m], difference of heights over a plane that legs along it are given
 
 
@@ -25,10 +28,11 @@ class Legs:
     """Legs of K sequences from n places.
 
     Attributes:
-        points: (K, n, L + 1, 3) float32 [m], place, reflections, transmitter; sequences shorter than L - 1
-            are padded with legs of no length.
+        points: (K, n, L + 1, 3) float32 [m], place, reflections, transmitter; sequences shorter
+            than L - 1 are padded with legs of no length.
         plane: (K, n, L) plane met at the end of each leg, -1 for none.
-        valid: (K, n) bool, whether the sequence's planes are met in order between receiver and image.
+        valid: (K, n) bool, whether the sequence's planes are met in order between receiver and
+            image.
     """
 
     points: Tensor
@@ -60,15 +64,18 @@ class Unfolding:
 
     Attributes:
         chain: (L, K, M, 1, 3) float32 [m]; entry l is the image after l reflections.
-        normal: (L - 1, K, M, 1, 3) float32 unit normals of the planes; zero beyond the sequence's end.
+        normal: (L - 1, K, M, 1, 3) float32 unit normals of the planes; zero beyond the sequence's
+            end.
         offset: (L - 1, K, M, 1) float32 [m]; zero beyond.
-        height: (L - 1, K, M, 1) float32 [m], of the image after the reflection over its plane; -1 beyond, so
-            that legs there have no length.
+        height: (L - 1, K, M, 1) float32 [m], of the image after the reflection over its plane; -1
+            beyond, so that legs there have no length.
         plane: (K, M, 1, L) in the order in which a path meets them, -1 where there is none.
         present: (K, M, 1) bool, whether the entry exists.
     """
 
-    def __init__(self, transmitter: Tensor, planes: Tensor, sequences: tuple[Reflections, ...]) -> None:
+    def __init__(
+        self, transmitter: Tensor, planes: Tensor, sequences: tuple[Reflections, ...]
+    ) -> None:
         variants = _equivalent_sequences(transmitter, planes, sequences)
         most, order = max(map(len, variants)), max(map(len, sequences), default=0)
         plane = torch.full((order, len(sequences), most, 1), -1)
@@ -87,7 +94,9 @@ class Unfolding:
         self.offset = offset[..., 0].float() * exists
         height = (self.chain[1:] * self.normal).sum(-1) - self.offset
         self.height = torch.where(exists, height, -1.0)
-        self.plane = torch.cat([plane.flip(0), torch.full((1, *self.present.shape), -1)]).movedim(0, -1)
+        self.plane = torch.cat([plane.flip(0), torch.full((1, *self.present.shape), -1)]).movedim(
+            0, -1
+        )
 
     def paths(self, places: Tensor) -> Legs:
         """Return the paths from places (n, 3) [m]."""

@@ -1,4 +1,6 @@
-"""Walls of a file as mirrors, and images of the static end that some receiver sees, strongest first."""
+"""Walls of a file as mirrors, and images of the static end that some receiver sees,
+strongest first.
+"""
 
 from __future__ import annotations
 
@@ -15,14 +17,20 @@ from torch import Tensor
 
 from gsparc.data.walls import SceneWalls, box_faces, polygon_area, polygon_normal
 from gsparc.models.apart import keep_apart
-from gsparc.models.image_sources.clutter.blocking import PATCH, Clutter, plane_tangents, visible_share
+from gsparc.models.image_sources.clutter.blocking import (
+    PATCH,
+    Clutter,
+    plane_tangents,
+    visible_share,
+)
 from gsparc.models.image_sources.clutter.unfold import SAME_M, Legs, Unfolding
 from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, hesse_form, images
 from gsparc.processes.few_rows import evenly_spaced
 from gsparc.processes.trend import Walls
 
 REFLECTED = 0.6  # amplitude that a reflection leaves, of building materials
-MOST_SEQUENCES = 3_000  # sequences of walls of each length that are looked at, over the largest of them
+# Sequences of walls of each length that are looked at, over the largest of them
+MOST_SEQUENCES = 3_000
 LOOKED_FROM = 100  # places
 AT_ONCE = 50  # sequences whose paths are held together: memory
 SHORTLIST = 4  # times as many as are wanted, before what walls hide is looked at
@@ -74,10 +82,13 @@ class Mirrors:
         top = size.topk(min(MOST_PATCHES, len(size))).indices.sort().values.tolist()
         boxes = torch.from_numpy(walls.boxes - origin).flatten(1).float()
         plane = tuple(indices[i] for i in top)
-        return Mirrors(planes, Clutter(boxes, rectangles[top].float(), plane), len(rectangles) - len(top))
+        return Mirrors(
+            planes, Clutter(boxes, rectangles[top].float(), plane), len(rectangles) - len(top)
+        )
 
     def large_planes(self, smallest: float) -> list[int]:
-        """Return numbers of planes with a rectangle whose sides are at least so long [m], the largest first.
+        """Return numbers of planes with a rectangle whose sides are at least so long [m],
+        the largest first.
 
         Others only block.
         """
@@ -93,9 +104,16 @@ class Mirrors:
         return Unfolding(transmitter, self.planes, tuple(sequences)).paths(places)
 
     def visible_sequences(
-        self, indices: list[int], transmitter: Tensor, places: Tensor, order: int, limit: int, hidden: bool
+        self,
+        indices: list[int],
+        transmitter: Tensor,
+        places: Tensor,
+        order: int,
+        limit: int,
+        hidden: bool,
     ) -> tuple[Reflections, ...]:
-        """Return at most `limit` sequences, the static end's own first, then by power expected at the places.
+        """Return at most `limit` sequences, the static end's own first,
+        then by power expected at the places.
 
         Args:
             indices: planes that mirror, the largest first.
@@ -133,7 +151,9 @@ class Mirrors:
     def obstacles_of(
         self, sequences: tuple[Reflections, ...], transmitter: Tensor, places: Tensor
     ) -> Clutter:
-        """Return the rectangles that mirror sequences or that hide one from a place, and the boxes."""
+        """Return the rectangles that mirror sequences or that hide one from a place,
+        and the boxes.
+        """
         clutter, paths = self.clutter, self.paths(sequences, transmitter, places)
         used = {index for sequence in sequences for index in sequence}
         numbers = []
@@ -148,7 +168,9 @@ class Mirrors:
     def _expected_powers(
         self, sequences: list[Reflections], transmitter: Tensor, places: Tensor, hidden: bool
     ) -> Tensor:
-        """Expected power (W,) of sequences over that of 1 m, where rectangles reflect them; nothing hides."""
+        """Expected power (W,) of sequences over that of 1 m, where rectangles reflect them;
+        nothing hides.
+        """
         # [m]: a place at an image would outweigh all others.
         away = torch.cdist(images(transmitter, self.planes, sequences), places).clamp_min(0.1)
         order = torch.tensor([len(sequence) for sequence in sequences])
@@ -173,7 +195,9 @@ class Mirrors:
 
 
 def walls_in_frame(walls: SceneWalls, origin: np.ndarray, static_end: np.ndarray | None) -> Walls:
-    """Return walls and boxes of a file for paths to the end that stands (3,) local [m]; None: both move."""
+    """Return walls and boxes of a file for paths to the end that stands (3,) local [m]; None:
+    both move.
+    """
     faces = [face for low, high in walls.boxes for face in box_faces(low, high)]
     mirrors = Mirrors.from_walls(SceneWalls((*walls.faces, *faces), walls.boxes[:0]), origin)
     planes, patches = mirrors.planes[list(mirrors.clutter.plane)], mirrors.clutter.patches.double()
@@ -210,21 +234,27 @@ def _join_touching(faces: list[np.ndarray]) -> list[np.ndarray]:
     """Corners (C, 3) of each group of faces that share corners."""
     face = np.repeat(np.arange(len(faces)), [len(corners) for corners in faces])
     corners = np.concatenate(faces)
-    corner = np.unique(np.round(corners / SAME_CORNER_M).astype(np.int64), axis=0, return_inverse=True)[1]
+    corner = np.unique(
+        np.round(corners / SAME_CORNER_M).astype(np.int64), axis=0, return_inverse=True
+    )[1]
     shared = coo_array((np.ones(len(face)), (face, corner.reshape(-1)))).tocsr()
     count, group = connected_components(shared @ shared.T, directed=False)
     return [corners[group[face] == number] for number in range(count)]
 
 
 def limit_mirrors(mirrors: int, length: int) -> int:
-    """Return how many of `mirrors` have at most `MOST_SEQUENCES` sequences of so many reflections."""
+    """Return how many of `mirrors` have at most `MOST_SEQUENCES` sequences
+    of so many reflections.
+    """
     count = mirrors
     while count > 1 and count * (count - 1) ** (length - 1) > MOST_SEQUENCES:
         count -= 1
     return count
 
 
-def _drop_doubles(sequences: list[Reflections], transmitter: Tensor, planes: Tensor) -> list[Reflections]:
+def _drop_doubles(
+    sequences: list[Reflections], transmitter: Tensor, planes: Tensor
+) -> list[Reflections]:
     """One sequence of each image: perpendicular mirrors have the same in both orders."""
     if not sequences:
         return []

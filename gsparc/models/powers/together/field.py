@@ -1,8 +1,8 @@
 """The field of powers of many ends: a law and a place term of the site, a process of each end.
 
-Stations that were heard answer by their own process about the law of the site. A station that was never
-heard is answered by the law and a process of place that all stations share, as strong as stations that were
-left out want it. Either end may be the station.
+Stations that were heard answer by their own process about the law of the site. A station that was
+never heard is answered by the law and a process of place that all stations share, as strong as
+stations that were left out want it. Either end may be the station.
 """
 
 from __future__ import annotations
@@ -69,7 +69,9 @@ class JointPowerField(ClosedForm):
     heard: SharedTerms  # shared terms for stations that have rows
     unheard: SharedTerms  # those for all others
 
-    def __init__(self, shared: bool = True, seed: int = 0, maps: Sequence[NetworkMaps] = ()) -> None:
+    def __init__(
+        self, shared: bool = True, seed: int = 0, maps: Sequence[NetworkMaps] = ()
+    ) -> None:
         self.shared, self.seed, self.maps = shared, seed, maps
         self.inflation = 1.0  # of variances of stations never heard
         self.posterior: SharedTermsPosterior | None = None
@@ -106,7 +108,9 @@ class JointPowerField(ClosedForm):
             names = data.site.every_station.shown
             evidence, prior, remarks = learn_network(used, network, names, self.seed)
             for maps in self.maps:
-                known, own, said = learn_network(used, maps.put_under(network, self.places), names, self.seed)
+                known, own, said = learn_network(
+                    used, maps.put_under(network, self.places), names, self.seed
+                )
                 if used_maps := known > evidence:
                     prior, remarks = own, said
                 # Second: a table shows the first few.
@@ -115,8 +119,12 @@ class JointPowerField(ClosedForm):
             self.own = StationPriors(prior, {})
         most, largest = rows_per_station(len(used.stations)), int(np.bincount(used.station).max())
         if largest > most:
-            remarks.append(f"at most {most} rows of each station are learned from, of up to {largest}")
-        self.heard = self.unheard = SharedTerms.from_rows(used, self.own.never.known_trend, 1.0, 0, self.seed)
+            remarks.append(
+                f"at most {most} rows of each station are learned from, of up to {largest}"
+            )
+        self.heard = self.unheard = SharedTerms.from_rows(
+            used, self.own.never.known_trend, 1.0, 0, self.seed
+        )
         if not self.shared or network is not None:
             return (*notes, *remarks)
         terms, self.inflation, remark = learn_shared_terms(used, self.own, self.seed)
@@ -142,10 +150,14 @@ class JointPowerField(ClosedForm):
         self.posterior, self._reach = self.own.condition(used, self.heard, self.seed), None
         elsewhere = self.posterior
         if self.network is None:  # sites share nothing that is learned here
-            elsewhere = self.own.condition(used.thin_rows(UNHEARD_EACH, self.seed), self.unheard, self.seed)
+            elsewhere = self.own.condition(
+                used.thin_rows(UNHEARD_EACH, self.seed), self.unheard, self.seed
+            )
         self.elsewhere = self._unheard_posterior((elsewhere.factor, elsewhere.mean))
         self.whole = max(float(used.heard_rows.decibels.var()), self.own.variance)
-        self.rows = {n: torch.from_numpy(used.select_station(n).measured_rows.index) for n in used.stations}
+        self.rows = {
+            n: torch.from_numpy(used.select_station(n).measured_rows.index) for n in used.stations
+        }
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; (B, 1) linear powers.
@@ -187,7 +199,9 @@ class JointPowerField(ClosedForm):
         covariance = torch.zeros(groups, count, count).double()
         for one in number.unique().tolist():
             at = (number == one).nonzero()[:, 0]
-            of, inflation = (posterior, 1.0) if one in posterior.processes else (elsewhere, self.inflation)
+            of, inflation = (
+                (posterior, 1.0) if one in posterior.processes else (elsewhere, self.inflation)
+            )
             mean[:, at], block = of.predict_joint(places[:, at], one)
             covariance[:, at[:, None], at] = inflation * block
             kernel = self.own.prior(one).kernel
@@ -218,13 +232,19 @@ class JointPowerField(ClosedForm):
         state: dict[str, Any] = {
             "places": torch.from_numpy(np.nan_to_num(self.places)),
             "nowhere": np.flatnonzero(np.isnan(self.places).any(1)).tolist(),
-            "never": self.own.never.state(), "own": heard,
-            "heard": self.heard.state(), "unheard": self.unheard.state(), "inflation": self.inflation,
-            "seed": self.seed, "whole": self.whole,
+            "never": self.own.never.state(),
+            "own": heard,
+            "heard": self.heard.state(),
+            "unheard": self.unheard.state(),
+            "inflation": self.inflation,
+            "seed": self.seed,
+            "whole": self.whole,
             "rows": {str(number): rows for number, rows in self.rows.items()},
-        }  # fmt: skip
+        }
         if self.posterior is not None and self.elsewhere is not None:
-            state["processes"] = {str(n): one.state() for n, one in self.posterior.processes.items()}
+            state["processes"] = {
+                str(n): one.state() for n, one in self.posterior.processes.items()
+            }
             for name, one in (("posterior", self.posterior), ("elsewhere", self.elsewhere)):
                 state[name] = {"lower": one.factor.lower, "mean": one.mean}
         return state
@@ -241,18 +261,26 @@ class JointPowerField(ClosedForm):
         self.rows = {int(number): rows for number, rows in state["rows"].items()}
         self.inflation, self.whole = float(state["inflation"]), float(state["whole"])
         if "processes" in state:
-            processes = {int(number): Exact.read(part) for number, part in state["processes"].items()}
-            weights = [(Factor(state[n]["lower"]), state[n]["mean"]) for n in ("posterior", "elsewhere")]
+            processes = {
+                int(number): Exact.read(part) for number, part in state["processes"].items()
+            }
+            weights = [
+                (Factor(state[n]["lower"]), state[n]["mean"]) for n in ("posterior", "elsewhere")
+            ]
             self.posterior = SharedTermsPosterior(processes, never, self.heard.columns, weights[0])
             self.elsewhere = self._unheard_posterior(weights[1])
 
     def _unheard_posterior(self, weights: tuple[Factor, Tensor]) -> SharedTermsPosterior:
-        """What is said of stations that have no rows; of a network's, of a sector without pattern, too."""
+        """What is said of stations that have no rows; of a network's, of a sector without pattern,
+        too.
+        """
         never, network = self.own.never, self.network
         never = never if network is None else replace(never, trend=network.add_sectors(ROUND))
         return SharedTermsPosterior({}, never, self.unheard.columns, weights)
 
-    def add_station(self, place: np.ndarray, sectors: Tensor, like: int | None = None) -> JointPowerField:
+    def add_station(
+        self, place: np.ndarray, sectors: Tensor, like: int | None = None
+    ) -> JointPowerField:
         """Return one that knows k further stations, of no rows, as its last.
 
         Args:
@@ -271,7 +299,8 @@ class JointPowerField(ClosedForm):
             raise DataError("azimuths of a new station: this model was learned without azimuths")
         if network is None and like is not None:
             raise DataError(
-                "antenna.carrier_hz: this model was learned without azimuths, and tells no bands apart"
+                "antenna.carrier_hz: this model was learned without azimuths, and tells no bands "
+                "apart"
             )
         if network is not None:
             never = replace(self.own.never, trend=network.add_sectors(sectors, like))
@@ -291,7 +320,9 @@ class JointPowerField(ClosedForm):
             return torch.cat([moving, still], 1), number
         here, there = (stations_at(table, one) for one in (still, moving))
         turned = (here < 0) & (there >= 0)  # asked the other way round
-        swapped = torch.where(turned[:, None], torch.cat([still, moving], 1), torch.cat([moving, still], 1))
+        swapped = torch.where(
+            turned[:, None], torch.cat([still, moving], 1), torch.cat([moving, still], 1)
+        )
         return swapped, torch.where(turned, there, here)
 
     def _process_places(self, places: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
@@ -299,18 +330,25 @@ class JointPowerField(ClosedForm):
         if self.network is None:
             return places, number
         site = self.network.site[number.clamp_min(0)]
-        sector = torch.where(number < 0, len(self.network.table), number)  # the last, without a pattern
+        # The last, without a pattern
+        sector = torch.where(number < 0, len(self.network.table), number)
         return torch.cat([places, sector[:, None]], 1), torch.where(number < 0, NOBODY, site)
 
     def _law_share(self, moving: Tensor) -> Tensor:
-        """Share (B,) of the variance that the law explains and places (B, 3) are too far to be sure of.
+        """Share (B,) of the variance that the law explains and places (B, 3)
+        are too far to be sure of.
 
         Its slope says nothing of places far from all data.
         """
         if self._reach is None:
             posterior, _ = self._require_posteriors()
-            places = torch.cat([first_end(one.rows) for one in posterior.processes.values()]).numpy()
-            self._reach = cKDTree(places), max(REACH * float(np.linalg.norm(np.ptp(places, axis=0))), TINY_M)
+            places = torch.cat(
+                [first_end(one.rows) for one in posterior.processes.values()]
+            ).numpy()
+            self._reach = (
+                cKDTree(places),
+                max(REACH * float(np.linalg.norm(np.ptp(places, axis=0))), TINY_M),
+            )
         tree, reach = self._reach
         far = nearest_distance(tree, moving)
         law = max(1 - self.own.variance / self.whole, 0.0)

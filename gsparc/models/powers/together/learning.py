@@ -1,7 +1,8 @@
 """Settings of stations' own processes by rows left out, and of what all share by stations left out.
 
-Where a station was heard its own process takes most of what shared terms could say, so the likelihood of its
-rows hardly tells how strong they are. Each station by turns is predicted from the others instead.
+Where a station was heard its own process takes most of what shared terms could say, so the
+likelihood of its rows hardly tells how strong they are.
+Each station by turns is predicted from the others instead.
 """
 
 from __future__ import annotations
@@ -23,24 +24,32 @@ from gsparc.processes.places import extra_columns, first_end
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import LEAST_SILENT, MOST_ROWS, condition_on_powers
 from gsparc.processes.prior import Prior
-from gsparc.processes.shared import Block, SharedTermsPosterior, left_out_processes, process_deviation
+from gsparc.processes.shared import (
+    Block,
+    SharedTermsPosterior,
+    left_out_processes,
+    process_deviation,
+)
 from gsparc.processes.trend import Trend
 from gsparc.processes.uncertainty import mean_and_error
 
-START = Kernel.from_lengths((0.1, 1.0), (0.5, 0.5), 0.3)  # lengths in median distances between places
+# Lengths in median distances between places
+START = Kernel.from_lengths((0.1, 1.0), (0.5, 0.5), 0.3)
 LEAST_DB2 = 1e-6  # of a station's process: levels that are equal to the last digit leave none
 ALIKE = 10.0  # rows that the amplitude of all stations counts as, for one of them
 SLOPE_DB = 2.0  # a decade: deviation of a station's slope
 LEARNED_EACH = 500  # rows of each station, for the law and for settings that all have alike
 WEIGHED_EACH = 160  # the same where some were silent: each look factors several covariances
-ENDS_FROM, ENDS_ON = 400, 700  # rows that a station needs for settings of its own, and has them from
+# Rows that a station needs for settings of its own, and has them from
+ENDS_FROM, ENDS_ON = 400, 700
 LEAST_STATIONS = 3  # to leave some out
 TRIED_ON = 3_600  # rows of all stations for the strength of shared terms
 TRIED_EACH = 300  # of each, and places that the shared process is known at
 LENGTHS = (0.7, 2.0)  # of the shared process, of a station's shorter one
 PLACE = (0.03, 0.1, 0.2)  # variances of g, of a station's own
 ERRORS = 1.0  # standard errors that the gain of shared terms over the law alone must exceed
-TOLD = 20.0  # amplitudes of a pseudo-value's variance, beyond which it is left out: .5 % of rmse at most
+# Amplitudes of a pseudo-value's variance, beyond which it is left out: .5 % of rmse at most
+TOLD = 20.0
 WIDEST = 4.0  # factor that variances are corrected by at most
 
 
@@ -72,10 +81,16 @@ class StationPriors:
                 wide = replace(prior.known_trend, more=(*prior.known_trend.more, shared))
                 # Each sector of a site has a level of its own, which its silent rows bound.
                 least = LEAST_SILENT * len(np.unique(extra_columns(part.places), axis=0))
-                process = condition_on_powers(part, Prior(prior.kernel, wide), seed, least)[0].posterior
+                process = condition_on_powers(part, Prior(prior.kernel, wide), seed, least)[
+                    0
+                ].posterior
                 assert isinstance(process, Exact)
                 mask = process.extra <= TOLD
-                places, values, extra = process.rows[mask], process.given_values()[mask], process.extra[mask]
+                places, values, extra = (
+                    process.rows[mask],
+                    process.given_values()[mask],
+                    process.extra[mask],
+                )
             result[number] = Exact.from_values(prior, places, values, extra)
         return SharedTermsPosterior(result, self.never, terms.columns)
 
@@ -94,7 +109,9 @@ def learn_station_priors(rows: StationRows, seed: int) -> tuple[StationPriors, l
     kernel, priors = _fit_common_kernel(heard, trend, seed)
     if some_silent:
         each = whole.share_of(MOST_ROWS, WEIGHED_EACH)
-        parts = [whole.select_station(n).draw_stretches(each, seed).view(trend) for n in whole.stations]
+        parts = [
+            whole.select_station(n).draw_stretches(each, seed).view(trend) for n in whole.stations
+        ]
         # What lists hold spreads less than what they were drawn from.
         narrow, (_, kernel) = kernel, fit_kernel_by_evidence(kernel, parts, EVIDENCE_LOOKS)
         wider = kernel.amplitude / narrow.amplitude
@@ -120,14 +137,17 @@ def _fit_site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
     residual = few.decibels - law.mean(torch.from_numpy(few.places)).numpy()
     residuals = [residual[few.station == number] for number in few.stations]
     levels, typical = np.array([[part.mean(), part.std()] for part in residuals]).T
-    law = replace(law, level=law.level + float(np.median(levels)))  # that of one station may be far off
+    # That of one station may be far off
+    law = replace(law, level=law.level + float(np.median(levels)))
     trend = Trend.from_law(law, torch.from_numpy(few.places))
     by = f"distance exponent {law.exponent:.3g}, gains +- {levels.std():.2g} dB"
     spread = max(float(np.median(typical)), 0.1) / SLOPE_DB
     return replace(trend, spread=spread), [f"{len(levels)} stations in one model, {by}"]
 
 
-def _fit_common_kernel(heard: StationRows, trend: Trend, seed: int) -> tuple[Kernel, dict[int, Prior]]:
+def _fit_common_kernel(
+    heard: StationRows, trend: Trend, seed: int
+) -> tuple[Kernel, dict[int, Prior]]:
     """Lengths and noise that all stations have alike, and priors with the amplitude of each."""
     few = heard.thin_rows(heard.share_of(MOST_ROWS, LEARNED_EACH), seed)
     views = {number: few.select_station(number).view(trend) for number in few.stations}
@@ -137,7 +157,9 @@ def _fit_common_kernel(heard: StationRows, trend: Trend, seed: int) -> tuple[Ker
     start = Kernel.from_lengths(lengths, START.shares, START.noise)
     _, kernel = fit_kernel_by_left_out([start], [*views.values()], start.bounds(far), alike=ALIKE)
     parts = [(view.gram(kernel), view.values) for view in views.values()]
-    kernels = (_with_amplitude(kernel, each) for each in left_out_density(parts, alike=ALIKE)[1].tolist())
+    kernels = (
+        _with_amplitude(kernel, each) for each in left_out_density(parts, alike=ALIKE)[1].tolist()
+    )
     priors = {number: Prior(own, trend) for number, own in zip(views, kernels, strict=True)}
     return _with_amplitude(kernel, kernel.amplitude), priors
 
@@ -147,8 +169,11 @@ def _with_amplitude(kernel: Kernel, amplitude: float) -> Kernel:
     return replace(kernel, amplitude=max(amplitude, LEAST_DB2))
 
 
-def learn_shared_terms(rows: StationRows, priors: StationPriors, seed: int) -> tuple[SharedTerms, float, str]:
-    """Return shared terms for stations that were never heard, of least squared error at left-out stations.
+def learn_shared_terms(
+    rows: StationRows, priors: StationPriors, seed: int
+) -> tuple[SharedTerms, float, str]:
+    """Return shared terms for stations that were never heard,
+    of least squared error at left-out stations.
 
     Args:
         rows: of all stations.
@@ -156,20 +181,24 @@ def learn_shared_terms(rows: StationRows, priors: StationPriors, seed: int) -> t
         seed: of rows and places drawn.
 
     Returns:
-        The terms, possibly of the law alone; the factor of variances that left-out stations ask for; and what
-        must be said of what g gains at these, each after one constant.
+        The terms, possibly of the law alone; the factor of variances that left-out stations ask
+        for; and what must be said of what g gains at these, each after one constant.
     """
     heard = rows.heard_rows
     few = heard.thin_rows(heard.share_of(TRIED_ON, TRIED_EACH), seed)
     short = min(priors.never.kernel.lengths)
-    bare = SharedTerms.from_rows(few, priors.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed)
+    bare = SharedTerms.from_rows(
+        few, priors.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed
+    )
     if len(few.stations) < LEAST_STATIONS:
         return bare, 1.0, "no shared terms: too few stations to leave some out"
     processes = priors.condition(few, bare, seed).processes
     best = plain = bare, *_left_out_errors(processes, bare)
     for length in LENGTHS:
         for share in PLACE:
-            terms = replace(bare, length=length * short, place_db=math.sqrt(share * priors.variance))
+            terms = replace(
+                bare, length=length * short, place_db=math.sqrt(share * priors.variance)
+            )
             result = _left_out_errors(processes, terms)
             if (result[0] ** 2).mean() < (best[1] ** 2).mean():
                 best = terms, *result
@@ -187,12 +216,15 @@ def learn_shared_terms(rows: StationRows, priors: StationPriors, seed: int) -> t
 def _left_out_errors(
     processes: Mapping[int, Exact], terms: SharedTerms
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Errors (n,) [dB] of what was heard of stations left out, after a constant of each, and their stations.
+    """Errors (n,) [dB] of what was heard of stations left out, after a constant of each,
+    and their stations.
 
     Between them the mean square of errors without that constant over their predicted variances.
     """
     errors, ratios = [], []
-    blocks = [Block.from_process(process, terms.columns(process.rows)) for process in processes.values()]
+    blocks = [
+        Block.from_process(process, terms.columns(process.rows)) for process in processes.values()
+    ]
     for error, variance in left_out_processes(blocks):
         ratios.append(float((error.square() / variance).mean()))
         errors.append((error - error.mean()).numpy())

@@ -1,8 +1,8 @@
 """Settings of a network's model of powers, from what its lists hold and from what they leave out.
 
-First laws, patterns and gains as if rows were independent (a Tobit model), which also says where an azimuth
-contradicts the data; then all settings by the evidence of processes that sectors of a site share, in which
-rows that are only below a level count by expectation propagation.
+First laws, patterns and gains as if rows were independent (a Tobit model), which also says where an
+azimuth contradicts the data; then all settings by the evidence of processes that sectors of a site
+share, in which rows that are only below a level count by expectation propagation.
 """
 
 from __future__ import annotations
@@ -49,11 +49,13 @@ NO_PATTERN = 1e9  # width [deg] of a beam in height whose tilt nobody gave
 ONE_BAND = 1.1  # ratio of carriers of one band
 GAIN_DB = 4.0  # deviation of a sector's level, before it is learned
 LOOSE = 1.5  # deviation of logarithms of kernels' numbers from usual
-LITTLE = 0.1  # usual noise and deviations by bearing, of the variance; usual lengths, of that between places
+# Usual noise and deviations by bearing, of the variance; usual lengths, of that between places
+LITTLE = 0.1
 BOUND = 5.0  # deviations of what sectors share, beyond which it is not looked for
 CONTRADICTED_DEG, ROUND_DEG = 30.0, 360.0
 LEAST_TESTED = 20  # rows of a file, whose azimuths are asked
-# At .1 nats a row 6 of 16 azimuths that were 60 degrees off passed; at .03 too many right ones do not.
+# At .1 nats a row 6 of 16 azimuths that were 60 degrees off passed;
+# at .03 too many right ones do not.
 SURE = 10.0, 0.05  # nats, and nats a row, by which another azimuth must be likelier
 SUREST, TURNED = 0.75, 8  # of the largest gain, that are turned at a time; times
 TURNS = torch.arange(-180.0, 180.0, 10.0)  # of an azimuth [deg]
@@ -63,7 +65,8 @@ ROUGH_ON, LEARNED_ON = 20_000, 160  # rows of all sites; of each site, whose cov
 
 
 def find_sectors(data: Measurements, places: np.ndarray | None = None) -> Sectors | None:
-    """Return the sectors that stations are; None without known beams or lists of sites with several.
+    """Return the sectors that stations are; None without known beams or lists
+    of sites with several.
 
     Args:
         data: powers of several stations.
@@ -128,7 +131,8 @@ def check_azimuths(data: Measurements, seed: int = 0) -> list[str]:
 def learn_network(
     rows: StationRows, network: Sectors, names: tuple[str, ...], seed: int
 ) -> tuple[float, Prior, list[str]]:
-    """Return the log evidence and the prior of every site of a network, and what must be said of it.
+    """Return the log evidence and the prior of every site of a network,
+    and what must be said of it.
 
     Args:
         rows: by sites, see `relabel_by_site`.
@@ -145,19 +149,26 @@ def learn_network(
     (site, own, bearing, gain, noise), (wide, near) = map(math.sqrt, variances), shadowing.lengths
     exponent, _, wider, higher, floor, tilt = trend.shared.tolist()
     law_note = (
-        f"{len(names)} sectors of {int(network.site.max()) + 1} sites in one model: distance exponent "
+        f"{len(names)} sectors of {int(network.site.max()) + 1} sites in one model: distance "
+        "exponent "
         f"{exponent:.3g}, gains +- {gain:.2g} dB, noise {noise:.2g} dB"
     )
     shadow_note = (
-        f"shadowing of a site {site:.2g} dB over {wide:.3g} m, of a sector {own:.2g} dB over {near:.3g} m, "
+        f"shadowing of a site {site:.2g} dB over {wide:.3g} m, of a sector {own:.2g} dB over "
+        f"{near:.3g} m, "
         f"{bearing:.2g} dB from bearing to bearing"
     )
     beams = (
-        f"beams {math.exp(wider):.2f} times as wide and {math.exp(higher):.2f} times as high as listed or "
+        f"beams {math.exp(wider):.2f} times as wide and {math.exp(higher):.2f} times as high as "
+        "listed or "
         f"usual, front-to-back ratio {floor:.3g} dB, tilts off by {tilt:+.2g} degrees"
     )
     aimed = [beams] if bool((trend.table[:, 0] != NO_AZIMUTH).any()) else []
-    return evidence, Prior(kernel, replace(trend, more=more)), [law_note, shadow_note, *aimed, *notes]
+    return (
+        evidence,
+        Prior(kernel, replace(trend, more=more)),
+        [law_note, shadow_note, *aimed, *notes],
+    )
 
 
 def _fit_azimuths(
@@ -169,15 +180,23 @@ def _fit_azimuths(
     loud = few.heard_rows
     decades = law.decades(torch.from_numpy(loud.places))
     start = replace(
-        network, law=law, middle=float(decades.mean()), spread=max(float(decades.std()), LEAST_SPREAD),
-        levels=torch.full((int(network.band.max()) + 1,), float(loud.decibels.mean()), dtype=torch.float64),
-    )  # fmt: skip
+        network,
+        law=law,
+        middle=float(decades.mean()),
+        spread=max(float(decades.std()), LEAST_SPREAD),
+        levels=torch.full(
+            (int(network.band.max()) + 1,), float(loud.decibels.mean()), dtype=torch.float64
+        ),
+    )
     # A receiver's noise is no level of a sector: no azimuth is doubted by it.
     piles = find_noise(sector_of(loud.places), loud.decibels).values()
     top = max((top for top, _ in piles), default=-math.inf)
-    quiet = replace(few, decibels=few.decibels.clip(top), side=np.where(few.decibels < top, 1, few.side))
+    quiet = replace(
+        few, decibels=few.decibels.clip(top), side=np.where(few.decibels < top, 1, few.side)
+    )
     rough, gains, scale = _fit_rough(quiet, start)
-    # A wrong azimuth bends what all sectors share, by which right ones are doubted: the surest first.
+    # A wrong azimuth bends what all sectors share, by which right ones are doubted:
+    # the surest first.
     for _ in range(TURNED):
         turned = _correct_azimuths(quiet, rough, gains, scale)
         if torch.equal(turned.table, rough.table):
@@ -208,7 +227,10 @@ def _shared_bounds() -> list[tuple[float, float]]:
 
 def _fit_rough(rows: StationRows, start: Sectors) -> tuple[Sectors, Tensor, float]:
     """Shared parameters, gains (T,) and the deviation [dB] of rows taken as independent."""
-    places, number = torch.from_numpy(rows.places), torch.from_numpy(sector_of(rows.places).astype(np.int64))
+    places, number = (
+        torch.from_numpy(rows.places),
+        torch.from_numpy(sector_of(rows.places).astype(np.int64)),
+    )
     bands, count = len(start.levels), len(start.table)
 
     def negative_log_posterior(at: Tensor) -> Tensor:
@@ -217,7 +239,9 @@ def _fit_rough(rows: StationRows, start: Sectors) -> tuple[Sectors, Tensor, floa
         likelihood = _misfits(mean, rows, scale.exp()).sum()
         return likelihood + _penalty(shared) + 0.5 * (gains / GAIN_DB).square().sum()
 
-    begin = np.r_[start.shared.numpy(), start.levels.numpy(), math.log(2 * GAIN_DB), np.zeros(count)]
+    begin = np.r_[
+        start.shared.numpy(), start.levels.numpy(), math.log(2 * GAIN_DB), np.zeros(count)
+    ]
     free = [(-math.inf, math.inf)]
     # A deviation of 1 dB at least.
     bounds = [*_shared_bounds(), *free * bands, (0.0, math.inf), *free * count]
@@ -230,7 +254,8 @@ def _fit_rough(rows: StationRows, start: Sectors) -> tuple[Sectors, Tensor, floa
 def _misfits_of_turns(
     rows: StationRows, trend: Sectors, gains: Tensor, scale: float
 ) -> tuple[Tensor, Tensor]:
-    """How badly rows fit each azimuth turned by `TURNS` (T, K) [nats], and what tells two turns apart (T,).
+    """How badly rows fit each azimuth turned by `TURNS` (T, K) [nats],
+    and what tells two turns apart (T,).
 
     Zero of all turns where a sector has no azimuth, or nothing was heard of it.
     """
@@ -265,12 +290,18 @@ def _correct_azimuths(rows: StationRows, trend: Sectors, gains: Tensor, scale: f
 def _note_untested(
     rows: StationRows, trend: Sectors, gains: Tensor, scale: float, names: tuple[str, ...]
 ) -> list[str]:
-    """A note on azimuths that rows do not tell to `CONTRADICTED_DEG`, and to how many degrees they do."""
+    """A note on azimuths that rows do not tell to `CONTRADICTED_DEG`,
+    and to how many degrees they do.
+    """
     misfit, sure = _misfits_of_turns(rows, trend, gains, scale)
     alike = misfit - misfit[:, len(TURNS) // 2, None] <= sure[:, None]
     farthest = torch.where(alike & (trend.table[:, :1] != NO_AZIMUTH), TURNS.abs(), 0.0).amax(1)
-    blind = [t for t in farthest.argsort(descending=True, stable=True) if farthest[t] >= CONTRADICTED_DEG]
-    each = [f"{names[t]} {min(float(farthest[t] + TURNS.diff()[0]), 180):.0f} degrees" for t in blind]
+    blind = [
+        t for t in farthest.argsort(descending=True, stable=True) if farthest[t] >= CONTRADICTED_DEG
+    ]
+    each = [
+        f"{names[t]} {min(float(farthest[t] + TURNS.diff()[0]), 180):.0f} degrees" for t in blind
+    ]
     cells = f"{len(blind)} of {len(names)} cells"
     told = f"azimuths of {cells} are tested little: the drive would not show an error of less than"
     return [f"{told}: {list_first(each, 30)}; drive to both sides of their beams"] if blind else []
@@ -291,7 +322,9 @@ def _fit_by_evidence(
 ) -> tuple[float, Sectors, Kernel]:
     """The log evidence of some rows of each site, and all settings of the largest."""
     rows, bands = rows.select_complete_places(), len(rough.levels)
-    parts = [rows.select_station(number).draw_stretches(LEARNED_ON, seed) for number in rows.stations]
+    parts = [
+        rows.select_station(number).draw_stretches(LEARNED_ON, seed) for number in rows.stations
+    ]
     places = [torch.from_numpy(part.places) for part in parts]
     values = [torch.from_numpy(part.decibels) for part in parts]
     side = [torch.from_numpy(part.side) for part in parts]
@@ -316,7 +349,10 @@ def _fit_by_evidence(
     begin = torch.cat([rough.shared, rough.levels, usual]).numpy()
     best, value = minimise(negative_log_evidence, [begin], bounds, settled=SETTLED / count)
     shared, levels, logs = torch.from_numpy(best).split((len(SHARED), bands, len(usual)))
-    learned, kernel = replace(rough, shared=shared.clone(), levels=levels.clone()), start.with_values(logs)
+    learned, kernel = (
+        replace(rough, shared=shared.clone(), levels=levels.clone()),
+        start.with_values(logs),
+    )
     precision = torch.eye(len(SHARED) + bands, dtype=torch.float64)
     for i, at_ in enumerate(places):
         gram, quiet = own[i] + kernel.gram(at_), side[i] != 0
@@ -330,7 +366,9 @@ def _fit_by_evidence(
 
 
 def _usual_kernel(trend: Sectors, middle: float, variance: float, level: float) -> Kernel:
-    """Before learning, of amplitude 1, so that parts are variances [dB^2]; `middle` is between places [m]."""
+    """Before learning, of amplitude 1, so that parts are variances [dB^2];
+    `middle` is between places [m].
+    """
     bearing = LITTLE if bool((trend.table[:, 0] != NO_AZIMUTH).any()) else 0.5
     site, sector, around, noise = (variance * share for share in (0.5, 0.3, bearing, LITTLE))
     signal = SectorShadowing((LITTLE * middle, LITTLE * middle), (site, sector, around, level))

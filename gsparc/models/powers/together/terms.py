@@ -1,8 +1,8 @@
 """Powers between pairs of ends as rows of stations, and what stations share beside their mean law.
 
-`P = law + b decades + c decades^2 + g(place) + r_station + noise`: the law's exponent is corrected, and bent;
-g, of a moving end's place, is the same for all stations, as street and crowd are. b, c and g are columns of
-unit normal weights; r is the process of a station's own (`learning.py`).
+`P = law + b decades + c decades^2 + g(place) + r_station + noise`: the law's exponent is corrected,
+and bent; g, of a moving end's place, is the same for all stations, as street and crowd are. b, c
+and g are columns of unit normal weights; r is the process of a station's own (`learning.py`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ STRETCH = 4  # places in the order of the drive that are drawn as one
 
 @dataclass(frozen=True)
 class StationRows(PowerRows):
-    """Rows of several stations; `places` (n, 6) float64 are of the moving end and of the station [m].
+    """Rows of several stations; `places` (n, 6)
+    float64 are of the moving end and of the station [m].
 
     Attributes:
         station: (n,) int64.
@@ -76,7 +77,8 @@ class StationRows(PowerRows):
         return self.subset(np.flatnonzero(whole[self._place_numbers])) if enough else self
 
     def draw_stretches(self, limit: int, seed: int) -> Self:
-        """Draw at most so many, all that there are of places that follow each other in short stretches.
+        """Draw at most so many, all that there are of places that follow each other
+        in short stretches.
 
         To take some of the rows of a place would tell of stronger or weaker ones than there are.
         """
@@ -93,7 +95,9 @@ class StationRows(PowerRows):
 
 
 def places_and_notes(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return places (T, 3) float64 [m] of the stations, local, and notes; one that nobody gave is sought."""
+    """Return places (T, 3) float64 [m] of the stations, local, and notes;
+    one that nobody gave is sought.
+    """
     site, notes = data.site, []
     places = np.array(site.every_station.position, np.float64)
     for number in np.flatnonzero(~np.isfinite(places).all(1)):
@@ -135,7 +139,9 @@ class SharedTerms(Columns):
     unit: float = 1.0
 
     @classmethod
-    def from_rows(cls, rows: StationRows, trend: Trend, length: float, places: int, seed: int) -> SharedTerms:
+    def from_rows(
+        cls, rows: StationRows, trend: Trend, length: float, places: int, seed: int
+    ) -> SharedTerms:
         """Make terms with g of 0 dB, known at so many places of rows, drawn evenly."""
         decades = _centred_decades(trend, torch.from_numpy(rows.places))
         bare = cls(trend, float(decades.min()), float(decades.max()), NO_PLACES, length)

@@ -1,4 +1,6 @@
-"""A scenario of DeepMIMO, read back as its loader reads it: channels, and geometry of a known mirror."""
+"""A scenario of DeepMIMO, read back as its loader reads it: channels,
+and geometry of a known mirror.
+"""
 
 import json
 from dataclasses import replace
@@ -17,17 +19,29 @@ WALL = 120.0  # a mirror in x
 
 class Mirror:
     site = Site(
-        "mirror", "csi", "tx", None, None, CARRIER, None, np.array([100.0, 50, 0]),
+        "mirror",
+        "csi",
+        "tx",
+        None,
+        None,
+        CARRIER,
+        None,
+        np.array([100.0, 50, 0]),
         static_position=np.array([0.0, 0, 8]),
-    )  # fmt: skip
+    )
 
     def paths(self, rx):
         sources = np.array([STILL, [2 * WALL - STILL[0], STILL[1], STILL[2]], [0, 0, 0]])
         away = sources - rx[:, None]
         far = np.linalg.norm(away, axis=-1)
         gain = 1e-2 / far * np.exp(-2j * np.pi * CARRIER * far / LIGHT) * [1, 0.5, 0]
-        return Paths(gain[:, None].astype(np.complex64), far[:, None] / LIGHT, CARRIER, None,
-                     away / far[..., None])  # fmt: skip
+        return Paths(
+            gain[:, None].astype(np.complex64),
+            far[:, None] / LIGHT,
+            CARRIER,
+            None,
+            away / far[..., None],
+        )
 
 
 PLACES = np.array([[110.0, 60, 1.5], [95.0, 41, 2.0]])
@@ -35,7 +49,9 @@ PLACES = np.array([[110.0, 60, 1.5], [95.0, 41, 2.0]])
 
 @pytest.fixture
 def scenario(tmp_path):
-    """By the names that DeepMIMO's loader makes: `{key}_t{set}_tx{index}_r{set}.npz`, one array called so."""
+    """By the names that DeepMIMO's loader makes: `{key}_t{set}_tx{index}_r{set}.npz`,
+    one array called so.
+    """
     assert deepmimo.write_scenario(tmp_path, Mirror(), PLACES)[0] == 2
     names = [*"power phase delay aoa_az aoa_el aod_az aod_el inter inter_pos rx_pos tx_pos".split()]  # noqa: SIM905
     held = {name: np.load(tmp_path / f"{name}_t000_tx000_r001.npz")[name] for name in names}
@@ -57,7 +73,9 @@ def test_channels_of_the_scenario_are_the_models(scenario):
 
 def unit(azimuth, zenith):
     azimuth, zenith = np.radians(azimuth), np.radians(zenith)
-    return np.stack([np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], -1)
+    return np.stack(
+        [np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)], -1
+    )
 
 
 def towards(start, end):
@@ -70,7 +88,8 @@ def test_places_in_utm_metres_were_rounded_to_half_a_metre(tmp_path, monkeypatch
     monkeypatch.setattr(Mirror, "paths", lambda self, rx, paths=Mirror.paths: paths(self, rx - utm))
     deepmimo.write_scenario(tmp_path, Mirror(), PLACES + utm)
     at, still, meets = (
-        np.load(tmp_path / f"{name}_t000_tx000_r001.npz")[name] for name in ("rx_pos", "tx_pos", "inter_pos")
+        np.load(tmp_path / f"{name}_t000_tx000_r001.npz")[name]
+        for name in ("rx_pos", "tx_pos", "inter_pos")
     )
     np.testing.assert_allclose(at, PLACES + utm, rtol=0, atol=1e-6)
     np.testing.assert_allclose(still[0], STILL + utm, rtol=0, atol=1e-6)

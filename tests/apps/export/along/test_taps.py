@@ -22,7 +22,9 @@ def site_of(tones: np.ndarray) -> Site:
 
 
 class Rays:
-    """A line of sight and a mirror image, of an array of three antennas; `paths` where it is asked to."""
+    """A line of sight and a mirror image, of an array of three antennas;
+    `paths` where it is asked to.
+    """
 
     sources = np.array([[0.0, 0, 5], [0, -40, 5], [-55.0, 0, 5]])
 
@@ -78,12 +80,15 @@ def test_doppler_is_that_of_the_motion():
     assert line.doppler_hz()[0, loudest] == pytest.approx(expected, rel=0.15)
 
 
-@pytest.mark.parametrize("said, tones, length, rate_hz", [
-    ("each later than the one before", TONES, 0.0, None),
-    ("rate_hz= is needed", TONES[:1], 0.5, None),
-    ("the tones span", TONES, 0.5, 1e6),
-    ("wavelengths long", TONES, 1e4, None),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "said, tones, length, rate_hz",
+    [
+        ("each later than the one before", TONES, 0.0, None),
+        ("rate_hz= is needed", TONES[:1], 0.5, None),
+        ("the tones span", TONES, 0.5, 1e6),
+        ("wavelengths long", TONES, 1e4, None),
+    ],
+)
 def test_what_cannot_be_is_refused(said, tones, length, rate_hz):
     with pytest.raises(ValueError, match=said):
         fit_taps(Rays(tones), drive(length=length), 4, rate_hz)
@@ -102,7 +107,10 @@ def test_the_command_writes_taps_and_says_what_they_leave(tmp_path, monkeypatch)
     def run(*given):
         return export.task(compose(*given, config="export"))
 
-    out, common = tmp_path / "out", (f"ckpt={tmp_path}/model.ckpt", "to=taps", f"table={tmp_path}/drive.csv")
+    out, common = (
+        tmp_path / "out",
+        (f"ckpt={tmp_path}/model.ckpt", "to=taps", f"table={tmp_path}/drive.csv"),
+    )
     facts = run(*common, f"out={out}", "taps=4")
     assert facts["taps/residual_db"] < -1
     held = read_raw(out / "taps.npz")

@@ -58,4 +58,6 @@ def test_without_visibility_every_image_is_seen_everywhere(room):
     settings = InitSettings("scene", file=str(file), order=1)
     field = CANDIDATES["scene"](settings, False, FitContext())
     fitted_to(field, data, fold.train[:40])
-    assert field.terms[0] == "phase" and "visibility" not in field.terms and field.count_gaussians == 7
+    assert (
+        field.terms[0] == "phase" and "visibility" not in field.terms and field.count_gaussians == 7
+    )

@@ -1,4 +1,6 @@
-"""Powers of many ends in one field: exact conditioning, stations never heard, silent rows, wiring, state."""
+"""Powers of many ends in one field: exact conditioning, stations never heard, silent rows, wiring,
+state.
+"""
 
 import re
 from dataclasses import replace
@@ -23,8 +25,17 @@ from gsparc.models.per_station import wrap_per_station
 from gsparc.models.powers.together import field as together
 from gsparc.models.powers.together import learning
 from gsparc.models.powers.together.field import JointPowerField, rows_per_station
-from gsparc.models.powers.together.learning import StationPriors, learn_shared_terms, learn_station_priors
-from gsparc.models.powers.together.terms import SharedTerms, StationRows, places_and_notes, rows_of_stations
+from gsparc.models.powers.together.learning import (
+    StationPriors,
+    learn_shared_terms,
+    learn_station_priors,
+)
+from gsparc.models.powers.together.terms import (
+    SharedTerms,
+    StationRows,
+    places_and_notes,
+    rows_of_stations,
+)
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose
 from gsparc.prediction.predictor import Predictor
@@ -41,7 +52,9 @@ LEVELS = np.array([0.0, 4.0, -5.0, 2.0, -2.0, 3.0])
 
 @cache
 def town(count: int = 90, shared_db: float = 4.0, posts: int = 6) -> Measurements:
-    """A square before six stations: a law, what all hear alike at a place, a residual of each, noise."""
+    """A square before six stations: a law, what all hear alike at a place, a residual of each,
+    noise.
+    """
     rng = np.random.default_rng(3)
     walk = np.c_[rng.uniform(8, 50, (count, 2)), np.full(count, 1.5)]
     far = np.linalg.norm(walk[:, None] - POSTS[:posts], axis=-1)
@@ -49,7 +62,8 @@ def town(count: int = 90, shared_db: float = 4.0, posts: int = 6) -> Measurement
     decibels += smooth(walk, 12, rng, 1)[:, 0, None] * shared_db
     decibels += 2 * smooth(walk, 8, rng, posts) + rng.standard_normal(far.shape)
     return from_arrays(
-        {"tx_position": walk, "station_position": POSTS[:posts], "rssi_db": decibels}, {"name": "town"}
+        {"tx_position": walk, "station_position": POSTS[:posts], "rssi_db": decibels},
+        {"name": "town"},
     )
 
 
@@ -64,7 +78,9 @@ def prior_of(data: Measurements) -> tuple[StationPriors, SharedTerms]:
     """Invented settings with every term."""
     trend = Trend(0.0, Law(36.0, 2.5, 2.0, 6.0, None), 1.5, 0.8)
     never = Prior(Kernel.from_lengths((4.0, 20.0), (0.4, 0.6), 0.1, 14.0), trend)
-    own = StationPriors(never, {1: Prior(Kernel.from_lengths((6.0, 25.0), (0.4, 0.6), 0.2, 18.0), trend)})
+    own = StationPriors(
+        never, {1: Prior(Kernel.from_lengths((6.0, 25.0), (0.4, 0.6), 0.2, 18.0), trend)}
+    )
     terms = SharedTerms.from_rows(rows_of(data), trend, 8.0, 30, 0)
     return own, replace(terms, place_db=2.7)
 
@@ -75,13 +91,17 @@ def rows_of(data: Measurements, rows: np.ndarray | None = None):
 
 
 def dense(rows, own: StationPriors, terms: SharedTerms) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance (n, n) of rows with noise, and values (n,) less the law, by what the prior says of pairs."""
+    """Covariance (n, n) of rows with noise, and values (n,) less the law,
+    by what the prior says of pairs.
+    """
     places = torch.from_numpy(rows.places)
     columns = terms.columns(places)
     total = columns @ columns.T
     for number in rows.stations:
         at, prior = np.flatnonzero(rows.station == number), own.prior(number)
-        block = prior.cross_covariance(places[at], places[at]) + prior.kernel.noise * torch.eye(len(at))
+        block = prior.cross_covariance(places[at], places[at]) + prior.kernel.noise * torch.eye(
+            len(at)
+        )
         total[np.ix_(at, at)] += prior.kernel.amplitude * block
     return total.numpy(), rows.decibels - terms.trend.mean(places).numpy()
 
@@ -107,7 +127,9 @@ def test_it_is_the_dense_process():
     places = torch.from_numpy(asked.places)
     rounded = posterior.answer(places, torch.from_numpy(asked.station))
     said = posterior.answer(places, torch.from_numpy(asked.station), float64=True)
-    assert np.allclose(rounded[0], said[0], atol=1e-4) and np.allclose(rounded[1], said[1], atol=1e-4)
+    assert np.allclose(rounded[0], said[0], atol=1e-4) and np.allclose(
+        rounded[1], said[1], atol=1e-4
+    )
     assert np.allclose(said[0].numpy(), asked.decibels - values[count:] + mean, atol=1e-8)
     assert np.allclose(said[1].numpy(), variance, atol=1e-8)
     known = gram[count:, count:] - gram[count:, :count] @ inner[:, 1:]
@@ -149,9 +171,13 @@ def test_rows_and_stations_left_out():
     for number, of_station in zip(every.stations, whole, strict=True):
         at = np.flatnonzero(every.station == number)
         found = posterior.left_out(number)
-        assert np.allclose(found[0].numpy(), error[at]) and np.allclose(found[1].numpy(), variance[at])
+        assert np.allclose(found[0].numpy(), error[at]) and np.allclose(
+            found[1].numpy(), variance[at]
+        )
         rest = np.setdiff1d(np.arange(len(gram)), at)
-        told = np.linalg.solve(gram[np.ix_(rest, rest)], np.c_[values[rest], gram[np.ix_(rest, at)]])
+        told = np.linalg.solve(
+            gram[np.ix_(rest, rest)], np.c_[values[rest], gram[np.ix_(rest, at)]]
+        )
         mean = gram[np.ix_(at, rest)] @ told[:, 0]
         spread = gram[at, at] - (gram[np.ix_(at, rest)] * told[:, 1:].T).sum(1)
         assert np.allclose(of_station[0].numpy(), values[at] - mean)
@@ -173,7 +199,9 @@ def test_settings_become_likelier():
     for own in (begin, learned):
         posterior = own.condition(rows, prior_of(town())[1], 0)
         found = [posterior.left_out(number) for number in rows.stations]
-        densities.append(sum(float((e.square() / v + v.log()).sum()) for e, v in found) / len(rows.index))
+        densities.append(
+            sum(float((e.square() / v + v.log()).sum()) for e, v in found) / len(rows.index)
+        )
     assert densities[1] < densities[0] - 0.01
 
 
@@ -217,7 +245,10 @@ def test_either_end_may_be_the_station(learned):
     data, fold, field, _ = learned
     batch = data.batch(fold.test[:20])
     turned = Pose(batch.tx, batch.rx.rotation)
-    there, back = field.predict(Query(batch.tx, batch.rx)), field.predict(Query(batch.rx.position, turned))
+    there, back = (
+        field.predict(Query(batch.tx, batch.rx)),
+        field.predict(Query(batch.rx.position, turned)),
+    )
     assert torch.allclose(there.mean, back.mean, rtol=1e-4)
     assert torch.allclose(there.mean, field.predict(batch).mean, rtol=1e-4)
 
@@ -227,7 +258,10 @@ def test_silent_rows_say_that_powers_are_low():
     level = np.quantile(data.target, 0.3)
     quiet = data.target[:, 0] < level
     silent = replace(
-        data, target=np.where(quiet[:, None], level, data.target), mask=~quiet[:, None], censored=quiet
+        data,
+        target=np.where(quiet[:, None], level, data.target),
+        mask=~quiet[:, None],
+        censored=quiet,
     )
     (own, terms), rows = prior_of(data), np.arange(len(data))
     errors = []
@@ -245,7 +279,9 @@ def test_a_station_whose_place_nobody_gave():
     gone = data.site.stations.position.copy()
     gone[2] = np.nan
     site = replace(data.site, stations=replace(data.site.stations, position=gone))
-    field, notes = fitted_to(JointPowerField(shared=False), replace(data, site=site), np.arange(len(data)))
+    field, notes = fitted_to(
+        JointPowerField(shared=False), replace(data, site=site), np.arange(len(data))
+    )
     field.condition(replace(data, site=site), np.arange(len(data)))
     assert any("place of station" in note for note in notes)
     assert np.linalg.norm((field.places - data.site.stations.position)[2, :2]) < 40
@@ -268,11 +304,15 @@ def test_a_station_of_no_known_place_that_was_never_heard_was_no_number():
     data = town(20)
     gone = data.site.stations.position.copy()
     gone[2:4] = np.nan
-    lost = replace(data, site=replace(data.site, stations=replace(data.site.stations, position=gone)))
+    lost = replace(
+        data, site=replace(data.site, stations=replace(data.site.stations, position=gone))
+    )
     of = [np.flatnonzero(data.station == number) for number in range(6)]
     fold = Fold(np.concatenate([of[0], of[1], of[3], of[4], of[5]]), of[0][:0], of[2])
     method = wrap_per_station(Gsparc(), lost)
-    with pytest.raises(ValueError, match=r"needs them for those without training rows \(.*2\); give them"):
+    with pytest.raises(
+        ValueError, match=r"needs them for those without training rows \(.*2\); give them"
+    ):
         method.fit(lost, fold, FitContext(stations="together"))
 
 
@@ -280,15 +320,22 @@ def test_rows_are_thinned_at_places_that_stations_share():
     few = rows_of(town()).thin_rows(20, 0)
     assert np.array_equal(np.bincount(few.station), [20] * 6)
     assert len(np.unique(few.places[:, :3], axis=0)) == 20
-    assert rows_per_station(1) == together.MOST_ROWS and 3_500 < rows_per_station(12) < together.MOST_ROWS
+    assert (
+        rows_per_station(1) == together.MOST_ROWS
+        and 3_500 < rows_per_station(12) < together.MOST_ROWS
+    )
 
 
 def test_what_it_refuses():
     data = town()
     with pytest.raises(ValueError, match="several stations"):
-        fitted_to(JointPowerField(), replace(data, site=replace(data.site, stations=None)), np.arange(4))
+        fitted_to(
+            JointPowerField(), replace(data, site=replace(data.site, stations=None)), np.arange(4)
+        )
     refused("at least one row", fitted_to, JointPowerField(), data, np.arange(0))
-    refused("stations=each", choose, data, Gsparc(init=InitSettings(name="scene", file="walls.yaml")))
+    refused(
+        "stations=each", choose, data, Gsparc(init=InitSettings(name="scene", file="walls.yaml"))
+    )
     own, terms = prior_of(data)
     refused("not fitted yet", known_field(data.site, POSTS, own, terms).left_out)
 
@@ -308,14 +355,17 @@ def test_gsparc_learns_stations_together(tmp_path):
     one = predictor.select_station(number).rssi(tx=place)
     assert np.allclose(one, db(said.mean[0] * data.site.target_scale), atol=4e-3)
     assert np.allclose(one, predictor.rssi(tx=place, rx=post), atol=4e-3)
-    assert np.isfinite(predictor.rssi(tx=place, rx=post + np.array([20.0, 20, 0]))).all()  # no station
+    # No station
+    assert np.isfinite(predictor.rssi(tx=place, rx=post + np.array([20.0, 20, 0]))).all()
 
 
 def test_stations_at_one_place_are_told_apart_by_their_numbers():
     data = town()
     position = data.site.stations.position.copy()
     position[1] = position[0]  # a sector, or the same one after its gain changed
-    data = replace(data, site=replace(data.site, stations=replace(data.site.stations, position=position)))
+    data = replace(
+        data, site=replace(data.site, stations=replace(data.site.stations, position=position))
+    )
     data = replace(data, rx_position=position[data.station])
     far = np.linalg.norm(data.tx - data.rx_position, axis=1)
     decibels = -20 - 30 * np.log10(far) + 10 * (data.station == 1)
@@ -345,7 +395,9 @@ def test_the_error_of_a_gain_is_that_of_stations():
     own, _ = learn_station_priors(every, 0)
     turned = every.subset(np.argsort(every.station, kind="stable"))
     said = (learn_shared_terms(rows, own, 0)[2] for rows in (every, turned))
-    (gain, error), other = (np.array(re.findall(r"gain (\S+) \+- (\S+)", one)[0], float) for one in said)
+    (gain, error), other = (
+        np.array(re.findall(r"gain (\S+) \+- (\S+)", one)[0], float) for one in said
+    )
     assert np.isclose(gain, other[0], rtol=0.3) and np.isclose(error, other[1], rtol=0.5)
     assert error > 0.05 * gain
 
@@ -362,8 +414,13 @@ def test_lists_of_the_strongest_were_all_that_settings_were_learned_from(monkeyp
     weakest = np.sort(level, 1)[:, -3:-2]
     at, who = (part.ravel() for part in np.indices(level.shape))
     side = (level < weakest).astype(np.int8).ravel()
-    rows = StationRows(np.c_[places[at], stations[who]], np.maximum(level, weakest).ravel(), side, who,
-                       np.arange(len(at)))  # fmt: skip
+    rows = StationRows(
+        np.c_[places[at], stations[who]],
+        np.maximum(level, weakest).ravel(),
+        side,
+        who,
+        np.arange(len(at)),
+    )
     priors, notes = learn_station_priors(rows, 0)
     # 64 of shadowing and 4 of noise; of what is listed alone 37.
     assert 50 < priors.variance < 90
@@ -371,7 +428,9 @@ def test_lists_of_the_strongest_were_all_that_settings_were_learned_from(monkeyp
 
 
 def test_a_median_station_of_one_row_took_the_kernel_of_all_into_a_corner():
-    """Its residual was exactly 0: the slope was NaN, and 42 stations had next to no noise; +47 dBm of it."""
+    """Its residual was exactly 0: the slope was NaN, and 42 stations had next to no noise;
+    +47 dBm of it.
+    """
     data = town(60)
     rows = rows_of(data)
     trend, _ = learning._fit_site_law(rows, 0)
@@ -379,6 +438,8 @@ def test_a_median_station_of_one_row_took_the_kernel_of_all_into_a_corner():
     places = np.r_[rows.places[1, :3], [30.0, 25.0, 6.0]][None]
     level = trend.mean(torch.from_numpy(places)).numpy()
     single = replace(single, places=places, decibels=level, station=np.array([6]))
-    before, after = (learn_station_priors(part, 0)[0].never.kernel for part in (rows, joined(rows, single)))
+    before, after = (
+        learn_station_priors(part, 0)[0].never.kernel for part in (rows, joined(rows, single))
+    )
     assert after.noise == pytest.approx(before.noise, rel=0.3)
     assert after.lengths == pytest.approx(before.lengths, rel=0.3)

@@ -1,4 +1,6 @@
-"""A network of sectors: what lists of the strongest leave out, patterns, wrong azimuths, a known truth."""
+"""A network of sectors: what lists of the strongest leave out, patterns, wrong azimuths,
+a known truth.
+"""
 
 import re
 from collections.abc import Sequence
@@ -29,7 +31,12 @@ from gsparc.models.powers.together.network import (
     learn_network,
     relabel_by_site,
 )
-from gsparc.models.powers.together.terms import SharedTerms, StationRows, places_and_notes, rows_of_stations
+from gsparc.models.powers.together.terms import (
+    SharedTerms,
+    StationRows,
+    places_and_notes,
+    rows_of_stations,
+)
 from gsparc.ops import Pose
 from gsparc.pictures.pictures import draw_sector_levels
 from gsparc.processes.kernel import Kernel, WhiteNoise
@@ -43,7 +50,9 @@ from gsparc.training.context import FitContext, FitReport
 NONE = np.zeros(0, np.int64)
 
 
-def fitted(one: Network, count: int, folder: Path, azimuths: bool = True) -> tuple[PerStation, FitReport]:
+def fitted(
+    one: Network, count: int, folder: Path, azimuths: bool = True
+) -> tuple[PerStation, FitReport]:
     """The recommended model of a drive's lists."""
     data = one.data(count, azimuths)
     method = wrap_per_station(Gsparc(), data)
@@ -67,7 +76,9 @@ def levels(method: PerStation, one: Network) -> tuple[np.ndarray, np.ndarray]:
         tx = torch.from_numpy(still - site.origin).float().expand(len(places), 3)
         said = method.station_method(number).predict(Query(tx, rx))
         assert said.variance is not None
-        result.append(power_in_decibels(said.mean[:, 0].double().numpy(), said.variance.double().numpy()))
+        result.append(
+            power_in_decibels(said.mean[:, 0].double().numpy(), said.variance.double().numpy())
+        )
     mean, spread = (np.stack(part, 1) for part in zip(*result, strict=True))
     return mean + 10 * np.log10(site.target_scale), spread
 
@@ -111,7 +122,10 @@ def test_a_network_with_two_wrong_azimuths(tmp_path):
 def test_sites_without_azimuths_have_no_pattern(tmp_path):
     one = network(2, moments=180, asked=100)
     method, report = fitted(one, 6, tmp_path, azimuths=False)
-    found, plain = judged(one, 6, *levels(method, one)), judged(one, 6, *reference(one, 6, azimuths=False))
+    found, plain = (
+        judged(one, 6, *levels(method, one)),
+        judged(one, 6, *reference(one, 6, azimuths=False)),
+    )
     assert found["rmse"] < 0.7 * plain["rmse"] and found["best"] > plain["best"]
     assert not any("beams" in note for note in report.notes)
 
@@ -119,12 +133,20 @@ def test_sites_without_azimuths_have_no_pattern(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("wrong", [0, 2])
 def test_azimuths_were_contradicted_by_a_receivers_noise(wrong, monkeypatch):
-    """Six of thirty that were right were turned; of several that are wrong a line named the first alone."""
+    """Six of thirty that were right were turned;
+    of several that are wrong a line named the first alone.
+    """
     one = network(0, wrong)
-    noise = np.quantile(one.measured, 0.3) + np.random.default_rng(1).normal(0, 0.7, one.measured.shape)
+    noise = np.quantile(one.measured, 0.3) + np.random.default_rng(1).normal(
+        0, 0.7, one.measured.shape
+    )
     heard = 10 * np.log10(10 ** (one.measured / 10) + 10 ** (noise / 10))
     moment, cell = (part.ravel() for part in np.indices(heard.shape))
-    arrays = one.arrays(6) | {"rx_position": one.moment[moment], "station": cell, "rssi_db": heard.ravel()}
+    arrays = one.arrays(6) | {
+        "rx_position": one.moment[moment],
+        "station": cell,
+        "rssi_db": heard.ravel(),
+    }
     data = from_arrays(arrays, {"name": "network"})
     turned = np.flatnonzero(one.azimuth != network(0).azimuth)
     assert set(contradicted(notes_of_azimuths(data, monkeypatch))) == {
@@ -135,7 +157,9 @@ def test_azimuths_were_contradicted_by_a_receivers_noise(wrong, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [2, 3])
 def test_right_azimuths_were_turned_beside_wrong_ones(seed, monkeypatch):
-    """Up to eight of thirty in tables of all cells: wrong ones had bent the pattern that all share."""
+    """Up to eight of thirty in tables of all cells:
+    wrong ones had bent the pattern that all share.
+    """
     one, data = network(seed, 3), network(seed, 3).data(30)
     turned = np.flatnonzero(one.azimuth != network(seed).azimuth)
     found = set(contradicted(notes_of_azimuths(data, monkeypatch)))
@@ -144,7 +168,9 @@ def test_right_azimuths_were_turned_beside_wrong_ones(seed, monkeypatch):
 
 @pytest.mark.slow
 def test_a_wrong_azimuth_in_few_lists_was_not_named():
-    """A sector in 52 of 700 lists, 60 degrees off, as two in more lists: rows had to tell .1 nats each."""
+    """A sector in 52 of 700 lists, 60 degrees off, as two in more lists:
+    rows had to tell .1 nats each.
+    """
     one, wrong = draw_network(2, 0, 700, 20), [3, 26, 28]
     azimuth = (one.azimuth + 60 * np.isin(np.arange(30), wrong)) % 360
     data = replace(one, azimuth=azimuth).data(6)
@@ -178,8 +204,12 @@ def test_a_contradicted_azimuth_was_in_no_picture(tmp_path, monkeypatch):
     method, report = fitted(one, 6, tmp_path)
     named = contradicted(report.notes)
     figures = []
-    monkeypatch.setattr("gsparc.pictures.pictures.save", lambda figure, path: figures.append(figure))
-    draw_sector_levels(method, one.data(6), Fold(np.arange(3960), NONE, NONE), tmp_path / "sectors.png")
+    monkeypatch.setattr(
+        "gsparc.pictures.pictures.save", lambda figure, path: figures.append(figure)
+    )
+    draw_sector_levels(
+        method, one.data(6), Fold(np.arange(3960), NONE, NONE), tmp_path / "sectors.png"
+    )
     titles = [axis.get_title() for axis in figures[0].axes]
     title = "12 of 30 sectors, contradicted azimuths first; too few rows to draw: 0-0, 0-2, "
     assert figures[0].get_suptitle().startswith(title)
@@ -191,7 +221,8 @@ def test_a_contradicted_azimuth_was_in_no_picture(tmp_path, monkeypatch):
 @pytest.mark.parametrize("seed", [pytest.param(0, marks=RARE), 1, pytest.param(2, marks=RARE)])
 @pytest.mark.parametrize("count", [pytest.param(3, marks=RARE), 6, pytest.param(10, marks=RARE)])
 @pytest.mark.parametrize(
-    ("azimuths", "wrong"), [pytest.param(True, 0, marks=RARE), (True, 2), pytest.param(False, 0, marks=RARE)]
+    ("azimuths", "wrong"),
+    [pytest.param(True, 0, marks=RARE), (True, 2), pytest.param(False, 0, marks=RARE)],
 )
 def test_networks_of_thirty_sectors(seed, count, azimuths, wrong, tmp_path):
     one = network(seed, wrong)
@@ -199,7 +230,9 @@ def test_networks_of_thirty_sectors(seed, count, azimuths, wrong, tmp_path):
     found = judged(one, count, *levels(method, one))
     plain = judged(one, count, *reference(one, count, azimuths))
     assert found["rmse"] < 0.9 * plain["rmse"] and abs(found["bias_unlisted"]) < 3, found
-    assert all(0.82 <= found[name] <= 0.95 for name in ("hold", "hold_listed", "hold_unlisted")), found
+    assert all(0.82 <= found[name] <= 0.95 for name in ("hold", "hold_listed", "hold_unlisted")), (
+        found
+    )
     assert found["best"] > plain["best"] - 0.05, (found, plain)
 
 
@@ -208,7 +241,9 @@ def test_stations_at_places_of_their_own_are_no_network():
     data = one.data(6, azimuths=False)
     assert find_sectors(data, one.place).site.max() == 9
     assert find_sectors(data, one.place + 500 * np.arange(30)[:, None]) is None
-    whole = from_arrays({"rx_position": one.moment, "station_position": one.place, "rssi_db": one.measured})
+    whole = from_arrays(
+        {"rx_position": one.moment, "station_position": one.place, "rssi_db": one.measured}
+    )
     assert find_sectors(whole) is None  # of all stations, not of the strongest
 
 
@@ -229,10 +264,16 @@ def sectors() -> Sectors:
     """Two sectors of a site."""
     table = torch.tensor([[90.0, 5, 65, 10, 0], [NO_AZIMUTH, 5, 65, 10, 3]], dtype=torch.float64)
     return Sectors(
-        0.0, Law(0.0, 0.0, 1.0, 1.0, None), 2.0, 1.0, table=table, site=torch.tensor([0, 0]),
+        0.0,
+        Law(0.0, 0.0, 1.0, 1.0, None),
+        2.0,
+        1.0,
+        table=table,
+        site=torch.tensor([0, 0]),
         band=torch.tensor([0, 0]),
-        levels=torch.tensor([-50.0], dtype=torch.float64), doubt=torch.zeros(7, 1, dtype=torch.float64),
-    )  # fmt: skip
+        levels=torch.tensor([-50.0], dtype=torch.float64),
+        doubt=torch.zeros(7, 1, dtype=torch.float64),
+    )
 
 
 def places(number: int, *bearings: float) -> torch.Tensor:
@@ -245,14 +286,19 @@ def places(number: int, *bearings: float) -> torch.Tensor:
 def test_the_pattern_of_a_sector():
     trend = sectors()
     ahead, edge, behind = (trend.mean(places(0, 90, 90 + 32.5, 270)) + 50).tolist()
-    assert (ahead, edge, behind) == pytest.approx((-3.0, -6.0, -25.0))  # tilted by half of 10 degrees
+    # Tilted by half of 10 degrees
+    assert (ahead, edge, behind) == pytest.approx((-3.0, -6.0, -25.0))
     assert (trend.mean(places(1, 90, 270)) + 50).tolist() == pytest.approx([3.0, 3.0])  # no azimuth
 
 
 def test_azimuths_that_no_row_tells_were_not_named():
-    """A planner's sector of 61 of 2,500 lists: its azimuth was wrong, and no line said it was untested."""
+    """A planner's sector of 61 of 2,500 lists: its azimuth was wrong,
+    and no line said it was untested.
+    """
     rng = np.random.default_rng(0)
-    table = torch.tensor([[azimuth, 5, 65, 10, 0] for azimuth in (90.0, 210, 330)], dtype=torch.float64)
+    table = torch.tensor(
+        [[azimuth, 5, 65, 10, 0] for azimuth in (90.0, 210, 330)], dtype=torch.float64
+    )
     trend = replace(sectors(), table=table, site=torch.zeros(3).long(), band=torch.zeros(3).long())
     all_around, ahead = rng.uniform(0, 360, 80), rng.uniform(205, 215, 3)
     at = torch.cat([places(0, *all_around), places(1, *ahead)])
@@ -264,7 +310,11 @@ def test_azimuths_that_no_row_tells_were_not_named():
     assert note.startswith("azimuths of 2 of 3 cells")
     assert "never 180 degrees, ahead 90 degrees; drive to" in note
     turned = replace(trend, table=table + torch.tensor([[120.0, 0, 0, 0, 0], [0] * 5, [0] * 5]))
-    assert _correct_azimuths(rows, turned, torch.zeros(3), 4.0).table[:, 0].tolist() == [90, 210, 330]
+    assert _correct_azimuths(rows, turned, torch.zeros(3), 4.0).table[:, 0].tolist() == [
+        90,
+        210,
+        330,
+    ]
 
 
 def shadowing() -> Kernel:
@@ -278,7 +328,9 @@ def given_settings() -> JointPowerField:
     known = find_sectors(data)
     trend = replace(sectors(), table=known.table, site=known.site, band=known.band)
     own = StationPriors(Prior(shadowing(), trend), {})
-    terms = SharedTerms.from_rows(rows_of_stations(data, rows, data.site.stations.position), trend, 1.0, 0, 0)
+    terms = SharedTerms.from_rows(
+        rows_of_stations(data, rows, data.site.stations.position), trend, 1.0, 0, 0
+    )
     field = known_field(data.site, data.site.stations.position, own, terms)
     field.condition(data, rows)
     return field
