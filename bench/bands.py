@@ -65,7 +65,8 @@ def rooms(seed: int) -> Iterator[tuple[str, np.ndarray, Trace]]:
         low = np.c_[rng.uniform(0.1, 0.8, (6, 2)) * size[:2], np.zeros(6)]
         cabinets = np.stack([low, low + rng.uniform([0.4, 0.4, 1.2], [1.6, 1.6, 2.4], (6, 3))], 1)
         solids = [
-            box(f"cabinet{i}", ("wood", "metal")[i % 2], *one) for i, one in enumerate(cabinets)
+            box(f"cabinet{i}", ("wood", "metal")[i % 2], *cabinet)
+            for i, cabinet in enumerate(cabinets)
         ]
         traces: dict[str, Trace] = {
             "home": partial(traced, SCENE),

@@ -193,7 +193,8 @@ def thinned(arrays: Arrays) -> Arrays:
         np.random.default_rng(0).permutation(heard)[: ROWS if count != 3 * ROWS else count]
     )
     return {
-        name: one[chosen] if np.shape(one)[:1] == (count,) else one for name, one in arrays.items()
+        name: array[chosen] if np.shape(array)[:1] == (count,) else array
+        for name, array in arrays.items()
     }
 
 

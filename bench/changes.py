@@ -394,7 +394,7 @@ def judge_maps(axis, cases):
                 file = Path(folder) / "map.tif"
                 with rasterio.open(file, "w", count=len(names), **how) as raster:
                     raster.write(levels.T.reshape(-1, len(axis), len(axis))[:, ::-1])
-                    raster.descriptions = [f"power_db {one}".strip() for one in names]
+                    raster.descriptions = [f"power_db {each_name}".strip() for each_name in names]
                 began = time.monotonic()
                 found = gsparc.fit(**known, settings={"prior": file})
                 spent = max(spent, time.monotonic() - began)
@@ -430,7 +430,7 @@ def priors():
             places[count:],
             level[count:, None],
             [""],
-            {n: one[:, None] for n, one in maps.items()},
+            {n: each_map[:, None] for n, each_map in maps.items()},
         )
 
     for count in (5, 10, 20, 50, 100):

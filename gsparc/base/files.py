@@ -241,7 +241,7 @@ def whole_folder(path: str | Path) -> Iterator[Path]:
 def is_out_of_space(error: BaseException | None) -> bool:
     """Tell whether a full disk, quota or limit is behind an error, or behind what caused it."""
     full = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
-    return any(isinstance(one, OSError) and one.errno in full for one in list_causes(error))
+    return any(isinstance(cause, OSError) and cause.errno in full for cause in list_causes(error))
 
 
 def list_causes(error: BaseException | None) -> list[BaseException]:

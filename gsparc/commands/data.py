@@ -42,8 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     console, failed = Console(soft_wrap=True, highlight=False), 0
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     names = [word for word in words if word != "accept=true"]
-    for one in () if names else public_sets().values():
-        console.print(describe_set(one), markup=False)
+    for public_set in () if names else public_sets().values():
+        console.print(describe_set(public_set), markup=False)
     for name in names:
         # One by one: what comes after a set that fails is fetched all the same.
         try:

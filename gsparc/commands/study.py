@@ -44,8 +44,8 @@ def configs_of(config: DictConfig) -> dict[str, DictConfig]:
     }
     models |= {name: OmegaConf.create(config_node(method_class(name))) for name in config.baselines}
     return {
-        name: OmegaConf.merge(whole, {"model": None}, {"model": one})
-        for name, one in models.items()
+        name: OmegaConf.merge(whole, {"model": None}, {"model": model})
+        for name, model in models.items()
     }  # type: ignore[misc]
 
 

@@ -105,11 +105,13 @@ def _add_rows(
 def alarm_rows(predictor: Predictor) -> list[dict[str, Any]]:
     """Return alarms as rows of `changes.csv`: names of stations, places in world coordinates."""
     rows = []
-    for one in predictor.alarms:
-        name = "all" if one.station < 0 else (predictor.stations or ["the station"])[one.station]
-        where = coordinates(np.array([[*one.place, 0.0]]), predictor)
+    for alarm in predictor.alarms:
+        name = (
+            "all" if alarm.station < 0 else (predictor.stations or ["the station"])[alarm.station]
+        )
+        where = coordinates(np.array([[*alarm.place, 0.0]]), predictor)
         place = {axis: float(value[0].round(7)) for axis, value in where.items() if axis != "z"}
-        values = name, one.kind, one.since, one.at, round(one.change_db, 2)
+        values = name, alarm.kind, alarm.since, alarm.at, round(alarm.change_db, 2)
         rows.append({**dict(zip(COLUMNS, values, strict=False)), **place})
     return rows
 

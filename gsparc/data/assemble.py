@@ -78,7 +78,9 @@ def identity_hash(data: Measurements) -> str:
 
 def auxiliary_hash(data: Measurements) -> str:
     """Return the SHA-256 of directions and uplinks, which that of a site leaves out."""
-    directions = {f"directions {row}": one for row, one in enumerate(data.directions or ())}
+    directions = {
+        f"directions {row}": direction for row, direction in enumerate(data.directions or ())
+    }
     return content_hash({**directions, "uplink": data.uplink})
 
 
@@ -88,7 +90,11 @@ def _fact_text(fact: Any) -> str:
         return content_hash({"": fact})
     if is_dataclass(fact):
         return str(
-            {one.name: _fact_text(getattr(fact, one.name)) for one in fields(fact) if one.compare}
+            {
+                setting_field.name: _fact_text(getattr(fact, setting_field.name))
+                for setting_field in fields(fact)
+                if setting_field.compare
+            }
         )
     return repr(fact.item() if isinstance(fact, np.generic) else fact)
 

@@ -108,7 +108,7 @@ def inner_folds(
         cut = _cut(where, settings, count, rng)
     else:
         which = np.arange(len(rows))  # folds of rows, not of places
-    folds = tuple(one.map(lambda part: rows[np.isin(which, part)]) for one in cut.folds)
+    folds = tuple(each_fold.map(lambda part: rows[np.isin(which, part)]) for each_fold in cut.folds)
     units = np.full(len(positions), NOT_TESTED)
     tested = np.isin(rows, np.concatenate([one.test for one in folds]))
     units[rows[tested]] = cut.unit[which][tested]

@@ -117,7 +117,7 @@ def find_outliers(data: Measurements) -> dict[str, np.ndarray]:
         "measure far more power than all others": np.flatnonzero(find_strong_outliers(amplitude)),
         "lie far outside the region of all others": np.flatnonzero(too_far(data.moving)),
     }
-    return {what: rows for what, rows in rows_by_fault.items() if len(rows)}
+    return {key: rows for key, rows in rows_by_fault.items() if len(rows)}
 
 
 def outlier_warnings(data: Measurements) -> list[str]:

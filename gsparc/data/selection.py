@@ -100,7 +100,11 @@ WHOLE = Selection()
 
 def take_selection(settings: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of `Selection` out of all of a dataset, which then lack them."""
-    return {one.name: settings.pop(one.name) for one in fields(Selection) if one.name in settings}
+    return {
+        setting_field.name: settings.pop(setting_field.name)
+        for setting_field in fields(Selection)
+        if setting_field.name in settings
+    }
 
 
 Part = tuple[Arrays, Stations | None, list[str]]
@@ -147,9 +151,10 @@ def select(
     if part.stations is not None:
         stations = _there(stations, "stations", source)
         numbers = (
-            _number(stations, one, f"dataset.stations={one}", source) for one in part.stations
+            _number(stations, station, f"dataset.stations={station}", source)
+            for station in part.stations
         )
-        chosen = np.unique([t for one in numbers for t in _parts(stations, one)])
+        chosen = np.unique([t for each_number in numbers for t in _parts(stations, each_number)])
         arrays = dict(kept("dataset.stations", np.isin(arrays["station"], chosen)))
         arrays["station"], stations = (
             np.searchsorted(chosen, arrays["station"]),

@@ -80,7 +80,14 @@ def read_prior_maps(
     found = list[tuple[int, bool, Levels]]()
     for number, names in enumerate(own):
         sites = [site_name(name) for name in names]
-        match = next(((one, one in names) for one in (*names, *sites) if one in maps), None)
+        match = next(
+            (
+                (each_name, each_name in names)
+                for each_name in (*names, *sites)
+                if each_name in maps
+            ),
+            None,
+        )
         found += [] if match is None else [(number, match[1], maps[match[0]])]
     if not found:
         shown = list_first(stations) or "one station"

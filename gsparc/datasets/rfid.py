@@ -161,7 +161,7 @@ def _at_carriers(data: Measurements, carrier_hz: np.ndarray, array: np.ndarray) 
     carriers, station = np.unique(carrier_hz, return_inverse=True)
     arrays = LIGHT / carriers[:, None, None] * array[:, [2, 0, 1]]
     places = np.repeat(data.rx_position[:1], len(carriers), axis=0)
-    names = [f"{one / 1e9:g} GHz" for one in carriers]
+    names = [f"{carrier / 1e9:g} GHz" for carrier in carriers]
     turned = np.repeat(data.rx_rotation[:1], len(carriers), axis=0)
     stations = Stations(places, tuple(names), turned, carriers, array=arrays)
     site = replace(data.site, stations=stations, array=arrays[0], carrier_hz=float(carriers[0]))

@@ -71,7 +71,7 @@ def read_wifi_csi(
     choice(*CHIPS).check("dataset.chip", chip)
     path = Path(path)
     table = _table(Path(places or (path if path.is_dir() else path.parent) / PLACES))
-    logs = [_placed(one, table, card, chip) for one in _logs(path, card)]
+    logs = [_placed(each_log, table, card, chip) for each_log in _logs(path, card)]
     logs = [one for one in logs if len(one.csi)]
     if not logs:
         raise DataError(
@@ -130,10 +130,10 @@ def _table(path: Path) -> pd.DataFrame:
 def _logs(path: Path, card: str | None) -> list[Path]:
     if path.is_file():
         return [path]
-    files = [one for one in sorted(path.rglob("*")) if one.name != PLACES]
+    files = [each_path for each_path in sorted(path.rglob("*")) if each_path.name != PLACES]
     endings = [ending for ending, of in SUFFIXES.items() if card in (None, of)]
     for ending in endings:  # tables may lie beside logs
-        found = [one for one in files if one.suffix.lower() == ending]
+        found = [file for file in files if file.suffix.lower() == ending]
         if found:
             return found
     raise DataError(f"{path}: no such log, or a folder without {', '.join(endings)}")

@@ -88,7 +88,9 @@ def channel_hz(channel: int) -> float:
 
 def format_address(octets: np.ndarray) -> np.ndarray:
     """Return addresses (n, 6) as texts (n,) like `b8:3a:5a:b2:6e:70`."""
-    return np.array([":".join(f"{octet:02x}" for octet in one) for one in octets], str)
+    return np.array(
+        [":".join(f"{octet:02x}" for octet in each_octet) for each_octet in octets], str
+    )
 
 
 def _nexmon(path: Path, csiread: Any, chip: str) -> Packets:

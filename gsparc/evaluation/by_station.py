@@ -161,10 +161,12 @@ def station_columns(methods: Mapping[str, Scores], data: Measurements) -> dict[s
     columns: dict[str, Any] = {}
     if not (called := data.site.every_station.named):
         return columns
-    for stem, one in methods.items():
-        for name in [name for name in ERRORS if name in one.samples]:
-            error = pd.DataFrame({"mean": one.samples[name], "square": one.samples[name] ** 2})
-            by, figure = error.groupby(data.stations_of(one.row)), name.replace("error", "rmse")
+    for stem, method in methods.items():
+        for name in [name for name in ERRORS if name in method.samples]:
+            error = pd.DataFrame(
+                {"mean": method.samples[name], "square": method.samples[name] ** 2}
+            )
+            by, figure = error.groupby(data.stations_of(method.row)), name.replace("error", "rmse")
             means, rows = by.mean(), by["mean"].count()
             for head, names in called.items():
                 columns.setdefault(head, np.array(names)[rows.index])
@@ -182,9 +184,9 @@ def worst_stations(columns: Mapping[str, Any], method: str, later: bool = False)
     """
     # Among the baselines may be the method itself.
     names = [
-        one
-        for one in columns
-        if one.endswith("/rmse_db") and one.split("/")[1] not in ("zero", method)
+        column
+        for column in columns
+        if column.endswith("/rmse_db") and column.split("/")[1] not in ("zero", method)
     ]
     heads = {
         "rmse_db": method,
@@ -209,7 +211,8 @@ def worst_stations(columns: Mapping[str, Any], method: str, later: bool = False)
     offset = named[rows.bias_db**2 > OFFSET * rows.rmse_db**2] if "bias_db" in rows else rows[:0]
     if len(offset):
         those = ", ".join(
-            f"{one.station} ({-one.bias_db:+.1f} dB)" for one in offset[:WORST].itertuples()
+            f"{itertuple.station} ({-itertuple.bias_db:+.1f} dB)"
+            for itertuple in offset[:WORST].itertuples()
         )
         note += f"{'; ' * bool(note)}measured levels differ from predicted by one offset: {those}"
         note += ": gsparc update learns that, but not from lists of the strongest" * later

@@ -86,13 +86,15 @@ def repeated_warnings() -> list[str]:
     """Return a command's last lines on warnings: severe ones,
     and where its log's file has others.
     """
-    screens = [one for one in logging.getLogger().handlers if isinstance(one, ConsoleHandler)]
-    more = [list(texts) for one in screens for texts in one.warned.values() if len(texts) > 1]
+    screens = [
+        handler for handler in logging.getLogger().handlers if isinstance(handler, ConsoleHandler)
+    ]
+    more = [list(texts) for screen in screens for texts in screen.warned.values() if len(texts) > 1]
     again = [
         f"{len(a)} like '{shorten(re.sub(PATH, '', a[0]), AGAIN, placeholder='')} ...'"
         for a in more
     ]
-    severe = dict.fromkeys(text for one in screens for text in one.severe)
+    severe = dict.fromkeys(text for each_screen in screens for text in each_screen.severe)
     return [*severe, *([f"repeated warnings: {', '.join(again)}"] if again else [])]
 
 

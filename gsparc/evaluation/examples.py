@@ -51,7 +51,7 @@ class Examples:
         predictions = {name: predict_rows(method, data, few) for name, method in methods.items()}
         confidence = [*predictions.values()][-1].confidence
         sure = np.full(len(few), np.nan) if confidence is None else confidence.numpy()
-        means = {name: one.mean.numpy() for name, one in predictions.items()}
+        means = {name: prediction.mean.numpy() for name, prediction in predictions.items()}
         return cls(few, np.array(data.site.grid.edges()), data.targets(few).numpy(), sure, means)
 
     def write(self, path: Path) -> None:
@@ -85,7 +85,7 @@ def join_examples(rows: pd.DataFrame) -> Examples | None:
         (name, Examples.read(run.folder / FILE))
         for name, run in zip(firsts.setting, firsts.run, strict=True)
     ]
-    there = [(name, one) for name, one in examples if one is not None]
+    there = [(name, example) for name, example in examples if example is not None]
     same = [(name, one) for name, one in there if np.array_equal(one.rows, there[0][1].rows)]
     if not same:
         return None

@@ -290,7 +290,9 @@ def interruptible(trainer: L.Trainer, batches: DataModule) -> Iterator[None]:
         KeyboardInterrupt: stopped by the user; the message names the checkpoint to go on from.
         RuntimeError: one of several processes was lost.
     """
-    stop = next(one for one in trainer.callbacks if isinstance(one, StopBetweenSteps))  # type: ignore[attr-defined]
+    stop = next(
+        callback for callback in trainer.callbacks if isinstance(callback, StopBetweenSteps)
+    )  # type: ignore[attr-defined]
     try:
         with stop.handling_interrupts():
             yield

@@ -151,7 +151,7 @@ def _group_snapshots(data: Measurements, rows: np.ndarray) -> list[Snapshots]:
     stations = np.unique(numbers)
     if len(rows) >= SHARED * len(stations) * (number_moments(data, rows).max() + 1):
         return [Snapshots.from_rows(data, rows)]
-    return [Snapshots.from_rows(data, rows[numbers == one]) for one in stations]
+    return [Snapshots.from_rows(data, rows[numbers == station]) for station in stations]
 
 
 def _rms_of_rows(values: np.ndarray) -> np.ndarray:

@@ -211,7 +211,7 @@ def _write(path: Path, content: dict[str, Any]) -> StoredModel:
     except (OSError, RuntimeError) as error:  # torch's writer makes the second of the first
         # What the system said, under whatever a library wrapped around it.
         reason = next(
-            (one.strerror for one in list_causes(error) if isinstance(one, OSError)), None
+            (cause.strerror for cause in list_causes(error) if isinstance(cause, OSError)), None
         )
         why = reason or "is the disk full?"
         raise CheckpointError(
@@ -410,7 +410,7 @@ def find_non_finite(value: Any, where: str, *, infinite: bool = False) -> str | 
         parts = ((f"{where}.{key}", one) for key, one in value.items())
     elif isinstance(value, (list, tuple)):
         parts = ((f"{where}[{i}]", one) for i, one in enumerate(value))
-    each = (find_non_finite(one, name, infinite=infinite) for name, one in parts)
+    each = (find_non_finite(part, name, infinite=infinite) for name, part in parts)
     return next((result for result in each if result is not None), None)
 
 

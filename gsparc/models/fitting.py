@@ -138,10 +138,11 @@ def run_folder(path: Path, parts: str) -> Path:
     given as that or by what is in a part.
     """
     inside = path if path.is_dir() else path.parent
-    if any(re.fullmatch(parts, one.name) for one in inside.glob("*")):
+    if any(re.fullmatch(parts, each_path.name) for each_path in inside.glob("*")):
         return inside
     return next(
-        (one.parent for one in (inside, *inside.parents) if re.fullmatch(parts, one.name)), inside
+        (parent.parent for parent in (inside, *inside.parents) if re.fullmatch(parts, parent.name)),
+        inside,
     )
 
 

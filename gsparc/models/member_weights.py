@@ -156,7 +156,7 @@ def leave_out_groups(
         clone.condition(data, np.setdiff1d(rows, group))
         answers.append(clone.predict(data.batch(group)))
     mean, variance = (
-        torch.cat([getattr(one, name) for one in answers]) for name in ("mean", "variance")
+        torch.cat([getattr(answer, name) for answer in answers]) for name in ("mean", "variance")
     )
     number = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
     return LeftOutRows(np.concatenate(groups), mean, variance, number)
@@ -182,7 +182,7 @@ def weigh_members(
     first = next(iter(members))
     if len(members) == 1:
         return {first: 1.0}
-    left_out = [one.held for one in members.values() if one.held is not None]
+    left_out = [member.held for member in members.values() if member.held is not None]
     rows = np.zeros(0, np.int64)
     if len(left_out) == len(members):
         # Only rows that every member was without can be compared.

@@ -196,7 +196,11 @@ class PerStation(Method):
         for _, report, took_s, took_cpu_s in fits:
             here = 0.0 if uses_other_processes() else took_cpu_s
             watch.charge(max(report.seconds - took_s, 0.0), max(report.cpu_s - here, 0.0))
-        heard = [one for one, number in zip(reports, numbers, strict=True) if number != UNHEARD]
+        heard = [
+            each_report
+            for each_report, number in zip(reports, numbers, strict=True)
+            if number != UNHEARD
+        ]
         learned = pool_station_weights([note for one in heard for note in one.notes])
         notes += dict.fromkeys(learned.values())
         nan_stations = [

@@ -105,7 +105,7 @@ def _refuse_members(
     the worst goes until it does.
     """
     asked = _draw_over_stations(rows := heard_rows(data, fold.learned()), data.stations_of(rows))
-    answers = {id(one): _rows_left_out(one, data, fold, asked) for _, one in members}
+    answers = {id(member): _rows_left_out(member, data, fold, asked) for _, member in members}
     rows = reduce(np.intersect1d, [answer.rows for answer in answers.values()])
     rows = _draw_over_stations(rows, data.stations_of(rows))
     means = {name: _select_rows(answer, rows) for name, answer in answers.items()}

@@ -142,7 +142,7 @@ def scale_bar(axis: Any) -> None:
     """Draw a bar of a round length, about a fifth of the map wide."""
     (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
     decade = 10.0 ** np.floor(np.log10((right - left) / 5))
-    length = max(one for one in (1, 2, 5) if one * decade <= (right - left) / 5) * decade
+    length = max(value for value in (1, 2, 5) if value * decade <= (right - left) / 5) * decade
     x, y = left + 0.04 * (right - left), low + 0.05 * (high - low)
     axis.plot(
         [x, x + length],

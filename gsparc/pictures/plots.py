@@ -139,7 +139,7 @@ def draw_distributions(
     line[0].set_ylabel("share of samples")
     handles, texts = line[0].get_legend_handles_labels()
     figure.legend(
-        handles, [shorten_setting(one, 90) for one in texts], loc="outside lower center", ncols=2
+        handles, [shorten_setting(text, 90) for text in texts], loc="outside lower center", ncols=2
     )
     figure.set_label("How the accuracy is distributed (95 % bands, dashed: medians)")
     return figure
@@ -252,7 +252,7 @@ def draw_efforts(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] 
     `rows` are as of `average_cells`.
     """
     groups = [here for _, here in rows.groupby("dataset", sort=False)]
-    columns = max(here.split.nunique() for here in groups) + bool(rows.query_ms.any())
+    columns = max(group.split.nunique() for group in groups) + bool(rows.query_ms.any())
     size = (max(PANEL * columns, 6.0), 0.9 * PANEL * len(groups) + 0.9)
     figure, grid = panels(*size, len(groups), columns, sharey="row")
     for line, here in zip(grid, groups, strict=True):

@@ -148,8 +148,8 @@ class Watch(Stored):
     ) -> np.ndarray:
         """Rows from number `first` on in their order, with what each misses in deviations."""
         parts = [np.zeros(0, ROW)]
-        for station, every in stations.items():
-            later = every[every.number >= int(self.begun[station])]
+        for station, each_station in stations.items():
+            later = each_station[each_station.number >= int(self.begun[station])]
             start = int((later.number < first).sum())
             if start == len(later):
                 continue
@@ -210,7 +210,9 @@ class Watch(Stored):
             self.begun[name] = since
         noted = Alarm(who, RETURNED if stream > self.every else "", since, number, 0.0, (0.0, 0.0))
         # Rows from then on tell nothing of the changes before.
-        earlier = self._named({n: one[one.number < since] for n, one in stations.items()}, extent)
+        earlier = self._named(
+            {n: station[station.number < since] for n, station in stations.items()}, extent
+        )
         return replace(earlier, alarms=(*earlier.alarms, noted))._named(stations, extent)
 
     def _named(self, stations: Mapping[int, LaterRows], extent: float) -> Watch:

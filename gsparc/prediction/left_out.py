@@ -131,7 +131,7 @@ class HeldOutLevels:
         """Return the rows of all."""
         names = [field.name for field in fields(HeldOutLevels)]
         return HeldOutLevels(
-            *(np.concatenate([getattr(one, name) for one in parts]) for name in names)
+            *(np.concatenate([getattr(part, name) for part in parts]) for name in names)
         )
 
     @property

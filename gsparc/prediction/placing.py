@@ -117,7 +117,7 @@ def say_tiny_extent(queries: QueryPlaces, world: dict[End, np.ndarray], site: Si
     # Places that came in degrees were projected, and have no unit that can be mistaken.
     metres = [world[end] for end, where in queries.ends.items() if not where.degrees]
     low, high = site.moving_box
-    wide = max((float(np.ptp(one[:, :2], axis=0).max()) for one in metres), default=0.0)
+    wide = max((float(np.ptp(metre[:, :2], axis=0).max()) for metre in metres), default=0.0)
     side = float((high - low).max())
     if not 0 < wide <= SPECK * side:
         return None

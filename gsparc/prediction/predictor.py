@@ -329,7 +329,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         answers = [None if predictor is None else ask(predictor) for predictor in stations]
         answer = next(one for one in answers if one is not None)
         # A station without an answer: NaN in the shape of the others', NumPy or torch alike.
-        columns = [answer * np.nan if one is None else one for one in answers]
+        columns = [
+            answer * np.nan if each_answer is None else each_answer for each_answer in answers
+        ]
         return (
             torch.cat(columns, dim=-1)
             if isinstance(answer, Tensor)

@@ -184,8 +184,8 @@ class UpdateMixin:
             stations[name] = before.fade(later, extent, fade_db).join(later)[-window:]
         # The test believes what earlier rows said of a station's noise.
         noisy = {
-            name: replace(one, noise=one.noise + belief.of(name)[1])
-            for name, one in stations.items()
+            name: replace(station, noise=station.noise + belief.of(name)[1])
+            for name, station in stations.items()
         }
         watch, deviations = version.watch.look(noisy, first, extent, false_alarm)
         numbers = np.arange(first, first + sum(map(len, new.values())))
@@ -220,8 +220,8 @@ class UpdateMixin:
                 f"forget: no later row that is kept has number {unknown[0]}; see `measured`"
             )
         remainder = {
-            n: one[~torch.isin(one.number, torch.as_tensor(gone, dtype=torch.int64))]
-            for n, one in stations.items()
+            n: station[~torch.isin(station.number, torch.as_tensor(gone, dtype=torch.int64))]
+            for n, station in stations.items()
         }
         self._add_version(remainder, f"forget: {len(gone)} rows")
 
@@ -286,9 +286,9 @@ class UpdateMixin:
         by which each has faded since [dB].
         """
         pairs = self._current.changes.rows
-        parts = [one for _, one in pairs]
+        parts = [pair for _, pair in pairs]
         joined = reduce(LaterRows.join, parts, LaterRows.empty())
-        of = np.repeat([name for name, _ in pairs], [len(one) for one in parts]).astype(np.int64)
+        of = np.repeat([name for name, _ in pairs], [len(part) for part in parts]).astype(np.int64)
         raised = torch.from_numpy(self._current.changes.shift(of, joined.number.numpy()))
         result = {
             "number": joined.number,
@@ -310,7 +310,9 @@ class UpdateMixin:
 
     def _in_world(self, alarms: Sequence[Alarm]) -> tuple[Alarm, ...]:
         x, y = self.site.origin[:2].tolist()
-        return tuple(replace(one, place=(one.place[0] + x, one.place[1] + y)) for one in alarms)
+        return tuple(
+            replace(alarm, place=(alarm.place[0] + x, alarm.place[1] + y)) for alarm in alarms
+        )
 
     @property
     def journal(self) -> tuple[str, ...]:
@@ -420,4 +422,4 @@ def read_versions(extra: Mapping[str, Any]) -> tuple[Version, ...]:
 
 def versions_extra(versions: Sequence[Version]) -> dict[str, Any]:
     """Return what a checkpoint holds of versions, for `checkpoint.update_extra`."""
-    return {STORED: [to_plain(one) for one in versions]}
+    return {STORED: [to_plain(version) for version in versions]}

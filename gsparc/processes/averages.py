@@ -71,8 +71,10 @@ def mixture_moments(parts: Sequence[tuple[float, Tensor, Tensor]]) -> MeanVarian
     """
     if len(parts) == 1:
         return MeanVariance(*parts[0][1:])
-    mean = torch.stack([share * one for share, one, _ in parts]).sum(0)
-    deviations = ((one - mean).abs().square().reshape(len(mean), -1).mean(1) for _, one, _ in parts)
+    mean = torch.stack([share * each_part for share, each_part, _ in parts]).sum(0)
+    deviations = (
+        (part - mean).abs().square().reshape(len(mean), -1).mean(1) for _, part, _ in parts
+    )
     spread = [
         share * (variance + off)
         for (share, _, variance), off in zip(parts, deviations, strict=True)

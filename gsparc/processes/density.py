@@ -170,11 +170,11 @@ def density_without_groups(
         partitions: each of groups of rows that are left out together.
     """
     inverse = Factor.from_gram(gram, "raise").inverse
-    parts = (groups for one in partitions for groups in (None, one))
+    parts = (groups for partition in partitions for groups in (None, partition))
     errors = [left_out_residuals(inverse, inverse @ values, groups) for groups in parts]
-    variance = torch.cat([one.variance for one in errors])
+    variance = torch.cat([error.variance for error in errors])
     amplitude = (
-        (torch.cat([one.residual for one in errors])[:, 0].square() / variance)
+        (torch.cat([each_error.residual for each_error in errors])[:, 0].square() / variance)
         .mean()
         .clamp_min(FLAT)
     )

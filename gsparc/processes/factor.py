@@ -188,8 +188,8 @@ def whiten_in_float32(factors: Sequence[Factor], values: Sequence[Tensor]) -> li
 
     Rounding moves their squares by 1e-6 where the noise is a hundredth of the signal's variance.
     """
-    if is_differentiated(*values) or max(len(one.lower) for one in factors) > ALONE:
-        return [one.whiten(part) for one, part in zip(factors, values, strict=True)]
+    if is_differentiated(*values) or max(len(each_factor.lower) for each_factor in factors) > ALONE:
+        return [factor.whiten(part) for factor, part in zip(factors, values, strict=True)]
     single, result = [part.float().numpy() for part in values], []
     # OpenBLAS multiplies few columns in a third of torch's time.
     with BLAS.limit(limits=1):

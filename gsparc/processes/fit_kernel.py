@@ -143,7 +143,7 @@ def fit_kernel(
         starts: of terms of one kind.
         bounds, looks, settled: see `minimise`.
     """
-    first, points = starts[0], [one.parameters().numpy() for one in starts]
+    first, points = starts[0], [start.parameters().numpy() for start in starts]
     best, _ = minimise(
         lambda at: objective(first.with_values(at))[0], points, bounds, looks, settled
     )
@@ -255,7 +255,7 @@ def choose_left_out_kernel(
     # A coarse look picks the valley, the optimiser walks down it:
     # each look factors an n x n matrix.
     lengths = combinations(spread * STARTS, count)
-    starts = [Kernel.from_lengths(one, [1 / count] * count, 0.01) for one in lengths]
+    starts = [Kernel.from_lengths(length, [1 / count] * count, 0.01) for length in lengths]
     places, values = torch.from_numpy(positions), torch.from_numpy(scores)
     view = KernelRows(distances(places, places), None, values)
     return fit_kernel_by_left_out(starts, [view], bounds, entries=entries, bounded=False)[1]

@@ -395,7 +395,8 @@ class Kernel(Stored):
             # Of logits all shares lie between 0 and 1, whatever a step does.
             shares = torch.cat([logits, logits.new_zeros(1)]).softmax(0)
             signals = tuple(
-                replace(one, share=to_number(s)) for one, s in zip(signals, shares, strict=True)
+                replace(signal, share=to_number(s))
+                for signal, s in zip(signals, shares, strict=True)
             )
         return replace(self, terms=(*signals, self.terms[-1].with_values(noise)))
 

@@ -64,7 +64,7 @@ def _padded_blocks(
     """Yield numbers (c,) of sets of rows, their rows (c, m), which of these are valid,
     and `K^-1` of them.
     """
-    size = torch.tensor([len(one) for one in sets])
+    size = torch.tensor([len(each_set) for each_set in sets])
     order = size.argsort()
     while len(order):
         # The largest that is left, and as many as memory takes with it.

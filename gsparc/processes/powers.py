@@ -163,7 +163,7 @@ class PowerProcess(Stored):
         """
         far = self.posterior.nearest_distance(queries) if far is None else far
         if self.others:
-            parts = [(share, *one.answer(queries, far)) for share, one in self.members]
+            parts = [(share, *member.answer(queries, far)) for share, member in self.members]
             mean, variance = mixture_moments([part[:3] for part in parts])
             return PowerAnswer(
                 mean, variance, sum((p[0] * p[3] for p in parts), torch.zeros_like(mean))
@@ -187,7 +187,7 @@ class PowerProcess(Stored):
     def mean_at(self, queries: Tensor) -> Tensor:
         """Return the mean alone (B,) [dB] at (B, 3) or (B, 6) float64 [m], with autograd."""
         return sum(
-            (share * one.posterior.mean_at(queries)[:, 0] for share, one in self.members),
+            (share * member.posterior.mean_at(queries)[:, 0] for share, member in self.members),
             queries.new_zeros(len(queries)),
         )
 
@@ -199,16 +199,16 @@ class PowerProcess(Stored):
             some: numbers (m,) of those that are asked for, among the heard ones; None: all.
         """
         parts = []
-        for share, one in self.members:
-            exact = one.posterior if isinstance(one.posterior, Exact) else None
+        for share, member in self.members:
+            exact = member.posterior if isinstance(member.posterior, Exact) else None
             heard = (
                 torch.from_numpy(places) if exact is None else (exact.extra == 0).nonzero()[:, 0]
             )
             if some is None:
-                mean, variance = (part[heard] for part in one.posterior.left_out())
+                mean, variance = (part[heard] for part in member.posterior.left_out())
             else:
-                mean, variance = one.posterior.left_out(heard[some])
-            parts.append((share, mean[:, 0], one.kernel.amplitude * variance))
+                mean, variance = member.posterior.left_out(heard[some])
+            parts.append((share, mean[:, 0], member.kernel.amplitude * variance))
         return mixture_moments(parts)
 
     def with_exact_posterior(self) -> PowerProcess:

@@ -86,7 +86,7 @@ class SharedTermsPosterior:
         weights: tuple[Factor, Tensor] | None = None,
     ) -> None:
         self.processes, self.never, self.columns = processes, never, columns
-        self._alike = len({one.prior.kernel for one in processes.values()}) == 1
+        self._alike = len({process.prior.kernel for process in processes.values()}) == 1
         self._blocks: dict[int, Block] = {}
         self._stacks: dict[tuple[tuple[int, ...], torch.dtype], tuple[Tensor, ...]] = {}
         self.factor, self.mean = weights or shared_weights(
@@ -155,8 +155,8 @@ class SharedTermsPosterior:
         if self._alike and numbers == sorted(self.processes) and max(map(len, at)) <= ROUNDED:
             yield tuple(numbers), pad_sequence(at, batch_first=True, padding_value=-1)
             return
-        for one, queries in zip(numbers, at, strict=True):
-            yield from (((one,), part[None]) for part in queries.split(QUERIES))
+        for each_number, queries in zip(numbers, at, strict=True):
+            yield from (((each_number,), part[None]) for part in queries.split(QUERIES))
 
     def _condition(
         self,
@@ -183,13 +183,18 @@ class SharedTermsPosterior:
             near = prior.kernel.correlations(queries.to(places), places)
             cross = process_deviation(prior) * near.baddbmm(own_terms.to(places), terms.mT)
             more = more + (cross @ weights)[..., 0]
-            blocks = [self.block(one) for one in numbers]
+            blocks = [self.block(number) for number in numbers]
             factors = [block.process.factor for block in blocks]
-            parts = [part[:, : len(one.lower)].T for one, part in zip(factors, cross, strict=True)]
+            parts = [
+                part[:, : len(factor.lower)].T for factor, part in zip(factors, cross, strict=True)
+            ]
             if rounded:
                 white = [one.T for one in whiten_in_float32(factors, parts)]
             else:
-                white = [one.whiten(part).T for one, part in zip(factors, parts, strict=True)]
+                white = [
+                    each_factor.whiten(part).T
+                    for each_factor, part in zip(factors, parts, strict=True)
+                ]
             if len(self.mean):
                 projections = [
                     one.double() @ block.columns for one, block in zip(white, blocks, strict=True)
@@ -205,8 +210,8 @@ class SharedTermsPosterior:
         """
         if (numbers, dtype) not in self._stacks:
             parts = []
-            for one in numbers:
-                block, process = self.block(one), self.processes[one]
+            for number in numbers:
+                block, process = self.block(number), self.processes[number]
                 rest = (block.values - block.columns @ self.mean)[:, None]
                 # The rest is whitened: K^-1 L rest = L^-T rest.
                 weights = process.factor.solve(process.factor.lower @ rest)

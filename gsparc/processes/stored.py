@@ -34,7 +34,11 @@ class Stored:
 
     def state(self) -> dict[str, Any]:
         """Return what `read` needs: the fields of a dataclass, else all attributes."""
-        names = [one.name for one in fields(self)] if is_dataclass(self) else vars(self)
+        names = (
+            [setting_field.name for setting_field in fields(self)]
+            if is_dataclass(self)
+            else vars(self)
+        )
         return {name: to_plain(getattr(self, name)) for name in names}
 
     @classmethod

@@ -32,10 +32,10 @@ def align_to_site(data: Measurements, site: Site, *, whole: bool = False) -> Mea
             knows.
     """
     ours = data.site
-    for what in ("kind", "static_end", "grid"):
-        here, there = getattr(ours, what), getattr(site, what)
+    for name in ("kind", "static_end", "grid"):
+        here, there = getattr(ours, name), getattr(site, name)
         if here != there:
-            raise ValueError(f"the model was trained with {what} {there}, {ours.name} has {here}")
+            raise ValueError(f"the model was trained with {name} {there}, {ours.name} has {here}")
     data = _about(data, site)
     if site.unknown_factor != "none":  # few rows of another file may not tell
         data = replace(data, site=replace(data.site, unknown_factor=site.unknown_factor))

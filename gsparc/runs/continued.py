@@ -38,8 +38,8 @@ def add_settings_of_run(words: Sequence[str]) -> list[str]:
     its, hydra = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in files)
     lines = [one for one in its if not {_key(one), _key(one).partition(".")[0]} & values.keys()]
     # Of runs that seconds ended
-    lines = [one for one in lines if _key(one).rpartition(".")[2] not in GONE]
-    lines = [_found_from(Path(hydra["hydra"]["runtime"]["cwd"]), one) for one in lines]
+    lines = [line for line in lines if _key(line).rpartition(".")[2] not in GONE]
+    lines = [_found_from(Path(hydra["hydra"]["runtime"]["cwd"]), each_line) for each_line in lines]
     if {"-m", "--multirun"} & {*words}:
         return [*lines, *words]
     lines.append("hydra.mode=RUN")  # it may be a job of a multirun

@@ -150,12 +150,16 @@ def evaluate(
     same = FittedBaseline(methods, scores, tuple(seconds or ()))
     told = eval_on, learned, hearing
     fits = {n: same if n == shared else fit_baseline(n, data, split, *told) for n in names}
-    others = {f"baseline/{name}": one for name, one in fits.items()}
+    others = {f"baseline/{name}": each_fit for name, each_fit in fits.items()}
     facts: dict[str, Any] = {}
     every = {eval_on: scores, **{room: other.scores for room, other in others.items()}}
     # The first fold's methods alone are timed: folds differ in rows, hardly in cost.
     contenders = {"time": methods[0], **{room: other.methods[0] for room, other in others.items()}}
-    fields = [one for one in (method.without_process() for method in methods) if one is not None]
+    fields = [
+        each_method
+        for each_method in (method.without_process() for method in methods)
+        if each_method is not None
+    ]
     # Only where each fold kept its field: figures of some folds would be of other rows
     # than those beside.
     if len(fields) == len(methods):

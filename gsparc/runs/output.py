@@ -67,13 +67,19 @@ def show_result(
     """
     console = open_console()
     console.record = True
-    for one in tables:
-        console.print(one)
+    for table in tables:
+        console.print(table)
     # Hydra opens a log for every job; one without a line is not worth a word.
-    log = "".join(f"; full log: {one.name}" for one in run_dir.glob("*.log") if one.stat().st_size)
+    log = "".join(
+        f"; full log: {path.name}" for path in run_dir.glob("*.log") if path.stat().st_size
+    )
     for line in (*repeated_warnings(), *lines, f"{before}written to {run_dir}{log}"):
         console.print(line, highlight=False)
-    files = [one for one in logging.getLogger().handlers if isinstance(one, logging.FileHandler)]
+    files = [
+        handler
+        for handler in logging.getLogger().handlers
+        if isinstance(handler, logging.FileHandler)
+    ]
     text = console.export_text().rstrip()
     for file in files:  # to the log's file alone: the console has it
         file.handle(

@@ -88,7 +88,7 @@ def assemble_dataset(
     if survey.georeference is not None:
         about |= {f"origin_{name}": value for name, value in asdict(survey.georeference).items()}
     about["antennas"] = json.dumps(
-        [str(getattr(one, "antenna", "isotropic")) for one in survey.engines]
+        [str(getattr(each_engine, "antenna", "isotropic")) for each_engine in survey.engines]
     )
     if convergence is not None:
         about |= {"convergence_error": convergence.nmse, **convergence.attributes()}

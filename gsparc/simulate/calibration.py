@@ -84,8 +84,10 @@ class RoomCalibration:
 def used_materials(tracer: RayTracer) -> dict[str, Material]:
     """Return materials of the scene's surfaces, as the tracer has them."""
     return {
-        name: Material(float(one.relative_permittivity[0]), float(one.conductivity[0]))
-        for name, one in sorted(tracer.radio_materials().items())
+        name: Material(
+            float(radio_material.relative_permittivity[0]), float(radio_material.conductivity[0])
+        )
+        for name, radio_material in sorted(tracer.radio_materials().items())
     }
 
 

@@ -138,7 +138,11 @@ class RayTracer(TracingEngine):
     def radio_materials(self) -> dict[str, Any]:
         """Return Sionna's materials (`sionna.rt.RadioMaterial`) of the scene's objects, by name."""
         used = {thing.radio_material.name for thing in self.scene.objects.values()}
-        return {name: one for name, one in self.scene.radio_materials.items() if name in used}
+        return {
+            name: radio_material
+            for name, radio_material in self.scene.radio_materials.items()
+            if name in used
+        }
 
     def trace(
         self, receivers: np.ndarray, effects: Effects, seed: int | None = None

@@ -108,8 +108,8 @@ def _record(cell: str, named: bool) -> dict[str, Any] | None:
         return {"point": [float(one) for one in (point[1] or "").split()]}
     pair = PAIR.fullmatch(cell)
     numbers = re.split(r"[,;\s]+", pair[1]) if pair else []
-    fine = named or (numbers and all(FINE.search(one) for one in numbers))
-    return {"pair": [float(one) for one in numbers]} if fine and numbers else None
+    fine = named or (numbers and all(FINE.search(each_number) for each_number in numbers))
+    return {"pair": [float(number) for number in numbers]} if fine and numbers else None
 
 
 def _numbers(cell: Any) -> np.ndarray | None:

@@ -112,7 +112,7 @@ Chosen = dict[str, tuple[Column, ...]]
 def used_heads(chosen: Chosen) -> set[str | None]:
     """Return the heads of all columns that are used."""
     columns = [column for one in chosen.values() for column in one]
-    return {column.head for one in columns for column in (one, *one.plus)}
+    return {column.head for each_column in columns for column in (each_column, *each_column.plus)}
 
 
 def choose_columns(
@@ -157,10 +157,10 @@ def choose_columns(
         guesses.setdefault(role, []).append(Column(**vars(meaning), head=head))
     # First of all, as a second measurement is no second candidate for the first one.
     _one_way(sheet, guesses)
-    for role, found in guesses.items():
+    for role, guess in guesses.items():
         # Columns whose head says less than others of the quantity count only
         # where there is nothing better.
-        candidates = [column for column in found if not column.less] or found
+        candidates = [column for column in guess if not column.less] or guess
         if role == "station":
             candidates = _finest(sheet, _identity(sheet, candidates, always=only is not None))
         tones = role in (*CHANNELS, *POLAR)  # of a row, or stations

@@ -183,7 +183,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     offsets = check.read_ragged(rows)
     release_split = check.read_split(rows)
     check.check_range(measured, values, mask)
-    if all(one is not None for one in (*ends.values(), rotation)):
+    if all(each_end is not None for each_end in (*ends.values(), rotation)):
         _static(check, links, ends, rotation)
     check.problems.raise_if_any()
     assert rotation is not None

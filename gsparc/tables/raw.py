@@ -270,7 +270,7 @@ def _datasets(
         items = {
             str(_plain(name)): one for name, one in file.items() if isinstance(one, h5py.Dataset)
         }
-        arrays = {name: one for name, one in items.items() if one.size is not None}
+        arrays = {name: item for name, item in items.items() if item.size is not None}
         # What lies in one piece takes nothing that is not in the file.
         stated = {
             name: (d.shape, 0 if d.id.get_offset() else d.nbytes) for name, d in arrays.items()
@@ -430,7 +430,8 @@ def _classic(path: Path) -> dict[str, tuple[np.ndarray, Any]]:
     with netcdf_file(str(path), "r", mmap=False) as file:
         variables = file.variables.items()
         return {
-            name: (np.array(one.data), getattr(one, "_FillValue", None)) for name, one in variables
+            name: (np.array(variable.data), getattr(variable, "_FillValue", None))
+            for name, variable in variables
         }
 
 

@@ -92,7 +92,7 @@ def _name_levels(sheet: Sheet, stations: Collection[str]) -> tuple[Sheet, dict[s
     roles = {head: heads.parse_head(head).role for head in sheet.heads}
     free = [head for head, role in roles.items() if role in (*heads.LEVELS, "station", None)]
     parts = {head: (heads.station_in_head(head), head) for head in free}
-    found = {head: one for head, names in parts.items() for one in names if one in stations}
+    found = {head: name for head, names in parts.items() for name in names if name in stations}
     others = [head for head in free if found and head not in found and roles[head] in heads.LEVELS]
     if others:
         which = list_first([*map(repr, others)])

@@ -110,7 +110,7 @@ def _of_columns(content: dict[str, Any]) -> list[dict[str, Any]]:
     ):
         return [dict(zip(heads, row, strict=True)) for row in rows]
     values = [*content.values()]
-    if all(isinstance(one, dict) for one in values) and all(map(str.isdigit, content)):
+    if all(isinstance(value, dict) for value in values) and all(map(str.isdigit, content)):
         return values if len(values) > 1 else []
     columns = [list(c.values()) if isinstance(c, dict) else c for c in values]
     if len(columns) < 2 or not all(

@@ -159,7 +159,7 @@ def _read_cells(
     unit = unit_of(head)[1] or UNITS.get(words_of(head)[-1])
     written, values = np.where(units == "", numbers, np.nan), np.full(len(units), np.nan)
     if name == "carrier_hz" and unit is None:  # their range is narrower than the steps of units
-        hertz = [UNITS[one] for one in ("hz", "khz", "mhz", "ghz")]
+        hertz = [UNITS[each_name] for each_name in ("hz", "khz", "mhz", "ghz")]
         unit = next((one for one in hertz if _fits(one, written, name)), hertz[0])
     for text in np.unique(units):
         one = UNITS.get(text) if text else unit or UNITS["m"]
@@ -218,12 +218,12 @@ def _doubt(
         one for one in UNITS.values() if one.kind == kind and (one.changes or kind == "power")
     ]
     least_usual, written = USUAL.get(name, (least,))[0], written[off]
-    trials = {one.name: _convert(one, written) for one in others}
+    trials = {other.name: _convert(other, written) for other in others}
     usual = {
-        one: (v >= least_usual) & (v <= high) & ~(abs(v - middle) > spread)
-        for one, v in trials.items()
+        key: (v >= least_usual) & (v <= high) & ~(abs(v - middle) > spread)
+        for key, v in trials.items()
     }
-    fitting = [one for one, holds in usual.items() if holds.all()]
+    fitting = [each_key for each_key, holds in usual.items() if holds.all()]
     cells = [f"{values[i]:g} in {sheet.rows[i]}" for i in np.flatnonzero(off)]
     fault = f"{sheet.source}: column {head!r} holds {list_first(cells, 3)}; expected {name} of "
     fault += f"{low:g} to {high:g}" + ("" if np.isnan(middle) else f", {middle:g} of most")

@@ -39,7 +39,9 @@ def find_times(sheet: Sheet, used: Container[str | None]) -> tuple[str, ...]:
     dates, clocks = ([h for h in heads if _all_match(texts[h], part)] for part in (DATE, CLOCK))
     pairs = [(dates[0], clocks[0])] if dates and clocks else []
     candidates = [*pairs, *((head,) for head in heads if head not in dates)]
-    return next((one for one in candidates if read_times(sheet, one) is not None), ())
+    return next(
+        (candidate for candidate in candidates if read_times(sheet, candidate) is not None), ()
+    )
 
 
 def read_times(sheet: Sheet, heads: Iterable[str]) -> tuple[np.ndarray, str] | None:

@@ -111,7 +111,10 @@ class FitContext(Checked):
         if self.loggers:
             from gsparc.training.tracking import PartLogger  # imports Lightning
 
-            changes = {"loggers": [PartLogger(one, folder) for one in self.loggers], **changes}
+            changes = {
+                "loggers": [PartLogger(logger, folder) for logger in self.loggers],
+                **changes,
+            }
         # No folder stays none: below an empty path lies the working directory.
         return replace(
             self, run_dir=self.run_dir / folder if self.run_dir != Path() else Path(), **changes

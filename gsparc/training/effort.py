@@ -46,7 +46,10 @@ class Effort:
         """Return all of it times `factor`; rows times its cube root,
         as a covariance of n rows takes n^3.
         """
-        counts = {one.name: factor * getattr(self, one.name) for one in fields(self)}
+        counts = {
+            setting_field.name: factor * getattr(self, setting_field.name)
+            for setting_field in fields(self)
+        }
         rows = {name: max(factor ** (1 / 3) * getattr(self, name), LEAST_ROWS) for name in ROWS}
         whole = {name: max(round(count), 1) for name, count in {**counts, **rows}.items()}
         return Effort(**{**whole, "factor": counts["factor"]})  # type: ignore[arg-type]

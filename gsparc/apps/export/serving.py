@@ -93,9 +93,11 @@ class Connection(H11Protocol):
         if len(self.connections) <= self.limits.connections:
             return
         others = [
-            one for one in self.connections if isinstance(one, Connection) and one is not self
+            connection
+            for connection in self.connections
+            if isinstance(connection, Connection) and connection is not self
         ]
-        works = [one for one in others if one.works()]
+        works = [each_other for each_other in others if each_other.works()]
         # Half the room is for those whose request is not read yet.
         if 2 * len(works) > self.limits.connections:
             other = max(works, key=lambda one: int(one.cycle.scope.get("places", 0)))  # type: ignore[call-overload]
@@ -228,7 +230,7 @@ class Batcher:
                     **site.name_moving(np.concatenate(places))
                 )
             values = np.stack([values.real, values.imag], -1) if np.iscomplexobj(values) else values
-            parts = np.split(values.astype("<f4"), np.cumsum([len(one) for one in places])[:-1])
+            parts = np.split(values.astype("<f4"), np.cumsum([len(place) for place in places])[:-1])
             return [part.copy() for part in parts[1:]]  # a view would keep the others' answers
         except Exception as error:
             # One faulty request must not spoil a batch: each is asked again alone,
@@ -272,7 +274,8 @@ def build_application(
     # One thread writes for all: text of numbers holds the interpreter's lock anyhow.
     routes, writer = {"/predict": site.kind, "/std": "std"}, ThreadPoolExecutor(1)
     batchers = {
-        r: Batcher(predictor, what, limits.delay_ms / 1e3, most, lock) for r, what in routes.items()
+        r: Batcher(predictor, route, limits.delay_ms / 1e3, most, lock)
+        for r, route in routes.items()
     }
 
     @asynccontextmanager

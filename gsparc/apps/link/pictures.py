@@ -59,8 +59,8 @@ def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, pat
         axes[0, column].set_title(f"{modulation.upper()}, one layer, {title}", fontsize=10)
         # 10 % is the target of rate adaptation in 5G NR (TS 38.214, 5.2.2.1).
         axes[0, column].axhline(0.1, color="grey", linewidth=0.6)
-        for row, what in enumerate(("block error rate", "bit error rate")):
-            axes[row, column].set(yscale="log", xlabel="Eb/N0 [dB]", ylabel=what)
+        for row, each_name in enumerate(("block error rate", "bit error rate")):
+            axes[row, column].set(yscale="log", xlabel="Eb/N0 [dB]", ylabel=each_name)
             axes[row, column].grid(alpha=0.3, which="both")
     axes[0, 0].plot([], [], "v", color="grey", fillstyle="none", label="none failed: 95 % limit")
     axes[0, 0].legend(fontsize=7)
@@ -75,8 +75,8 @@ def draw_rates(
     """
     figure, ((left, right),) = panels(11, 4, 1, 2)
     for name, (style, label) in RATES.items():
-        mean = [getattr(one, name).mean() / 1e6 for one in rates]
-        left.plot([one.snr_db for one in rates], mean, style, label=label)
+        mean = [getattr(rate, name).mean() / 1e6 for rate in rates]
+        left.plot([each_rate.snr_db for each_rate in rates], mean, style, label=label)
     left.set(
         xlabel="median signal-to-noise ratio [dB]", ylabel="mean throughput of one layer [Mbit/s]"
     )

@@ -128,7 +128,7 @@ def rate_facts(rates: Sequence[Rates], accepted: np.ndarray) -> dict[str, Any]:
     `shortfall` is against the oracle that meets the target, `shortfall_best` against the MCS that
     carries most; of all positions, of accepted ones, and of all where the others send pilots.
     """
-    parts = ((one.snr_db, _rates_of(one, accepted)) for one in rates)
+    parts = ((rate.snr_db, _rates_of(rate, accepted)) for rate in rates)
     return {
         f"mcs/{snr:g}dB/{name}": value for snr, figures in parts for name, value in figures.items()
     }

@@ -27,7 +27,7 @@ def calibrate_trust(snapshots: Sequence[PlaceSearch], places: np.ndarray, start:
         places: (n, 3), where they were heard [m, local].
         start: of the search.
     """
-    edge = float(np.max([one.cells.edge.max() for one in snapshots]))
+    edge = float(np.max([snapshot.cells.edge.max() for snapshot in snapshots]))
     spans = np.log([INFLATIONS, TEMPERATURES, TAILS, SPREADS]).T
 
     # In logarithms: all are positive and known up to factors.
@@ -37,7 +37,9 @@ def calibrate_trust(snapshots: Sequence[PlaceSearch], places: np.ndarray, start:
 
     def surprise(point: np.ndarray) -> float:
         trust, pairs = decode_trust(point), zip(snapshots, places, strict=True)
-        return -float(np.mean([one.posterior(trust).log_density_at(place) for one, place in pairs]))
+        return -float(
+            np.mean([pair.posterior(trust).log_density_at(place) for pair, place in pairs])
+        )
 
     first = np.log([start.inflation, start.temperature, start.tail, start.spread / edge or SPREAD])
     # First steps, in logarithms: 1 is a factor of 2.7; the temperature is first tried lower.
@@ -56,8 +58,13 @@ def calibrate_level(
     areas of that level hold the share of places that are exchangeable with these.
     """
     levels = [
-        one.posterior(trust).mass_above(place) for one, place in zip(snapshots, places, strict=True)
+        snapshot.posterior(trust).mass_above(place)
+        for snapshot, place in zip(snapshots, places, strict=True)
     ]
     # Too few snapshots for this share: nothing less than the whole site is sure to hold it.
     level = min(conformal_quantile(levels, share), 1.0)
-    return replace(trust, level=level, worst=max(one.least_misfit(trust) for one in snapshots))
+    return replace(
+        trust,
+        level=level,
+        worst=max(each_snapshot.least_misfit(trust) for each_snapshot in snapshots),
+    )

@@ -396,17 +396,17 @@ def write_classes(
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
         # Before the values, which fix what colours mean.
         file.write_colormap(
-            1, {i: tuple((255 * one[:3]).astype(int)) for i, one in enumerate(colours)}
+            1, {i: tuple((255 * colour[:3]).astype(int)) for i, colour in enumerate(colours)}
         )
         file.write(values, 1)
     named = []
-    for area, one in shapes(values, values != NO_CLASS, transform=profile["transform"]):
+    for area, shape in shapes(values, values != NO_CLASS, transform=profile["transform"]):
         area = (
             area
             if raster.grid.origin is None
             else transform_geom(profile["crs"], "EPSG:4326", area)
         )
-        named.append((area, {"number": int(one), "station": names[int(one)]}))
+        named.append((area, {"number": int(shape), "station": names[int(shape)]}))
     write_shapes(Path(path).with_suffix(".geojson"), named)
 
 

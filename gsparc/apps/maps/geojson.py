@@ -37,7 +37,10 @@ def draws_shapes(path: str | Path) -> bool:
     if Path(path).suffix.lower() not in SUFFIXES or not Path(path).is_file():
         return False
     try:
-        return any(one and one["type"] not in ("Point", "MultiPoint") for one in _geometries(path))
+        return any(
+            geometry and geometry["type"] not in ("Point", "MultiPoint")
+            for geometry in _geometries(path)
+        )
     except UNREADABLE:
         return False
 
@@ -124,7 +127,9 @@ def read_shapes(
 
     try:
         with np.errstate(invalid="ignore"):  # NaN is refused below
-            parts = np.array([shape(one) for one in _geometries(path) if one], object)
+            parts = np.array(
+                [shape(geometry) for geometry in _geometries(path) if geometry], object
+            )
     except FileNotFoundError:
         raise DataError(f"{where}: no such file") from None
     except (*UNREADABLE, shapely.errors.ShapelyError) as error:
@@ -165,5 +170,7 @@ def read_shapes(
 
 def write_shapes(path: Path, shapes: list[tuple[dict[str, Any], Any]]) -> None:
     """Write geometries, each with its properties."""
-    features = [{"type": "Feature", "properties": facts, "geometry": one} for one, facts in shapes]
+    features = [
+        {"type": "Feature", "properties": facts, "geometry": shape} for shape, facts in shapes
+    ]
     write_whole(path, json.dumps({"type": "FeatureCollection", "features": features}))

@@ -123,9 +123,11 @@ def calibrate(evidence: HeldOutLevels, share: float = 0.9) -> IntervalScales:
     ).T
     scales, weight = (
         np.array([_half_and_rms(one, level) for one in bins]).T,
-        [len(one) for one in bins],
+        [len(each_bin) for each_bin in bins],
     )
-    half, rms = (isotonic_regression(one * typical, weights=weight).x / typical for one in scales)
+    half, rms = (
+        isotonic_regression(scale * typical, weights=weight).x / typical for scale in scales
+    )
     scaled = used.error / np.interp(used.distance, middle, rms)
     tail = np.quantile(scaled, TAIL) if heard.all() else None
     reach = float(np.quantile(used.distance, REACH))

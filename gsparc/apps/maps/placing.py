@@ -84,7 +84,9 @@ class NewAntenna(Checked):
         carriers = np.zeros(0) if stations.carrier_hz is None else stations.carrier_hz
         away = np.abs(np.log(carriers / self.carrier_hz))
         if not len(carriers) or away.min() > np.log(ONE_BAND):
-            bands = ", ".join(f"{one / 1e6:g}" for one in np.unique(carriers)) or "unknown ones"
+            bands = (
+                ", ".join(f"{carrier / 1e6:g}" for carrier in np.unique(carriers)) or "unknown ones"
+            )
             raise DataError(
                 f"antenna.carrier_hz={self.carrier_hz:g}: no station's band; there are {bands} MHz"
             )
@@ -106,7 +108,7 @@ class NewAntenna(Checked):
     def __str__(self) -> str:
         beams = "one antenna alike in all directions"
         if self.azimuth is not None:
-            towards = ", ".join(f"{one:g}" for one in self.sectors()[:, 0])
+            towards = ", ".join(f"{sector:g}" for sector in self.sectors()[:, 0])
             beams = (
                 f"sectors towards {towards} deg, tilt {self.tilt:g}, {self.width:g} x "
                 f"{self.height:g}"
@@ -133,9 +135,9 @@ class NewStationError:
     def from_evidence(cls, parts: Sequence[HeldOutLevels]) -> NewStationError:
         """Return what rows of sites tell, each of which was left out as a whole."""
         # With silent rows: of lists those alone that were heard are the strong ones.
-        errors = (one.distribution() for one in parts)
+        errors = (part.distribution() for part in parts)
         mean, square = np.array([[mass @ e, mass @ e**2] for e, mass in errors]).T
-        stated = [np.square(one.spread_db).mean() for one in parts]
+        stated = [np.square(each_part.spread_db).mean() for each_part in parts]
         within = np.average(square - mean**2, weights=[one.heard.sum() for one in parts])
         return cls(float(np.sqrt(np.mean(mean**2 * stated))), float(np.sqrt(within)), len(parts))
 
@@ -316,7 +318,7 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
         at_site = site == one
         inner = Fold(rows[~at_site], rows[:0], rows[at_site])
         parts.append(leave_out(learned, inner, np.full(int(at_site.sum()), one)))
-    parts = [one for one in parts if one.heard.any()]  # of silent rows alone no error is known
+    parts = [part for part in parts if part.heard.any()]  # of silent rows alone no error is known
     return NewStationError.from_evidence(parts) if parts else NewStationError()
 
 

@@ -189,7 +189,7 @@ def _began_as_interrupt(error: BaseException | None) -> bool:
     """A clean-up that meets what Ctrl-C left half done raises an error
     of its own over the interrupt.
     """
-    return any(isinstance(one, KeyboardInterrupt) for one in list_causes(error))
+    return any(isinstance(cause, KeyboardInterrupt) for cause in list_causes(error))
 
 
 def _multirun_advice() -> str:
@@ -227,7 +227,10 @@ def help_text(answers: str, config: str) -> str:
     texts = [answers, text.partition("\nhydra:")[0].rstrip()]
     defaults = yaml.safe_load(text).get("defaults", ())
     groups = {
-        group: choice for one in defaults if isinstance(one, dict) for group, choice in one.items()
+        group: choice
+        for default in defaults
+        if isinstance(default, dict)
+        for group, choice in default.items()
     }
     if "kind" in groups:  # settings of the command itself
         kinds = [word.partition("=")[2] for word in sys.argv if word.startswith("kind=")]

@@ -97,7 +97,9 @@ class PublicSet:
         # By size alone: hashes are checked when files are fetched,
         # and reading all at each start takes long.
         return [
-            p for p, one in self.files().items() if not p.is_file() or p.stat().st_size != one.bytes
+            p
+            for p, file in self.files().items()
+            if not p.is_file() or p.stat().st_size != file.bytes
         ]
 
 
@@ -129,9 +131,9 @@ def fetched_path(choice: str, setting: str = "file") -> Path:
     Raises:
         DataError: nothing is fetched, or only a part; says in one line how to get it.
     """
-    sets = [one for one in public_sets().values() if one.dataset == choice]
+    sets = [public_set for public_set in public_sets().values() if public_set.dataset == choice]
     say = f"say dataset.{setting}={setting.upper()} for dataset={choice}"
-    here = next((one for one in sets if one.sources), None)
+    here = next((each_set for each_set in sets if each_set.sources), None)
     if here is not None and not (missing := here.missing()):
         return here.folder / here.opens
     if here is None:
@@ -217,7 +219,7 @@ def _fetch_files(wanted: PublicSet, timeout_s: float, retries: int) -> None:
 
     pooch.get_logger().setLevel(logging.WARNING)
     files = {
-        path.relative_to(wanted.folder).as_posix(): one for path, one in wanted.files().items()
+        path.relative_to(wanted.folder).as_posix(): file for path, file in wanted.files().items()
     }
     store = pooch.create(
         wanted.folder,

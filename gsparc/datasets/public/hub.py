@@ -59,7 +59,9 @@ def _download(repository: str, part: str, folder: Path, revision: str | None, fa
     try:
         about = HfApi().dataset_info(repository, revision=revision, files_metadata=True)
         sizes = [
-            one.size or 0 for one in about.siblings or () if one.rfilename.startswith(f"{part}/")
+            sibling.size or 0
+            for sibling in about.siblings or ()
+            if sibling.rfilename.startswith(f"{part}/")
         ]
         if not sizes or about.sha is None:
             raise DataError(

@@ -50,7 +50,7 @@ def recover_cached(
     """
     watch = watch or Stopwatch()
     cache = _solved_rows(f"{identity_hash(data)} {seed}")
-    names = [one.name for one in fields(RecoveredVectors)]
+    names = [setting_field.name for setting_field in fields(RecoveredVectors)]
     missing = np.array([row for row in rows.tolist() if row not in cache], np.int64)
     unpaid = [row for row in rows.tolist() if row in cache and cache[row][2] is not watch]
     if unpaid:
@@ -68,7 +68,8 @@ def recover_cached(
         parts = zip(*(getattr(recovery, name) for name in names), strict=True)
         each = (watch.seconds - began) / len(part)
         cache.update(
-            (row, (one, each, watch)) for row, one in zip(part.tolist(), parts, strict=True)
+            (row, (each_part, each, watch))
+            for row, each_part in zip(part.tolist(), parts, strict=True)
         )
     return RecoveredVectors(
         *map(np.stack, zip(*(cache[row][0] for row in rows.tolist()), strict=True))

@@ -55,7 +55,7 @@ class CarriersAlone(Stored):
 
     def condition(self, places: Tensor, values: Tensor, station: Tensor) -> Self:
         """Return the same kernels conditioned on rows; see `learn`."""
-        priors = [None if one is None else one.prior for one in self.processes]
+        priors = [None if process is None else process.prior for process in self.processes]
         return self._from_priors(priors, places, values, station)
 
     @classmethod
@@ -82,14 +82,14 @@ class CarriersAlone(Stored):
         NaN without a process.
         """
         result = torch.full((len(station), self.means.shape[1]), torch.nan, dtype=torch.float64)
-        for number, one in enumerate(self.processes):
-            if one is not None:
-                result[station == number] = one.left_out_residuals().residual
+        for number, process in enumerate(self.processes):
+            if process is not None:
+                result[station == number] = process.left_out_residuals().residual
         return result
 
     def has_process(self, station: Tensor) -> Tensor:
         """Return which of these carriers (n,) have one, bool."""
-        return torch.tensor([one is not None for one in self.processes])[station]
+        return torch.tensor([process is not None for process in self.processes])[station]
 
     def answer(self, places: Tensor, station: Tensor) -> MeanVariance:
         """Return values (n, P) at places (n, 3), and variances (n,) per pixel;

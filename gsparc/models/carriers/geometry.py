@@ -112,7 +112,9 @@ def find_paths(
     trials = [
         _planes_to_try(ends, turn, COARSE_STEP) for turn in torch.arange(0, 90, TURN_STEP).deg2rad()
     ]
-    errors = torch.stack([_choose_planes(looks, one, target)[2].square().sum() for one in trials])
+    errors = torch.stack(
+        [_choose_planes(looks, trial, target)[2].square().sum() for trial in trials]
+    )
     errors[0] *= NEARLY  # along the axes, where that is nearly as good
     turn = torch.tensor(TURN_STEP * int(errors.argmin())).deg2rad()
     planes, powers, _ = _choose_planes(looks, _planes_to_try(ends, turn, STEP), target)

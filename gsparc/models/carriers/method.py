@@ -226,7 +226,12 @@ class CarrierField(OneArray):
         grid = self.fitted_site.grid
         assert grid is not None
         return next(
-            (one for one in (4, 3, 2) if not grid.width % one and grid.height >= one * COARSE), 1
+            (
+                value
+                for value in (4, 3, 2)
+                if not grid.width % value and grid.height >= value * COARSE
+            ),
+            1,
         )
 
     def _expected_values(self, places: Tensor) -> Tensor:

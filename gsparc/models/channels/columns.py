@@ -215,7 +215,10 @@ def _slots_of_station(
         # Antennas of a moving receiver are offsets in its frame,
         # those of a static one are static ends.
         moves = site.static_end == "tx"
-        both = [(centre, one) if moves else (centre + rotation @ one, ORIGIN) for one in offsets]
+        both = [
+            (centre, offset) if moves else (centre + rotation @ offset, ORIGIN)
+            for offset in offsets
+        ]
         elements = [((number,), *pair) for number, pair in enumerate(both)]
     slots = []
     for band in coherent_bands(frequency, reach):

@@ -261,8 +261,8 @@ def choose_waves(groups: tuple[Group, ...], runs: int) -> tuple[Kernel, Tensor]:
         one = cast(IsotropicWaves, first.signals[0])
         waves = [replace(one, wavenumber=group.slot.wavenumber) for group in groups]
         alike = [
-            one.covariance(rows.places, rows.places)
-            for one, rows in zip(waves, groups, strict=True)
+            wave.covariance(rows.places, rows.places)
+            for wave, rows in zip(waves, groups, strict=True)
         ]
         for kernel in (first, *others):
             grams = [each + kernel.noise * torch.eye(len(each), dtype=each.dtype) for each in alike]

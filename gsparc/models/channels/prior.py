@@ -39,7 +39,11 @@ class ChannelPrior(Stored):
         """
         by_class = {type(term): term for term in (*self.terms, *terms)}
         # In the order of `KINDS`: parameters of terms stand one after the other in vectors.
-        ordered = (by_class[one] for one in dict.fromkeys([*KINDS, *by_class]) if one in by_class)
+        ordered = (
+            by_class[fromkey]
+            for fromkey in dict.fromkeys([*KINDS, *by_class])
+            if fromkey in by_class
+        )
         return ChannelPrior(tuple(term for term in ordered if len(term.power)))
 
     def change_frame(self, **numbers: Any) -> ChannelPrior:

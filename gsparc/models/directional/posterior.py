@@ -130,7 +130,7 @@ class SightedSources:
         """The rows given their covariance, which is factored in float64."""
         exact = to_double(replace(self))
         # Of all sources: gigabytes
-        one_by_one = (coherence(one, one) for one in exact.phase_vectors)
+        one_by_one = (coherence(phase_vector, phase_vector) for phase_vector in exact.phase_vectors)
         covariance = exact._cross_covariance(exact.waves, one_by_one, exact.power)
         covariance *= exact._gain_correlation(self.kernel)
         return condition_with_noise(covariance, self.kernel.noise, exact.rows.target).in_float32

@@ -152,7 +152,9 @@ class ImageSourceGP(SourcesInFrame):
             if again is not data:
                 data, row_sets = again, self._draw_row_sets(again, seen)
                 # Factors change little the second time: a refinement does, no other search.
-                members = [ensemble.refine_member(row_sets[one.number], one) for one in members]
+                members = [
+                    ensemble.refine_member(row_sets[member.number], member) for member in members
+                ]
         rows = self._draw(data, seen)
         self._set_members(rows, members)
         self.held = self._predict_left_out(data, seen, members, len(rows))
@@ -271,7 +273,7 @@ class ImageSourceGP(SourcesInFrame):
         """
         rows, means = [], []
         for turn, group in enumerate(self._groups):
-            if mine := [one for one in members if one.number % len(self._groups) == turn]:
+            if mine := [member for member in members if member.number % len(self._groups) == turn]:
                 # As many rows as the process that answers has: fewer would err more than it does.
                 others = self._draw(data, self._rows_of_search(known, turn), limit)
                 rows.append(group)
@@ -399,7 +401,7 @@ class ImageSourceGP(SourcesInFrame):
         """Carrier phase, and visibility where it is modelled."""
         return (
             ("phase", "visibility")
-            if any(len(one.scene.clutter) for one in self.members)
+            if any(len(member.scene.clutter) for member in self.members)
             else ("phase",)
         )
 

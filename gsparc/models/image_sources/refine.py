@@ -55,8 +55,8 @@ def refine_scene(
                 group["lr"] *= DECAY
         if step % REFRESH == 0:
             seen = (
-                scene.visibility.correlation(rows.places, one)
-                for one in _scene_at(scene, values).sources
+                scene.visibility.correlation(rows.places, source)
+                for source in _scene_at(scene, values).sources
             )
             correlation = torch.stack([*seen])
         value, gradient = _cost_and_gradient(rows, scene, values, correlation, cost)

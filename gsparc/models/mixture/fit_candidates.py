@@ -111,5 +111,5 @@ def _why_not_searched(race: Race | None) -> str | None:
 
 def _training_groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:
     """Training rows (n,) of each group."""
-    result = [np.intersect1d(one.test, train) for one in cut.folds]
+    result = [np.intersect1d(fold.test, train) for fold in cut.folds]
     return tuple(group for group in result if 0 < len(group) < len(train))

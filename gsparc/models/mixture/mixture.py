@@ -230,7 +230,7 @@ class Mixture(LearnsTogether, ClosedForm):
 
     def keep_members(self, kept: Sequence[ClosedForm]) -> None:
         """See `HasMembers`; their weights keep their ratios."""
-        chosen = [number for number, one in enumerate(self.members) if one in kept]
+        chosen = [number for number, member in enumerate(self.members) if member in kept]
         names, weights = self.started.split("+"), np.array(self.weights)[chosen]
         self.members, self.started = (
             [self.members[i] for i in chosen],
@@ -266,10 +266,14 @@ class Mixture(LearnsTogether, ClosedForm):
             return result[0]
         pairs = list(zip(self.weights, result, strict=True))
         # Members are in closed form, and state both.
-        moments = [(weight, one.mean, cast(Tensor, one.variance)) for weight, one in pairs]
+        moments = [(weight, pair.mean, cast(Tensor, pair.variance)) for weight, pair in pairs]
         mean, variance = mixture_moments(moments)
         unknown = torch.stack([weight * cast(Tensor, one.unknown) for weight, one in pairs]).sum(0)
-        parts = [weight * one.explained for weight, one in pairs if one.explained is not None]
+        parts = [
+            weight * each_pair.explained
+            for weight, each_pair in pairs
+            if each_pair.explained is not None
+        ]
         variance, unknown = (each.to(mean.real.dtype) for each in (variance, unknown))
         return Prediction(mean, variance, unknown, torch.stack(parts).sum(0) if parts else None)
 
@@ -297,7 +301,9 @@ class Mixture(LearnsTogether, ClosedForm):
         What other solutions and the residual add to channels is in no path.
         """
         members = [
-            (weight, one) for weight, one in self.weighted_members() if isinstance(one, HasPaths)
+            (weight, weighted_member)
+            for weight, weighted_member in self.weighted_members()
+            if isinstance(weighted_member, HasPaths)
         ]
         if not members:
             raise ValueError("its channels are not made of paths")
@@ -338,7 +344,7 @@ class Mixture(LearnsTogether, ClosedForm):
     @property
     def terms(self) -> tuple[str, ...]:
         """Terms of any member."""
-        return tuple(dict.fromkeys(term for one in self.members for term in one.terms))
+        return tuple(dict.fromkeys(term for member in self.members for term in member.terms))
 
     @property
     def effects(self) -> str:  # type: ignore[override]

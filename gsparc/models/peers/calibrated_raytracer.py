@@ -136,8 +136,8 @@ class CalibratedRayTracer(Checked, Method):
     def _describe_fit(self, dark: int) -> tuple[str, ...]:
         assert self.learned is not None
         materials = ", ".join(
-            f"{name} {one.permittivity:.3g} and {one.conductivity:.2g} S/m"
-            for name, one in self.learned.materials.items()
+            f"{name} {material.permittivity:.3g} and {material.conductivity:.2g} S/m"
+            for name, material in self.learned.materials.items()
         )
         notes = [
             f"permittivity and conductivity of {materials}; residuals "

@@ -176,7 +176,8 @@ def fit_fringes(
     if count < ROWS_PER_WAVE * columns.shape[1]:
         return None, f"no fringes: {count} rows are too few for {columns.shape[1]} coherent waves"
     error, distance = (
-        one[index] for one in _errors_and_distances(every, [*parts, order[:probes]], plain, seed)
+        each_distance[index]
+        for each_distance in _errors_and_distances(every, [*parts, order[:probes]], plain, seed)
     )
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None

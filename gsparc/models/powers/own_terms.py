@@ -165,7 +165,7 @@ class UserTerm(Columns):
 def subtract_means(rows: PowerRows, terms: Sequence[UserTerm]) -> PowerRows:
     """Return rows less what terms have as their mean."""
     places = torch.from_numpy(rows.places)
-    return replace(rows, decibels=rows.decibels - sum(one.mean(places).numpy() for one in terms))
+    return replace(rows, decibels=rows.decibels - sum(term.mean(places).numpy() for term in terms))
 
 
 def add_terms_to_trend(rows: PowerRows, trend: Trend, terms: tuple[UserTerm, ...]) -> Trend:
@@ -216,9 +216,9 @@ def describe_weights(posterior: Exact, terms: tuple[UserTerm, ...]) -> list[Lear
     numbers = torch.stack(
         [weights, std, torch.zeros_like(std), torch.full_like(std, scale**0.5)]
     ).numpy()
-    sizes = [one.columns(at[:1]).shape[1] for one in terms]
+    sizes = [term.columns(at[:1]).shape[1] for term in terms]
     parts = np.split(numbers[:, -sum(sizes) :], np.cumsum(sizes)[:-1], 1)
-    classes = [type(one.term).__name__ for one in terms]
+    classes = [type(each_term.term).__name__ for each_term in terms]
     # Several of one class are told apart by their order.
     order = [classes[: k + 1].count(name) for k, name in enumerate(classes)]
     counted = zip(classes, order, strict=True)

@@ -228,7 +228,8 @@ class NetworkMaps(Columns):
         table[aimed] = ROUND.double()
         still = torch.from_numpy(places[:, :2])
         levels = [
-            one.level + usual_loss(one.points - still[number]) for number, _, one in self.maps
+            each_map.level + usual_loss(each_map.points - still[number])
+            for number, _, each_map in self.maps
         ]
         level = float(np.quantile(torch.cat(levels).numpy(), ALONG))
         return replace(network, table=table, more=(replace(self, level=level),))
@@ -240,11 +241,11 @@ class NetworkMaps(Columns):
     def mean(self, places: Tensor) -> Tensor:
         """See `Columns`; of places of sectors (n, 7), 0 of one without a map."""
         result = places.new_zeros(len(places))
-        for number, _, one in self.maps:
+        for number, _, each_map in self.maps:
             own = (sector_of(places) == number).nonzero()[:, 0]
             if len(own):
                 at = places[own]
-                inside, level = one.look_up(at[:, :2])
+                inside, level = each_map.look_up(at[:, :2])
                 level = inside * (level + usual_loss(first_end(at) - other_end(at)) - self.level)
                 result = result.index_add(0, own, level.to(result))
         return result

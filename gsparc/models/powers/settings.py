@@ -146,7 +146,7 @@ def candidate_priors(
     Of few or very many rows the best law alone. Each law has further `terms`,
     and stands there without a map, too.
     """
-    sure = tuple(one for one in terms if not isinstance(one.term, PriorMap))
+    sure = tuple(term for term in terms if not isinstance(term.term, PriorMap))
     trends = [
         MeanLaw(add_terms_to_trend(rest, trend, some), cost + MAP_COST * (some is not sure), notes)
         for some in ((sure, terms) if len(sure) < len(terms) else (terms,))
@@ -161,9 +161,11 @@ def candidate_priors(
     found = [choose_candidate(rows, trends, seed, max_rows, MIXED_ON)]
     # Other laws have a kernel like it: a short walk from there, not one from anywhere.
     others = [
-        replace(found[0], **one._asdict()) for one in trends if one.trend is not found[0].trend
+        replace(found[0], **each_trend._asdict())
+        for each_trend in trends
+        if each_trend.trend is not found[0].trend
     ]
-    found += [_refine_kernel(rows, one, seed, max_rows) for one in others]
+    found += [_refine_kernel(rows, other, seed, max_rows) for other in others]
     # One row of a place: levels that repeat there to the digit would speak for no noise.
     once = np.sort(np.unique(rows.places, axis=0, return_index=True)[1])
     few = rows.subset(once).draw_subset(MIXED_ON, seed)
@@ -202,18 +204,20 @@ def mix_candidates(
     if len(candidates) == 1:
         return ((1.0, candidates[0].prior),), (candidates[0].description, *candidates[0].notes)
     part = rows.draw_subset(max_rows, seed)
-    posteriors = [condition_on_powers(part, one.prior, seed)[0].posterior for one in candidates]
+    posteriors = [
+        condition_on_powers(part, candidate.prior, seed)[0].posterior for candidate in candidates
+    ]
     # Of all rows: drawn ones are farther apart than those that will answer.
     values = rows.measured_rows.means_at_places()
     near = [
-        condition_on_nearest(one.prior, values, seed, cover=FEW).left_out().mean
-        for one in candidates
+        condition_on_nearest(each_candidate.prior, values, seed, cover=FEW).left_out().mean
+        for each_candidate in candidates
     ]
     gram = AMONG_ROWS * _relative_gram([(values.values - mean)[:, 0].numpy() for mean in near])
     for sides in SPANS:
-        gram += _relative_gram([_errors_without_squares(one, sides) for one in posteriors]) / len(
-            SPANS
-        )
+        gram += _relative_gram(
+            [_errors_without_squares(posterior, sides) for posterior in posteriors]
+        ) / len(SPANS)
     share = best_weights(gram)
     bare = np.flatnonzero([not one.has_map for one in candidates])
     if 0 < len(bare) < len(candidates):
@@ -283,10 +287,13 @@ def _choose_on_part(
     weighed = rows.draw_subset(min(WEIGHED_ON, max_rows), seed)
     both = weighed.silent.any() and not weighed.silent.all()
     candidates = [_fit_one_length(few, *law) for law in trends]
-    scores = [one.score for one in candidates]
+    scores = [candidate.score for candidate in candidates]
     if both:
         weighed = _select_doubtful(weighed, candidates[-1])
-        scores = [_fit_by_evidence(weighed, one, REFINED).score for one in candidates]
+        scores = [
+            _fit_by_evidence(weighed, each_candidate, REFINED).score
+            for each_candidate in candidates
+        ]
     best = candidates[int(np.argmax(scores))]
     if len(few.places) >= TWO_LENGTHS_NEED:
         scale = median_distance(few.view(best.trend).apart)
@@ -368,7 +375,7 @@ def _end_starts(scale: float, kernel: Kernel) -> list[Kernel]:
     starts = []
     for length in (kernel.length, SHARES[0] * scale):
         ends = (EndShadowing(length), EndShadowing(length, other=True))
-        signals = [replace(one, share=1 / 3) for one in (Shadowing(kernel.lengths[-1]), *ends)]
+        signals = [replace(end, share=1 / 3) for end in (Shadowing(kernel.lengths[-1]), *ends)]
         starts.append(replace(kernel, terms=(*signals, kernel.terms[-1])))
     return starts
 

@@ -135,7 +135,7 @@ class ImageProcess(LearnedField):
         if len(val):
             batch = data.batch(val)
             answers = (self.predict(batch).mean, process.predict(batch).mean, batch.target)
-            triples.append([data.site.target.in_error_unit(one).detach() for one in answers])
+            triples.append([data.site.target.in_error_unit(answer).detach() for answer in answers])
         if left_out is not None:
             triples.append([torch.from_numpy(one) for one in left_out.beside_process(self._apart)])
         prediction, _, target = triples[0]

@@ -126,7 +126,7 @@ def equal_settings(own: pd.DataFrame) -> list[str]:
     alike: dict[str, list[str]] = defaultdict(list)
     for setting, runs in own.groupby("setting", sort=False).run:
         figures = (
-            sorted(one for one in run.facts.items() if one[0].startswith(SCORED)) for run in runs
+            sorted(fact for fact in run.facts.items() if fact[0].startswith(SCORED)) for run in runs
         )
         alike[repr(sorted(map(repr, figures)))].append(str(setting))
     return [list_first(names) for names in alike.values() if len(names) > 1]

@@ -327,14 +327,20 @@ def plan_cells(
                 f"like {names[0] if names else 'rfid/random/gp/any/any'}"
             )
     return [
-        one for one in cells if not only or any(fnmatchcase(str(one[1]), part) for part in only)
+        each_cell
+        for each_cell in cells
+        if not only or any(fnmatchcase(str(each_cell[1]), part) for part in only)
     ]
 
 
 def plan_jobs(settings: Mapping[str, Any], cells_dir: Path) -> list[Job]:
     """List the fits that conf/compare.yaml asks for, see `plan_cells`."""
     entries = settings["methods"]
-    unlisted = {name: one for name, one in unlisted_contenders().items() if name not in entries}
+    unlisted = {
+        name: unlisted_contender
+        for name, unlisted_contender in unlisted_contenders().items()
+        if name not in entries
+    }
     methods = unlisted | read_entries("methods", Contender, entries)
     for effort in settings["efforts"]:
         POSITIVE.check("efforts", effort)

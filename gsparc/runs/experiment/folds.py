@@ -234,8 +234,8 @@ def fit_folds(
     return FoldFits(
         # Notes of the first fold stand for all: the others differ in numbers.
         methods,
-        tuple(one.seconds for one in reports),
-        tuple(one.cpu_s for one in reports),
+        tuple(report.seconds for report in reports),
+        tuple(each_report.cpu_s for each_report in reports),
         reports[0].notes,
         sum((one.cost for one in reports), NO_COST),
     )

@@ -42,10 +42,10 @@ def command_line_options() -> dict[str, str]:
     hydra = HydraConfig.get()
     words: dict[str, str] = {}
     # Hydra's own grammar: quotes, lists and + or ~ at the head are not to be split by hand.
-    for one in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
-        path, value = one.key_or_group, one.value()
+    for parse_override in OverridesParser.create().parse_overrides(list(hydra.overrides.task)):
+        path, value = parse_override.key_or_group, parse_override.value()
         inner = dotted_settings(value, f"{path}.") if isinstance(value, dict) else [(path, value)]
-        words |= {name: one.input_line or name for name, _ in inner}
+        words |= {name: parse_override.input_line or name for name, _ in inner}
     return {path: text.lstrip("+") for path, text in words.items()}
 
 

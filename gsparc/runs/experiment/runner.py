@@ -178,7 +178,9 @@ def run_jobs(
         ValueError: none can be done; why the first cannot.
     """
     found = {
-        str(one.name): one.row() for one in jobs if read_finished(one.folder, one.state, one.reuse)
+        str(each_job.name): each_job.row()
+        for each_job in jobs
+        if read_finished(each_job.folder, each_job.state, each_job.reuse)
     }
     missing = [one for one in jobs if str(one.name) not in found]
     log.info("%d cells, %d already done", len(jobs), len(found))

@@ -116,7 +116,7 @@ def plan_rounds(
         data, split: as they are before any condition.
         folder: of the study.
     """
-    learned = dict.fromkeys(one.learned for one in conditions)
+    learned = dict.fromkeys(each_condition.learned for each_condition in conditions)
     content, jobs = measurements_hash(data), []
     for turn, (variant, config), condition in product(range(rounds), configs.items(), learned):
         job_config = OmegaConf.merge(config, {"seed": config.seed + turn})
@@ -236,7 +236,9 @@ class DataChanges:
             "keep": self.keep,
         }
         changed = [
-            Condition(what, float(amount)) for what, every in amounts.items() for amount in every
+            Condition(key, float(amount))
+            for key, each_amount in amounts.items()
+            for amount in each_amount
         ]
         return changed if self.keep else [Condition(), *changed]
 

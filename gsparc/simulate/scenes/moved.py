@@ -69,7 +69,7 @@ def move_solids(solids: Sequence[Solid], moves: Sequence[Move]) -> tuple[list[So
             continue
         matches = [k for k, one in enumerate(result) if one.name.startswith(move.name)]
         if not matches:
-            names = [one.name for one in solids]
+            names = [solid.name for solid in solids]
             hint = suggest_name(move.name, names) or f"; there are {list_first(names, MOST_NAMED)}"
             raise ValueError(f"moved: no object's name begins with {move.name!r}{hint}")
         for k in matches:

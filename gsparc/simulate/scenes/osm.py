@@ -110,7 +110,7 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
     count = len(shapes)
     notes = (
         f"{count} buildings about {origin.latitude:g}, {origin.longitude:g} degrees",
-        *(f"{number} of {count} buildings: {what}" for what, number in sorted(guesses.items())),
+        *(f"{number} of {count} buildings: {guess}" for guess, number in sorted(guesses.items())),
     )
     streets = [line for geometry, tags in features for line in _streets(geometry, tags, origin)]
     (x0, y0), (x1, y1) = box + np.array([[-MARGIN_M], [MARGIN_M]])

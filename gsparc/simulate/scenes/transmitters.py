@@ -106,7 +106,7 @@ def place_transmitters(
             transmitters.append(
                 Transmitter(label, position, Antenna(pattern, azimuth, mast.downtilt_deg))
             )
-    names = [one.name for one in transmitters]
+    names = [transmitter.name for transmitter in transmitters]
     # Files tell stations apart by their names.
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:

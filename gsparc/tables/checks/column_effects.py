@@ -114,12 +114,13 @@ def find_effects(
             _effect(links, plain, pairs, head, texts[head], values[head]) for head in rest
         ]
         effects = sorted(
-            (one for one in candidates if one is not None), key=lambda one: one.contrast
+            (candidate for candidate in candidates if candidate is not None),
+            key=lambda one: one.contrast,
         )
         if not effects:
             break
         # Of columns that tell the same apart the first of the fewest values.
-        alike = (one for one in effects if one.contrast <= ALIKE * effects[0].contrast)
+        alike = (effect for effect in effects if effect.contrast <= ALIKE * effects[0].contrast)
         best = min(alike, key=lambda one: texts[one.head].max())
         found.append(best)
         value = values[best.head]
@@ -143,9 +144,9 @@ def run_warnings(data: Measurements) -> list[str]:
         "a table's",
     }
     return [
-        f"runs explain {one.share:.0%} of what places and stations leave: {hints[one.kind]}"
-        for one in find_effects(links, rows, {"run": data.run.astype(str)})
-        if one.kind in hints
+        f"runs explain {effect.share:.0%} of what places and stations leave: {hints[effect.kind]}"
+        for effect in find_effects(links, rows, {"run": data.run.astype(str)})
+        if effect.kind in hints
     ]
 
 

@@ -143,7 +143,7 @@ def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[s
     ):
         return []
     how = f"{len(data.target)} rows drawn fit the direct path more than 1,000 times better"
-    return _mending(how, {name: one.log_likelihood for name, one in rivals.items()})
+    return _mending(how, {name: rival.log_likelihood for name, rival in rivals.items()})
 
 
 def _tried(data: Measurements) -> list[str]:
@@ -152,7 +152,7 @@ def _tried(data: Measurements) -> list[str]:
 
 def _mending(how: str, rivals: Mapping[str, float]) -> list[str]:
     """The best of rivals by their likelihoods, with those that are as likely, and what mends it."""
-    alike = [name for name, one in rivals.items() if one > max(rivals.values()) - RATIO]
+    alike = [name for name, rival in rivals.items() if rival > max(rivals.values()) - RATIO]
     ways = " or ".join(f"dataset.{name}=true" for name in alike)
     ways += ", which these rows do not tell apart," if len(alike) > 1 else ""
     return [f"{how} with {CONVENTIONS[alike[0]].words}: is it that? {ways} mends it"]
@@ -299,7 +299,7 @@ def _decibels(data: Measurements) -> list[str]:
     if data.target.dtype.kind != "f" or values.max() < LEAST_DB:
         return []
     gains = np.array(
-        [_lobe(one.ravel(), grid.directions().numpy().reshape(-1, 3)) for one in values]
+        [_lobe(value.ravel(), grid.directions().numpy().reshape(-1, 3)) for value in values]
     )
     gains = np.nan_to_num(gains)
     if _of_most_groups(gains, data) < RATIO or np.median(gains) < LOBE:

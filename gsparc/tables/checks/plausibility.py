@@ -324,7 +324,7 @@ def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) ->
     names, rows, warnings = levels.names, levels.rows, []
     for t in dict.fromkeys(t for t, _ in steps):
         who = f"station {names[t]}" if len(names) > 1 else "the level"
-        station_steps = [step for one, step in steps if one == t]
+        station_steps = [step for each_step, step in steps if each_step == t]
         change = " and ".join(
             f"{'rises' if step.change_db > 0 else 'falls'} by {abs(step.change_db):.0f} dB between "
             f"{rows[step.last]} and {rows[step.first]}"

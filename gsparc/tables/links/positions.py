@@ -69,10 +69,10 @@ def _without_fix(check: Checker, measured: str) -> None:
         ):
             x, y = place[off.argmax()]
             faults[f"no such place on Earth, ({x:g}, {y:g}) {'degrees' if degrees else 'm'}"] = off
-        for what, out in [(what, out) for what, out in faults.items() if out.any()]:
+        for fault, out in [(key, out) for key, out in faults.items() if out.any()]:
             which = name_row_ranges([str(name) for name in arrays["row_name"][out]])
             check.notes.append(
-                Caution(f"{which}: {what}; these {out.sum()} of {rows} rows are left out")
+                Caution(f"{which}: {fault}; these {out.sum()} of {rows} rows are left out")
             )
         keep = ~np.any([*faults.values()], axis=0)
         if faults and not keep.all():

@@ -62,7 +62,7 @@ def read_station_table(check: Checker, may_miss: bool = False) -> Stations | Non
         return None
     count = len(places)
     places[no_place] = np.nan
-    names, label = (check.raw.arrays.get(f"station_{what}") for what in ("name", "label"))
+    names, label = (check.raw.arrays.get(f"station_{each_name}") for each_name in ("name", "label"))
     for what, texts in (("station_name", names), ("station_label", label)):
         if texts is not None and not check.has_shape(what, texts, (count,)):
             return None

@@ -200,9 +200,9 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
 def _sources_of(method: Method) -> ImageSourceGP:
     """The sources of largest weight in a model of channels."""
     parts = method.weighted_members() if isinstance(method, ClosedForm) else ()
-    for _, one in sorted(parts, key=lambda part: -part[0]):
-        if isinstance(one, ImageSourceGP):
-            return one
+    for _, each_part in sorted(parts, key=lambda part: -part[0]):
+        if isinstance(each_part, ImageSourceGP):
+            return each_part
     fault = (
         "channels that are no sum of image sources have no compiled form "
         "(model=image_source_gp has)"

@@ -74,7 +74,7 @@ class Basis:
         return get_or_make(
             self.shared,
             (*self.key, key),
-            lambda: torch.stack([self.compress(one) for one in matrices()]),
+            lambda: torch.stack([self.compress(matrix) for matrix in matrices()]),
         )
 
     def compress(self, matrix: Tensor) -> Tensor:

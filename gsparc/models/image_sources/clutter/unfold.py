@@ -87,8 +87,8 @@ class Unfolding:
         table = planes if len(planes) else torch.tensor([[1.0, 0, 0, 0]], dtype=planes.dtype)
         used, exists = table[plane.clamp_min(0)], plane >= 0
         chain = [transmitter.expand(*self.present.shape, -1)]
-        for mirror, here in zip(used, exists, strict=True):
-            chain.append(torch.where(here[..., None], reflect(chain[-1], mirror), chain[-1]))
+        for mirror, exist in zip(used, exists, strict=True):
+            chain.append(torch.where(exist[..., None], reflect(chain[-1], mirror), chain[-1]))
         normal, offset = hesse_form(used)
         self.normal, self.chain = normal.float() * exists[..., None], torch.stack(chain).float()
         self.offset = offset[..., 0].float() * exists

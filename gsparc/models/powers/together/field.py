@@ -243,7 +243,7 @@ class JointPowerField(ClosedForm):
         }
         if self.posterior is not None and self.elsewhere is not None:
             state["processes"] = {
-                str(n): one.state() for n, one in self.posterior.processes.items()
+                str(n): process.state() for n, process in self.posterior.processes.items()
             }
             for name, one in (("posterior", self.posterior), ("elsewhere", self.elsewhere)):
                 state[name] = {"lower": one.factor.lower, "mean": one.mean}
@@ -343,7 +343,7 @@ class JointPowerField(ClosedForm):
         if self._reach is None:
             posterior, _ = self._require_posteriors()
             places = torch.cat(
-                [first_end(one.rows) for one in posterior.processes.values()]
+                [first_end(process.rows) for process in posterior.processes.values()]
             ).numpy()
             self._reach = (
                 cKDTree(places),

@@ -115,8 +115,8 @@ def learn_station_priors(rows: StationRows, seed: int) -> tuple[StationPriors, l
         # What lists hold spreads less than what they were drawn from.
         narrow, (_, kernel) = kernel, fit_kernel_by_evidence(kernel, parts, EVIDENCE_LOOKS)
         wider = kernel.amplitude / narrow.amplitude
-        for number, one in priors.items():
-            kernel_here = replace(kernel, amplitude=wider * one.kernel.amplitude)
+        for number, prior in priors.items():
+            kernel_here = replace(kernel, amplitude=wider * prior.kernel.amplitude)
             priors[number] = Prior(kernel_here, trend)
     for number in numbers:
         if some_silent:
