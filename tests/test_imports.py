@@ -34,8 +34,8 @@ ARROWS = {
     "prediction": "base data datasets field models ops physics processes tables training",
     "evaluation": "base conf data models physics prediction processes tables training",
     "runs": "base data datasets evaluation models physics prediction simulate tables training",
-    "pictures": "base data evaluation field models physics prediction processes runs simulate "
-    "tables training",
+    "pictures": "base data datasets evaluation field models physics prediction processes runs "
+    "simulate tables training",
     "callbacks": "base evaluation field pictures processes training",
     "apps.locate": "base data datasets evaluation models pictures prediction processes runs",
     "apps.maps": "base data models physics pictures prediction processes runs tables",

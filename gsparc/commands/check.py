@@ -41,11 +41,11 @@ def check(
     # Here: they bring torch, which --help does not need.
     from gsparc.data.outliers import outlier_warnings
     from gsparc.datasets.campaign import find_implausible
+    from gsparc.datasets.describe import describe
     from gsparc.datasets.load import split_for
     from gsparc.datasets.own import read_any
     from gsparc.models.powers.together.network import check_azimuths
     from gsparc.tables.checks.array_layout import carrier_warnings, layout_warnings
-    from gsparc.tables.checks.describe import describe
 
     try:
         reading = read_any(path, columns=columns, stations_file=stations_file, **settings)

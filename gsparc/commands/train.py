@@ -76,16 +76,9 @@ def train(
             keep = partial(folds.keep_fold, split, contexts, run_id)
             fits = folds.fit_folds(method, data, split, contexts, learned=inputs.learned, keep=keep)
             unused = options.warn_of_unheeded(config, fits.methods[0], data) if in_full else None
-            evaluation = evaluate(
-                fits.methods,
-                fits.train_s,
-                data,
-                split,
-                eval_on=config.eval_on,
-                baselines=config.baselines,
-                shared=same_as_baseline(config, method),
-                timed=in_full,
-            )
+            how: dict[str, Any] = {"eval_on": config.eval_on, "baselines": config.baselines}
+            how |= {"shared": same_as_baseline(config, method), "timed": in_full}
+            evaluation = evaluate(fits.methods, fits.train_s, data, split, **how)
             folds.end_curves(contexts, fits.train_s, evaluation.columns, config.eval_on)
             facts = {**evaluation.facts, **summary.provenance(), **fits.facts(), "run_id": run_id}
             facts |= {"seed": int(config.seed), "options/unused": unused}

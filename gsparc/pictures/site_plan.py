@@ -19,6 +19,12 @@ from gsparc.data.outliers import find_outliers, too_far
 from gsparc.data.schema import ENDS, Measurements
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
+from gsparc.datasets.describe import (
+    distinct_places,
+    held_out_block_rows,
+    propose_side,
+    spacing_words,
+)
 from gsparc.physics.decibels import to_decibels
 from gsparc.pictures.drawing import PALETTE, panels, save
 from gsparc.pictures.from_above import (
@@ -29,12 +35,6 @@ from gsparc.pictures.from_above import (
     frame_of,
     legend_below,
     set_bounds,
-)
-from gsparc.tables.checks.describe import (
-    distinct_places,
-    held_out_block_rows,
-    propose_side,
-    spacing_words,
 )
 from gsparc.tables.checks.level_steps import LevelStep
 from gsparc.tables.checks.link_levels import LinkLevels

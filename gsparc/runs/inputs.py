@@ -14,13 +14,13 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.data.walls import read_walls
 from gsparc.datasets.datamodule import DataModule
+from gsparc.datasets.describe import summarise
 from gsparc.datasets.load import datamodule, split_for
 from gsparc.models import checkpoint
 from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, fill_defaults
 from gsparc.runs.align_site import align_to_site
 from gsparc.runs.settings import RunSettings, to_dict
-from gsparc.tables.checks.describe import summarise
 from gsparc.training import tracking
 from gsparc.training.effort import Effort
 

@@ -9,9 +9,9 @@ from layouts import KINDS, POSTS, rows_of
 import gsparc
 from gsparc.data.row_order import find_copies, order_rows
 from gsparc.data.splits import Fold
+from gsparc.datasets.describe import describe
 from gsparc.models import device_offsets
 from gsparc.models.channels.columns import group_channels
-from gsparc.tables.checks.describe import describe
 from gsparc.tables.heads import KINDS as TABLE_KINDS
 from gsparc.tables.own import from_arrays, interpret
 from gsparc.tables.raw import Raw

@@ -278,10 +278,12 @@ def test_files_that_a_setting_names_in_a_list_a_folder_or_behind_a_link_count_by
         "inner link": str(tmp_path / "in"),
         "nested": [{"of": [str(folder / "b.tif")]}],
     }[how]
+
     def of():
         return FitInputs.from_config(
             OmegaConf.create({"model": {"prior": value, "name": str(folder)}})
         )
+
     before = of()
     assert before == of() and [*before.files] == ["model.prior"]
     run_once(tmp_path / "in" / "fit", before, ends(tmp_path / "in" / "fit"))

@@ -5,7 +5,7 @@ and asks about holes wider than the places are apart.
 import numpy as np
 from invented import divide, invent
 
-from gsparc.tables.checks.describe import (
+from gsparc.datasets.describe import (
     held_out_block_rows,
     propose_side,
     propose_split,
