@@ -19,15 +19,8 @@ from gsparc.data.limits import SettingError, whole
 from gsparc.evaluation.console import open_console
 from gsparc.models import checkpoint
 from gsparc.prediction.operating_point import load
-from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.updating import versions_extra
 
 OTHERS = 64  # files that are open beside connections: the log, libraries
-
-
-def keep_versions(ckpt: str, predictor: Predictor) -> None:
-    """Store what later rows made of a model in its file, whole or not at all."""
-    checkpoint.update_extra(ckpt, versions_extra(predictor.versions), ckpt)
 
 
 def is_loopback(host: str) -> bool:
@@ -49,21 +42,23 @@ def task(config: DictConfig) -> None:
     if find_spec("fastapi") is None or find_spec("uvicorn") is None:
         raise DataError("gsparc serve needs the extra `serve`: pip install 'gsparc[serve]'")
     from gsparc.apps.export.serving import LimitedServer, Limits, build_application
+    from gsparc.apps.export.told_file import ToldFile
 
     limits = Limits(**{field.name: config[field.name] for field in fields(Limits)})
     needed, allowed = 2 * limits.connections + OTHERS, resource.getrlimit(resource.RLIMIT_NOFILE)[0]
     if 0 <= allowed < needed:
         files = f"{needed} open files may be needed, {allowed} are allowed"
         raise SettingError(f"connections={limits.connections}: {files}; say ulimit -n {needed}")
-    predictor = load(config.ckpt, unit=config.unit).select_station(config.station)
+    stored, as_stored = checkpoint.read(config.ckpt), partial(load, unit=config.unit)
+    predictor = as_stored(stored).select_station(config.station)
     site, powers = predictor.site, predictor.site.target.is_level
     # Powers of all stations are one answer; channels and spectra are of one station each.
     if site.paired or (site.stations and not powers):
         raise DataError("serve: one end that stands still is needed; of several stations say station=NAME")
-    keep = partial(keep_versions, config.ckpt, predictor) if config.updates else None
-    if keep is not None and (config.station is not None or not powers):
+    told = ToldFile(stored, as_stored) if config.updates else None
+    if told is not None and (config.station is not None or not powers):
         raise DataError("updates=true: is of powers, and of all stations of the model")
-    app = build_application(predictor, limits, token, keep)
+    app = build_application(predictor, limits, token, told)
     open_console().print(f"{predictor} at http://{config.host}:{config.port}", highlight=False, markup=False)
     gc.freeze()  # going through all that was loaded held up answers by half a second
     with suppress(KeyboardInterrupt):  # the server has ended by then

@@ -13,50 +13,39 @@ from omegaconf import DictConfig
 from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.data.errors import DataError
 from gsparc.data.files import write_whole
-from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, switch, whole
+from gsparc.data.limits import check_arguments, or_null, switch, whole
 from gsparc.evaluation.open_runs import read_like_stored
 from gsparc.evaluation.summary import coordinates
 from gsparc.evaluation.table import Column, Table
 from gsparc.models import checkpoint
+from gsparc.prediction.later_rows import check_updatable, read_level_rows
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.updating import check_updatable, level_rows, versions_extra
+from gsparc.prediction.updating import LIMITS, ToldBefore, versions_extra
 from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
-LIMITS = {
-    "window": whole(1), "fade_db": number(0), "undo": whole(0), "false_alarm": POSITIVE,
-    "batch": or_null(whole(1)), "refit": switch(),
-}  # fmt: skip
+OWN_LIMITS = {"undo": whole(0), "batch": or_null(whole(1)), "again": switch()}
 COLUMNS = ("station", "kind", "since", "at", "change_db", "x", "y")  # and degrees where they are known
 
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Condition a model on a file's rows, or go back; return the facts of `summary.json`."""
     run_dir, settings = begin_run(config)
-    check_arguments(config, **LIMITS)
+    check_arguments(config, **LIMITS, **OWN_LIMITS)
     if (config.data is None) == (config.undo == 0):
         raise DataError("gsparc update: say data=FILE to add rows, or undo=COUNT to take updates back")
-    stored = checkpoint.read(config.ckpt)
-    check_updatable(stored.site)  # before the data are read
-    predictor = load(config.ckpt)
-    alarms_before, watch, row_count, skipped = len(predictor.alarms), Stopwatch(), 0, 0
-    if config.undo:
-        predictor.undo(config.undo)
-    else:
-        data, placed = read_like_stored(stored, config.data)
-        if not placed:
-            raise DataError(f"{config.data}: has no places; later rows need them")
-        how = {name: settings[name] for name in ("window", "fade_db", "false_alarm")}
-        rows = level_rows(data, predictor.site)
-        size = config.batch or len(rows)
-        for start in range(0, len(rows), size):
-            refit = config.refit and start + size >= len(rows)
-            found = predictor.update(rows.subset(slice(start, start + size)), refit=refit, **how)
-            row_count, skipped = row_count + len(found.rows), skipped + found.skipped
-    seconds, out = watch.seconds, config.out or config.ckpt
-    checkpoint.update_extra(config.ckpt, versions_extra(predictor.versions), out)
+    with checkpoint.rewriting(config.ckpt, config.out) as file:
+        check_updatable(file.stored.site)  # before the data are read
+        predictor = load(file.stored)
+        alarms_before, watch, row_count, skipped = len(predictor.alarms), Stopwatch(), 0, 0
+        if config.undo:
+            predictor.undo(config.undo)
+        else:
+            row_count, skipped = _add_rows(predictor, file.stored, config, settings)
+        seconds, out = watch.seconds, config.out or config.ckpt
+        file.store(versions_extra(predictor.versions))
     table = alarm_rows(predictor)
     text = io.StringIO()
     writer = csv.DictWriter(text, dict.fromkeys([*COLUMNS, *(table or [{}])[0]]), lineterminator="\n")
@@ -74,6 +63,27 @@ def task(config: DictConfig) -> dict[str, Any]:
     message += f", {seconds:.2g} s"
     before = f"update: {message}; model in {out}; summary "
     return finish_run(run_dir, facts, *[changes_table(table)] * bool(table), before=before)
+
+
+def _add_rows(
+    predictor: Predictor, stored: checkpoint.StoredModel, config: DictConfig, settings: dict[str, Any]
+) -> tuple[int, int]:
+    """Tell the rows of a file; return how many are kept, and how many were skipped."""
+    data, placed = read_like_stored(stored, config.data)
+    if not placed:
+        raise DataError(f"{config.data}: has no places; later rows need them")
+    how = {name: settings[name] for name in ("window", "fade_db", "false_alarm")}
+    rows, row_count, skipped = read_level_rows(data, predictor.site), 0, 0
+    size, content = config.batch or len(rows), rows.content()
+    if content in predictor.told and not config.again:
+        fault = f"the same rows were told to {config.ckpt} before"
+        raise ToldBefore(f"{config.data}: {fault}; again=true tells them once more")
+    for start in range(0, len(rows), size):
+        refit = config.refit and start + size >= len(rows)
+        key = content if start == 0 and not config.again else None
+        found = predictor.update(rows.subset(slice(start, start + size)), refit=refit, key=key, **how)
+        row_count, skipped = row_count + len(found.rows), skipped + found.skipped
+    return row_count, skipped
 
 
 def alarm_rows(predictor: Predictor) -> list[dict[str, Any]]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import math
 import pickle
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from torch import Tensor
 
 from gsparc.data.errors import DataError
 from gsparc.data.files import list_causes, load_yaml, whole_file
+from gsparc.data.locks import hold_file
 from gsparc.data.raw import verified_archive
 from gsparc.data.schema import Site, Stations
 from gsparc.models.method import Method, import_path
@@ -28,6 +30,7 @@ PARTS = {"format", "version", "config", "method", "target", "site", "state", "ex
 DEEPEST = 50  # of containers in containers
 RENAMED = {"freedom": "unknown_factor"}  # facts of sites in older checkpoints
 MODEL = "model.ckpt"  # of a run's folder
+WAIT_S = 60.0  # for others who write a file: a large file of later rows takes seconds
 
 
 class CheckpointError(ValueError):
@@ -46,6 +49,7 @@ class StoredModel:
         state: what `Method.restore` needs.
         extra: what a trainer or harness added (optimizer, random states, position in the data order, split).
         path: the file.
+        sha256: of all that it holds; "" of older files.
     """
 
     method: str
@@ -55,6 +59,7 @@ class StoredModel:
     state: dict[str, Any]
     extra: dict[str, Any] = field(default_factory=dict)
     path: Path = Path()
+    sha256: str = ""
 
     @property
     def configuration(self) -> dict[str, Any]:
@@ -91,7 +96,8 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
         extra: tensors, numbers, strings, None, nested dicts and lists.
 
     Raises:
-        CheckpointError: something in the state is of another type, its place is named; or there is no room.
+        CheckpointError: something in the state is of another type or not finite, its place is named; there is
+            no room; or another process writes the file.
     """
     if method.site is None:
         raise CheckpointError(f"{path}: {method.name} has not been fitted, there is nothing to store")
@@ -101,34 +107,88 @@ def save(path: str | Path, method: Method, config: str = "", extra: Mapping[str,
         "site": _to_plain(asdict(method.site), "site"), "state": _to_plain(method.state(), "state"),
         "extra": _to_plain(dict(extra or {}), "extra"),
     }  # fmt: skip
-    _write(Path(path), content)
+    with _one_writer(Path(path), WAIT_S):
+        _write(Path(path), content)
 
 
-def update_extra(path: str | Path, extra: Mapping[str, Any], out: str | Path | None = None) -> None:
-    """Add to (or replace in) the `extra` of a checkpoint; everything else in the file stays as it is.
+class Rewriting:
+    """A checkpoint that nobody else writes meanwhile; see `rewriting`.
+
+    Args:
+        path: the file that is read.
+        out: the file that is written.
+
+    Attributes:
+        stored: what the file holds.
+    """
+
+    def __init__(self, path: Path, out: Path) -> None:
+        self._content, self._out = _read_content(path), out
+        self.stored = _stored_from_content(self._content, path)  # refuses what is incomplete
+
+    def store(self, extra: Mapping[str, Any]) -> None:
+        """Add to (or replace in) `stored.extra`; everything else in the file stays as it is.
+
+        Raises:
+            CheckpointError: as `save` does; the file is then as it was.
+        """
+        self._content["extra"] = {**self._content["extra"], **_to_plain(dict(extra), "extra")}
+        self.stored = _write(self._out, self._content)
+
+
+@contextmanager
+def rewriting(path: str | Path, out: str | Path | None = None, wait_s: float = WAIT_S) -> Iterator[Rewriting]:
+    """Hold a checkpoint from reading to writing: of two who add to it at once, one waits for the other.
 
     With `out` the result is another file, and `path` stays.
 
+    >>> with rewriting("model.ckpt") as file:
+    ...     file.store({"note": len(file.stored.extra)})
+
     Raises:
-        CheckpointError: as `read` and `save` do; the file is then as it was.
+        CheckpointError: as `read` does; or others wrote it for so long [s].
     """
-    path = Path(path)
-    content = _read_content(path)
-    _stored_from_content(content, path)  # refuses what is incomplete
-    content["extra"] = {**content["extra"], **_to_plain(dict(extra), "extra")}
-    _write(path if out is None else Path(out), content)
+    target = Path(path if out is None else out)
+    with _one_writer(target, wait_s):
+        yield Rewriting(Path(path), target)
 
 
-def _write(path: Path, content: dict[str, Any]) -> None:
+def update_extra(path: str | Path, extra: Mapping[str, Any]) -> None:
+    """Add to a checkpoint what does not depend on what is in it; see `Rewriting.store`."""
+    with rewriting(path) as file:
+        file.store(extra)
+
+
+@contextmanager
+def _one_writer(path: Path, wait_s: float) -> Iterator[None]:
+    """Hold a file that is there; of a new one nothing can be lost."""
+    with ExitStack() as held:
+        try:
+            _ = held.enter_context(hold_file(path, wait_s)) if path.is_file() else None
+        except TimeoutError as error:
+            busy = f"others have been writing it for {wait_s:g} s; try again, or write another file"
+            raise CheckpointError(f"{path}: {busy}") from error
+        except OSError as error:
+            why = error.strerror or error
+            raise CheckpointError(f"{path}: cannot be locked ({why}); what was there is kept") from error
+        yield
+
+
+def _write(path: Path, content: dict[str, Any]) -> StoredModel:
+    """Write what passes as it would when it is read: what nobody could read takes no file's place."""
+    content.pop("sha256", None)
+    _check_content(content, path)
     content["sha256"] = _content_digest(content)
+    stored = _stored_from_content(content, path)
     try:
-        with whole_file(path) as partial, partial.open("wb") as file:
+        with whole_file(path.resolve()) as partial, partial.open("wb") as file:
             torch.save(content, file)
     except (OSError, RuntimeError) as error:  # torch's writer makes the second of the first
         # What the system said, under whatever a library wrapped around it.
         reason = next((one.strerror for one in list_causes(error) if isinstance(one, OSError)), None)
         why = reason or "is the disk full?"
         raise CheckpointError(f"{path}: cannot be written ({why}); what was there is kept") from error
+    return stored
 
 
 def read(path: str | Path) -> StoredModel:
@@ -184,6 +244,11 @@ def _read_content(path: Path) -> dict[str, Any]:
         reason = str(error).strip().splitlines()
         why = reason[0] if reason else type(error).__name__
         raise CheckpointError(f"{path}: cannot be read ({why})") from None
+    return _check_content(content, path)
+
+
+def _check_content(content: Any, path: Path) -> dict[str, Any]:
+    """Return what a file holds, or is to hold, if it is of our format, whole and of finite numbers."""
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise CheckpointError(f"{path}: not a gsparc checkpoint (weights of another program?)")
     version = content.get("version")
@@ -223,7 +288,7 @@ def _stored_from_content(content: Mapping[str, Any], path: Path) -> StoredModel:
         return StoredModel(
             method=str(content["method"]), target=str(content["target"]), config=str(content["config"]),
             site=_site_from(content["site"]), state=dict(content["state"]), extra=dict(content["extra"]),
-            path=path,
+            path=path, sha256=str(content.get("sha256", "")),
         )  # fmt: skip
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise CheckpointError(f"{path}: incomplete checkpoint ({type(error).__name__}: {error})") from None

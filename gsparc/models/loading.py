@@ -54,14 +54,14 @@ def rebuild_method(factory: MethodFactory, stored: checkpoint.StoredModel) -> Me
     return method
 
 
-def load(path: str | Path) -> tuple[Method, checkpoint.StoredModel]:
-    """Return `restore(read(path))` with rows that came later, and what else the file holds.
+def load(path: str | Path | checkpoint.StoredModel) -> tuple[Method, checkpoint.StoredModel]:
+    """Return the model of a file, or of what was read of it, with later rows, and what else it holds.
 
     Raises:
         CheckpointError: as these two.
     """
-    stored = checkpoint.read(path)
-    return with_changes(method_from_checkpoint(stored), stored_changes(stored.extra)), stored
+    stored = path if isinstance(path, checkpoint.StoredModel) else checkpoint.read(path)
+    return with_changes(method_from_checkpoint(stored), stored_changes(stored.extra, stored.path)), stored
 
 
 def load_module(path: str | Path) -> GaussianModule:

@@ -111,8 +111,9 @@ def choose_within_budget(
 
 
 def load(
-    path: str | Path, budget_ms: float | None = None, confidence: str | None = None, unit: str | None = None
-) -> Predictor:
+    path: str | Path | checkpoint.StoredModel, budget_ms: float | None = None, confidence: str | None = None,
+    unit: str | None = None,
+) -> Predictor:  # fmt: skip
     """Load the model in a checkpoint, ready to be asked.
 
     >>> gsparc.load("model.ckpt").rssi(rx=[2.0, 1.0, 1.5]).shape
@@ -122,7 +123,7 @@ def load(
     'mW'
 
     Args:
-        path: the file.
+        path: the file, or what `checkpoint.read` read of it.
         budget_ms: what one query may take on this machine, end to end [ms]. The operating points that
             `gsparc tradeoff` stored with the model are timed here (a few seconds), the most
             accurate that fits answers, and torch's number of threads becomes that point's.

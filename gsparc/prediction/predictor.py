@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from copy import copy
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -59,7 +60,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         site: the dataset's fixed facts: `kind`, the `box` of places [m, local] and its `origin`, `stations`.
         whole: asked for the confidence, where `method` spares it; None asks `method`.
         point: the operating point `method` answers at, if one was chosen (`load(budget_ms=...)`), else None.
-        extra: what else the checkpoint holds, such as the split's hash; empty after `fit`.
+        extra: what else the checkpoint holds, such as the split's hash.
         trusted: which confidence is answered, and from when on a prediction is accepted (`gsparc calibrate`).
         kind: of the confidence, as in `load`; None: as `trusted` says.
         unit: of powers; None: that of the measurements. The attribute is "1" of channels and spectra.
@@ -84,6 +85,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         self.unit = self._answer_unit(None).name  # "1" of channels and spectra
         self._device = MEAN_DEVICE
         self._prepared: list[Method] = []  # whose caches were filled outside of transforms
+        # Of the whole model, and which of its stations is asked: later rows are of it in every view.
+        self._model_site, self._own_station = site, None
 
     def __repr__(self) -> str:
         # Boxes are in local coordinates, users read the world's.
@@ -138,9 +141,10 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         # By number: two stations at one place, with different carriers, cannot be told apart by it.
         both = self.method, self._whole
         method, whole = (None if m is None else m.station_method(number) for m in both)
-        copy = self._copy_with(method, whole, station_site(self.site, number), self._unit)
-        copy.queries = Queries(copy.site, None if isinstance(self.method, PerStation) else number)
-        return copy
+        view = self._view(method, whole, station_site(self.site, number), self._unit)
+        view.queries = Queries(view.site, None if isinstance(self.method, PerStation) else number)
+        view._own_station = number
+        return view
 
     def select_carrier(self, frequency_hz: float) -> Predictor:
         """Return the same model asked about one carrier [Hz], also one that nobody measured if it can.
@@ -164,12 +168,15 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         if not all(isinstance(one, AddsCarriers) for one in both):
             raise ValueError(f"frequency_hz={frequency_hz:g}: {self.method.name} has no other carriers")
         method, whole = (cast(AddsCarriers, one).add_carrier(frequency_hz) for one in both)
-        return self._copy_with(method, whole, method.fitted_site, self._unit).ask_station(len(carriers))
+        return self._view(method, whole, method.fitted_site, self._unit).ask_station(len(carriers))
 
-    def _copy_with(self, method: Method, whole: Method | None, site: Site, unit: str | None) -> Predictor:
-        copy = Predictor(method, site, whole, self.point, self.trusted, self.kind, self.extra, unit)
-        copy._device, copy.queries = self._device, Queries(site, self.queries.station)
-        return copy
+    def _view(self, method: Method, whole: Method | None, site: Site, unit: str | None) -> Predictor:
+        """A copy that goes on from here apart: whatever is not given stays, later rows too."""
+        view = copy(self)
+        view.method, view._whole, view.site, view._unit = method, whole or method, site, unit
+        view.unit = view._answer_unit(None).name
+        view.queries, view._prepared = Queries(site, self.queries.station), []
+        return view
 
     def select_device(self, device: str) -> Predictor:
         """Return the same model answering as one of the devices that measured would read.
@@ -179,9 +186,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         Raises:
             ValueError: no device is called that.
         """
-        copy = self._copy_with(self.method, self._whole, self.site, self._unit)
-        copy._device = find_device(device, self.site)
-        return copy
+        view = self._view(self.method, self._whole, self.site, self._unit)
+        view._device = find_device(device, self.site)
+        return view
 
     def in_levels(self, unit: str | None) -> Predictor:
         """Return the same model whose powers and maps are levels in `unit`, dBm or dBW; None: as measured.
@@ -189,7 +196,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         Raises:
             ValueError: decibels of a reference that nobody knows.
         """
-        return self._copy_with(self.method, self._whole, self.site.in_levels(unit), None)
+        return self._view(self.method, self._whole, self.site.in_levels(unit), None)
 
     def _answer_unit(self, unit: str | None) -> PowerUnit:
         """The unit that answers are wanted in."""
@@ -276,7 +283,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         # One call for all stations where the method has one, else a call for each.
         every = self.method.all_stations() if isinstance(self.method, PerStation) else None
         if every is not None:
-            return ask(self._copy_with(every, None, station_site(self.site, 0), self._unit))
+            return ask(self._view(every, None, station_site(self.site, 0), self._unit))
         stations = self._each_station()
         answers = [None if predictor is None else ask(predictor) for predictor in stations]
         answer = next(one for one in answers if one is not None)
@@ -336,6 +343,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         """Return the channel (B, antennas, subcarriers) complex64, in the physical units of the measurements.
 
         All three axes are there for one antenna or tone, too: of measured channels (B, K) take `[:, 0]`.
+        What was constant in all rows, as null tones are, is NaN.
 
         >>> heard, tones = np.exp(1j * places[:, :1] * [1, 2]), [2.4e9, 2.41e9]  # (60, 2)
         >>> near = gsparc.fit(rx=places, tx=[9.0, 9.0, 2.6], csi=heard, frequency_hz=tones, model="nearest")
@@ -351,7 +359,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
             grad: as in `predict`; at the measured tones alone.
         """
         if uplink is None and frequency_hz is None and symbols is None:
-            return self._predict_mean("csi", tx, rx, grad)
+            return self.site.in_shape_of_file(self._predict_mean("csi", tx, rx, grad))
         if grad:
             raise ValueError("grad=True: channels have gradients at positions and the measured tones alone")
         from gsparc.prediction import channels
@@ -425,9 +433,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
             moments, single = self._predict_grad(self.method, tx, rx, wanted)
             return moments.mean[0] if single else moments.mean
         query, single, as_torch = self.queries.query(tx, rx)
-        return match_input(
-            self._in_unit(predict_with_threads(self.method, query), wanted).mean, single, as_torch
-        )
+        stored = predict_with_threads(self.method, query)
+        mean = self._in_unit(stored, wanted).mean.to(stored.mean.dtype)
+        return match_input(mean, single, as_torch)
 
     def _predict_grad(self, method: Method, tx: Any, rx: Any, wanted: PowerUnit) -> tuple[Prediction, bool]:
         """Moments in a unit that autograd follows, and whether one position was given; see the class."""
@@ -443,4 +451,5 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         # In decibels a variance depends on the mean too.
         variance = None if stored.variance is None else unit.variance(stored.mean, stored.variance)
         explained = None if stored.explained is None else unit.values(stored.explained).to(stored.mean.dtype)
-        return Prediction(unit.values(stored.mean).to(stored.mean.dtype), variance, stored.unknown, explained)
+        mean = unit.values(stored.mean)  # in float64, as levels of -100 dB in float32 lose 1e-5 dB
+        return Prediction(mean, variance, stored.unknown, explained)

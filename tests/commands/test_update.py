@@ -6,17 +6,23 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
 from doors import knock
 from rooms_later import PLACES, SCREENED, levels, room_file
+from told import CLIENTS, Soak
 
 import gsparc
 from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
+from gsparc.prediction.updating import versions_extra
+
+SOAK_S = int(os.environ.get("GSPARC_SOAK_S", "15"))
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +52,24 @@ def test_rows_of_a_file_are_told_and_taken_back(before, tmp_path):
     assert update(tmp_path / "back", f"ckpt={out}", "undo=4")[0].status == 0
     again = gsparc.load(out)
     assert np.array_equal(again.rssi(rx=at), old.rssi(rx=at))
+
+
+def test_a_file_that_is_told_twice_is_taken_once_unless_it_is_said(before, tmp_path):
+    new, out = room_file(tmp_path / "new.npz", 40), tmp_path / "after.ckpt"
+    assert update(tmp_path / "run", f"ckpt={before}", f"data={new}", f"out={out}", "batch=30")[0].status == 0
+    (tmp_path / "copy.npz").write_bytes(new.read_bytes())  # by content, whatever it is called
+    answer, _ = update(tmp_path / "twice", f"ckpt={out}", f"data={tmp_path}/copy.npz")
+    assert answer.status != 0 and "again=true tells them once more" in " ".join(answer.err)
+    assert len(gsparc.load(out).rows) == 40
+    update(tmp_path / "again", f"ckpt={out}", f"data={new}", "again=true")
+    assert len(gsparc.load(out).rows) == 80
+
+
+def test_rows_of_another_site_are_refused(before, tmp_path):
+    places, file = PLACES[:5] + np.array([2e6, 0, 0]), tmp_path / "far.npz"
+    np.savez(file, rx_position=places, tx_position=np.array([9.0, 9.0, 2.6]), rssi_db=levels(places, 0))
+    answer, _ = update(tmp_path / "run", f"ckpt={before}", f"data={file}")
+    assert answer.status != 0 and "km from all rows" in " ".join(answer.err)
 
 
 def test_changes_are_listed_where_they_are(before, tmp_path):
@@ -80,6 +104,40 @@ def test_a_model_of_channels_was_refused_for_the_name_of_its_new_rows(tmp_path):
 def test_a_model_of_powers_takes_no_spectra(before):
     with pytest.raises(TypeError, match="takes rssi=, not spectrum="):
         gsparc.load(before).update(rx=PLACES[:1], spectrum=[1.0])
+
+
+def test_rows_that_came_while_a_file_was_read_were_overwritten(before, tmp_path):
+    """Of four updates of 30 rows at once 60 rows were left."""
+    live, new, held = tmp_path / "live.ckpt", room_file(tmp_path / "new.npz", 40), threading.Event()
+    live.write_bytes(before.read_bytes())
+
+    def tell():
+        with checkpoint.rewriting(live) as file:
+            held.set()
+            predictor = gsparc.load(file.stored)
+            predictor.update(rx=PLACES[:3], rssi=[-60.0] * 3)
+            time.sleep(0.5)
+            file.store(versions_extra(predictor.versions))
+
+    with ThreadPoolExecutor(1) as pool:
+        beside = pool.submit(tell)
+        held.wait()
+        assert update(tmp_path / "run", f"ckpt={live}", f"data={new}")[0].status == 0
+        beside.result()
+    assert len(gsparc.load(live).rows) == 43
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(200 + SOAK_S)
+def test_rows_that_were_acknowledged_were_lost(tmp_path, capsys):
+    """83 of 218 that a server and `gsparc update` took in a minute; `GSPARC_SOAK_S=60`: for a minute."""
+    pytest.importorskip("uvicorn", reason="the extra `serve` is not installed")
+    counts = Soak(tmp_path, SOAK_S, alive_s=5).counts()
+    with capsys.disabled():
+        sys.stderr.write(f"{counts}\n")
+    assert counts["told"] > counts["by command"] > 0 and counts["kills"] > 0
+    assert counts["lost"] == counts["twice"] == counts["of nobody"] == 0
+    assert counts["of these on disk"] <= CLIENTS * counts["kills"]  # what was in flight
 
 
 @pytest.mark.slow

@@ -3,7 +3,9 @@
 import collections
 import os
 import re
+import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 
@@ -154,6 +156,51 @@ def test_numbers_that_are_not_finite_are_refused_by_name(path, part, value):
     tensor.view(-1)[0] = value
     torch.save(content, path)
     refused(rf"m\.ckpt: {part}\.{name}\[0.*\] is NaN or infinite", checkpoint.read, path)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_what_could_never_be_read_was_written_and_took_the_place_of_what_could(fitted, path, value):
+    """A state with NaN was trained, written and praised; only `gsparc.load` refused it."""
+    method, before = fitted[0], path.read_bytes()
+    sound = method.state()
+    name = next(key for key, one in sound.items() if isinstance(one, torch.Tensor))
+    method.state = lambda: sound | {name: torch.full((2,), value)}
+    refused(rf"m\.ckpt: state\.{name}\[0\] is NaN or infinite", checkpoint.save, path, method)
+    with checkpoint.rewriting(path) as file:
+        file._content["site"].pop("name")
+        refused(r"m\.ckpt: incomplete checkpoint", file.store, {})
+    assert path.read_bytes() == before and list(path.parent.glob(".*")) == []
+
+
+def test_rows_of_who_wrote_meanwhile_were_lost(path):
+    """Read, change and write of one were within those of another."""
+
+    def add(name):
+        for turn in range(5):
+            with checkpoint.rewriting(path) as file:
+                told = file.stored.extra.get("told", [])
+                time.sleep(0.01)
+                file.store({"told": [*told, (name, turn)]})
+
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(add, range(4)))
+    told = checkpoint.read(path).extra["told"]
+    assert sorted(told) == [(name, turn) for name in range(4) for turn in range(5)]
+
+
+def test_a_writer_that_stays_is_said(path, tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoint, "WAIT_S", 0.0)
+    link = tmp_path / "link.ckpt"
+    link.symlink_to(path)
+    with ThreadPoolExecutor(1) as pool, checkpoint.rewriting(path):
+        busy = r"link\.ckpt: others have been writing it for 0 s; try again, or write another file"
+        with pytest.raises(CheckpointError, match=busy):
+            pool.submit(lambda: checkpoint.rewriting(link, wait_s=0).__enter__()).result()
+        with pytest.raises(CheckpointError, match="others have been writing it"):
+            pool.submit(checkpoint.save, path, loading.load(path)[0]).result()
+        pool.submit(lambda: checkpoint.rewriting(path, tmp_path / "other.ckpt").__enter__()).result()
+    checkpoint.update_extra(link, {"note": 1})
+    assert link.is_symlink() and checkpoint.read(path).extra["note"] == 1
 
 
 def leaves(part, at=()):

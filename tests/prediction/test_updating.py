@@ -1,5 +1,6 @@
 """A predictor that is told of later rows, and goes back."""
 
+import inspect
 import time
 
 import numpy as np
@@ -8,6 +9,8 @@ from refusals import refused
 from rooms_later import PLACES, SCREENED, draw, levels, truth
 
 import gsparc
+from gsparc.prediction.later_rows import read_level_arrays
+from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.updating import VERSIONS
 from gsparc.processes import factor
 
@@ -121,9 +124,66 @@ def test_a_refit_finds_that_a_change_is_small(predictor):
     assert misses[1] < 0.95 * misses[0], misses
 
 
+@pytest.fixture(scope="module", params=["gp", "powers"])  # each station apart, and all together
+def stations(request):
+    """A model of three stations and two phones, levels (n, 3) at places, and places of later rows."""
+    rng = np.random.default_rng(0)
+    masts, places = np.c_[rng.uniform(0, 40, (3, 2)), np.full(3, 8.0)], draw(40, 4)
+
+    def heard(at):
+        return -40 - 25 * np.log10(np.linalg.norm(at[:, None] - masts, axis=-1))
+
+    phone = rng.integers(0, 2, 40).repeat(3)
+    rows = {"rx": places.repeat(3, 0), "rssi": heard(places).ravel() + 4 * phone, "unit": "dBm"}
+    names = {"station": np.tile(range(3), 40), "station_name": np.array(["a", "b", "c"])}
+    device = np.array(["p", "q"])[phone]
+    model = gsparc.fit(**rows, **names, station_position=masts, device=device, model=request.param)
+    return model, heard, draw(10, 6)
+
+
+VIEWS = {"select_station": ["b"], "ask_station": [1], "select_device": ["q"], "in_levels": ["dBW"]}
+
+
+def test_every_view_of_a_predictor_is_looked_at():
+    methods = inspect.getmembers(Predictor, inspect.isfunction)
+    views = {name for name, one in methods if one.__annotations__.get("return") == "Predictor"}
+    assert views - {"_view", "select_carrier"} == {*VIEWS}  # levels of other carriers: no model has them
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_views_forgot_later_rows_and_what_came_after_was_all_they_knew(stations, name):
+    """Of 30 rows `in_levels` and others kept none; what was told to a station's was another's, or refused."""
+    fitted, heard, at = stations
+    model, asked, later = fitted.in_levels(None), at[:5] + np.array([0, 2, 0]), at + np.array([1, 0, 0])
+    view_of = lambda one: getattr(one, name)(*VIEWS[name])  # noqa: E731
+    alone = "station" in name
+    model.update(rx=at, rssi=heard(at) - 6, unit="dBm")
+    view, before = view_of(model), model.rssi(rx=asked)
+    assert view.rows.tolist() == model.rows.tolist() and view.journal == model.journal
+    levels = heard(later) - 6
+    view.update(rx=later, rssi=levels[:, 1:2] if alone else levels, unit="dBm")
+    assert np.array_equal(model.rssi(rx=asked), before) and len(model.rows) == 30  # they go on apart
+    levels[:, [0, 2]] = np.nan if alone else levels[:, [0, 2]]
+    model.update(rx=later, rssi=levels, unit="dBm")
+    assert view.rows.tolist() == model.rows.tolist() and len(view.rows) == (40 if alone else 60)
+    for turn in range(2):
+        for ask in ("rssi", "std"):
+            assert np.array_equal(getattr(view, ask)(rx=asked), getattr(view_of(model), ask)(rx=asked)), turn
+        view.shift(-3.0)
+        model.shift(-3.0, "b" if alone else None)
+    view.undo(3)
+    assert len(view.rows) == 30
+
+
+def test_rows_of_several_stations_are_not_told_to_one(stations):
+    model, _, at = stations
+    rows, _ = read_level_arrays(model.site, at, np.full((10, 3), -60.0), model._answer_unit("dBm"))
+    refused("rows of several stations", model.select_station("a").update, rows)
+
+
 def test_misuse_is_said(predictor):
     refused("rx= and rssi= are needed", predictor.update, rx=SCREENED)
-    refused("4 places and 1 stations", predictor.update, rx=SCREENED[:4], rssi=np.zeros((4, 2)))
+    refused(r"found \(4, 2\)", predictor.update, rx=SCREENED[:4], rssi=np.zeros((4, 2)))
 
 
 @pytest.mark.slow

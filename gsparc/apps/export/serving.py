@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import asyncio
 import hmac
+import json
 import socket
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import asdict, dataclass
@@ -18,15 +19,19 @@ import numpy as np
 import uvicorn
 from fastapi import FastAPI, HTTPException, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
-from pydantic import BaseModel, ConfigDict, FailFast, ValidationError
+from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 from pydantic_core import to_json
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from gsparc.apps.export.told_file import ToldFile
+from gsparc.data.files import is_out_of_space, list_causes, refuse_repeated
 from gsparc.data.limits import POSITIVE, Checked, SettingError, number, setting, whole
+from gsparc.models.checkpoint import CheckpointError
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import read_places
+from gsparc.prediction.updating import ToldBefore
 
 RAW = "application/octet-stream"
 PLACE, BYTES, MORE = 12, 64, 8192  # bytes of a place, raw and at most as JSON, and of what is around places
@@ -61,9 +66,13 @@ class PlacesBody(BaseModel):
 
 
 class RowsBody(PlacesBody):
-    """A request's body: the same, and levels there of each station; null is not measured."""
+    """A request's body: the same, and levels there of each station; null is not measured.
+
+    Rows of a `key` are taken once; without one as often as they come, as a sensor that stands still repeats.
+    """
 
     levels: Annotated[list[list[float | None]], FailFast()]
+    key: Annotated[str | None, Field(min_length=1, max_length=100)] = None
 
 
 class Connection(H11Protocol):
@@ -198,7 +207,7 @@ class Batcher:
 
 
 def build_application(
-    predictor: Predictor, limits: Limits, token: str | None, keep: Callable[[], object] | None = None
+    predictor: Predictor, limits: Limits, token: str | None, told: ToldFile | None = None
 ) -> ASGIApp:
     """Return the routes: POST /predict, and /std for its deviations, GET /healthz; POST /update where wanted.
 
@@ -206,13 +215,13 @@ def build_application(
         predictor: of one end that moves and one station.
         limits: more places or numbers in one request are refused (413).
         token: that a request must bear (401) but for /healthz; None: none.
-        keep: stores the model after an update; None: there are none.
+        told: the model's file, for updates; None: there are none.
 
     Raises:
         SettingError: updates without a token, or more numbers in the answer at one place than `limits` allow.
     """
-    site, lock = predictor.site, Lock()
-    if keep is not None and token is None:
+    site, lock, telling = predictor.site, Lock(), asyncio.Lock()
+    if told is not None and token is None:
         raise SettingError(
             "updates=true: whoever reaches it changes the model; set GSPARC_TOKEN, or say token=WORD"
         )
@@ -265,28 +274,32 @@ def build_application(
 
     def add_rows(body: bytes) -> dict[str, Any]:
         rows = RowsBody.model_validate_json(body)
-        with lock:
-            levels = np.array(rows.levels, float).reshape(len(rows.places), -1)
-            where: dict[str, Any] = site.name_moving(np.array(rows.places))
-            found = predictor.update(**where, rssi=levels)
-            assert keep is not None
-            try:
-                keep()
-            except OSError:  # answers are those of the file
-                predictor.undo()
-                raise
+        json.loads(body, object_pairs_hook=refuse_repeated)
+        where: dict[str, Any] = site.name_moving(rows.places)
+        assert told is not None
+        more = {"rssi": rows.levels, "key": rows.key}
+        found = told.tell(predictor, lock, limits.request_s / 2, **where, **more)
         return {"rows": found.rows.tolist(), "skipped": found.skipped, "alarms": [*map(asdict, found.alarms)]}
 
     async def update(request: Request) -> dict[str, Any]:
         body, _ = await read_body(request, False, lists=2)
         try:
-            return await asyncio.to_thread(add_rows, body)
+            async with telling:  # waiting for the file holds one thread, the others answer
+                if await request.is_disconnected():  # it would send its rows again
+                    raise HTTPException(400, "the client left")
+                return await asyncio.to_thread(add_rows, body)
+        except CheckpointError as error:
+            busy = any(isinstance(cause, TimeoutError) for cause in list_causes(error))
+            status = 503 if busy else 507 if is_out_of_space(error) else 500
+            raise HTTPException(status, str(error)) from error
+        except ToldBefore as error:
+            raise HTTPException(409, str(error)) from error
         except ValueError as error:  # of a body, too
             wanted = '{"places": [[x, y, z], ...], "levels": [[level or null of each station], ...]}'
             message = f"expected {wanted}" if isinstance(error, ValidationError) else str(error)
             raise HTTPException(422, message) from error
 
-    if keep is not None:
+    if told is not None:
         app.post("/update")(update)
 
     @app.post("/std")

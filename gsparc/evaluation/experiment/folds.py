@@ -22,6 +22,7 @@ from gsparc.evaluation.console import to_dict
 from gsparc.models import checkpoint, fitting
 from gsparc.models.method import Method, MethodFactory
 from gsparc.models.per_station import wrap_per_station
+from gsparc.prediction.hearing import Hearing
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import NO_COST, Cost
 
@@ -115,6 +116,7 @@ def keep_fold(
     for note in report.notes:
         log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
     extra = fitting.run_extra(report, data, fold, context)
+    extra |= Hearing.from_learned(data, fold.learned()).to_extra()
     extra |= {"fold": number, "split_sha256": split.sha256, "run_id": run_id, "tested": len(fold.test)}
     extra["read_notes"] = [] if context.datamodule is None else [*map(str, context.datamodule.notes)]
     checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)

@@ -67,8 +67,10 @@ class OwnTerms:
             return self.terms
         if data.site.several:
             return (*self.terms, NetworkMaps.from_file(self.prior, data))
-        station = data.site.name.rpartition(OF_STATION)[2] if OF_STATION in data.site.name else ""
-        return (*self.terms, PriorMap.from_levels(*read_prior_levels(self.prior, data, station)))
+        (station,), still = data.site.every_station.shown, data.site.every_station.position[0]
+        station = data.site.name.rpartition(OF_STATION)[2] if OF_STATION in data.site.name else station
+        levels = read_prior_levels(self.prior, data, station)
+        return (*self.terms, PriorMap.from_levels(*levels, still + data.site.origin))
 
 
 @dataclass(frozen=True)
@@ -78,23 +80,23 @@ class UserTerm(Columns):
     Attributes:
         term: of a user.
         origin: (3,) of local coordinates [m].
-        still: (3,) the end that stands, local [m]; NaN where unknown, or where both move.
+        still: (3,) the end that stands, local [m]; None where unknown, or where both move.
         middle: (Q,) mean columns of the rows, less which they are nearly independent of the level.
         unit: deviation of the process [dB], which columns are relative to.
     """
 
     term: Columns
     origin: Tensor
-    still: Tensor
+    still: Tensor | None
     middle: Tensor | float = 0.0
     unit: float = 1.0
 
     @classmethod
     def from_site(cls, term: Columns, site: Site) -> Self:
         """Return a term of a site of one station, or of ends that both move."""
-        ends = site.origin.astype(np.float64), site.every_station.position[0]
-        origin, still = map(torch.from_numpy, ends)
-        return cls(term, origin, still)
+        origin, still = site.origin.astype(np.float64), site.every_station.position[0]
+        known = np.isfinite(still).all()  # NaN could be written to a checkpoint, and never read
+        return cls(term, torch.from_numpy(origin), torch.from_numpy(still) if known else None)
 
     @property
     def weight_prior(self) -> tuple[float, float]:
@@ -112,7 +114,8 @@ class UserTerm(Columns):
         return mean * self._user_columns(places).sum(1) if mean else super().mean(places)
 
     def _user_columns(self, places: Tensor) -> Tensor:
-        both = places if has_both_ends(places) else torch.cat([places, self.still.expand_as(places)], 1)
+        still = torch.full((3,), torch.nan) if self.still is None else self.still
+        both = places if has_both_ends(places) else torch.cat([places, still.expand_as(places)], 1)
         result = self.term.columns(both + torch.cat([self.origin, self.origin]))
         if not isinstance(result, Tensor):
             gave = f"{type(self.term).__name__}.columns gave {type(result).__name__}"
@@ -136,7 +139,7 @@ class UserTerm(Columns):
         if result.ndim != 2 or len(result) != len(places):
             raise ValueError(f"{gave}; ({len(places)}, Q) finite numbers are needed")
         if wrong := int((~result.isfinite()).any(1).sum()):
-            unknown = not has_both_ends(places) and not self.still.isfinite().all()
+            unknown = not has_both_ends(places) and self.still is None
             why = ", but the place of the end that stands is not given" if unknown else ""
             raise ValueError(f"{gave}, NaN or infinite in {wrong} rows; finite numbers are needed{why}")
         if (most := float(result.abs().max())) * (1.0 if prior is None else prior[1]) > LARGEST:

@@ -18,28 +18,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from crashes import Limited
 
 import gsparc
 from gsparc.data.limits import SettingError
 from gsparc.models import checkpoint
+from gsparc.prediction.updating import versions_extra
 
 pytest.importorskip("uvicorn", reason="the extra `serve` is not installed")
 pytest.importorskip("fastapi", reason="the extra `serve` is not installed")
 from gsparc.apps.export.serving import RAW, LimitedServer, Limits, build_application
+from gsparc.apps.export.told_file import ToldFile
 
 TX = np.array([3.0, 2, 2])
 HOSTILE = Path(__file__).parents[2] / "helpers" / "hostile.py"
 HOSTILE_S = int(os.environ.get("GSPARC_HOSTILE_S", "15"))
 
 
-def fitted(kind="rssi"):
+def fitted(kind="rssi", model=None, save=None):
     rng = np.random.default_rng(0)
     rx = rng.uniform([0, 0, 0], [20, 20, 2], (60, 3))
     far = np.linalg.norm(rx - TX, axis=1)
     if kind == "rssi":
-        return gsparc.fit(rx=rx, tx=TX, rssi=-40 - 20 * np.log10(far), model="gp")
+        return gsparc.fit(rx=rx, tx=TX, rssi=-40 - 20 * np.log10(far), model=model or "gp", save=save)
     csi = (np.exp(-2j * np.pi * 30e6 / 3e8 * far) / far)[:, None, None]
-    return gsparc.fit(rx=rx, tx=TX, csi=csi, frequency_hz=30e6, model="complex_gp")
+    return gsparc.fit(rx=rx, tx=TX, csi=csi, frequency_hz=30e6, model="complex_gp", save=save)
 
 
 def ask_http(port, method, path, body, headers):
@@ -51,9 +54,9 @@ def ask_http(port, method, path, body, headers):
 
 
 class Served:
-    def __init__(self, predictor, token=None, keep=None, **limits):
+    def __init__(self, predictor, token=None, told=None, **limits):
         limits = Limits(**{"most": 64, **limits})
-        app = build_application(predictor, limits, token, keep)
+        app = build_application(predictor, limits, token, told)
         self.server = LimitedServer(app, limits, port=0)
         self.thread = threading.Thread(target=self.server.run, daemon=True)
 
@@ -466,39 +469,95 @@ def test_raw_places_are_of_one_media_type_alone(served):
     assert answer.startswith(b"HTTP/1.1 422") and b"Content-Type twice" in answer
 
 
-def test_levels_that_were_measured_change_the_answers_and_are_stored():
-    predictor, kept, rng = fitted(), [], np.random.default_rng(5)
-    at = rng.uniform([0, 0, 0], [20, 20, 2], (30, 3)).round(3)
+@pytest.fixture
+def told(tmp_path):
+    """A model's file, the model, and a server of it that is told rows."""
+    path = tmp_path / "m.ckpt"
+    fitted(save=path)
+    stored = checkpoint.read(path)
+    predictor = gsparc.load(stored)
+    with Served(predictor, "word", ToldFile(stored, gsparc.load), request_s=1) as running:
+        yield path, predictor, partial(running.post, **{"path": "/update", "authorization": "Bearer word"})
+
+
+ROW = json.dumps({"places": [[1.0, 2.0, 1.0]], "levels": [[-90.0]]})
+
+
+def test_levels_that_were_measured_change_the_answers_and_are_stored(told):
+    path, predictor, post = told
+    at = np.random.default_rng(5).uniform([0, 0, 0], [20, 20, 2], (30, 3)).round(3)
     before = predictor.rssi(rx=at)
     rows = {"places": at.tolist(), "levels": [[float(level) - 10] for level in before[:, 0]]}
     rows["levels"][0] = [None]
-    bearer = {"authorization": "Bearer word"}
-    with Served(predictor, "word", lambda: kept.append(len(predictor.versions))) as running:
-        post = partial(running.post, path="/update", **bearer)
-        assert running.post(json.dumps(rows), path="/update")[0] == 401
-        status, body, _ = post(json.dumps(rows))
-        said = json.loads(body)
-        assert status == 200 and said["rows"] == [*range(29)] and said["alarms"][0]["kind"] == "offset"
-        after = json.loads(running.post(as_json(at), **bearer)[1])["values"]
-        np.testing.assert_allclose(np.array(after), before - 10, atol=2)
-        assert post(json.dumps({**rows, "levels": rows["levels"][:5]}))[0] == 422
-        status, body, _ = post(b'{"places": [[1, 2, 3]]}')
-        assert status == 422 and b"levels" in body
-        assert post(json.dumps({name: part * 3 for name, part in rows.items()}))[0] == 413
-    assert kept == [2]
+    assert post(json.dumps(rows), authorization="")[0] == 401
+    status, body, _ = post(json.dumps(rows))
+    said = json.loads(body)
+    assert status == 200 and said["rows"] == [*range(29)] and said["alarms"][0]["kind"] == "offset"
+    after = json.loads(post(as_json(at), path="/predict")[1])["values"]
+    np.testing.assert_allclose(np.array(after), before - 10, atol=2)
+    np.testing.assert_allclose(gsparc.load(path).rssi(rx=at), after)
+    assert post(json.dumps({**rows, "levels": rows["levels"][:5]}))[0] == 422
+    status, body, _ = post(b'{"places": [[1, 2, 3]]}')
+    assert status == 422 and b"levels" in body
+    for wrong, says in (
+        ('{"places": [], "levels": []}', b"holds nothing"),
+        ('{"places": [[1, 2, 1]], "levels": [[-90]], "levels": [[-60]]}', b"'levels' is twice"),
+        ('{"places": [[1, 2, 1], [2, 2, 1]], "levels": [[-90], [400]]}', b"row 1: a level"),
+        ('{"places": [[1, 2, 1], [2000000, 2, 1]], "levels": [[-90], [-90]]}', b"row 1: 2000 km"),
+        ('{"places": [[1, 2, 1], [2, 2, 1]], "levels": [[-90, -90]]}', b"found (1, 2)"),
+    ):
+        status, body, _ = post(wrong)
+        assert status == 422 and says in body, body
+    assert post(json.dumps({name: part * 3 for name, part in rows.items()}))[0] == 413
+    assert len(gsparc.load(path).rows) == 29
     with pytest.raises(SettingError, match="updates=true: whoever reaches it"):
-        build_application(predictor, Limits(), None, kept.clear)
+        build_application(predictor, Limits(), None, ToldFile(checkpoint.read(path), gsparc.load))
     with Served(predictor) as running:
         assert running.post(json.dumps(rows), path="/update")[0] == 404
 
 
-def test_an_update_that_a_full_disk_refused_is_taken_back():
-    predictor = fitted()
+def test_rows_that_a_full_disk_refused_were_answered_by_all_the_same(told):
+    """The file cannot be written, which is no `OSError` then: nothing was taken back, and it said 422."""
+    path, predictor, post = told
+    before, answers = path.read_bytes(), post(as_json([[1, 2, 1]]), path="/predict")[1]
+    with Limited(len(before) // 2):
+        status, body, _ = post(ROW)
+    assert status == 507 and b"cannot be written (File too large)" in body
+    assert not predictor.versions and path.read_bytes() == before
+    assert post(as_json([[1, 2, 1]]), path="/predict")[1] == answers
+    assert post(ROW)[0] == 200 and len(gsparc.load(path).rows) == len(predictor.rows) == 1
 
-    def keep():
-        raise OSError(28, "No space left on device")
 
-    rows = json.dumps({"places": [[1.0, 2.0, 1.0]], "levels": [[-90.0]]})
-    with Served(predictor, "word", keep) as running:
-        assert running.post(rows, path="/update", authorization="Bearer word")[0] == 500
-    assert len(predictor.versions) == 1
+def test_rows_of_a_key_that_are_posted_twice_are_taken_once(told):
+    """A client that tried again after a lost answer told its rows twice."""
+    path, predictor, post = told
+    rows = {"places": [[1.0, 2.0, 1.0]], "levels": [[-90.0]]}
+    for key, status in (("a", 200), ("a", 409), ("b", 200), (None, 200), (None, 200)):
+        assert post(json.dumps(rows | ({"key": key} if key else {})))[0] == status
+    assert len(predictor.rows) == len(gsparc.load(path).rows) == 4
+
+
+def test_rows_that_another_process_told_the_file_were_overwritten(told):
+    """Of 303 rows 120 were lost, and the server never heard of what it had left of them."""
+    path, predictor, post = told
+    assert post(ROW)[0] == 200
+    with checkpoint.rewriting(path) as file:
+        other = gsparc.load(file.stored)
+        other.update(rx=[[3.0, 4.0, 1.0]] * 2, rssi=[-70.0] * 2)
+        assert post(ROW)[0] == 503  # and the row is not told later: its sender knows
+        file.store(versions_extra(other.versions))
+    assert post(ROW)[0] == 200
+    assert predictor.rows.tolist() == gsparc.load(path).rows.tolist() == [0, 1, 2, 3]
+
+
+def test_a_file_that_was_made_anew_is_what_answers_or_is_left_alone(told):
+    path, predictor, post = told
+    old = path.read_bytes()
+    fitted(save=path, model="mean")
+    assert post(ROW)[0] == 200 and predictor.method.label == "mean, updated"
+    fitted("csi", save=path)
+    other = path.read_bytes()
+    status, body, _ = post(ROW)
+    assert status == 500 and b"start the server again" in body and path.read_bytes() == other
+    path.write_bytes(old[:1000])
+    assert post(ROW)[0] == 500 and len(predictor.rows) == 1

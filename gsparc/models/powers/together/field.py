@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data.ends import NOBODY, Ends, stations_at
-from gsparc.data.errors import DataError
+from gsparc.data.errors import Caution, DataError
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
@@ -102,7 +102,7 @@ class JointPowerField(ClosedForm):
         if network is None:
             self.own, remarks = learn_station_priors(used, self.seed)
         else:
-            used = relabel_by_site(used, network)
+            measured, used = used, relabel_by_site(used, network)
             names = data.site.every_station.shown
             evidence, prior, remarks = learn_network(used, network, names, self.seed)
             for maps in self.maps:
@@ -111,6 +111,7 @@ class JointPowerField(ClosedForm):
                     prior, remarks = own, said
                 # Second: a table shows the first few.
                 remarks.insert(1, describe_use(used_maps, len(maps.maps)))
+                remarks += map(Caution, maps.explain_misfits(measured, names))
             self.own = StationPriors(prior, {})
         most, largest = rows_per_station(len(used.stations)), int(np.bincount(used.station).max())
         if largest > most:
