@@ -17,7 +17,7 @@ from gsparc.data.datamodule import Loaded
 from gsparc.data.load import datamodule
 from gsparc.data.load import load as load_data
 from gsparc.data.splits import Fold
-from gsparc.models import checkpoint
+from gsparc.models import checkpoint, fitting
 from gsparc.models.fitting import Origin
 from gsparc.models.loading import load_module
 from gsparc.training.context import FitContext
