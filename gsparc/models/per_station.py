@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.ends import NOBODY, SAME_PLACE_M, Ends, station_distances
-from gsparc.data.errors import Caution, group_warnings, list_first
+from gsparc.data.errors import Caution, Severe, group_warnings, list_first
 from gsparc.data.executor import run_all, uses_other_processes
 from gsparc.data.query import Query
 from gsparc.data.schema import OF_STATION, Measurements, Site
@@ -188,8 +188,10 @@ class PerStation(Method):
             self._copies[number] = fits[turn][0]
             name = "all stations" if numbers == [UNHEARD] else self._station_name(number)
             notes += [type(note)(f"{name}: {note}") for note in reports[turn].notes if note not in learned]
-        cautions = group_warnings([note for note in notes if isinstance(note, Caution)])
-        notes = [*(note for note in notes if not isinstance(note, Caution)), *map(Caution, cautions)]
+        cautions = [note for note in notes if isinstance(note, Caution)]
+        notes = [note for note in notes if not isinstance(note, Caution)]
+        for kind in (Severe, Caution):  # a severe one is said again at the end of a run
+            notes += map(kind, group_warnings([note for note in cautions if type(note) is kind]))
         cost = sum((one.cost for one in reports), Cost())
         return FitReport(watch.seconds, tuple(notes), cost, watch.cpu_elsewhere)
 
