@@ -20,7 +20,6 @@ import torch
 from gsparc.ops.calls import Call
 
 SOURCES = Path(__file__).parent / "csrc"
-READS = ("csrc/**/*.cu", "csrc/**/*.cuh", "csrc/**/*.h")  # a fit is of another program where these change
 FLAGS = ("-std=c++17", "-O3", "-fmad=false", "--expt-relaxed-constexpr", "-Xcompiler=-fPIC", "-shared", "-t0")
 LOG = logging.getLogger(__name__)
 

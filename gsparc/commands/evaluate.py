@@ -19,6 +19,7 @@ from gsparc.evaluation.plots import draw_sweep
 from gsparc.evaluation.results import Run, frame_of_runs
 from gsparc.evaluation.summary import remarks
 from gsparc.models import checkpoint
+from gsparc.prediction.hearing import read_hearing
 
 
 def evaluate_files(
@@ -50,9 +51,10 @@ def evaluate_files(
     seconds = [one.extra.get("train_s") for one in run.stored]
     # One fold that does not say its seconds makes the mean of all unknown.
     train_s = None if None in seconds else [float(s) for s in seconds if s is not None]
+    hearing = [read_hearing(one.extra) for one in run.stored]
     evaluation = evaluate(
         run.methods, train_s, run.data, run.split, eval_on=eval_on, baselines=baselines,
-        learned=run.trained if other else None,
+        learned=run.trained if other else None, hearing=hearing,
     )  # fmt: skip
     evaluation.facts.update({"split/foreign": run.doubt, "split/without_baselines": without})
     return evaluation, run.data, run.split

@@ -13,29 +13,27 @@ from omegaconf import DictConfig
 from gsparc.commands.shared.output import begin_run, finish_run
 from gsparc.data.errors import DataError
 from gsparc.data.files import write_whole
-from gsparc.data.limits import POSITIVE, check_arguments, number, or_null, switch, whole
+from gsparc.data.limits import check_arguments, or_null, switch, whole
 from gsparc.evaluation.open_runs import read_like_stored
 from gsparc.evaluation.summary import coordinates
 from gsparc.evaluation.table import Column, Table
 from gsparc.models import checkpoint
+from gsparc.prediction.later_rows import check_updatable, read_level_rows
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.updating import check_updatable, level_rows, versions_extra
+from gsparc.prediction.updating import LIMITS, ToldBefore, versions_extra
 from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
 
-LIMITS = {
-    "window": whole(1), "fade_db": number(0), "undo": whole(0), "false_alarm": POSITIVE,
-    "batch": or_null(whole(1)), "refit": switch(),
-}  # fmt: skip
+OWN_LIMITS = {"undo": whole(0), "batch": or_null(whole(1)), "again": switch()}
 COLUMNS = ("station", "kind", "since", "at", "change_db", "x", "y")  # and degrees where they are known
 
 
 def task(config: DictConfig) -> dict[str, Any]:
     """Condition a model on a file's rows, or go back; return the facts of `summary.json`."""
     run_dir, settings = begin_run(config)
-    check_arguments(config, **LIMITS)
+    check_arguments(config, **LIMITS, **OWN_LIMITS)
     if (config.data is None) == (config.undo == 0):
         raise DataError("gsparc update: say data=FILE to add rows, or undo=COUNT to take updates back")
     with checkpoint.rewriting(config.ckpt, config.out) as file:
@@ -75,11 +73,15 @@ def _add_rows(
     if not placed:
         raise DataError(f"{config.data}: has no places; later rows need them")
     how = {name: settings[name] for name in ("window", "fade_db", "false_alarm")}
-    rows, row_count, skipped = level_rows(data, predictor.site), 0, 0
-    size = config.batch or len(rows)
+    rows, row_count, skipped = read_level_rows(data, predictor.site), 0, 0
+    size, content = config.batch or len(rows), rows.content()
+    if content in predictor.told and not config.again:
+        fault = f"the same rows were told to {config.ckpt} before"
+        raise ToldBefore(f"{config.data}: {fault}; again=true tells them once more")
     for start in range(0, len(rows), size):
         refit = config.refit and start + size >= len(rows)
-        found = predictor.update(rows.subset(slice(start, start + size)), refit=refit, **how)
+        key = content if start == 0 and not config.again else None
+        found = predictor.update(rows.subset(slice(start, start + size)), refit=refit, key=key, **how)
         row_count, skipped = row_count + len(found.rows), skipped + found.skipped
     return row_count, skipped
 

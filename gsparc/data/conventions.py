@@ -124,13 +124,6 @@ def _with_delays(data: Measurements) -> Measurements:
     return replace(data, target=data.target * np.exp(-2j * np.pi * turns)[:, None])
 
 
-def mask_zero_tones(data: Measurements) -> Measurements:
-    """Mark tones that are 0 in all rows and antennas as not measured, like guard tones of OFDM."""
-    heard = [(data.target[part] != 0).any(axis=(0, 1)) for part in row_blocks(data.target)]
-    measured = np.broadcast_to(np.any(heard, axis=0), data.target.shape)
-    return replace(data, mask=measured if data.mask is None else measured & data.mask)
-
-
 def _transposed(data: Measurements) -> Measurements:
     # Only images without `grid_deg` come here (`hemisphere`): the grid follows from their shape.
     grid = SphereGrid.hemisphere(*data.target.shape[:0:-1])
@@ -184,7 +177,6 @@ CONVENTIONS = {
                               _turned(lambda r: Rotation.from_quat(np.roll(r.as_quat(), 1, 1)))),
     "world_to_receiver": Convention("orientations from the world to the receiver", "turned",
                                     _turned(lambda r: r.inv())),
-    "zeros_unmeasured": Convention("0 for tones that were not measured", "tones", mask_zero_tones, False),
     "transposed": Convention("rows as azimuths, columns as elevations", "hemisphere", _transposed),
     "zenith": Convention("elevation from the zenith", "above", _grid(_from_zenith, 1)),
     "clockwise": Convention("clockwise azimuth", "spectra",
@@ -211,9 +203,7 @@ def convert_conventions(data: Measurements, names: Iterable[str]) -> Measurement
         if one.trait not in traits(data):
             shape = data.target.shape[1:]
             raise DataError(f"dataset.{name}: {one.words}: cannot be of rows of shape {shape}")
-        # Which tones are 0 is a matter of all rows, and changes no value.
-        by_block = is_big(data.target) and name != "zeros_unmeasured"
-        data = _in_blocks(data, one.change) if by_block else one.change(data)
+        data = _in_blocks(data, one.change) if is_big(data.target) else one.change(data)
     return data
 
 

@@ -8,6 +8,7 @@ import io
 import math
 import os
 import shutil
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -20,13 +21,10 @@ import numpy as np
 import yaml
 
 from gsparc.data.errors import DataError, readable
+from gsparc.data.limits import DEEPEST, LEAST_CONTENT, LEAST_NODES, LONGEST_LINE, MOST_GROWTH
 
 SUMMARY = "summary.json"  # of a finished run, written last
-LEAST_CONTENT = 5  # characters for each line, tag or bracket of a large file
 POINTER = b"version https://git-lfs"
-LONGEST_LINE = 2**20  # characters: of 200 MB of them cells took 10 GiB
-MOST_GROWTH = 10  # times a YAML text, with its aliases written out: a few lines may be a billion values
-LEAST_NODES = 10_000  # of YAML that are not counted
 
 
 def platform_cache() -> Path:
@@ -54,6 +52,15 @@ def read_shipped_table(package: str, name: str) -> list[dict[str, str]]:
     return list(csv.DictReader(text.splitlines()))
 
 
+def refuse_repeated(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a record of JSON, as `object_pairs_hook` does; `ValueError` where a name is twice in it."""
+    record = dict(pairs)
+    if len(record) < len(pairs):
+        twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
+        raise ValueError(f"{twice!r} is twice in one record")
+    return record
+
+
 def check_line_length(path: str | Path, number: int, line: str) -> str:
     """Return the line of a table; DataError where it is longer than `LONGEST_LINE`."""
     if len(line) > LONGEST_LINE:
@@ -77,6 +84,21 @@ def check_content(path: str | Path, text: str | bytes, marks: str) -> None:
             raise DataError(f"{path}: {fault}; expected values")
 
 
+def check_depth(source: str | Path, text: str) -> None:
+    """Raise `DataError` of a text with more than `DEEPEST` brackets in brackets, which parsers hang on."""
+    depth = 0
+    for start in range(0, len(text), LONGEST_LINE):
+        codes = np.frombuffer(text[start : start + LONGEST_LINE].encode("utf-32-le", "replace"), "<u4")
+        opened, closed = np.isin(codes, OPENING).astype(np.int32), np.isin(codes, CLOSING).astype(np.int32)
+        depths = depth + np.cumsum(opened - closed)
+        if depths.max(initial=0) > DEEPEST:
+            raise DataError(f"{source}: more than {DEEPEST} brackets within brackets; expected a table")
+        depth = int(depths[-1])
+
+
+OPENING, CLOSING = ([*map(ord, brackets)] for brackets in ("[{", "]}"))
+
+
 def load_yaml(text: str, source: str | Path) -> Any:
     """Read what a text in YAML holds.
 
@@ -84,6 +106,7 @@ def load_yaml(text: str, source: str | Path) -> Any:
         DataError: aliases that repeat without end, or nearly.
         yaml.YAMLError, ValueError, RecursionError: it is none.
     """
+    check_depth(source, text)
     loader, sizes = yaml.SafeLoader(text), dict[int, float]()
     node = loader.get_single_node()
     if node is None:
@@ -121,10 +144,11 @@ def read_yaml(path: Path, missing_message: str, expected: str) -> Mapping[str, A
 
 
 def check_yaml(folder: str | None) -> None:
-    """Refuse (DataError) aliases without end in a folder of configurations, which Hydra would write out."""
+    """Refuse (DataError) brackets or aliases without end in configurations, which Hydra would write out."""
     for path in () if folder is None else sorted(Path(folder).rglob("*.yaml")):
         text = path.read_bytes()
         with suppress(yaml.YAMLError, UnicodeDecodeError, RecursionError):  # Hydra says so, where it reads it
+            check_depth(path, text.decode())
             _ = load_yaml(text.decode(), path) if b"&" in text and b"*" in text else None
 
 

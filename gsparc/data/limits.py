@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -105,6 +106,34 @@ def or_null(limit: Limit) -> Limit:
     True
     """
     return Limit(f"{limit.words}, or null", lambda v: v is None or limit.holds(v), limit.known)
+
+
+# Of files, whoever wrote them.
+LIFTED_BY = "GSPARC_MOST_BYTES"  # in the environment: another number of bytes than the following
+MOST_BYTES = 2**27  # of a table of text, which takes twenty times as many in memory
+MOST_UNPACKED, LEAST_UNPACKED = 100, 2**24  # times its packed bytes, rows of levels are 3 to 20; bytes of any
+MOST_COLUMNS = 10_000  # read in two seconds; a hundred thousand in a minute
+MOST_CELLS = 3 * 10**7  # of 90 bytes each in memory
+MOST_VALUES = 10_000  # of a cell
+LEAST_CONTENT = 5  # characters for each line, tag or bracket of a large file
+LONGEST_LINE = 2**20  # characters: of 200 MB of them cells took 10 GiB
+LONGEST_HEAD = 1_000  # characters: words and units are sought in each
+DEEPEST = 500  # brackets within brackets
+MOST_GROWTH = 10  # times a YAML text, with its aliases written out: a few lines may be a billion values
+LEAST_NODES = 10_000  # of YAML that are not counted
+
+
+def most_text(packed: int | None = None) -> int:
+    """Return how many bytes of text are read from a file; from so many `packed` ones of a compressed file.
+
+    Raises:
+        SettingError: `GSPARC_MOST_BYTES` is no whole number.
+    """
+    lifted = os.environ.get(LIFTED_BY, "")
+    if lifted:
+        whole(1).check(LIFTED_BY, int(lifted) if lifted.isdecimal() else lifted)
+        return int(lifted)
+    return MOST_BYTES if packed is None else min(MOST_BYTES, max(LEAST_UNPACKED, MOST_UNPACKED * packed))
 
 
 MOST_NAMED = 30  # of the words that may stand in a setting

@@ -7,7 +7,7 @@ or lists everything that is wrong, `load_own` is its strict form, `write_own` re
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,14 +16,15 @@ import numpy as np
 
 from gsparc.data.amplitudes import amplitudes_to_levels
 from gsparc.data.assemble import centre_positions, check_positions, rounded_rms
-from gsparc.data.blocks import is_big, row_blocks, write_blocks
+from gsparc.data.blocks import is_big, write_blocks
+from gsparc.data.checks.constant import leave_out_unmeasured, mark_constants
 from gsparc.data.checks.outliers import check_static_ends, find_strong_outliers, peak_magnitudes
 from gsparc.data.conventions import convert_conventions
 from gsparc.data.errors import Caution
 from gsparc.data.limits import number, or_null
 from gsparc.data.links.expand import expand_links
 from gsparc.data.other_names import name_arrays
-from gsparc.data.own_checks import Checker
+from gsparc.data.own_checks import Checker, are_infinite, rows_with
 from gsparc.data.raw import Raw, read_raw, write_raw
 from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, OTHER, Links, Measurements, Site
 from gsparc.data.selection import WHOLE, Selection
@@ -168,12 +169,11 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     about["device_names"], devices = check.read_devices(rows, kind)
     offsets = check.read_ragged(rows)
     release_split = check.read_split(rows)
-    _in_range(check, measured, values, mask)
+    check.check_range(measured, values, mask)
     if all(one is not None for one in (*ends.values(), rotation)):
         _static(check, links, ends, rotation)
     check.problems.raise_if_any()
     assert rotation is not None
-    static_end = links.static_end
     # Copies, as broadcast views are read-only.
     rx, tx = (np.broadcast_to(np.asarray(ends[end]), (rows, 3)).copy() for end in ("rx", "tx"))
     directions = _directions(check, offsets, rx, rotation)
@@ -183,7 +183,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
             f"{SSIM_WINDOW} x {SSIM_WINDOW}: losses are L1 alone, ssim_gauss is undefined"
         )
     site = Site(
-        kind=kind, static_end=static_end, grid=grid, array=array, carrier_hz=carrier,
+        kind=kind, static_end=links.static_end, grid=grid, array=array, carrier_hz=carrier,
         subcarriers_hz=frequency if facts.is_complex else None, stations=links.stations,
         georeference=links.georeference, **about,
     )  # fmt: skip
@@ -192,15 +192,16 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
         site, tx, rx, rotation, values, mask, noise, directions, row_names, release_split, provenance,
         position_std=position_std, device=devices, sequence=check.read_sequence(rows, kind), **of_rows,
     )  # fmt: skip
-    # Conventions turn values before they are scaled: the constant is that of what is stored.
-    data = convert_conventions(data, named)
+    data = mark_constants(data, check.notes)
+    # Conventions turn values before they are scaled: the scale is that of what is stored.
+    data = leave_out_unmeasured(convert_conventions(data, named))
     if facts.is_complex:
-        _note_plane(check, tx if static_end == "rx" else rx, carrier)
+        _note_plane(check, tx if links.static_end == "rx" else rx, carrier)
     target, scale = _scaled(measured, data.target, data.mask, data.censored)
     # A damaged row of 1e300 overflows float32 once it is divided by the others' scale: it is named.
     if scale > 0:
         huge = "beyond float32 in units of the other rows; is it damaged?"
-        check.refuse_rows(measured, _rows(target, _infinite), huge)
+        check.refuse_rows(measured, rows_with(target, are_infinite), huge)
     if not (np.isfinite(scale) and scale > 0):
         check.refuse(measured, "every measured value is zero; expected some signal")
     check.problems.raise_if_any()
@@ -273,35 +274,6 @@ def _not_negative(check: Checker, name: str, rows: int) -> np.ndarray | None:
     bad = ~(np.isfinite(values) & (values >= 0))
     check.refuse_rows(name, bad, "expected a finite number, at least 0")
     return values
-
-
-def _in_range(check: Checker, name: str, values: np.ndarray, mask: np.ndarray | None) -> None:
-    """Measured entries of `values` (S, ...) are finite; powers are not negative, decibels are decibels."""
-    # Magnitudes of complex64 overflow and comparisons with NaN warn; both are tested for here.
-    with np.errstate(over="ignore", invalid="ignore"):
-        unmarked = "not finite; expected numbers (mark what was not measured in mask)"
-        check.refuse_rows(name, _rows(values, _infinite, mask), unmarked)
-        followed = str(check.raw.attributes.get("conventions", "")).split()
-        if name == "csi" or values.dtype.kind == "u" or "decibels" in followed:
-            return
-        wanted = "linear power, at least 0 (is it in dB?"
-        wanted += "; then dataset.decibels=true)" if name == "spectrum" else ")"
-        out = _rows(values, lambda part: part < 0, mask)
-        if name == "rssi_db":
-            wanted, out = "dB between -400 and 400", _rows(values, lambda part: np.abs(part) > 400, mask)
-    check.refuse_rows(name, out, f"out of range; expected {wanted}")
-
-
-def _rows(
-    values: np.ndarray, test: Callable[[np.ndarray], np.ndarray], mask: np.ndarray | None = None
-) -> np.ndarray:
-    """Rows (S,) of `values` (S, ...) with a measured entry that passes `test`, a block at a time."""
-    passed = (test(values[p]) & (True if mask is None else mask[p]) for p in row_blocks(values))
-    return np.concatenate([part.reshape(len(part), -1).any(1) for part in passed])
-
-
-def _infinite(values: np.ndarray) -> np.ndarray:
-    return ~np.isfinite(np.abs(values))
 
 
 def _static(check: Checker, links: Links, ends: Mapping[str, Any], rotation: Any) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from gsparc.data.assemble import check_positions
+from gsparc.data.blocks import row_blocks
 from gsparc.data.errors import Problems, list_first, suggest_name
 from gsparc.data.raw import Raw, numbered_rows
 from gsparc.data.schema import FIELDS, HOLDS, MEASUREMENTS, POWER, Stations, TrainTest
@@ -19,7 +20,7 @@ from gsparc.ops import SphereGrid
 
 # From long wave (100 kHz) to the far infrared: what lies outside was mostly given in MHz or GHz.
 LOWEST_HZ, HIGHEST_HZ = 1e5, 1e13
-
+MOST_DB = 400  # of any level
 
 Shape = tuple[int | str | None, ...]
 
@@ -165,6 +166,24 @@ class Checker:
                 f"{step * 1e3:.1f} mm; store float64"
             )
         return array
+
+    def check_range(self, name: str, values: np.ndarray, mask: np.ndarray | None) -> None:
+        """Refuse rows of which a measured entry of `values` (S, ...) is not finite, or beyond all powers."""
+        # Magnitudes of complex64 overflow and comparisons with NaN warn; both are tested for here.
+        with np.errstate(over="ignore", invalid="ignore"):
+            unmarked = "not finite; expected numbers (mark what was not measured in mask)"
+            self.refuse_rows(name, rows_with(values, are_infinite, mask), unmarked)
+            followed = str(self.raw.attributes.get("conventions", "")).split()
+            if name == "csi" or values.dtype.kind == "u" or "decibels" in followed:
+                return
+            if name == "rssi_db":
+                wanted = f"dB between -{MOST_DB} and {MOST_DB}"
+                out = rows_with(values, lambda part: np.abs(part) > MOST_DB, mask)
+            else:
+                wanted = "linear power, at least 0 (is it in dB?"
+                wanted += "; then dataset.decibels=true)" if name == "spectrum" else ")"
+                out = rows_with(values, lambda part: part < 0, mask)
+        self.refuse_rows(name, out, f"out of range; expected {wanted}")
 
     def read_devices(self, rows: int, kind: Kind) -> tuple[tuple[str, ...] | None, np.ndarray | None]:
         """Return names (D,) of devices and which of them measured each row (S,) int64; None where none is."""
@@ -327,6 +346,19 @@ class Checker:
 
     def _refuse_numbers(self, name: str, rows: np.ndarray, what: str) -> None:
         self.problems.add_rows(self.describe_array(name), (f"row {i}" for i in rows), what)
+
+
+def rows_with(
+    values: np.ndarray, test: Callable[[np.ndarray], np.ndarray], mask: np.ndarray | None = None
+) -> np.ndarray:
+    """Tell which rows (S,) of `values` (S, ...) have a measured entry that passes a test, by blocks."""
+    passed = (test(values[p]) & (True if mask is None else mask[p]) for p in row_blocks(values))
+    return np.concatenate([part.reshape(len(part), -1).any(1) for part in passed])
+
+
+def are_infinite(values: np.ndarray) -> np.ndarray:
+    """Tell which of `values` are NaN or infinite, bool."""
+    return ~np.isfinite(np.abs(values))
 
 
 UNIT_TOLERANCE = 1e-2  # releases print quaternions with few digits; beyond this they are refused

@@ -9,12 +9,16 @@ from pathlib import Path
 
 import numpy as np
 
+from gsparc.data.checks.plausibility import find_marks
 from gsparc.data.datasets.own import read_own
 from gsparc.data.errors import Caution, DataError, list_first
 from gsparc.data.links.stations import site_name
 from gsparc.data.own import interpret
+from gsparc.data.own_checks import MOST_DB
 from gsparc.data.schema import Measurements
 from gsparc.data.tables import is_table
+from gsparc.data.units import UNITS
+from gsparc.physics.decibels import to_decibels
 
 log = logging.getLogger(__name__)
 
@@ -114,7 +118,8 @@ def _read_file(
 
 def _near_rows(path: Path, data: Measurements, points: np.ndarray, level: np.ndarray) -> Levels:
     """What is known about rows and stations; `DataError` where that is nothing, or too much."""
-    finite = np.isfinite(level) & np.isfinite(points).all(1)
+    finite = np.isfinite(level) & (np.abs(level) <= MOST_DB) & np.isfinite(points).all(1)
+    _say_marks(path, int((np.isfinite(level) & (np.abs(level) > MOST_DB)).sum()), f"beyond {MOST_DB} dB")
     if not finite.any():
         raise DataError(f"model.prior={path}: no level is known in it")
     points, level = points[finite], level[finite]
@@ -132,7 +137,17 @@ def _near_rows(path: Path, data: Measurements, points: np.ndarray, level: np.nda
         raise DataError(
             f"model.prior={path}: {near.sum():,} levels about the rows; {MOST:,} at most are kept"
         )
-    return points[near], level[near]
+    points, level = points[near], level[near]
+    marks = find_marks(level)
+    marked = np.isin(level, marks)
+    _say_marks(path, int(marked.sum()), f"exactly {list_first([f'{mark:g}' for mark in marks])}")
+    return points[~marked], level[~marked]
+
+
+def _say_marks(path: Path, count: int, what: str) -> None:
+    if count:
+        advice = "left out as no levels; tag them as nodata of the file"
+        log.warning("model.prior=%s: %d levels are %s, apart from all others: %s", path, count, what, advice)
 
 
 def _extent(points: np.ndarray) -> np.ndarray:
@@ -155,6 +170,12 @@ def _read_raster(
         known = {*stations, *map(site_name, stations)}
         named = [t.removeprefix(f"{BAND} ") for t in titles]
         bands = {t: k for k, t in enumerate(named) if t != titles[k] or t in known}
+        if not bands and file.count > 1 and BAND not in titles:
+            if stations and all(titles):  # of others: as a station alone is asked for, none of them is known
+                bands = {t: k for k, t in enumerate(named)}
+            else:
+                shown = list_first([title or f"{k}" for k, title in enumerate(titles, 1)])
+                log.warning("model.prior=%s: the first of its bands %s is taken", path, shown)
         row, column = np.mgrid[: file.height, : file.width]
         x, y = file.transform @ (column.ravel() + 0.5, row.ravel() + 0.5)
         points, crs, origin = np.c_[x, y], file.crs, data.site.georeference
@@ -166,7 +187,20 @@ def _read_raster(
             longitude, latitude = (np.asarray(one) for one in transform(crs, "EPSG:4326", x, y))
             points = origin.from_degrees(latitude, longitude)
         for name, band in (bands or one).items():
-            yield name, points, file.read(band + 1, masked=True).astype(float).filled(np.nan).ravel()
+            stored = file.read(band + 1, masked=True).astype(float).filled(np.nan).ravel()
+            values = stored * file.scales[band] + file.offsets[band]
+            yield name, points, _to_decibels(path, values, str(file.units[band] or ""))
+
+
+def _to_decibels(path: Path, values: np.ndarray, name: str) -> np.ndarray:
+    """Levels of values whose unit a file names, if it names one; `DataError` where that is none of powers."""
+    unit = UNITS.get(name.lower())
+    if unit is None:
+        return values
+    if unit.kind not in ("level", "power"):
+        raise DataError(f"model.prior={path}: its unit is {name}; levels are needed, or powers such as mW")
+    with np.errstate(divide="ignore", invalid="ignore"):  # of no power nothing is known
+        return to_decibels(unit.convert(values)) + 30 if unit.kind == "power" else unit.convert(values)
 
 
 def _read_rows(

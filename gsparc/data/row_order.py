@@ -96,12 +96,19 @@ def content_order(data: Measurements) -> np.ndarray:
         *(data.tx, data.rx_position, data.rx_rotation, data.target, data.mask, data.noise_variance),
         *(data.censored, data.position_std, data.uplink, data.device),
     )
-    moment = number_moments(data, np.arange(len(data)))
+    rows = np.arange(len(data))
+    # Visits are counted in the order of the file, and only channels, whose phases moments share, need them.
+    moment = number_moments(data, rows) if data.site.target.is_complex else rows
     together = np.zeros(len(data), np.uint64)
     np.add.at(together, moment, row)
     # The largest moment of a place first: counting visits then finds the same moments again.
     largest = -np.bincount(moment)[moment]
-    return np.lexsort((row, together[moment], largest, hash_rows(data.moving), along_curve(data.moving)))
+    # Stations at one place, and runs, may have measured the same: their numbers are of the file's order.
+    names = data.site.every_station.shown
+    several = len(names) > 1  # rows of one may have its number among others
+    station = np.unique(names, return_inverse=True)[1][data.stations_of()] if several else rows * 0
+    among = data.runs_of(rows), station, row
+    return np.lexsort((*among, together[moment], largest, hash_rows(data.moving), along_curve(data.moving)))
 
 
 def along_curve(places: np.ndarray) -> np.ndarray:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from gsparc.data.links.georeference import Georeference
 
 Places = TypeVar("Places")
+Channels = TypeVar("Channels", np.ndarray, Tensor)
 
 # Channels with unknown factors are compared after alignment, which is another figure.
 Scored = Literal["spectrum", "csi", "aligned csi", "rssi"]  # by which figures of merit
@@ -174,6 +175,8 @@ class Site:
         device_names: (D,) what measured powers is called; None where nothing tells.
         device_levels: (D + 1, 2) offset [dB] of each to their mean, which was taken off, and variance [dB^2]
             of what is not known of it; the last of a device that nobody named. None before that.
+        measured: (A, K) bool, of a file's antennas and tones those that targets hold, as all others are
+            constant or marked in every row; None: all.
     """
 
     name: str
@@ -204,6 +207,7 @@ class Site:
     phase_reference: Literal["carrier", "neighbours"] | None = None
     device_names: tuple[str, ...] | None = None
     device_levels: np.ndarray | None = field(default=None, compare=False)
+    measured: np.ndarray | None = field(default=None, compare=False)
 
     @property
     def target(self) -> Target:
@@ -215,6 +219,21 @@ class Site:
         """The figures of merit that tell of it; rows with factors of their own are aligned first."""
         # Only channels have phases: powers and spectra are the same under any factor.
         return "aligned csi" if self.target.is_complex and self.unknown_factor != "none" else self.kind
+
+    def in_shape_of_file(self, channels: Channels) -> Channels:
+        """Return channels (..., a, k) as a file holds them, (..., A, K), NaN where nothing was `measured`."""
+        if self.measured is None:
+            return channels
+        known: np.ndarray = self.measured
+        shape = (*channels.shape[:-2], *known.shape)
+        entries = channels.reshape(*channels.shape[:-2], -1)
+        if isinstance(channels, Tensor):
+            whole = channels.new_full(shape, torch.nan)
+            whole[..., torch.from_numpy(known)] = entries
+            return whole
+        filled = np.full(shape, np.nan, channels.dtype)
+        filled[..., known] = entries
+        return filled
 
     def need_phase(self, what: str) -> None:
         """Raise `ValueError` where rows have phases of their own, so that `what` cannot be told."""

@@ -13,6 +13,7 @@ from gsparc.data.errors import list_first
 from gsparc.data.links.stations import all_names
 from gsparc.data.schema import Measurements, Site, Stations
 from gsparc.data.units import WATTS
+from gsparc.models.method import MEAN_DEVICE
 
 log = logging.getLogger(__name__)
 
@@ -35,6 +36,7 @@ def align_to_site(data: Measurements, site: Site, *, whole: bool = False) -> Mea
     data = _about(data, site)
     if site.unknown_factor != "none":  # few rows of another file may not tell
         data = replace(data, site=replace(data.site, unknown_factor=site.unknown_factor))
+    data = _with_devices(_with_entries(data, site), site)
     ours = data.site
     shift = ours.origin - site.origin
     if ours.static_position is not None and site.static_position is not None:
@@ -59,6 +61,38 @@ def align_to_site(data: Measurements, site: Site, *, whole: bool = False) -> Mea
         # Variances are of the square of the unit.
         noise_variance=_times(data.noise_variance, rescale**2),
     )  # fmt: skip
+
+
+def _with_entries(data: Measurements, site: Site) -> Measurements:
+    """`data` with the antennas and tones that a model learned; those that it lacks were not measured."""
+    if not site.target.is_complex or (data.site.measured is None and site.measured is None):
+        return data
+    have, want = (one.measured for one in (data.site, site))
+    shape = data.target.shape[1:] if have is None else have.shape
+    want = np.ones(shape, bool) if want is None else want
+    if want.shape != shape:
+        raise ValueError(
+            f"the model was trained on {want.shape} antennas and tones, {data.site.name} has {shape}"
+        )
+    known = np.ones(data.target.shape, bool) if data.mask is None else data.mask
+    target, mask = (np.zeros((len(data), *shape), one.dtype) for one in (data.target, known))
+    for whole, part in ((target, data.target), (mask, known)):
+        whole[:, np.ones(shape, bool) if have is None else have] = part.reshape(len(data), -1)
+    rows, columns = want.any(1), want.any(0)
+    facts = {n: getattr(site, n) for n in ("subcarriers_hz", "array", "antennas", "measured")}
+    there = replace(data.site, **facts)
+    target, mask = (whole[:, rows][:, :, columns] for whole in (target, mask))
+    return replace(data, site=there, target=target, mask=mask)
+
+
+def _with_devices(data: Measurements, site: Site) -> Measurements:
+    """`data` with the numbers that a model has for devices, by their names; unknown ones are the mean one."""
+    if data.device is None or data.site.device_names == site.device_names:
+        return data
+    known = {name: number for number, name in enumerate(site.device_names or ())}
+    number = np.array([known.get(name, MEAN_DEVICE) for name in data.site.device_names or ()])
+    device = number[data.device] if known else None
+    return replace(data, device=device, site=replace(data.site, device_names=site.device_names))
 
 
 def _about(data: Measurements, site: Site) -> Measurements:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +17,12 @@ from gsparc.data.executor import run_each
 from gsparc.data.files import write_archive
 from gsparc.data.query_places import QueryPlaces, read_query_places
 from gsparc.data.schema import End, Site
-from gsparc.data.target import Kind, Target
+from gsparc.data.target import Target
 from gsparc.data.units import PowerUnit, power_in_decibels
 from gsparc.evaluation.summary import write_samples
-from gsparc.models.method import Prediction
+from gsparc.models.device_offsets import find_device
+from gsparc.models.method import MEAN_DEVICE, Prediction
+from gsparc.prediction.hearing import read_hearing
 from gsparc.prediction.placing import (
     far_outside_and_margin,
     fill_heights,
@@ -36,6 +38,7 @@ log = logging.getLogger(__name__)
 # 512 spectra of 90 x 360 pixels take 66 MB in float32: what a block costs in memory.
 CHUNK = 512  # places predicted at a time
 MOST_ENTRIES = 16  # of a channel, as columns of a table
+DIGITS = 6  # of decibels: `evaluate` and an error computed from the file agree so far
 ENDINGS = (".csv", ".npz")
 # Expected errors (N,) [dB] of local places, numbers of stations and deviations [dB]; NaN where refused.
 Tested = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -51,6 +54,8 @@ class Answers:
         names: (N,) of stations by heads of columns, see `Stations.named`; empty where the model has none.
         said: (N, ...) in the predictor's unit.
         refused: (N,) bool, as maps refuse places; None where no error was tested.
+        heard: (N,) in the predictor's unit, of powers given that they are heard, see `Hearing.given_heard`,
+            by the names of its results; empty where the model learned of no silence.
     """
 
     place: np.ndarray
@@ -58,6 +63,7 @@ class Answers:
     names: dict[str, np.ndarray]
     said: Prediction
     refused: np.ndarray | None = None
+    heard: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(self.place)
@@ -107,13 +113,15 @@ def predict_file(
             queries.rows[int(np.argmax(far))],
         )  # fmt: skip
     power = site.power_unit(predictor.unit) if site.target.is_level else None
+    if power is not None:
+        predictions = _with_heard(predictor, queries, site.local_places(world), predictions, power)
     if tested is not None and power is not None and predictions.said.variance is not None:
         local = site.local_places(world)[predictions.place]
         predictions = _with_tested(predictions, local, power, tested)
         if refused := predictions.count_refused():
             what = f"{refused} of {len(predictions)} predictions are refused (column refused)"
             log.warning("%s: %s: too far from what was measured", places, what)
-    write_answers(path, queries, predictions, site.kind, power)
+    write_answers(path, queries, predictions, site, power)
     facts: dict[str, Any] = {
         "predict/places": len(queries), "predict/predictions": len(predictions),
         "predict/far_outside": int(far.sum()),
@@ -151,6 +159,27 @@ def _with_tested(answers: Answers, local: np.ndarray, power: PowerUnit, tested: 
     scaled = torch.from_numpy(deviation * ratio)
     prediction = replace(answers.said, variance=scaled.square())
     return replace(answers, said=prediction, refused=np.isnan(error))
+
+
+def _with_heard(
+    predictor: Predictor, queries: QueryPlaces, local: np.ndarray, answers: Answers, power: PowerUnit
+) -> Answers:
+    """Answers with levels given that they are heard, which `evaluate` judges where rows were chosen so."""
+    hearing, method, site = read_hearing(predictor.extra), predictor.method, predictor.site
+    variance, raised_db = answers.said.variance, power.raised_db - site.power_unit(site.level_unit).raised_db
+    # Numbers of stations are those of a whole model: `select_carrier` leaves one.
+    whole = predictor.queries.station is None and len(site.every_station) > max(hearing.station, default=0)
+    if not (len(hearing) and whole and power.decibels and method.uses_censored) or variance is None:
+        return answers
+    device = None
+    if queries.device is not None and site.device_names is not None:
+        number = {name: find_device(name, site) for name in np.unique(queries.device) if name}
+        device = np.array([number.get(name, MEAN_DEVICE) for name in queries.device])[answers.place]
+    level_db, spread_db = answers.said.mean[:, 0].numpy() - raised_db, variance.double().sqrt().numpy()
+    asked = local[answers.place], answers.station, level_db, spread_db, device
+    heard = hearing.given_heard(method, *asked)
+    heard["heard_db"] += raised_db
+    return replace(answers, heard=heard)
 
 
 def _notes(queries: QueryPlaces, site: Site) -> list[str]:
@@ -267,19 +296,22 @@ def unit_suffix(unit: PowerUnit) -> str:
 
 
 def write_answers(
-    path: Path, queries: QueryPlaces, predictions: Answers, kind: Kind, power: PowerUnit | None
+    path: Path, queries: QueryPlaces, predictions: Answers, site: Site, power: PowerUnit | None
 ) -> None:
     """Write all predictions, whole or not at all; NaN for the level of no power."""
-    archive = path.suffix.lower() == ".npz"
+    archive, kind = path.suffix.lower() == ".npz", site.kind
     columns, name = _places(queries, predictions), kind if power is None else f"{kind}_{unit_suffix(power)}"
     outputs, mean = predictions.said, predictions.said.mean.numpy()
     if power is not None:
-        columns[name] = np.where(np.isfinite(mean[:, 0]), mean[:, 0], np.float32(np.nan))
+        columns[name] = np.where(np.isfinite(mean[:, 0]), mean[:, 0], np.nan)
+        columns[name] = columns[name].round(DIGITS) if power.decibels else columns[name].astype(np.float32)
     if outputs.variance is not None:
         # Stored as a variance because those of independent parts add; a reader wants it in the level's unit.
         columns[f"{name}_std"] = outputs.variance.sqrt().float().numpy()
     if power is None:
+        mean = site.in_shape_of_file(mean) if site.target.is_complex else mean
         columns |= {kind: mean} if archive else _entries(mean)
+    columns |= {name: values.round(DIGITS) for name, values in predictions.heard.items()}
     columns |= {} if outputs.confidence is None else {"confidence": outputs.confidence.numpy()}
     columns |= {} if predictions.refused is None else {"refused": predictions.refused.astype(np.int8)}
     if not archive:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from gsparc.evaluation.experiment.folds import fit_folds
 from gsparc.evaluation.scores import Scores, score_methods
 from gsparc.models.method import Method, MethodFactory
 from gsparc.models.registry import all_methods, method_class, plain_methods
+from gsparc.prediction.hearing import Hearing
 from gsparc.training.context import FitContext, FitReport
 
 log = logging.getLogger(__name__)
@@ -55,7 +57,7 @@ class FittedBaseline:
 
 def fit_baseline(
     name: str, data: Measurements, split: Split, eval_on: str = "test",
-    learned: tuple[Measurements, Split] | None = None,
+    learned: tuple[Measurements, Split] | None = None, hearing: Sequence[Hearing] | None = None,
 ) -> FittedBaseline:  # fmt: skip
     """Fit the baseline `name` with its default settings on each fold, and score it.
 
@@ -65,6 +67,7 @@ def fit_baseline(
         split: folds; baselines learn from train and val rows, or from train rows when `val` is scored.
         eval_on: `train`, `val` or `test`.
         learned: other measurements to learn from, and the folds of these; None: `data` and `split`.
+        hearing: see `score_methods`.
     """
     learned_data, before = learned or (data, split)
     if eval_on == "val" and learned is None:  # learned from as methods do, but where they are scored
@@ -76,5 +79,5 @@ def fit_baseline(
 
     contexts = [FitContext(Path())] * len(before.folds)
     fits = fit_folds(method_class(name)(), learned_data, before, contexts, keep=say)
-    scores = score_methods(fits.methods, data, split, eval_on, learned)
+    scores = score_methods(fits.methods, data, split, eval_on, learned, hearing=hearing)
     return FittedBaseline(fits.methods, scores, fits.train_s)

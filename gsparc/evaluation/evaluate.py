@@ -31,6 +31,7 @@ from gsparc.models.fitting import common_label
 from gsparc.models.method import Method
 from gsparc.physics.decibels import to_decibels
 from gsparc.prediction import timing
+from gsparc.prediction.hearing import Hearing
 from gsparc.prediction.timing import ClockSettings, query_calls, time_beside_copy, time_interleaved
 
 log = logging.getLogger(__name__)
@@ -93,7 +94,7 @@ def evaluate(
     methods: Method | Sequence[Method], train_s: float | Sequence[float] | None, data: Measurements,
     split: Split, *, eval_on: str = "test", baselines: Sequence[str] | None = None,
     clock: ClockSettings | None = None, learned: tuple[Measurements, Split] | None = None,
-    shared: str | None = None, timed: bool = True,
+    shared: str | None = None, timed: bool = True, hearing: Sequence[Hearing] | None = None,
 ) -> Evaluation:  # fmt: skip
     """Score and time a method beside the baselines.
 
@@ -108,6 +109,7 @@ def evaluate(
         learned: what baselines learn from where the methods learned from other data; None: `data`, `split`.
         shared: the baseline that the methods are, which is then not fitted again.
         timed: whether latencies are measured.
+        hearing: see `score_methods`; as checkpoints hold it.
 
     Nothing is scored or timed where `split=none` left no test rows.
 
@@ -124,14 +126,18 @@ def evaluate(
         raise ValueError(f"{len(seconds)} training times for {len(methods)} methods")
     if split.name == "none" and eval_on == "test":
         return Evaluation(_about(methods, seconds, data, split), {})
-    scores = score_methods(methods, data, split, eval_on, learned)
+    if hearing is None:
+        learned_data, before = learned or (data, split)
+        hearing = [Hearing.from_learned(learned_data, fold.learned()) for fold in before.folds]
+    scores = score_methods(methods, data, split, eval_on, learned, hearing=hearing)
     # Which baselines serve is decided by the rows that they learn from, not by those scored.
     names = baselines_for(*(learned or (data, split))) if baselines is None else baselines
     if fitted := [name for name in names if name != shared]:
         log.info("%-10s%s", "baselines", ", ".join(fitted))
     # A method that is a baseline (model=gp) has one fit and one row: another would only differ in seconds.
     same = FittedBaseline(methods, scores, tuple(seconds or ()))
-    fits = {n: same if n == shared else fit_baseline(n, data, split, eval_on, learned) for n in names}
+    told = eval_on, learned, hearing
+    fits = {n: same if n == shared else fit_baseline(n, data, split, *told) for n in names}
     others = {f"baseline/{name}": one for name, one in fits.items()}
     facts: dict[str, Any] = {}
     every = {eval_on: scores, **{room: other.scores for room, other in others.items()}}
@@ -140,7 +146,7 @@ def evaluate(
     fields = [one for one in (method.without_process() for method in methods) if one is not None]
     # Only where each fold kept its field: figures of some folds would be of other rows than those beside.
     if len(fields) == len(methods):
-        every[FIELD] = score_methods(fields, data, split, eval_on, learned)
+        every[FIELD] = score_methods(fields, data, split, eval_on, learned, hearing=hearing)
         contenders[FIELD] = fields[0]
     nearest = every.get("baseline/nearest")
     for room, one in every.items():
@@ -152,7 +158,7 @@ def evaluate(
         # Rows of lists that they do not fill are judged by other levels: it is no choice of rows alone.
         fitted_of = {eval_on: methods, **{room: other.methods for room, other in others.items()}}
         cells[WITHOUT_OFF] = {
-            room: score_methods(fitted, data, split, eval_on, learned, off=off)
+            room: score_methods(fitted, data, split, eval_on, learned, off=off, hearing=hearing)
             for room, fitted in fitted_of.items()
         }
         for room, one in cells[WITHOUT_OFF].items():

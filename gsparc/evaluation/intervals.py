@@ -22,9 +22,10 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
     `reduced_chi2` is that of `reduced_chi_squared`, of heard rows in decibels;
     `interval/coverage_90` is the share of heard rows whose power lies in the central 90 % interval,
     `interval/width_db` its mean width; beside silent rows that of levels given that they are heard, which
-    exceed the others by `heard_above_db`. Where powers may be too weak to be heard or listed, `outage/rate`
-    is the share of rows that were, `outage/brier` the mean square of (predicted probability - what
-    happened), 0 when perfect, and `outage/brier_rate` what always saying the rate gives.
+    exceed the others by `heard_above_db`; `levels_rmse_db` is the error of the others there. Where powers
+    may be too weak to be heard or listed, `outage/rate` is the share of rows that were, `outage/brier` the
+    mean square of (predicted probability - what happened), 0 when perfect, and `outage/brier_rate` what
+    always saying the rate gives.
     """
     mean, variance = scores.samples["prediction"], scores.variance * data.site.target_scale**2
     # Decibels of a power need a mean above 0.
@@ -44,7 +45,10 @@ def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | Non
         coverage, width = coverage_and_width(error, half_width(SHARE) * spread)
         figures |= {"interval/coverage_90": coverage, "interval/width_db": width}
         figures |= {CALIBRATION: float(np.mean((error / spread) ** 2))}
-        figures |= {"heard_above_db": float((middle - mean_db[heard]).mean())} if moments else {}
+        if moments:
+            plain = to_decibels(power[heard]) - mean_db[heard]
+            figures["heard_above_db"] = float((middle - mean_db[heard]).mean())
+            figures["levels_rmse_db"] = float(np.sqrt(np.mean(plain**2)))
     chance = scores.samples.get("heard_share", scores.variance * np.nan)[valid]
     limited = np.isfinite(chance)
     if not limited.any():  # all of them are of stations that heard everything

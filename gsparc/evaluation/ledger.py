@@ -6,16 +6,14 @@ import functools
 import json
 import logging
 import os
-import re
 import sys
 import sysconfig
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from hashlib import file_digest, sha256
 from importlib.metadata import version
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +25,7 @@ from gsparc.data.errors import DataError, list_first
 from gsparc.data.files import SUMMARY, set_aside, write_whole
 from gsparc.data.schema import Measurements
 from gsparc.evaluation.results import read_summary
+from gsparc.evaluation.summary import provenance, run_git
 from gsparc.models.checkpoint import MODEL
 from gsparc.models.fitting import LAST, dotted_settings
 
@@ -35,7 +34,11 @@ log = logging.getLogger(__name__)
 RECORD = "job.json"  # in a fit's folder: its state and program, when it began, and whether it has ended
 FAILURE = "failure.txt"  # why it has failed
 WHERE = ("engine", "workers", "ray", "logger", "reuse", "ckpt_path")  # of where, or whether, a fit is done
-OF_DATA = ("dataset.root", "dataset.file", "split.path")  # paths that stand for what was read from them
+OF_DATA = (  # paths that stand for what was read from them, or is written there where nothing is
+    *("dataset.root", "dataset.file", "split.path"),
+    "dataset.stand_in.root",
+)
+WORDS = (".name", "._target_")  # settings that are never paths: a folder may be called as a method is
 WHOLE = "gsparc.data.datasets.own.Own"  # reads no file but those that its settings name
 LEFT = (  # by a training: of another one, all of it would be read beside this one's
     *("summary.json", "split.json", "per_sample.csv", "by_station.csv", "render_ms.csv"),
@@ -43,13 +46,9 @@ LEFT = (  # by a training: of another one, all of it would be read beside this o
     *(f"{fold}{name}" for fold in ("", "fold*/") for name in (MODEL, "learning_curve.csv")),
 )
 PARTS = ("fold*/**/*.ckpt", "station*/*.ckpt", "unheard/*.ckpt")  # finished or not
-READS = "READS"  # of a module: patterns, from its folder, of the data files that it reads
-STRING = r"""(?:\"{3}(?:\\.|[^\\])*?\"{3}|'{3}(?:\\.|[^\\])*?'{3}|"(?:\\.|[^"\\\n])*"|'(?:\\.|[^'\\\n])*')"""
-REMARK = re.compile(rf"({STRING})|[ \t]*#[^\n]*|\n\s*(?=\n)", re.DOTALL)  # or an empty line
-# After the head of a definition, or its last line: text after other colons is read by a program.
-HEAD = r"(?m:^)[ \t]*(?:async def|def|class|\))[^\n]*:\n\s+"
-DOCSTRING = re.compile(rf'({HEAD}|\A\s*)r?"{{3}}(?:\\.|[^\\])*?"{{3}}|({STRING})', re.DOTALL)
-ENVIRONMENT = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
+GSPARC, ROOT = "gsparc", Path(__file__).resolve().parents[1]
+OURS = ("gsparc", "hydra_plugins", "__main__", "__mp_main__")  # modules that the edition tells of
+INSTALLED = tuple({sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")})
 
 
 @dataclass(frozen=True)
@@ -78,9 +77,8 @@ class FitInputs:
         whole: Any = OmegaConf.to_container(subset, resolve=True)  # what is missing is `???`
         named = dict(dotted_settings(whole))
         where = {name: named.pop(name) for name in OF_DATA if name in named}
-        files = {name: value for name, value in named.items() if isinstance(value, str)}
         settings = json.loads(json.dumps(named, default=str))
-        return cls(settings, _hashes(files), data, split, {} if data else _hashes(where))
+        return cls(settings, _hashes(named), data, split, {} if data else _hashes(where))
 
     @property
     def tells_data(self) -> bool:
@@ -95,9 +93,6 @@ class FitInputs:
         """
         names = ("settings", "files", *(("data", "split") if self.data else ("unread",)))
         now, before = ({name: of.get(name) or {} for name in names} for of in (vars(self), record))
-        before["settings"] = {
-            n: v for n, v in before["settings"].items() if n not in OF_DATA
-        }  # older records
         one, other = dict(dotted_settings(now)), dict(dotted_settings(before))
         differing = [name for name in other | one if one.get(name) != other.get(name)]
         return differing if reuse else differing + edited(record)
@@ -152,8 +147,7 @@ def run_once(
     if record is None or record.get("ended") or changes:
         if record is not None and changes and not resumes:
             settings = state.changes(record, reuse=True)
-            files = len(changes) - len(settings)  # of the program: hundreds of modules tell a reader nothing
-            words = [*settings, f"{files} files of the program"] if files else settings
+            words = [*settings, "the program"] if changes != settings else settings
             log.info("%s: runs again, as these changed since it ran: %s", folder, list_first(words))
         set_aside(folder, SUMMARY)  # before the record: of two states one would take the other's for its own
         record = {**asdict(state), "began": time.time()}
@@ -188,65 +182,36 @@ def set_earlier_aside(run_dir: Path, *begun_from: str | None) -> None:
 
 
 def edited(record: Mapping[str, Any]) -> list[str]:
-    """Return which of the files that a record's program imported are others now."""
+    """Return which parts of a record's program are others now."""
     before = record.get("program")
     if not isinstance(before, Mapping):  # an older record has one hash of all
-        return ["program"]
+        return [GSPARC]
     return [name for name, content in before.items() if _content(name) != content]
 
 
 def program() -> dict[str, str]:
-    """Return the content of every file imported so far, by module, and of the data files that it `READS`.
+    """Return gsparc's edition, and the content of modules that no environment installed, by their files.
 
-    Those of the environment's packages are left out: their versions stand in each summary. Of gsparc itself
-    all count, wherever it is installed. Changes of comments and docstrings alone change nothing.
+    The edition is the commit of the source tree with a hash of what was edited since, else the version.
     """
-    found = {"version": version("gsparc")}
-    for name, module in list(sys.modules.items()):
-        if _counts(name, getattr(module, "__file__", None)):
-            reads = [name, *(f"{name}:{pattern}" for pattern in getattr(module, READS, ()))]
-            found |= {one: _content(one) for one in reads}
-    return found
-
-
-@functools.cache
-def _counts(name: str, file: str | None) -> bool:
-    """Whether a module is of the program."""
-    if name in ("__main__", "__mp_main__") or not file or not os.path.isfile(file):
-        return False
-    return name.partition(".")[0] == "gsparc" or not os.path.abspath(file).startswith(ENVIRONMENT)
+    modules = [m for name, m in list(sys.modules.items()) if name.partition(".")[0] not in OURS]
+    files = {os.path.abspath(getattr(module, "__file__", None) or os.curdir) for module in modules}
+    others = sorted(file for file in files if os.path.isfile(file) and not file.startswith(INSTALLED))
+    return {name: _content(name) for name in (GSPARC, *others)}
 
 
 def _content(name: str) -> str:
     """Of an entry of `program`; "" where it is gone."""
-    module, _, pattern = name.partition(":")
-    if module == "version":
-        return version("gsparc")
-    file = getattr(sys.modules.get(module), "__file__", None)
-    with suppress(ImportError, ValueError, AttributeError):  # of a parent that is gone
-        file = file or getattr(find_spec(module), "origin", None)
-    if file is None or not os.path.isfile(file):
-        return ""
-    if pattern:
-        return _joined(Path(file).parent.glob(pattern), Path(file).parent)
-    return _hash_of_program(file)
+    if name == GSPARC:
+        return _edition()
+    return _hash_of(Path(name)) if os.path.isfile(name) else ""
 
 
 @functools.cache  # of a process, which runs what it has read
-def _hash_of_program(file: str) -> str:
-    return _hash_of(Path(file))
-
-
-def strip_comments(text: str) -> str:
-    """Return Python without comments and empty lines, and with empty docstrings.
-
-    By strings and comments alone: parsing every file of gsparc would take seconds at the start of each run.
-
-    >>> strip_comments("mark = '#'  # of a comment")
-    "mark = '#'"
-    """
-    code = REMARK.sub(lambda one: one[1] or "", text)
-    return DOCSTRING.sub(lambda one: one[2] or f'{one[1]}""', code)
+def _edition() -> str:
+    commit = provenance()["git"] or version("gsparc")
+    edits = run_git(ROOT, "diff", "HEAD") if commit.endswith("-dirty") else ""
+    return f"{commit} {sha256(edits.encode()).hexdigest()}" if edits else commit
 
 
 def _joined(files: Iterable[Path], root: Path) -> str:
@@ -254,19 +219,36 @@ def _joined(files: Iterable[Path], root: Path) -> str:
     return sha256(repr(hashes).encode()).hexdigest()
 
 
-def _hashes(paths: Mapping[str, Any]) -> dict[str, str]:
-    """Of those settings that name a file, or the folder of a dataset."""
-    found = {name: _hash_of(Path(path)) for name, path in paths.items() if path and os.path.isfile(path)}
-    if (root := paths.get("dataset.root")) and os.path.isdir(root):
-        found["dataset.root"] = _joined(Path(root).rglob("*"), Path(root))
-    return found
+def _hashes(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Of those settings that name a file or folder, alone or in a list."""
+    hashes = {name: _named(value) for name, value in settings.items() if not name.endswith(WORDS)}
+    return {name: content for name, content in hashes.items() if content}
+
+
+def _named(value: Any) -> str:
+    """The hash of the files that a setting's value names; empty: none."""
+    if isinstance(value, Mapping | list | tuple):
+        parts = [_named(part) for part in (value.values() if isinstance(value, Mapping) else value)]
+        return sha256(repr(parts).encode()).hexdigest() if any(parts) else ""
+    if not isinstance(value, str) or not value:
+        return ""
+    if os.path.isdir(value):
+        return _joined(_files_under(value), Path(value))
+    return _hash_of(Path(value)) if os.path.isfile(value) else ""
+
+
+def _files_under(root: str) -> Iterator[Path]:
+    """All files of a folder and of those that links in it lead to, each folder once; not those of fits."""
+    seen = set[str]()
+    for folder, inner, names in os.walk(root, followlinks=True):
+        if os.path.realpath(folder) in seen or (RECORD in names and folder != root):
+            inner.clear()
+            continue
+        seen.add(os.path.realpath(folder))
+        yield from (Path(folder, name) for name in names)
 
 
 def _hash_of(file: Path) -> str:
-    """The hash of a file, of Python of what it does."""
-    if file.suffix == ".py":
-        text = file.read_text(encoding="utf-8", errors="replace")
-        return sha256(strip_comments(text).encode()).hexdigest()
     with open(file, "rb") as stream:
         return file_digest(stream, "sha256").hexdigest()
 

@@ -70,7 +70,7 @@ FIGURES = {
     "rmse_db_after_constant": Figure("after a constant, dB", ".2f", "smaller"),
 }
 WITH_SILENT = "rmse_db_with_silent"
-GIVEN_HEARD = "rmse_db judges levels of rows that are heard or listed"
+GIVEN_HEARD = "rmse_db judges levels of rows that are heard or listed, heard_db of gsparc predict"
 LISTED = "ahead_listed"
 BEST_SERVER = "best_server"  # beside errors of several stations, never compared by
 CALIBRATION = "reduced_chi2"  # 1 where predicted variances are right: shown beside errors, never compared

@@ -16,8 +16,8 @@ from gsparc.data.schema import Measurements, Scored
 from gsparc.data.splits import Fold, Split
 from gsparc.data.units import power_in_decibels
 from gsparc.evaluation.given_heard import (
-    levels_given_heard,
     levels_of_nearest_moment,
+    names_every_station,
     never_listed,
     strongest_told,
 )
@@ -25,6 +25,7 @@ from gsparc.evaluation.metric_formats import OF_KIND
 from gsparc.evaluation.metrics import power_errors
 from gsparc.models.method import Method, predict_in_batches
 from gsparc.physics.decibels import from_decibels
+from gsparc.prediction.hearing import Hearing
 
 SUBSETS = ("train", "val", "test")
 # 64 spectra of 90 x 360 pixels take 8 MB in float32, and their targets as much.
@@ -136,12 +137,13 @@ def best_phase_of_runs(method: Method, data: Measurements, rows: np.ndarray, run
 def score_methods(
     methods: Sequence[Method], data: Measurements, split: Split, eval_on: str = "test",
     learned: tuple[Measurements, Split] | None = None, means: list[Tensor] | None = None,
-    off: Sequence[int] = (),
+    off: Sequence[int] = (), hearing: Sequence[Hearing] | None = None,
 ) -> Scores:  # fmt: skip
     """Predict the chosen rows of every fold with that fold's method.
 
-    Channels of runs that it did not learn from are scored after the best common phase of each. Heard rows are
-    judged by `levels_given_heard`, which are among the samples, where it learned from silent ones.
+    Channels of runs that it did not learn from are scored after the best common phase of each. Where it
+    learned from silent rows, and the chosen ones do not name every station at each place, heard rows are
+    judged by `Hearing.given_heard`, which are among the samples: column `heard_db` of `gsparc predict`.
 
     Args:
         methods: one fitted method per fold.
@@ -151,6 +153,7 @@ def score_methods(
         learned: what the methods learned from, where it is not `data` and `split`.
         means: which the mean of every batch is added to.
         off: stations that are not scored and fill no list of the strongest.
+        hearing: what each method learned of silence; None: as the rows tell that it learned from.
 
     Raises:
         ValueError: another number of methods than folds, an empty subset, a prediction with NaN.
@@ -161,9 +164,12 @@ def score_methods(
     every = [rows[~np.isin(data.stations_of(rows), off)] for rows in every] if len(off) else every
     missing: list[pd.DataFrame] = []
     learned_data, before = learned or (data, split)
-    limited = (learned_data.censored_side(before.folds[0].train) > 0).any()
+    if hearing is None:
+        hearing = [Hearing.from_learned(learned_data, fold.learned()) for fold in before.folds]
+    limited = any(map(len, hearing)) and not names_every_station(data, np.concatenate(every))
     are_lists = limited and strongest_lists(data) is not None
-    for method, rows, fold, taught in zip(methods, every, split.folds, before.folds, strict=True):
+    of_folds = zip(methods, every, split.folds, before.folds, hearing, strict=True)
+    for method, rows, fold, taught, silence in of_folds:
         runs = unseen_runs(data, fold, eval_on)
         # Before scoring: the phase is found on all rows of a run, chunks alone would each have one.
         turn = best_phase_of_runs(method, data, rows, runs) if len(runs) else None
@@ -182,23 +188,20 @@ def score_methods(
         # Metrics are in the order of updates, station by station; rows are wanted in that of the fold.
         back = np.argsort(np.concatenate(order))
         scored = {name: values[back] for name, values in metric.compute().items()} | outputs
-        learned_rows = np.sort(taught.learned(eval_on))
         if method.name == "nearest" and data.site.target.is_level and data.station is not None:
+            learned_rows = np.sort(taught.learned(eval_on))
             scored["served"] = levels_of_nearest_moment(learned_data.subset(learned_rows), data.subset(rows))
         if limited:
             variance = scored["variance"] * data.site.target_scale**2
             with np.errstate(divide="ignore", invalid="ignore"):  # of no power, which has no decibels
                 level = power_in_decibels(scored["prediction"], variance)
-            there, queries = learned_data.subset(learned_rows), data.subset(rows)
-            lists = strongest_lists(there)
-            if lists is not None and len(off):
-                lists.level[:, off] = np.nan
-            if lists is not None and are_lists:
-                scored["strongest_told"] = strongest_told(method, lists, queries)
-                missing.append(never_listed(method, lists, data.subset(np.concatenate(every)), queries))
-            heard_levels = levels_given_heard(method, there, queries, *level, lists)
+            queries, told = data.subset(rows), silence.without(np.asarray(off, np.int64))
+            if told.lists is not None and are_lists:
+                scored["strongest_told"] = strongest_told(method, told.lists, queries)
+                missing.append(never_listed(method, told, data.subset(np.concatenate(every)), queries))
+            heard = told.given_heard(method, queries.moving, queries.stations_of(), *level, queries.device)
             # Who learned from heard rows alone predicts such levels.
-            scored |= heard_levels if method.uses_censored else {"heard_share": heard_levels["heard_share"]}
+            scored |= heard if method.uses_censored else {"heard_share": heard["heard_share"]}
         samples.append(scored)
     pooled = {name: np.concatenate([s[name] for s in samples]) for name in samples[0]}
     row = np.concatenate(every)

@@ -162,9 +162,10 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
     if above := facts.get(f"{prefix}/heard_above_db"):
         rest.append(
-            f"{GIVEN_HEARD}; maps and predict show all levels, {above:.1f} dB lower in the mean: "
-            "compare maps with levels of all cells (a scanner), and with lists of a second drive by "
-            "gsparc evaluate, which allows for it"
+            f"{GIVEN_HEARD}: these rows do not name every station at each place. Levels as they are "
+            f"(rssi_db of gsparc predict, maps) are {above:.1f} dB lower in the mean, with rmse_db "
+            f"{facts[f'{prefix}/levels_rmse_db']:.2f} at these rows: compare them with levels of all cells "
+            "(a scanner)"
         )
     if unlisted := facts.get(f"{prefix}/unlisted"):
         rest.append(f"cells that may be off: lists should hold them and none does: {unlisted}")

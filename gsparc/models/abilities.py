@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -30,6 +31,17 @@ class HasProcess(Protocol):
 
     def process(self) -> PowerProcess | None:
         """Return the process; None where what was fitted has none."""
+
+
+@runtime_checkable
+class HasMembers(Protocol):
+    """A mean of several methods, which can do without some of them."""
+
+    def members_data(self, data: Measurements) -> Measurements:
+        """Return measurements as its members see them."""
+
+    def keep_members(self, kept: Sequence[Any]) -> None:
+        """Answer by these alone, at least one of its own."""
 
 
 class JointLevels(NamedTuple):

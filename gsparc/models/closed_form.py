@@ -31,11 +31,13 @@ class LeftOutRows:
         rows: (n,) of the measurements.
         mean: (n, ...) predictions, stored units.
         variance: (n,) expected squared error per entry.
+        group: (n,) rows of one were left out together; None: each alone.
     """
 
     rows: np.ndarray
     mean: Tensor
     variance: Tensor
+    group: np.ndarray | None = None
 
 
 class Moments(NamedTuple):
@@ -78,8 +80,11 @@ class ClosedForm(Method):
         """Set the weights from rows (n,); settings are chosen anew where that costs little."""
         self.fit(data, Fold.of_all(rows), FitContext())
 
-    def left_out(self) -> LeftOutRows:
+    def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """Return the rows it was conditioned on, each predicted from the others.
+
+        Args:
+            rows: (m,) that are asked for, of which it knows some; others may come with them. None: all.
 
         Raises:
             ValueError: not conditioned yet, or they are not kept.

@@ -27,6 +27,7 @@ from gsparc.models.aligned_rows import align_phases
 from gsparc.models.checkpoint import StoredModel
 from gsparc.models.device_offsets import take_off_devices
 from gsparc.models.method import Method, MethodFactory
+from gsparc.models.sanity import judge_fit, make_stored
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.stopwatch import Stopwatch
@@ -93,6 +94,7 @@ def fit_or_resume(
         instead = "Gaussian fields do; start without it"
         raise ValueError(f"init_from: {method.name} takes no weights to start from here, {instead}")
     report = method.fit(ordered, rows, replace(context, fold=fold))
+    method, report = judge_fit(method, report, ordered, rows)
     if 0 < (places := len(np.unique(ordered.moving[rows.train], axis=0))) < FEW_PLACES:
         few = Caution(f"{places} places to learn from are too few to tell errors: deviations are guesses")
         report = replace(report, notes=(*report.notes, few))
@@ -122,7 +124,7 @@ def _restore_fit(
 ) -> tuple[Method, FitReport]:
     stored = checkpoint.read(file)
     Origin.from_fit(data, fold, context).require_same(stored)
-    method, extra = factory.create_as(stored.target), stored.extra
+    method, extra = make_stored(factory, stored.target), stored.extra
     method.restore(data.site, stored.state)
     cost = Cost(extra.get("stages", {}), extra.get("unused", {}))
     notes = tuple(extra.get("notes", ()))

@@ -12,6 +12,7 @@ from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method, MethodFactory, import_path
 from gsparc.models.per_station import PerStation
 from gsparc.models.registry import all_methods, build
+from gsparc.models.sanity import make_stored
 from gsparc.models.splat.method import LearnedField
 from gsparc.models.updated import stored_changes, with_changes
 
@@ -47,7 +48,7 @@ def method_from_checkpoint(stored: checkpoint.StoredModel) -> Method:
 def rebuild_method(factory: MethodFactory, stored: checkpoint.StoredModel) -> Method:
     """Return what `factory` makes of the stored class, or one for each station, with a stored state."""
     several = "per_station" in stored.state
-    method = PerStation(factory) if several else factory.create_as(stored.target)
+    method = PerStation(factory) if several else make_stored(factory, stored.target)
     method.restore(stored.site, stored.state)
     method.name = stored.method
     return method
@@ -60,7 +61,7 @@ def load(path: str | Path | checkpoint.StoredModel) -> tuple[Method, checkpoint.
         CheckpointError: as these two.
     """
     stored = path if isinstance(path, checkpoint.StoredModel) else checkpoint.read(path)
-    return with_changes(method_from_checkpoint(stored), stored_changes(stored.extra)), stored
+    return with_changes(method_from_checkpoint(stored), stored_changes(stored.extra, stored.path)), stored
 
 
 def load_module(path: str | Path) -> GaussianModule:

@@ -135,7 +135,8 @@ def leave_out_groups(
         clone.condition(data, np.setdiff1d(rows, group))
         answers.append(clone.predict(data.batch(group)))
     mean, variance = (torch.cat([getattr(one, name) for one in answers]) for name in ("mean", "variance"))
-    return LeftOutRows(np.concatenate(groups), mean, variance)
+    number = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    return LeftOutRows(np.concatenate(groups), mean, variance, number)
 
 
 def weigh_members(

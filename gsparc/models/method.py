@@ -186,6 +186,11 @@ class Method(MethodFactory):
         return deepcopy(self)
 
     @property
+    def is_yardstick(self) -> bool:
+        """Whether others are held against it, so that it answers however bad it is: plain methods here."""
+        return vars(type(self)).get("baseline_order") is not None
+
+    @property
     def label(self) -> str:
         """The name as people read it, with how the fit approximates."""
         return self.name
@@ -313,8 +318,9 @@ def predict_in_batches(
             chosen = order[start : start + size]
             batch = data.batch(rows[chosen])
             answer = method.predict(batch)
-            if data.device is not None:
-                answer = answer.of_devices(method.fitted_site, torch.from_numpy(data.device[rows[chosen]]))
+            if method.site is not None and data.site.device_levels is None:  # else rows are the mean device's
+                device = MEAN_DEVICE if data.device is None else torch.from_numpy(data.device[rows[chosen]])
+                answer = answer.of_devices(method.site, device)
             yield chosen, batch, answer
 
     if data.site.unknown_factor == "none":

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.ends import NOBODY, SAME_PLACE_M, Ends, station_distances
-from gsparc.data.errors import Caution, list_first
+from gsparc.data.errors import Caution, group_warnings, list_first
 from gsparc.data.executor import run_all, uses_other_processes
 from gsparc.data.query import Query
 from gsparc.data.schema import OF_STATION, Measurements, Site
@@ -32,6 +32,7 @@ from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
 from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.powers.own_terms import pool_station_weights
+from gsparc.models.sanity import make_stored
 from gsparc.models.station_views import AllStationsView, OneStationView
 from gsparc.models.target_rows import heard_rows
 from gsparc.training.context import FitContext, FitReport
@@ -187,6 +188,8 @@ class PerStation(Method):
             self._copies[number] = fits[turn][0]
             name = "all stations" if numbers == [UNHEARD] else self._station_name(number)
             notes += [type(note)(f"{name}: {note}") for note in reports[turn].notes if note not in learned]
+        cautions = group_warnings([note for note in notes if isinstance(note, Caution)])
+        notes = [*(note for note in notes if not isinstance(note, Caution)), *map(Caution, cautions)]
         cost = sum((one.cost for one in reports), Cost())
         return FitReport(watch.seconds, tuple(notes), cost, watch.cpu_elsewhere)
 
@@ -320,7 +323,7 @@ class PerStation(Method):
         """See `Method.restore`."""
         self.site, self._shared = site, bool(state["shared"])
         for number, part in state["per_station"].items():
-            self._copies[int(number)] = copy = self.factory.create_as(part["target"])
+            self._copies[int(number)] = copy = make_stored(self.factory, part["target"])
             copy.name = self.name
             copy.restore(self._site_of_copy(site, int(number)), part["state"])
 

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Site
 from gsparc.models.abilities import HasProcess
+from gsparc.models.checkpoint import CheckpointError, find_non_finite
 from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import View
@@ -22,6 +26,7 @@ from gsparc.processes.averages import MeanVariance
 from gsparc.processes.changes import TINY, Belief, LaterRows, correct
 from gsparc.processes.stored import Stored, from_plain
 
+NOW = 2**62  # number after those of all rows
 STORED = "updates"  # in what a checkpoint holds besides
 UNSAID = 1.0  # variance of powers, of their square, where a method states none
 SIGNAL = 0.2  # share of a stated variance that counts as the map's own error where nothing tells it apart
@@ -34,13 +39,13 @@ class Changes(Stored):
     Attributes:
         belief: see there.
         rows: later rows, a pair of station and rows each; 0 stands for a site with one station.
-        shifts: (station, dB) that was said of stations, not measured.
+        shifts: (station, dB, number of the row that comes next) that were said, not measured.
         next_number, next_batch: of the row and of the update that come next.
     """
 
     belief: Belief
     rows: tuple[tuple[int, LaterRows], ...] = ()
-    shifts: tuple[tuple[int, float], ...] = ()
+    shifts: tuple[tuple[int, float, int], ...] = ()
     next_number: int = 0
     next_batch: int = 0
 
@@ -48,6 +53,23 @@ class Changes(Stored):
     def stations(self) -> dict[int, LaterRows]:
         """Later rows by station."""
         return dict(self.rows)
+
+    def check(self) -> None:
+        """Raise `ValueError` where parts do not go together, as in a damaged file."""
+        for station, rows in self.rows:
+            sizes = {name: len(part) for name, part in vars(rows).items()}
+            if len(set(sizes.values())) > 1 or rows.places.shape[1:] != (3,):
+                raise ValueError(f"rows of station {station}: {sizes}")
+        if self.belief.names and len(self.belief.weight) != len(self.belief.names):
+            raise ValueError(f"{len(self.belief.weight)} weights of {len(self.belief.names)} stations")
+
+    def shift(self, station: int | np.ndarray, number: int | np.ndarray = NOW) -> Any:
+        """Return what was said of stations () or (n,) before the rows of these numbers came [dB]."""
+        # Older files do not say when.
+        parts = [(change * (station == name), since) for name, change, *since in self.shifts]
+        return sum(
+            (change * (number >= (*since, 0)[0]) for change, since in parts), 0.0 * np.asarray(station)
+        )
 
 
 @dataclass(frozen=True)
@@ -123,7 +145,7 @@ class Updated(View):
 
     def _level_now(self, query: Query, before: Level) -> Level:
         mean, doubt = before.mean.clone(), before.doubt.clone()
-        rows, shifts = self.changes.stations, dict(self.changes.shifts)
+        rows = self.changes.stations
         places, number = query.places(self.fitted_site), query.station
         if self.own is not None or number is None:
             number = torch.full((len(query),), self.own or 0)
@@ -133,7 +155,7 @@ class Updated(View):
                 mean[at], doubt[at] = correct(
                     self.changes.belief, station, later, places[at], mean[at], doubt[at]
                 )
-            mean[at] += shifts.get(station, 0.0)
+            mean[at] += self.changes.shift(station)
         return Level(mean, doubt, before.noise)
 
     def state(self) -> dict[str, Any]:  # type: ignore[override]
@@ -145,18 +167,38 @@ class Updated(View):
         return self.inner.facts()
 
 
-def stored_changes(extra: Mapping[str, Any]) -> Changes | None:
-    """Return what came after the map of a checkpoint, of its last version; None: nothing."""
-    versions = extra.get(STORED)
-    changes = from_plain(versions[-1]["state"]["changes"]) if versions else None
-    return changes if changes is not None and (changes.rows or changes.shifts) else None
+@contextmanager
+def sound_updates(path: Path | str = "the checkpoint") -> Iterator[None]:
+    """Raise `CheckpointError` in place of what reading damaged later rows of a file raises."""
+    try:
+        yield
+    except (TypeError, ValueError, LookupError, AttributeError, RuntimeError) as error:
+        fault = f"its later rows ({STORED}) are damaged ({error}); take another copy, or the one before them"
+        raise CheckpointError(f"{path}: {fault}") from None
+
+
+def stored_changes(extra: Mapping[str, Any], path: Path | str = "the checkpoint") -> Changes | None:
+    """Return what came after the map of a checkpoint, of its last version; None: nothing.
+
+    Raises:
+        CheckpointError: any version of it is damaged.
+    """
+    with sound_updates(path):
+        parts = [version["state"]["changes"] for version in extra.get(STORED, ())]
+        if where := find_non_finite(parts, STORED):
+            raise ValueError(f"{where} is NaN or infinite")
+        changes = [from_plain(part) for part in parts]
+        for version in changes:
+            version.check()
+    return changes[-1] if changes else None
 
 
 def with_changes(method: Method, changes: Changes | None, own: int | None = None) -> Method:
-    """Return a method with later rows in place of what it had of them; None: as it was learned.
+    """Return a method with later rows in place of what it had of them; None, or none: as it was learned.
 
     `own` is the number of the station that the method alone answers for; None: it knows all.
     """
+    changes = changes if changes is not None and (changes.rows or changes.shifts) else None
     if isinstance(method, OneStationView):
         view = copy(method)
         view.inner = with_changes(method.inner, changes)

@@ -23,6 +23,7 @@ from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models import checkpoint, fitting
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
+from gsparc.prediction.hearing import Hearing
 from gsparc.prediction.predictor import Predictor
 from gsparc.training.context import FitContext
 from gsparc.training.effort import refuse_seconds
@@ -92,9 +93,11 @@ def fit(
     method, report = fitting.fit_or_resume(factory, data, fold, context)
     for note in report.notes:
         log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
+    extra = {"train_s": report.seconds, **Hearing.from_learned(data, fold.learned()).to_extra()}
     if save is not None:
-        checkpoint.save(save, method, extra={"train_s": report.seconds})
-    return Predictor(method, replace(data.site, device_levels=method.fitted_site.device_levels))
+        checkpoint.save(save, method, extra=extra)
+    site = replace(data.site, device_levels=method.fitted_site.device_levels)
+    return Predictor(method, site, extra=extra)
 
 
 def _array_of(value: Any) -> np.ndarray:

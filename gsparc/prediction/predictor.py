@@ -60,7 +60,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         site: the dataset's fixed facts: `kind`, the `box` of places [m, local] and its `origin`, `stations`.
         whole: asked for the confidence, where `method` spares it; None asks `method`.
         point: the operating point `method` answers at, if one was chosen (`load(budget_ms=...)`), else None.
-        extra: what else the checkpoint holds, such as the split's hash; empty after `fit`.
+        extra: what else the checkpoint holds, such as the split's hash.
         trusted: which confidence is answered, and from when on a prediction is accepted (`gsparc calibrate`).
         kind: of the confidence, as in `load`; None: as `trusted` says.
         unit: of powers; None: that of the measurements. The attribute is "1" of channels and spectra.
@@ -343,6 +343,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         """Return the channel (B, antennas, subcarriers) complex64, in the physical units of the measurements.
 
         All three axes are there for one antenna or tone, too: of measured channels (B, K) take `[:, 0]`.
+        What was constant in all rows, as null tones are, is NaN.
 
         >>> heard, tones = np.exp(1j * places[:, :1] * [1, 2]), [2.4e9, 2.41e9]  # (60, 2)
         >>> near = gsparc.fit(rx=places, tx=[9.0, 9.0, 2.6], csi=heard, frequency_hz=tones, model="nearest")
@@ -358,7 +359,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
             grad: as in `predict`; at the measured tones alone.
         """
         if uplink is None and frequency_hz is None and symbols is None:
-            return self._predict_mean("csi", tx, rx, grad)
+            return self.site.in_shape_of_file(self._predict_mean("csi", tx, rx, grad))
         if grad:
             raise ValueError("grad=True: channels have gradients at positions and the measured tones alone")
         from gsparc.prediction import channels
@@ -432,9 +433,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
             moments, single = self._predict_grad(self.method, tx, rx, wanted)
             return moments.mean[0] if single else moments.mean
         query, single, as_torch = self.queries.query(tx, rx)
-        return match_input(
-            self._in_unit(predict_with_threads(self.method, query), wanted).mean, single, as_torch
-        )
+        stored = predict_with_threads(self.method, query)
+        mean = self._in_unit(stored, wanted).mean.to(stored.mean.dtype)
+        return match_input(mean, single, as_torch)
 
     def _predict_grad(self, method: Method, tx: Any, rx: Any, wanted: PowerUnit) -> tuple[Prediction, bool]:
         """Moments in a unit that autograd follows, and whether one position was given; see the class."""
@@ -450,4 +451,5 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         # In decibels a variance depends on the mean too.
         variance = None if stored.variance is None else unit.variance(stored.mean, stored.variance)
         explained = None if stored.explained is None else unit.values(stored.explained).to(stored.mean.dtype)
-        return Prediction(unit.values(stored.mean).to(stored.mean.dtype), variance, stored.unknown, explained)
+        mean = unit.values(stored.mean)  # in float64, as levels of -100 dB in float32 lose 1e-5 dB
+        return Prediction(mean, variance, stored.unknown, explained)

@@ -11,27 +11,39 @@ from typing import Any
 import numpy as np
 import torch
 
+from gsparc.data.errors import DataError
+from gsparc.data.limits import POSITIVE, check_arguments, switch, whole
+from gsparc.data.limits import number as limit_number
 from gsparc.data.links.stations import find_station
-from gsparc.data.links.strongest import strongest_lists
+from gsparc.data.own_checks import MOST_DB
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.units import PowerUnit
-from gsparc.models.device_offsets import without_devices
 from gsparc.models.method import Method, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
 from gsparc.models.station_views import OneStationView
-from gsparc.models.updated import STORED, Changes, Level, Updated, map_level, stored_changes, with_changes
+from gsparc.models.updated import (
+    STORED,
+    Changes,
+    Level,
+    Updated,
+    map_level,
+    sound_updates,
+    stored_changes,
+    with_changes,
+)
 from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.drift import ROWS, Alarm, Watch
-from gsparc.prediction.query import Queries, read_places
+from gsparc.prediction.later_rows import LevelRows, check_updatable, read_level_arrays, read_level_rows
+from gsparc.prediction.query import Queries
 from gsparc.processes.changes import Belief, LaterRows, learn, refit_scale
-from gsparc.processes.powers import PowerRows
 from gsparc.processes.stored import Stored, from_plain, to_plain
 
 WINDOW = 1_000  # later rows of a station that are kept
 FADE_DB = 1.0  # deviation that a hundred later rows of a station add to one of it that came before
 JOURNAL = 1_000  # lines that a version keeps
 VERSIONS = 11  # that are kept, the one that answers among them
+LIMITS = {"window": whole(1), "fade_db": limit_number(0), "false_alarm": POSITIVE, "refit": switch()}
 LOUD = 2.0  # deviations that a map must be above a level for silence to contradict it
 
 
@@ -43,25 +55,17 @@ class Version(Stored):
         changes: rows, and what they say together.
         watch: state of the sequential test.
         journal: a line for each thing that was done, the last ones, in their order.
+        told: keys of the rows, the last ones.
     """
 
     changes: Changes
     watch: Watch
     journal: tuple[str, ...] = ()
+    told: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class LevelRows(PowerRows):
-    """Levels of stored powers that were measured, as they came, at local places of the end that moves.
-
-    Attributes:
-        station: (n,) int64.
-    """
-
-    station: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.station)
+class ToldBefore(DataError):
+    """Rows that a model was told before, by their key."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +106,7 @@ class UpdateMixin:
     def update(
         self, rows: Measurements | LevelRows | None = None, *, tx: Any = None, rx: Any = None,
         rssi: Any = None, unit: str | None = None, window: int = WINDOW, fade_db: float = FADE_DB,
-        false_alarm: float = ROWS, refit: bool = False, **others: Any,
+        false_alarm: float = ROWS, refit: bool = False, key: str | None = None, **others: Any,
     ) -> Found:  # fmt: skip
         """Condition on rows that came later, and tell what changed.
 
@@ -119,27 +123,31 @@ class UpdateMixin:
         Args:
             rows: measurements in the model's coordinates (`align_to_site`); None: the arrays that follow.
             tx, rx: (n, 3) places of the end that moves, world [m].
-            rssi: (n,) or (n, T) powers; NaN is not measured.
+            rssi: (n,) or (n, T) powers; NaN is not measured, minus infinity (a power of 0) tells nothing.
             unit: of `rssi`; None: that of the measurements.
             window: later rows of a station that are kept, at least 1; the first ones are dropped.
             fade_db: deviation that a hundred later rows of a station add to one that came before [dB].
             false_alarm: readings to a false alarm without any change, at least, in the mean.
             refit: fit the length over which changes vary to the rows kept, too; tenths of a second.
+            key: a name of these rows, which are taken once; None: as often as they are told.
             **others: such as `spectrum`, refused.
 
         Raises:
-            ValueError: no powers, both ends move, or arrays that do not go together.
+            ValueError: no powers, both ends move, arrays or settings that cannot be.
+            ToldBefore: rows of this key are known.
             TypeError: no such argument.
         """
         check_updatable(self.site)
+        check_arguments(locals(), **LIMITS)
         if others:
             raise TypeError(f"update: takes rssi=, not {next(iter(others))}=")
+        version, first, silent = self._current, self._current.changes.next_number, 0
+        if key in version.told:
+            raise ToldBefore(f"update: {key} was told before")
         if rows is None:
-            rows = self._rows_of_arrays(tx, rx, rssi, unit)
-        rows = level_rows(rows, self.site) if isinstance(rows, Measurements) else rows
-        if window < 1:
-            raise ValueError(f"update: window={window}: at least one row of a station is kept")
-        version, first = self._current, self._current.changes.next_number
+            places = tx if self.site.moving_end == "tx" else rx
+            rows, silent = read_level_arrays(self.site, places, rssi, self._answer_unit(unit))
+        rows = read_level_rows(rows, self.site) if isinstance(rows, Measurements) else rows
         changes, belief, stations = version.changes, version.changes.belief, version.changes.stations
         extent = belief.extent
         new = self._read_rows(rows, changes)
@@ -150,7 +158,7 @@ class UpdateMixin:
         noisy = {name: replace(one, noise=one.noise + belief.of(name)[1]) for name, one in stations.items()}
         watch, deviations = version.watch.look(noisy, first, extent, false_alarm)
         numbers = np.arange(first, first + sum(map(len, new.values())))
-        alarms, skipped = watch.alarms[len(version.watch.alarms) :], len(rows) - len(numbers)
+        alarms, skipped = watch.alarms[len(version.watch.alarms) :], silent + len(rows) - len(numbers)
         entry = f"update: {len(numbers)} rows, {skipped} skipped, {len(alarms)} alarms"
         if refit:
             belief = replace(belief, scale=refit_scale(stations, belief))
@@ -158,7 +166,7 @@ class UpdateMixin:
         changes = replace(
             changes, belief=belief, next_number=first + len(numbers), next_batch=changes.next_batch + 1
         )
-        self._add_version(stations, entry, changes, watch)
+        self._add_version(stations, entry, changes, watch, key)
         return Found(numbers, deviations, self._in_world(alarms), skipped)
 
     def forget(self, rows: Any) -> None:
@@ -167,10 +175,15 @@ class UpdateMixin:
         Raises:
             ValueError: no later row has such a number.
         """
-        gone, stations = np.atleast_1d(np.asarray(rows, np.int64)), self._current.changes.stations
+        gone, stations = np.atleast_1d(np.asarray(rows)), self._current.changes.stations
+        if gone.size and gone.dtype.kind not in "iu":
+            raise ValueError(f"forget: rows={rows!r}: whole numbers are needed; see `measured`")
         if len(unknown := np.setdiff1d(gone, self.rows)):
             raise ValueError(f"forget: no later row that is kept has number {unknown[0]}; see `measured`")
-        remainder = {n: one[~torch.isin(one.number, torch.from_numpy(gone))] for n, one in stations.items()}
+        remainder = {
+            n: one[~torch.isin(one.number, torch.as_tensor(gone, dtype=torch.int64))]
+            for n, one in stations.items()
+        }
         self._add_version(remainder, f"forget: {len(gone)} rows")
 
     def shift(self, change_db: float, station: str | int | None = None) -> None:
@@ -183,19 +196,18 @@ class UpdateMixin:
         number = self._own_station if station is None else find_station(station, known)
         if station is not None and number is None:
             raise ValueError(f"shift: no station {station!r}; there are {', '.join(self.stations) or 'none'}")
-        if not np.isfinite(change_db):
-            raise ValueError(f"shift: change_db={change_db} is no finite number")
-        names = range(len(known)) if number is None else [number]
+        limit_number(-MOST_DB, MOST_DB).check("change_db", change_db)
         changes = self._current.changes
-        shifts = {n: dict(changes.shifts).get(n, 0.0) + float(change_db) for n in names}
-        shifts = dict(changes.shifts) | shifts
+        numbers = range(len(known)) if number is None else [number]
+        shifts = tuple((n, float(change_db), changes.next_number) for n in numbers)
         whose = "all stations" if number is None else station or known.shown[number]
         entry = f"shift: {change_db:+g} dB of {whose}"
-        self._add_version(changes.stations, entry, replace(changes, shifts=tuple(sorted(shifts.items()))))
+        self._add_version(changes.stations, entry, replace(changes, shifts=(*changes.shifts, *shifts)))
 
     def undo(self, count: int = 1) -> None:
         """Go back so many versions, bit for bit; `ValueError` where so many are not kept."""
-        if not 1 <= count < len(self.versions):
+        whole(1).check("count", count)
+        if not count < len(self.versions):
             raise ValueError(f"undo: {count} back, {max(len(self.versions) - 1, 0)} are kept")
         self._become(self.versions[:-count])
 
@@ -232,10 +244,11 @@ class UpdateMixin:
         parts = [one for _, one in pairs]
         joined = reduce(LaterRows.join, parts, LaterRows.empty())
         of = np.repeat([name for name, _ in pairs], [len(one) for one in parts]).astype(np.int64)
+        raised = torch.from_numpy(self._current.changes.shift(of, joined.number.numpy()))
         result = {
             "number": joined.number, "batch": joined.batch, "station": torch.from_numpy(of),
             "place": joined.places + torch.from_numpy(self.site.origin) if len(joined) else joined.places,
-            "level": joined.level + joined.missed + to_decibels(self.site.target_scale),
+            "level": joined.level + joined.missed + raised + to_decibels(self.site.target_scale),
             "faded_db": joined.faded.sqrt(),
         }  # fmt: skip
         order = joined.number.argsort()
@@ -255,6 +268,11 @@ class UpdateMixin:
         """A line for each thing that was done since the fit, of the last `JOURNAL`."""
         return self._current.journal
 
+    @property
+    def told(self) -> tuple[str, ...]:
+        """Keys of the rows that were told, the last `JOURNAL`."""
+        return self._current.told
+
     # -- versions --------------------------------------------------------------------------------------
 
     @property
@@ -266,41 +284,25 @@ class UpdateMixin:
 
     def _add_version(
         self, stations: dict[int, LaterRows], said: str, changes: Changes | None = None,
-        watch: Watch | None = None,
+        watch: Watch | None = None, key: str | None = None,
     ) -> None:  # fmt: skip
         """Learn from stations' rows together, and answer by it."""
         now = self._current
         changes = changes or now.changes
         belief = learn(stations, changes.belief.extent, changes.belief.scale)
         changes = replace(changes, rows=tuple(sorted(stations.items())), belief=belief)
-        version = Version(changes, watch or now.watch, (*now.journal, said)[-JOURNAL:])
+        told = now.told if key is None else (*now.told, key)[-JOURNAL:]
+        version = Version(changes, watch or now.watch, (*now.journal, said)[-JOURNAL:], told)
         self._become((*(self.versions or (now,)), version)[-VERSIONS:])
 
     def _become(self, versions: tuple[Version, ...]) -> None:
-        changes = stored_changes(versions_extra(versions[-1:]))
+        changes = versions[-1].changes
         whole_is_same, own = self._whole is self.method, self._own_station
         self.versions, self.method = versions, with_changes(self.method, changes, own)
         self._whole = self.method if whole_is_same else with_changes(self._whole, changes, own)
         self._prepared = []
 
     # -- rows ------------------------------------------------------------------------------------------
-
-    def _rows_of_arrays(self, tx: Any, rx: Any, rssi: Any, unit: str | None) -> LevelRows:
-        """Rows of arrays of the API."""
-        places = {"tx": tx, "rx": rx}[self.site.moving_end]
-        count = len(self.site.every_station)
-        if places is None or rssi is None:
-            raise ValueError(f"update: {self.site.moving_end}= and rssi= are needed")
-        at = np.atleast_2d(read_places(self.site.moving_end, places)) - self.site.origin
-        powers = np.asarray(rssi, np.float64).reshape(len(at), -1)
-        if powers.shape[1] != count:
-            raise ValueError(
-                f"update: rssi= of shape {np.shape(rssi)}, {len(at)} places and {count} stations"
-            )
-        stored = self._answer_unit(unit).stored(torch.from_numpy(powers)).numpy()
-        row, station = np.nonzero(np.isfinite(powers) & (stored > 0))
-        level = to_decibels(stored[row, station])
-        return LevelRows(at[row], level, np.zeros(len(row), np.int8), station)
 
     def _read_rows(self, rows: LevelRows, changes: Changes) -> dict[int, LaterRows]:
         """New rows of each station that has a map, as they miss it."""
@@ -309,7 +311,7 @@ class UpdateMixin:
             if rows.station.any():
                 raise ValueError("update: rows of several stations; tell them to the model of all of them")
             rows = replace(rows, station=np.full(len(rows), self._own_station))
-        number, result, shifts = np.full(len(rows), -1), {}, dict(changes.shifts)
+        number, result = np.full(len(rows), -1), {}
         levels: dict[int, tuple[np.ndarray, Level]] = {}
         for name in np.unique(rows.station).tolist():
             index = np.flatnonzero(rows.station == name)
@@ -320,7 +322,7 @@ class UpdateMixin:
             there = station_site(site, name) if isinstance(method, PerStation) else site
             query = Query.from_places(there, torch.from_numpy(rows.places[index]).float())
             level = map_level(answers, predict_with_threads(answers, query), site)
-            missed = rows.decibels[index] - level.mean.numpy() - shifts.get(name, 0.0)
+            missed = rows.decibels[index] - level.mean.numpy() - changes.shift(name)
             # Of silence only a level is known that the power is below.
             tells = missed * -rows.side[index] > LOUD * np.sqrt((level.doubt + level.noise).numpy())
             used = np.flatnonzero((rows.side[index] == 0) | tells)
@@ -328,7 +330,7 @@ class UpdateMixin:
             number[index[used]] = 0
         number[number == 0] = changes.next_number + np.arange((number == 0).sum())
         for name, (index, level) in levels.items():
-            missed = torch.from_numpy(rows.decibels[index]) - level.mean - shifts.get(name, 0.0)
+            missed = torch.from_numpy(rows.decibels[index]) - level.mean - changes.shift(name)
             result[name] = LaterRows(
                 torch.from_numpy(number[index]), torch.full((len(index),), changes.next_batch),
                 torch.from_numpy(rows.places[index]), level.mean, missed, level.doubt, level.noise,
@@ -337,37 +339,18 @@ class UpdateMixin:
         return {name: one for name, one in result.items() if len(one)}
 
 
-def check_updatable(site: Site) -> None:
-    """Raise `ValueError` where a site's models learn no later rows: not powers, or both ends move."""
-    if not site.maps_levels:
-        what = f"{site.target.called}{' of two moving ends' * site.target.is_level}"
-        raise ValueError(f"update: models of {what} cannot be updated: train again on all rows")
-
-
-def level_rows(data: Measurements, site: Site) -> LevelRows:
-    """Return measurements of powers, in a model's coordinates, as `update` takes them, in their order.
+def read_versions(extra: Mapping[str, Any]) -> tuple[Version, ...]:
+    """Return the versions that a checkpoint holds, the last one last; none where it was never updated.
 
     Raises:
-        ValueError: lists of the strongest.
+        CheckpointError: they are damaged.
     """
-    if strongest_lists(data) is not None:
-        raise ValueError(
-            "update: lists of the strongest hold what is strong, and would raise all levels; train on all "
-            "drives, gsparc evaluate names cells that are gone"
-        )
-    data = without_devices(data, site)
-    rows = np.arange(len(data)) if data.sequence is None else np.argsort(data.sequence, kind="stable")
-    if data.mask is not None:
-        rows = rows[data.mask[rows].reshape(len(rows)) | (data.censored_side(rows) != 0)]
-    side = data.censored_side(rows)
-    station = data.stations_of(rows)
-    level = data.site.target.to_real(data.target[rows])[:, 0].astype(np.float64)
-    return LevelRows(data.moving[rows], level, side, station)
-
-
-def read_versions(extra: Mapping[str, Any]) -> tuple[Version, ...]:
-    """Return the versions that a checkpoint holds, the last one last; none where it was never updated."""
-    return tuple(map(from_plain, extra.get(STORED, ())))
+    stored_changes(extra)
+    with sound_updates():
+        versions = tuple(map(from_plain, extra.get(STORED, ())))
+        if not all(isinstance(version, Version) and isinstance(version.watch, Watch) for version in versions):
+            raise TypeError("of another kind")
+    return versions
 
 
 def versions_extra(versions: Sequence[Version]) -> dict[str, Any]:

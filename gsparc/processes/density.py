@@ -19,57 +19,81 @@ from gsparc.processes.factor import BLAS, Factor
 from gsparc.processes.left_out import left_out_residuals
 
 TINY = np.finfo(float).tiny
+FLAT = 1e-150  # amplitude below which values are all alike, and tell of nothing: its inverse has a square
+EXCESS = 27.6  # nats at most: a factor of 1e12
+LOG_NORMAL = math.log(2 * math.pi * math.e)
+SETTLING, LEAST_STEEPNESS = 12, 1e-2  # steps to the common amplitude
 
 
-class LeftOutDensity(torch.autograd.Function):
-    """Negative density of rows left out one by one, and the amplitude that minimises it.
+class LeftOutSums(torch.autograd.Function):
+    """Squared errors of rows left out one by one over their variances, summed, and logarithms of precisions.
 
     With R = K^-1 Y and q = diag(K^-1) the error of row i is R_i / q_i, its variance amplitude / q_i
     (Rasmussen and Williams 2006, eqs. 5.10 to 5.13, over outputs that share K).
     """
 
     @staticmethod
-    def forward(ctx: Any, gram: Tensor, values: Tensor, entries: int, bounded: bool) -> tuple[Tensor, Tensor]:
-        """Score values (n, P) with a covariance `gram` (n, n) with noise, relative to the amplitude.
-
-        Args:
-            ctx: of autograd.
-            gram: see there.
-            values: less the mean; coordinates in an orthonormal basis.
-            entries: real numbers of a value, P or more.
-            bounded: adds half the square of the amplitude's excess in nats over the values' variance; without
-                it few rows may choose a long process with next to no noise, good at its neighbours alone.
-
-        Returns:
-            The density [nats per output], and the amplitude.
-        """
-        count, inverse = len(values), Factor.from_gram(gram.detach(), "raise").inverse
+    def forward(ctx: Any, gram: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Sum over values (n, P) with a covariance `gram` (n, n) with noise, relative to the amplitude."""
+        inverse = Factor.from_gram(gram.detach(), "raise").inverse
         ratio, share = inverse @ values, inverse.diagonal()
-        squared = ratio.square().sum(1)
-        # Where the slope by the amplitude is 0: the mean of squared errors over their relative variances.
-        amplitude = max(float((squared / share).sum()) / (count * entries), TINY)
-        density = 0.5 * count * math.log(2 * math.pi * math.e * amplitude) - 0.5 * float(share.log().sum())
-        least = float(values.square().sum()) / (count * entries) if bounded else amplitude
-        excess = max(math.log(amplitude / max(least, amplitude * 1e-12)), 0.0)
-        steeper = (1 + 2 * excess / count) / (entries * amplitude)
-        ctx.save_for_backward(inverse, ratio, steeper * ratio / share[:, None])
-        ctx.by_share = -0.5 * (steeper * squared / share.square() + 1 / share)
-        result = gram.new_tensor(amplitude)
-        ctx.mark_non_differentiable(result)
-        return gram.new_tensor(density + 0.5 * excess**2), result
+        ctx.save_for_backward(inverse, ratio)
+        return (ratio.square().sum(1) / share).sum(), share.log().sum()
 
     @staticmethod
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
         """Turn slopes by R = K^-1 Y and by diag(K^-1) into one by K: dK^-1 = -K^-1 dK K^-1."""
-        inverse, ratio, by_ratio = ctx.saved_tensors
-        # These slopes are never positive: with their roots on both sides the product is symmetric.
-        scaled = (inverse * (-ctx.by_share).sqrt()).numpy()
+        inverse, ratio = ctx.saved_tensors
+        (by_squares, by_logs), share = slopes, inverse.diagonal()
+        by_ratio = by_squares * 2 * ratio / share[:, None]
+        # Never negative, as a density falls with precisions: with roots on both sides of a symmetric product.
+        by_share = by_squares * ratio.square().sum(1) / share.square() - by_logs / share
+        scaled = (inverse * by_share.sqrt()).numpy()
         with BLAS.limit(limits=1):
             # One triangle of a symmetric product: half the multiplications of all of it.
             lower = torch.from_numpy(blas.dsyrk(1.0, scaled.T, lower=0, trans=1)).T
         column = inverse @ by_ratio
         mixed = column @ ratio.T
-        return slopes[0] * (lower + lower.tril(-1).T - 0.5 * (mixed + mixed.T)), None, None, None
+        return lower + lower.tril(-1).T - 0.5 * (mixed + mixed.T), None
+
+
+def left_out_density(
+    parts: Sequence[tuple[Tensor, Tensor]], entries: int = 1, bounded: bool = True, alike: float = 0.0
+) -> tuple[Tensor, Tensor]:
+    """Return the negative density of rows left out one by one [nats per output], and amplitudes (V,).
+
+    These minimise it. Of several processes each is inverse gamma about a common one, which minimises it, too:
+    one of few rows, or of equal values, has the common amplitude and divides nothing by its own spread.
+
+    Args:
+        parts: of V independent processes covariances (n, n) with noise, relative to the amplitude, and values
+            (n, P) less the mean, coordinates in an orthonormal basis.
+        entries: real numbers of a value, P or more.
+        bounded: adds half the square of the amplitudes' excess in nats over the values' variance, for each
+            process; without it few rows may choose a long one with next to no noise, good at neighbours.
+        alike: rows that the common amplitude counts as, for one process.
+    """
+    sums = (LeftOutSums.apply(gram, values) for gram, values in parts)  # type: ignore[no-untyped-call]
+    squares, logs = (torch.stack(part) / entries for part in zip(*sums, strict=True))
+    count = squares.new_tensor([len(values) for _, values in parts])
+    common = _common_amplitude(squares.detach(), count, alike) if alike else FLAT
+    amplitude = ((squares + alike * common) / (count + alike)).clamp_min(FLAT)
+    density = 0.5 * ((count + alike) * amplitude.log() - alike * math.log(common) + count * LOG_NORMAL)
+    power = sum(float(values.square().sum()) for _, values in parts) / entries
+    excess = (squares.sum().clamp_min(FLAT).log() - math.log(max(power, FLAT))).clamp(0.0, EXCESS)
+    penalty = 0.5 * len(parts) * excess.square() if bounded else 0.0
+    return (density - 0.5 * entries * logs).sum() + penalty, amplitude.detach()
+
+
+def _common_amplitude(squares: Tensor, count: Tensor, alike: float) -> float:
+    """The common one of largest density, of squares (V,) of n rows each: the harmonic mean of amplitudes."""
+    common = (squares.sum() / count.sum()).clamp_min(FLAT)
+    for _ in range(SETTLING):  # Newton's, of its logarithm
+        weight = (count + alike) / (squares + alike * common)
+        steepness = 1 - (weight * alike * common / (squares + alike * common)).sum() / weight.sum()
+        step = (weight.mean() * common).log() / steepness.clamp_min(LEAST_STEEPNESS)
+        common = (common * (-step).exp()).clamp_min(FLAT)
+    return float(common)
 
 
 class NegativeLogEvidence(torch.autograd.Function):
@@ -126,5 +150,5 @@ def density_without_groups(
     parts = (groups for one in partitions for groups in (None, one))
     errors = [left_out_residuals(inverse, inverse @ values, groups) for groups in parts]
     variance = torch.cat([one.variance for one in errors])
-    amplitude = (torch.cat([one.residual for one in errors])[:, 0].square() / variance).mean()
+    amplitude = (torch.cat([one.residual for one in errors])[:, 0].square() / variance).mean().clamp_min(FLAT)
     return 0.5 * (amplitude.log() + variance.log().mean()), amplitude.detach()

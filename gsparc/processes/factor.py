@@ -156,6 +156,16 @@ class Factor:
         # diag(L^-H L^-1) is the squared length of each column of L^-1.
         return self.root.abs().square().sum(-2)
 
+    def root_of(self, rows: Tensor) -> Tensor:
+        """Return some columns (n, m) of `L^-1`, of which few cost less than all."""
+        unit = torch.zeros(len(self.lower), len(rows), dtype=self.lower.dtype)
+        unit[rows, torch.arange(len(rows))] = 1
+        return self.whiten(unit)
+
+    def precision_of(self, rows: Tensor) -> Tensor:
+        """Return `precision` of some rows (m,)."""
+        return self.root_of(rows).abs().square().sum(0)
+
     @cached_property
     def log_determinant(self) -> Tensor:
         """Of K (...), float64."""

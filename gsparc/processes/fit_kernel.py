@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import combinations
-from typing import NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -17,10 +17,10 @@ from torch import Tensor
 from gsparc.processes.censored import PseudoValues
 from gsparc.processes.density import (
     TINY,
-    LeftOutDensity,
     NegativeLogEvidence,
     ProfiledDensity,
     density_without_groups,
+    left_out_density,
 )
 from gsparc.processes.factor import NotDefiniteError
 from gsparc.processes.few_rows import covering_rows
@@ -68,11 +68,6 @@ class KernelRows(NamedTuple):
             total = total + self.columns @ self.columns.T
         return total + kernel.noise * torch.eye(len(total), dtype=total.dtype)
 
-    def left_out(self, kernel: Kernel, entries: int = 1, bounded: bool = True) -> tuple[Tensor, Tensor]:
-        """Return the density and amplitude of `LeftOutDensity`, which see."""
-        result = LeftOutDensity.apply(self.gram(kernel), self.values, entries, bounded)  # type: ignore[no-untyped-call]
-        return cast(tuple[Tensor, Tensor], result)
-
 
 def minimise(
     objective: Callable[[Tensor], Tensor], starts: Sequence[np.ndarray],
@@ -102,6 +97,8 @@ def minimise(
         except NotDefiniteError:  # in float64: as bad as it gets
             return BAD, np.zeros(len(point))
         (slope,) = torch.autograd.grad(value, at)
+        # A walk by a slope that is none ends in a corner, and says nothing of it.
+        assert torch.cat([value[None], slope]).isfinite().all(), f"no slope at {point}: {value}, {slope}"
         return float(value.detach()), slope.numpy()
 
     def evaluate(point: np.ndarray) -> tuple[float, np.ndarray]:
@@ -138,6 +135,7 @@ def fit_kernel(
 def fit_kernel_by_left_out(
     starts: Sequence[Kernel], views: Sequence[KernelRows], bounds: Sequence[tuple[float, float]] = (),
     looks: int = LOOKS, entries: int = 1, bounded: bool = True, partitions: Sequence[Iterable[Tensor]] = (),
+    alike: float = 0.0,
 ) -> tuple[float, Kernel]:  # fmt: skip
     """Find the least negative density of rows left out [nats per output], and its kernel.
 
@@ -148,7 +146,7 @@ def fit_kernel_by_left_out(
         views: rows of independent processes that differ in their amplitudes alone; the mean of these is told.
         bounds: of the parameters; none: those of the first process.
         looks: most evaluations.
-        entries, bounded: see `LeftOutDensity`.
+        entries, bounded, alike: see `left_out_density`.
         partitions: groups of rows, each left out together.
     """
     sizes = torch.tensor([len(view.values) for view in views], dtype=torch.float64)
@@ -156,10 +154,9 @@ def fit_kernel_by_left_out(
     def objective(kernel: Kernel) -> tuple[Tensor, Tensor]:
         if partitions:
             return density_without_groups(views[0].gram(kernel), views[0].values, partitions)
-        value, amplitude = map(
-            torch.stack, zip(*(v.left_out(kernel, entries, bounded) for v in views), strict=True)
-        )
-        return value.sum() / sizes.sum(), ((sizes * amplitude.log()).sum() / sizes.sum()).exp()
+        parts = [(view.gram(kernel), view.values) for view in views]
+        value, amplitude = left_out_density(parts, entries, bounded, alike)
+        return value / sizes.sum(), ((sizes * amplitude.log()).sum() / sizes.sum()).exp()
 
     count = float(sizes.sum())
     settled = max(SETTLED / (count * entries), FINEST)

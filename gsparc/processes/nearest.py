@@ -134,9 +134,10 @@ class Nearest(Posterior):
         """See `Posterior`."""
         return torch.cat([self._answer(part, None, float64).mean for part in queries.split(self._block)])
 
-    def left_out(self) -> MeanVariance:
+    def left_out(self, rows: Tensor | None = None) -> MeanVariance:
         """See `Posterior`."""
-        return self._answer_blocks(self.places, np.arange(len(self.places)))
+        number = np.arange(len(self.places)) if rows is None else rows.numpy()
+        return self._answer_blocks(self.places[number], number)
 
     def _answer_blocks(
         self, queries: Tensor, excluded: np.ndarray | None, float64: bool = False

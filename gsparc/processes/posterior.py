@@ -119,14 +119,17 @@ class Exact(Posterior):
         lower = self.factor.lower
         return self.prior.mean(self.rows) + weighted_sum(lower, weighted_sum(lower.T, self.weights))
 
-    def left_out(self) -> MeanVariance:
+    def left_out(self, rows: Tensor | None = None) -> MeanVariance:
         """See `Posterior`."""
-        residual, variance = self.left_out_residuals()
-        return MeanVariance(self.given_values() - residual, variance)
+        residual, variance = self.left_out_residuals(rows)
+        values = self.given_values() if rows is None else self.given_values()[rows]
+        return MeanVariance(values - residual, variance)
 
-    def left_out_residuals(self) -> LeftOutErrors:
-        """Return what all other rows miss of each (n, P), and its variance (n,)."""
-        return left_out_residuals(self.factor.precision, self.weights)
+    def left_out_residuals(self, rows: Tensor | None = None) -> LeftOutErrors:
+        """Return what all other rows miss of each (n, P), or of some (m,), and its variance."""
+        if rows is None:
+            return left_out_residuals(self.factor.precision, self.weights)
+        return left_out_residuals(self.factor.precision_of(rows), self.weights[rows])
 
     @torch.no_grad()
     def covariance(self, queries: Tensor) -> Tensor:

@@ -174,18 +174,22 @@ class PowerProcess(Stored):
             queries.new_zeros(len(queries)),
         )
 
-    def left_out(self, places: np.ndarray) -> MeanVariance:
+    def left_out(self, places: np.ndarray, some: np.ndarray | None = None) -> MeanVariance:
         """Return mean [dB] and variance [dB^2] of a measurement at each heard row without its own.
 
         Args:
             places: (n,) numbers of the rows' places, where the nearest alone are looked at.
+            some: numbers (m,) of those that are asked for, among the heard ones; None: all.
         """
         parts = []
         for share, one in self.members:
-            mean, variance = one.posterior.left_out()
             exact = one.posterior if isinstance(one.posterior, Exact) else None
-            heard = torch.from_numpy(places) if exact is None else exact.extra == 0
-            parts.append((share, mean[heard, 0], one.kernel.amplitude * variance[heard]))
+            heard = torch.from_numpy(places) if exact is None else (exact.extra == 0).nonzero()[:, 0]
+            if some is None:
+                mean, variance = (part[heard] for part in one.posterior.left_out())
+            else:
+                mean, variance = one.posterior.left_out(heard[some])
+            parts.append((share, mean[:, 0], one.kernel.amplitude * variance))
         return mixture_moments(parts)
 
     def with_exact_posterior(self) -> PowerProcess:

@@ -85,8 +85,11 @@ class Posterior(Stored, ABC):
         """Return the mean alone (B, P), as `answer` has it."""
 
     @abstractmethod
-    def left_out(self) -> MeanVariance:
-        """Return the mean (n, P) and variance of a measurement (n,) at each row's place without its own."""
+    def left_out(self, rows: Tensor | None = None) -> MeanVariance:
+        """Return the mean (n, P) and variance of a measurement (n,) at each row's place without its own.
+
+        Of some `rows` (m,) by their numbers, or of all.
+        """
 
     @abstractmethod
     def nearest_distance(self, queries: Tensor) -> Tensor:

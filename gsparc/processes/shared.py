@@ -187,10 +187,16 @@ class SharedTermsPosterior:
         return self._stacks[numbers, dtype]
 
     @torch.no_grad()
-    def left_out(self, number: int) -> LeftOutErrors:
-        """Return errors (n,) of a process's rows, each predicted from all others, and variances (n,)."""
+    def left_out(self, number: int, rows: Tensor | None = None) -> LeftOutErrors:
+        """Return errors (n,) of a process's rows, each predicted from all others, and variances (n,).
+
+        Of some `rows` (m,) by their numbers, or of all.
+        """
         block = self.block(number)
-        root = block.process.factor.root / process_deviation(block.process.prior)
+        factor = block.process.factor
+        root = (factor.root if rows is None else factor.root_of(rows)) / process_deviation(
+            block.process.prior
+        )
         # Diagonal of `L^-T (1 - V C V^T) L^-1`, C the covariance of the weights (Woodbury).
         reduction = self.factor.whiten((root.T @ block.columns).T).square().sum(0)
         rest = block.values - block.columns @ self.mean

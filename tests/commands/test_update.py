@@ -54,6 +54,24 @@ def test_rows_of_a_file_are_told_and_taken_back(before, tmp_path):
     assert np.array_equal(again.rssi(rx=at), old.rssi(rx=at))
 
 
+def test_a_file_that_is_told_twice_is_taken_once_unless_it_is_said(before, tmp_path):
+    new, out = room_file(tmp_path / "new.npz", 40), tmp_path / "after.ckpt"
+    assert update(tmp_path / "run", f"ckpt={before}", f"data={new}", f"out={out}", "batch=30")[0].status == 0
+    (tmp_path / "copy.npz").write_bytes(new.read_bytes())  # by content, whatever it is called
+    answer, _ = update(tmp_path / "twice", f"ckpt={out}", f"data={tmp_path}/copy.npz")
+    assert answer.status != 0 and "again=true tells them once more" in " ".join(answer.err)
+    assert len(gsparc.load(out).rows) == 40
+    update(tmp_path / "again", f"ckpt={out}", f"data={new}", "again=true")
+    assert len(gsparc.load(out).rows) == 80
+
+
+def test_rows_of_another_site_are_refused(before, tmp_path):
+    places, file = PLACES[:5] + np.array([2e6, 0, 0]), tmp_path / "far.npz"
+    np.savez(file, rx_position=places, tx_position=np.array([9.0, 9.0, 2.6]), rssi_db=levels(places, 0))
+    answer, _ = update(tmp_path / "run", f"ckpt={before}", f"data={file}")
+    assert answer.status != 0 and "km from all rows" in " ".join(answer.err)
+
+
 def test_changes_are_listed_where_they_are(before, tmp_path):
     new, out = room_file(tmp_path / "new.npz", 200, change=-12.0), tmp_path / "after.ckpt"
     update(tmp_path / "run", f"ckpt={before}", f"data={new}", f"out={out}")

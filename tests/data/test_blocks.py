@@ -13,7 +13,7 @@ from releases import write_release
 
 from gsparc.data import blocks, raw
 from gsparc.data.assemble import content_hash
-from gsparc.data.conventions import convert_conventions
+from gsparc.data.checks.constant import leave_out_unmeasured, mark_constants
 from gsparc.data.datasets.own import read_any
 from gsparc.data.datasets.rfid import load_rfid
 from gsparc.data.own import load_own, write_own
@@ -51,12 +51,14 @@ def unchunked(path, values):
 
 
 def test_tones_that_are_zero_in_a_block_alone_were_not_measured_there(small):
-    values, none = arrays()["csi"], np.zeros((40, 3))
+    values = arrays()["csi"]
     values[:4, :, 2], values[:, :, 5] = 0, 0
     site = Site("room", "csi", "rx", None, None, None, arrays()["frequency_hz"])
-    data = Measurements(site, none, none, np.zeros((40, 3, 3)), values)
-    mask = convert_conventions(data, ["zeros_unmeasured"]).mask
-    assert mask[:, :, 2].all() and not mask[:, :, 5].any()
+    places = np.random.default_rng(0).random((40, 3))
+    data = Measurements(site, places, 0 * places, np.zeros((40, 3, 3)), values)
+    kept = leave_out_unmeasured(mark_constants(data, []))
+    assert kept.site.measured[:, [2, 5]].tolist() == [[True, False]] * len(kept.site.measured)
+    np.testing.assert_array_equal(kept.target, np.delete(values, 5, 2))
 
 
 @pytest.mark.parametrize("write", [write_own, unchunked])

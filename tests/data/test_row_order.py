@@ -12,6 +12,9 @@ from gsparc.data.own import from_arrays, interpret
 from gsparc.data.raw import Raw
 from gsparc.data.row_order import find_copies, order_rows
 from gsparc.data.splits import Fold
+from gsparc.data.tables.heads import KINDS as TABLE_KINDS
+from gsparc.data.tables.read import parse_table
+from gsparc.models import device_offsets
 from gsparc.models.channels.columns import group_channels
 
 NONE = np.zeros(0, np.int64)
@@ -71,6 +74,63 @@ def test_two_devices_that_read_the_same_level_are_two_measurements():
     assert len(measurements(rows, np.arange(120))) == 120
     rows["device"] = np.full(120, "first")
     assert len(measurements(rows, np.arange(120))) == 60
+
+
+OPTIONS = {
+    "device": lambda i, rng: f"phone {i % 3}", "run": lambda i, rng: f"day {i // 90}",
+    "time_s": lambda i, rng: f"{rng.uniform(0, 1e4):.3f}", "sensitivity_db": lambda i, rng: "-110",
+    "carrier_hz": lambda i, rng: f"{1e9 + 1e9 * (i % 2):g}", "row_name": lambda i, rng: f"r{rng.integers(9)}",
+}  # fmt: skip
+
+
+def test_every_option_of_columns_that_is_of_rows_is_shuffled_here():
+    ends, csi = ("_x", "_y", "_z", "latitude", "longitude"), ("csi", "frequency", "spacing")
+    of_rows = {name for name in TABLE_KINDS if not name.endswith(ends) and not name.startswith(csi)}
+    assert of_rows - {"x", "y", "z", "rssi", "rssi_db", "station"} == OPTIONS.keys()
+
+
+@pytest.mark.parametrize("options", [*((name,) for name in OPTIONS), ("device", "run", "time_s")])
+@pytest.mark.parametrize("stations", [1, 3])
+def test_rows_of_a_table_shuffled_with_any_columns_are_one_order(write, options, stations):
+    """Visits of a place were counted in the order of the file: other rows of devices were drawn, .1 dB."""
+    rng, lines = np.random.default_rng(0), []
+    for i in range(270):
+        place, station = i // 9, i % stations
+        more = [OPTIONS[name](i, rng) for name in options]
+        lines.append(
+            ",".join([f"{place * 7 % 30},{place},1.5,{-60 - rng.integers(40)}", f"s{station}", *more])
+        )
+    heads = ",".join(["x_m,y_m,z_m,rsrp_dbm,station", *options])
+    listed = write("name,x_m,y_m,z_m\n" + "".join(f"s{t},{40 * t},5,9\n" for t in range(3)), "stations.csv")
+    every = []
+    for order in (np.arange(270), np.arange(270)[::-1], rng.permutation(270)):
+        file = write("\n".join([heads, *(lines[i] for i in order)]))
+        data = interpret(parse_table(file, {name: name for name in options}, listed), file).data
+        every.append(order_rows(data, Fold(NONE, NONE, NONE))[0])
+    first, *others = every
+    names = np.array(first.site.every_station.name)
+    for other in others:
+        for name in ("tx", "rx_position", "target", "mask", "place", "censored", "device", "run"):
+            assert np.array_equal(getattr(first, name), getattr(other, name)), name
+        stations_of_other = np.array(other.site.every_station.name)[other.stations_of()]
+        assert np.array_equal(names[first.stations_of()], stations_of_other)
+
+
+def test_answers_of_devices_at_visits_of_places_did_not_stay_the_same_when_shuffled(monkeypatch):
+    """They moved by .1 dB: other rows told the offsets of devices."""
+    monkeypatch.setattr(device_offsets, "MOST_ROWS", 100)
+    rng = np.random.default_rng(1)
+    place = np.c_[rng.uniform(0, 100, (60, 2)), np.full(60, 1.5)].repeat(9, axis=0)
+    station, device = np.tile([0, 1, 2], 180), np.tile(np.repeat([0, 1, 2], 3), 60)
+    level = -40 - 30 * np.log10(np.linalg.norm(place - POSTS[station], axis=1)) + 4 * device
+    level = (level + rng.normal(0, 1, 540)).round(1)
+    kept = np.flatnonzero(rng.random(540) > 0.15)
+    rows = {"rx": place, "rssi": level, "station": station, "device": np.array(list("abc"))[device]}
+    answers = []
+    for order in (kept, rng.permutation(kept)):
+        model = gsparc.fit(**{k: v[order] for k, v in rows.items()}, station_position=POSTS, model="gp")
+        answers.append(model.rssi(rx=place[::9]))
+    assert np.abs(answers[0] - answers[1]).max() < 1e-3
 
 
 def test_a_drive_reversed_is_answered_alike(caplog):

@@ -1,9 +1,15 @@
 """Text of tables: comments, heads in comments, spaces of other kinds."""
 
+import gzip
+import time
+
 import numpy as np
 import pytest
+import yaml
 
-from gsparc.data.files import read_csv
+from gsparc.data import limits
+from gsparc.data.errors import DataError
+from gsparc.data.files import load_yaml, read_csv
 from gsparc.data.own import interpret
 from gsparc.data.tables import opening
 from gsparc.data.tables.read import parse_table
@@ -85,8 +91,39 @@ def test_lines_and_heads_without_end_took_all_memory(write, refused, monkeypatch
     """A line of 200 MB took 10.4 GiB; 1e8 cells of a head did not end in a minute."""
     monkeypatch.setattr(opening, "MOST_CELLS", 30_000)
     refused(says, parse_table, write(content))
-    monkeypatch.setattr(opening, "MOST_BYTES", 1000)
+    monkeypatch.setenv(limits.LIFTED_BY, "1000")
     refused("a table of text of more than 1,000 bytes; write it as Parquet", parse_table, write(content))
+
+
+def test_a_small_file_that_unpacks_to_a_large_table_took_all_memory(tmp_path, refused, monkeypatch):
+    """.9 MB held 600 MB of text, which took 12 GB; of 20 MB of it the same is told."""
+    rows = b"1,2,1.5,-60\n" * 2**21
+    (path := tmp_path / "rows.csv.gz").write_bytes(gzip.compress(b"x_m,y_m,z_m,rsrp_dbm\n" + rows))
+    packed = path.stat().st_size
+    assert limits.MOST_UNPACKED * packed < len(rows) < limits.MOST_BYTES
+    began = time.process_time()
+    refused(r"more than 16,777,216 bytes when it is unpacked; .* set GSPARC_MOST_BYTES=N", parse_table, path)
+    assert time.process_time() - began < 2
+    monkeypatch.setattr(opening, "MOST_CELLS", 1000)  # read to here, as it is lifted
+    monkeypatch.setenv(limits.LIFTED_BY, str(2**27))
+    refused("1,000 cells are read", parse_table, path)
+    monkeypatch.setenv(limits.LIFTED_BY, "1e9")
+    refused("GSPARC_MOST_BYTES='1e9': a whole number", parse_table, path)
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 200_000, "[" * 200_000 + "]" * 200_000, '{"a": ' * 100_000, "(" * 200_000]
+)
+@pytest.mark.parametrize("ending", [".csv", ".json", ".txt"])
+def test_brackets_without_end_did_not_end(tmp_path, refused, text, ending):
+    """A name of a column of 200,000 of them was searched for a unit from each on."""
+    (path := tmp_path / f"deep{ending}").write_text(text)
+    began = time.process_time()
+    refused("single column|brackets within brackets|no records|not a table|expected", parse_table, path)
+    if "(" not in text:  # of these a text is made
+        with pytest.raises((DataError, yaml.YAMLError)):
+            load_yaml(text, path)
+    assert time.process_time() - began < 5
 
 
 def test_other_tables_of_text_have_lines_as_long(write, refused):

@@ -7,16 +7,15 @@ import pytest
 import torch
 from networks import network
 
-from gsparc.data.links.strongest import strongest_lists
 from gsparc.data.own import from_arrays
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.evaluate import evaluate
-from gsparc.evaluation.given_heard import levels_given_heard
 from gsparc.evaluation.summary import remarks
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.per_station import wrap_per_station
+from gsparc.prediction.hearing import Hearing
 from gsparc.training.context import FitContext
 
 NONE = np.zeros(0, np.int64)
@@ -77,8 +76,8 @@ class Told(Method):
 
     name, uses_censored = "told", True
 
-    def __init__(self, unit):
-        self.unit = unit
+    def __init__(self, site):
+        self.site, self.unit = site, site.target_scale
 
     def predict(self, query):
         mean = torch.from_numpy(10 ** (MEANS_DB / 10) / self.unit)[query.station][:, None]
@@ -99,8 +98,8 @@ def test_listed_levels_had_to_exceed_those_of_lists_that_lack_their_station():
     data = from_arrays(arrays)
     heard = data.subset(np.flatnonzero(data.censored == 0))
     own = np.full(len(heard), SPREAD_DB)
-    told, lists = Told(data.site.target_scale), strongest_lists(data)
-    found = levels_given_heard(told, data, heard, MEANS_DB[heard.station], own, lists)
+    hearing = Hearing.from_learned(data, np.arange(len(data)))
+    found = hearing.given_heard(Told(data.site), heard.moving, heard.station, MEANS_DB[heard.station], own)
     error = found["heard_db"] - every[moment, station]
     for one in range(6):
         assert abs(error[station == one].mean()) < 0.3

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from gsparc.data.own import from_arrays
-from gsparc.evaluation.given_heard import levels_given_heard
 from gsparc.evaluation.intervals import power_intervals, reduced_chi_squared, rmse_with_silent
 from gsparc.evaluation.scores import Scores, errors_with_silent
 from gsparc.models.baselines.kriging import Kriging
+from gsparc.prediction.hearing import Hearing
 
 COUNT, LEVEL = 4000, -80.0
 
@@ -29,13 +29,15 @@ def drawn():
     return data, mean_db
 
 
+def given_heard(learned, asked, mean_db, spread_db):
+    hearing, spread = Hearing.from_learned(learned, np.arange(len(learned))), np.full(len(asked), spread_db)
+    return hearing.given_heard(Kriging(), asked.moving, asked.stations_of(), mean_db, spread)
+
+
 def scored(data, mean_db, spread_db):
     mean = 10 ** (mean_db / 10)
     linear = (np.log(10) / 10 * mean * spread_db / data.site.target_scale) ** 2
-    silent = data.subset(np.flatnonzero(data.censored_side(np.arange(COUNT)) > 0))
-    samples = {"prediction": mean} | levels_given_heard(
-        Kriging(), silent, data, mean_db, np.full(COUNT, spread_db)
-    )
+    samples = {"prediction": mean} | given_heard(data, data, mean_db, spread_db)
     return Scores("rssi", np.zeros(COUNT, int), np.arange(COUNT), samples, np.full(COUNT, np.nan), linear)
 
 
@@ -102,7 +104,7 @@ def test_levels_of_lists_are_none_of_a_station(drawn):
     silent = data.subset(np.flatnonzero(data.censored_side(np.arange(COUNT)) > 0))
     west = silent.moving[:, 0] < np.median(data.moving[:, 0])
     silent = replace(silent, target=np.where(west, 0.1, 10)[:, None].astype(np.float32) * silent.target)
-    found = levels_given_heard(Kriging(), silent, data, np.full(COUNT, LEVEL), np.full(COUNT, 3.0))
+    found = given_heard(silent, data, np.full(COUNT, LEVEL), 3.0)
     share = found["heard_share"][np.argsort(data.moving[:, 0])]
     assert share[: COUNT // 4].min() > 0.9 and share[-COUNT // 4 :].max() < 0.1
     # Far above what it must exceed a level is what it was.
@@ -122,12 +124,11 @@ def test_rows_of_stations_without_a_level_had_an_outage_of_nan():
     row = np.flatnonzero(data.station == 1)
     mean = data.target[row, 0].astype(float) * data.site.target_scale
     spread = np.full(len(row), 1e-2) * data.target[row, 0] ** 2
-    silent = data.subset(np.flatnonzero(data.censored_side(np.arange(len(data))) > 0))
-    given = levels_given_heard(
-        Kriging(), silent, data.subset(row), 10 * np.log10(mean), np.full(len(row), 3.0)
-    )
+    given = given_heard(data, data.subset(row), 10 * np.log10(mean), 3.0)
     scores = Scores("rssi", 0 * row, row, {"prediction": mean} | given, np.full(len(row), np.nan), spread)
-    figures = {"interval/coverage_90", "interval/width_db", "reduced_chi2", "heard_above_db"}
+    figures = {"interval/coverage_90", "interval/width_db", "reduced_chi2", "heard_above_db"} | {
+        "levels_rmse_db"
+    }
     assert set(power_intervals(scores, data)) == figures
 
 

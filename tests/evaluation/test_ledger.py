@@ -1,19 +1,16 @@
 """A cell is done once for the same settings, files, data, split and program; one cut short goes on."""
 
-import ast
 import importlib
-import json
 import os
 import sys
 from dataclasses import replace
-from pathlib import Path
+from importlib.metadata import version
 
 import numpy as np
 import pytest
 from campaigns import compose, spectra
 from omegaconf import OmegaConf
 
-import gsparc
 from gsparc.commands.shared.inputs import read_inputs
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Fold, Split
@@ -26,7 +23,6 @@ from gsparc.evaluation.ledger import (
     program,
     read_finished,
     run_once,
-    strip_comments,
 )
 from gsparc.evaluation.results import read_summary
 from gsparc.evaluation.summary import write_summary
@@ -159,59 +155,35 @@ def test_a_job_found_done_read_its_data_first(tmp_path):
     assert not FitInputs.from_config(compose("dataset=rfid", "dataset.root=null", "model=mean")).tells_data
 
 
-def test_commits_of_comments_alone_made_every_cell_stale():
-    """What is hashed of a file differs from it in comments, empty lines and docstrings alone."""
-    for file in sorted(Path(gsparc.__file__).parent.rglob("*.py"))[::12]:
-        tree = ast.parse(text := file.read_text(encoding="utf-8"))
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
-                node.body[0].value.value = ""
-        assert ast.dump(ast.parse(strip_comments(text))) == ast.dump(tree), file
-    assert strip_comments("x = 1  # one\n") == strip_comments("x = 1\n") != strip_comments("x = 2\n")
-
-
-def test_text_after_a_colon_was_taken_for_a_docstring():
-    one, two = (f'WORDS = {{\n    "a":\n        """{word}""",\n}}\n' for word in ("one", "two"))
-    assert strip_comments(one) != strip_comments(two)
-    assert "said" not in strip_comments('def f(\n    x,\n) -> int:\n    """said"""\n    return x\n')
-
-
 @pytest.fixture
 def plugin(tmp_path, monkeypatch):
-    """Write a module `lone_plugin`, which imports `lone_helper` and reads weights; return their folder."""
+    """Write a module `lone_plugin`, which imports `lone_helper`; return their folder."""
     folder = tmp_path / "plugin"
     folder.mkdir()
     monkeypatch.syspath_prepend(folder)
-    (folder / "lone_plugin.py").write_text("import lone_helper\nREADS = ('*.npz',)\n")
+    (folder / "lone_plugin.py").write_text("import lone_helper\n")
     (folder / "lone_helper.py").write_text('"""Of a value."""\nVALUE = 1\n')
-    (folder / "weights.npz").write_text("1")
     importlib.import_module("lone_plugin")
     yield folder
     for name in ("lone_plugin", "lone_helper"):
         sys.modules.pop(name, None)
-    ledger._hash_of_program.cache_clear()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    ("file", "text", "counts"),
+    ("file", "counts"),
     [
-        ("lone_helper.py", "VALUE = 2\n", ["lone_helper"]),
-        ("weights.npz", "2", ["lone_plugin:*.npz"]),
-        ("lone_helper.py", '"""Of a value."""\n\nVALUE = 1  # in metres\n', []),
-        ("README.md", "other words", []),
-        ("lone_other.py", "VALUE = 2\n", []),  # a new program beside it that nobody imports
+        ("lone_helper.py", True),
+        ("README.md", False),
+        ("lone_other.py", False),  # a new program beside it that nobody imports
     ],
 )
-def test_a_plugin_s_helper_or_weights_were_edited_and_it_counted_as_done(
-    tmp_path, plugin, file, text, counts
-):
+def test_a_plugin_s_helper_was_edited_and_it_counted_as_done(tmp_path, plugin, file, counts):
     """Two jobs were done already, 2.93 dB where over 20 is right."""
     run_once(tmp_path, state(), ends(tmp_path, 1))
-    (plugin / file).write_text(text)
-    ledger._hash_of_program.cache_clear()  # another process
-    assert state().changes(read_summary(tmp_path / "job.json")) == counts
-    assert (read_finished(tmp_path, state()) is None) == bool(counts)
+    (plugin / file).write_text("VALUE = 2\n")
+    changed = [str(plugin / file)] if counts else []
+    assert state().changes(read_summary(tmp_path / "job.json")) == changed
+    assert (read_finished(tmp_path, state()) is None) == counts
     assert read_finished(tmp_path, state(), reuse=True) == {"value": 1}
     assert run_once(tmp_path, state(), ends(tmp_path, 2)) == {"value": 2 if counts else 1}
 
@@ -222,22 +194,24 @@ def test_a_new_program_in_the_clone_threw_finished_sweeps_away(tmp_path, plugin)
     assert read_finished(tmp_path, state()) == {"value": 1}
 
 
-def test_cells_were_current_whose_method_s_own_files_had_changed():
+def test_cells_were_current_whose_method_s_own_files_had_changed(monkeypatch):
     """The key of `gp` hashed 2 files, and none of those of its process."""
-    found = program()
-    assert "gsparc.evaluation.ledger" in found and "numpy" not in found and "json" not in found
-    for name in ("models.baselines.gp", "ops._native", "ops.cuda_library"):
-        importlib.import_module(f"gsparc.{name}")
-    wanted = ("processes.kernel", "ops._native", "ops.cuda_library:csrc/**/*.cu")
-    assert {f"gsparc.{name}" for name in wanted} <= {*program()}
-    assert edited({"program": program()}) == []
+    monkeypatch.setattr(ledger, "_edition", ledger._edition.__wrapped__)
+    found = []
+    for commit, edits in (("a", ""), ("b", ""), ("b-dirty", "+ 1"), ("b-dirty", "+ 2")):
+        monkeypatch.setattr(ledger, "provenance", lambda commit=commit: {"git": commit})
+        monkeypatch.setattr(ledger, "run_git", lambda *_, edits=edits: edits)
+        found.append(program()["gsparc"])
+        assert edited({"program": program()}) == []
+    assert len({*found}) == 4 and not {"numpy", "gsparc.evaluation.ledger"} & {*program()}
+    monkeypatch.setattr(ledger, "provenance", lambda: {"git": None})
+    assert program()["gsparc"] == version("gsparc")
 
 
 def test_a_method_that_was_imported_by_an_interrupted_job_counts(tmp_path, plugin):
     with pytest.raises(KeyboardInterrupt):
         run_once(tmp_path, state(), cut_short(tmp_path))
     (plugin / "lone_helper.py").write_text("VALUE = 2\n")
-    ledger._hash_of_program.cache_clear()
     seen = []
     run_once(tmp_path, state(), ends(tmp_path, 1, seen))
     assert seen == [None]
@@ -253,14 +227,38 @@ def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):
     assert states[0].files != states[1].files and states[0].settings == states[1].settings
 
 
-def test_records_of_an_older_program_are_reused_where_that_is_asked(tmp_path):
-    """They have one hash of all files, and settings that say where data lay."""
-    run_once(tmp_path, state(), ends(tmp_path, 1))
-    record = read_summary(tmp_path / "job.json")
-    record |= {"program": "0123456789ab", "settings": record["settings"] | {"dataset.file": "own.npz"}}
-    (tmp_path / "job.json").write_text(json.dumps(record))
-    assert read_finished(tmp_path, state()) is None and state().changes(record) == ["program"]
-    assert read_finished(tmp_path, state(), reuse=True) == {"value": 1}
+@pytest.mark.parametrize("how", ["folder", "list", "link", "inner link", "nested"])
+def test_files_that_a_setting_names_in_a_list_a_folder_or_behind_a_link_count_by_content(tmp_path, how):
+    """A sweep answered of the maps of before: `model.prior=FOLDER`, `[a.tif,b.tif]`, a linked `spectrum/`."""
+    (folder := tmp_path / "maps").mkdir()
+    for name in ("a.tif", "b.tif"):
+        (folder / name).write_text(name)
+    (tmp_path / "in").mkdir()
+    (tmp_path / "in" / "spectrum").symlink_to(folder)
+    (folder / "loop").symlink_to(tmp_path / "in")
+    (tmp_path / "link").symlink_to(folder)
+    value = {
+        "folder": str(folder), "list": [str(folder / "a.tif"), str(folder / "b.tif")],
+        "link": str(tmp_path / "link"), "inner link": str(tmp_path / "in"),
+        "nested": [{"of": [str(folder / "b.tif")]}],
+    }[how]  # fmt: skip
+    of = lambda: FitInputs.from_config(OmegaConf.create({"model": {"prior": value, "name": str(folder)}}))  # noqa: E731
+    before = of()
+    assert before == of() and [*before.files] == ["model.prior"]
+    run_once(tmp_path / "in" / "fit", before, ends(tmp_path / "in" / "fit"))
+    assert of() == before  # what fits write there is none of what they read
+    (folder / "b.tif").write_text("changed")
+    assert of().files != before.files and of().settings == before.settings
+
+
+def test_a_release_behind_a_link_counts_by_its_content(tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "release").mkdir()
+    (tmp_path / "release" / "spectrum").symlink_to(tmp_path / "elsewhere")
+    config = compose("dataset=rfid", f"dataset.root='{tmp_path}/release'", "model=mean")
+    before = FitInputs.from_config(config)
+    (tmp_path / "elsewhere" / "1.png").write_text("1")
+    assert before.unread != FitInputs.from_config(config).unread
 
 
 def test_a_job_that_begins_anew_says_why(tmp_path, caplog):

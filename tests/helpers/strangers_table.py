@@ -43,9 +43,9 @@ CASES: dict[str, tuple[str, dict, dict | None, dict | None]] = {
         for name, what, setting in (
             ("conj", "conjugated", "conjugate"), ("fftorder", "tones in the order of an FFT", "fft_order"),
             ("normdelay", "delays taken out", "delays_removed"),
-            ("null_dc", "guard tones", "zeros_unmeasured"),
         )
     },
+    "c04_null_dc.npz": ("guard tones", {}, None, None),
     "c04_baseband_f_carrier.npz": ("tones as offsets from the carrier", {}, None, None),
     "c05_ok.npz": ("nothing", {}, None, None),
     "c05_zenith.npz": ("elevations from the zenith", {}, {"zenith": True}, None),

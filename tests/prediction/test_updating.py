@@ -9,6 +9,7 @@ from refusals import refused
 from rooms_later import PLACES, SCREENED, draw, levels, truth
 
 import gsparc
+from gsparc.prediction.later_rows import read_level_arrays
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.updating import VERSIONS
 from gsparc.processes import factor
@@ -176,13 +177,13 @@ def test_views_forgot_later_rows_and_what_came_after_was_all_they_knew(stations,
 
 def test_rows_of_several_stations_are_not_told_to_one(stations):
     model, _, at = stations
-    rows = model.in_levels(None)._rows_of_arrays(None, at, np.full((10, 3), -60.0), "dBm")
+    rows, _ = read_level_arrays(model.site, at, np.full((10, 3), -60.0), model._answer_unit("dBm"))
     refused("rows of several stations", model.select_station("a").update, rows)
 
 
 def test_misuse_is_said(predictor):
     refused("rx= and rssi= are needed", predictor.update, rx=SCREENED)
-    refused("4 places and 1 stations", predictor.update, rx=SCREENED[:4], rssi=np.zeros((4, 2)))
+    refused(r"found \(4, 2\)", predictor.update, rx=SCREENED[:4], rssi=np.zeros((4, 2)))
 
 
 @pytest.mark.slow

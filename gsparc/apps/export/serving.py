@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hmac
+import json
 import socket
 from collections.abc import AsyncIterator
 from concurrent.futures import ThreadPoolExecutor
@@ -18,18 +19,19 @@ import numpy as np
 import uvicorn
 from fastapi import FastAPI, HTTPException, Request, Response
 from fastapi.responses import JSONResponse, StreamingResponse
-from pydantic import BaseModel, ConfigDict, FailFast, ValidationError
+from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 from pydantic_core import to_json
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Receive, Scope, Send
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from gsparc.apps.export.told_file import ToldFile
-from gsparc.data.files import is_out_of_space, list_causes
+from gsparc.data.files import is_out_of_space, list_causes, refuse_repeated
 from gsparc.data.limits import POSITIVE, Checked, SettingError, number, setting, whole
 from gsparc.models.checkpoint import CheckpointError
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import read_places
+from gsparc.prediction.updating import ToldBefore
 
 RAW = "application/octet-stream"
 PLACE, BYTES, MORE = 12, 64, 8192  # bytes of a place, raw and at most as JSON, and of what is around places
@@ -64,9 +66,13 @@ class PlacesBody(BaseModel):
 
 
 class RowsBody(PlacesBody):
-    """A request's body: the same, and levels there of each station; null is not measured."""
+    """A request's body: the same, and levels there of each station; null is not measured.
+
+    Rows of a `key` are taken once; without one as often as they come, as a sensor that stands still repeats.
+    """
 
     levels: Annotated[list[list[float | None]], FailFast()]
+    key: Annotated[str | None, Field(min_length=1, max_length=100)] = None
 
 
 class Connection(H11Protocol):
@@ -268,10 +274,11 @@ def build_application(
 
     def add_rows(body: bytes) -> dict[str, Any]:
         rows = RowsBody.model_validate_json(body)
-        levels = np.array(rows.levels, float).reshape(len(rows.places), -1)
-        where: dict[str, Any] = site.name_moving(np.array(rows.places))
+        json.loads(body, object_pairs_hook=refuse_repeated)
+        where: dict[str, Any] = site.name_moving(rows.places)
         assert told is not None
-        found = told.tell(predictor, lock, limits.request_s / 2, **where, rssi=levels)
+        more = {"rssi": rows.levels, "key": rows.key}
+        found = told.tell(predictor, lock, limits.request_s / 2, **where, **more)
         return {"rows": found.rows.tolist(), "skipped": found.skipped, "alarms": [*map(asdict, found.alarms)]}
 
     async def update(request: Request) -> dict[str, Any]:
@@ -285,6 +292,8 @@ def build_application(
             busy = any(isinstance(cause, TimeoutError) for cause in list_causes(error))
             status = 503 if busy else 507 if is_out_of_space(error) else 500
             raise HTTPException(status, str(error)) from error
+        except ToldBefore as error:
+            raise HTTPException(409, str(error)) from error
         except ValueError as error:  # of a body, too
             wanted = '{"places": [[x, y, z], ...], "levels": [[level or null of each station], ...]}'
             message = f"expected {wanted}" if isinstance(error, ValidationError) else str(error)

@@ -19,8 +19,7 @@ import numpy as np
 
 from gsparc.data.blocks import rows_by
 from gsparc.data.checks.column_effects import LevelsAtPlaces
-from gsparc.data.conventions import CONVENTIONS, convert_conventions, known_array, mask_zero_tones, traits
-from gsparc.data.errors import list_first
+from gsparc.data.conventions import CONVENTIONS, convert_conventions, known_array, traits
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.processes.few_rows import draw_rows
@@ -74,12 +73,11 @@ def convention_warnings(data: Measurements) -> list[str]:
     whole, labels = _arrayed(data)
     rows = _drawn(whole)
     few, drawn, labels = data.subset(rows[:1]), whole.subset(rows), labels[rows]
-    zeros = _zeros(drawn) if facts.is_complex and len(rows) else []
     entries = drawn.target.shape[2] * (1 if known_array(drawn) is None else drawn.target.shape[1])
     if len(rows) < FEWEST[facts.kind]:
-        return zeros
+        return []
     if facts.is_complex:
-        return [*zeros, *_rivals(mask_zero_tones(drawn), few, labels)] if entries >= COHERENT else zeros
+        return _rivals(drawn, few, labels) if entries >= COHERENT else []
     return _rivals(drawn, few, labels) + _decibels(drawn)
 
 
@@ -110,15 +108,6 @@ def _drawn(data: Measurements) -> np.ndarray:
     cells = np.floor((place[order] - place[order].min(axis=0)) / side)
     first = np.sort(np.unique(cells, axis=0, return_index=True)[1])
     return order[first[: min(ROWS, max(LEAST, ENTRIES[facts.kind] // data.target[0].size))]]
-
-
-def _zeros(data: Measurements) -> list[str]:
-    measured = data.target != 0 if data.mask is None else (data.target != 0) | ~data.mask
-    zero = np.flatnonzero(~measured.any(axis=(0, 1)))
-    if not len(zero):
-        return []
-    which = f"tones {list_first(zero.tolist())} (of {measured.shape[2]}, from 0) are 0 in all rows"
-    return [f"{which}: guards, or the direct current? dataset.zeros_unmeasured=true: they were not measured"]
 
 
 def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[str]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsparc.data.blocks import rows_by
+from gsparc.data.links.strongest import ALONE
 from gsparc.data.schema import Measurements
 from gsparc.data.selection import FROM_ROW
 from gsparc.physics.decibels import to_decibels
@@ -73,7 +74,7 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     # What was not heard is known to be weak, or was said to be unknown, which `links.absent` judges; a file
     # with a station for each place, as of serving cells, has no empty cells.
     absence_stated = data.censored is not None or data.provenance.get("absent") == "unknown"
-    if not absence_stated and len(first) < len(np.unique(link)):
+    if not absence_stated and np.mean(np.bincount(np.unique(link) // count) == 1) < ALONE:
         absent = np.setdiff1d(np.arange(len(first) * count), link)
     parts = [name.split(FROM_ROW) for name in stations.name]
     for t in [t for t, (name, *_) in enumerate(parts) if sum(name == other for other, *_ in parts) > 1]:

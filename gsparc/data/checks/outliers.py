@@ -19,6 +19,7 @@ FEW = 0.02  # share of the rows, at least one row
 GAP_DB = 50.0  # to the next row: no step of a receiver between two of its neighbours is as high
 FAR = 10.0  # times the farthest distance of the others from the median place
 FAR_M = 50.0  # and this much farther: in a small box nothing is far
+WITHIN, APART_PLACES = 0.1, 3  # of a box: its margin, how wide rows lie in it at least; rows that tell
 
 
 def find_strong_outliers(peaks: np.ndarray) -> np.ndarray:
@@ -35,6 +36,32 @@ def too_far(positions: np.ndarray) -> np.ndarray:
     """Tell which rows (S,) of `positions` (S, 3) [m] lie far outside the region of all others."""
     distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
     return _few_beyond(distance, lambda inner, outer: outer > FAR * inner and outer - inner > FAR_M)
+
+
+def far_from_box(positions: np.ndarray, box: np.ndarray) -> np.ndarray:
+    """Tell which `positions` (n, 3) [m] lie as far outside the `box` (2, 3) of other rows."""
+    distance, reach = np.linalg.norm(positions - box.mean(0), axis=1), np.linalg.norm(np.ptp(box, axis=0)) / 2
+    return (distance > FAR * reach) & (distance - reach > FAR_M)
+
+
+def are_kilometres(positions: np.ndarray, box: np.ndarray) -> bool:
+    """Tell whether a `box` (2, 3) [m] holds `positions` (n, 3) only when these are taken for kilometres.
+
+    Or holds both, but these as a heap about the origin, and their thousandfold spread out as rows are.
+    """
+    margin = np.maximum(WITHIN * np.ptp(box, axis=0), LOW_M)
+
+    def inside(places: np.ndarray) -> np.ndarray:
+        return ((places >= box[0] - margin) & (places <= box[1] + margin)).all(axis=1)
+
+    across = positions * [1e3, 1e3, 1.0]
+    if not (inside(across) | inside(positions * 1e3)).all():
+        return False
+    spread = (
+        len(positions) >= APART_PLACES
+        and (np.ptp(across[:, :2], axis=0) >= WITHIN * np.ptp(box[:, :2], axis=0)).all()
+    )
+    return bool(spread or not inside(positions).any())
 
 
 def find_gap(places: np.ndarray) -> tuple[np.ndarray, float] | None:

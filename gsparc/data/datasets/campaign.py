@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from gsparc.data.assemble import check_positions
+from gsparc.data.checks.coherence import place_warnings
 from gsparc.data.checks.column_effects import run_warnings
 from gsparc.data.checks.conventions import convention_warnings
 from gsparc.data.checks.gone import gone_warnings
@@ -93,7 +94,7 @@ def find_implausible(
     if places * len(data.site.every_station) > most:
         note = "too many links to be looked at for implausible levels here; gsparc check does"
         return [*hints, note], None, []
-    hints += map(Severe, convention_warnings(data))
+    hints += map(Severe, [*convention_warnings(data), *place_warnings(data)])
     if (levels := link_levels(data, file_row)) is None:
         return hints, None, []
     steps, hints = find_level_steps(levels), [*hints, *run_warnings(data), *gone_warnings(data)]

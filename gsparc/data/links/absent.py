@@ -14,7 +14,7 @@ from gsparc.data.own_checks import Checker
 from gsparc.data.schema import OTHER, End, Stations
 from gsparc.data.selection import take_rows
 
-LEAST_LISTED = 3  # stations, for lists of the strongest
+LEAST_LISTED = 3  # stations, for a floor
 UNLISTED_EACH = 2  # rows of what is not listed for one that is
 
 
@@ -52,7 +52,7 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
     levels, of, floor = arrays["rssi_db"], arrays["station"], _floors(arrays, count)
     whole = levels.ndim == 1 and "mask" not in arrays
     heard = np.flatnonzero(np.isfinite(levels) if whole else np.zeros(0))
-    if count < LEAST_LISTED or not len(heard) or ("sensitivity_db" in arrays and floor is None):
+    if not len(heard) or ("sensitivity_db" in arrays and floor is None):
         return 0
     # Noise below a stated level has its place in a list, and bounds what is not listed by that level.
     levels = np.where(np.isfinite(levels), np.fmax(levels, arrays.get("sensitivity_db", -np.inf)), levels)
@@ -61,11 +61,13 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
     lists = StrongestLists.from_rows(arrays["place"][heard], of[heard], levels[heard], moving, count)
     strongest = lists.are_strongest()
     # What is known not to be heard, of marks or a stated sensitivity, needs no guess.
-    limit_known = floor is not None or np.isneginf(levels).any() or find_marks(levels[heard])
-    found = None if strongest or limit_known or absent == "silent" else lists.below_floor()
+    limit_known = floor is not None or np.isneginf(levels).any() or bool(find_marks(levels[heard]))
+    no_floor = strongest or limit_known or absent == "silent" or count < LEAST_LISTED
+    found = None if no_floor else lists.below_floor()
     if not strongest and found is None:
         return 0
-    missing = f"lists of the {lists.length} strongest of {count} stations"
+    listed = "the strongest alone" if lists.length == 1 else f"the {lists.length} strongest"
+    missing = f"lists of {listed} of {count} stations"
     if found is not None:
         (floor, may), lists = found, replace(lists, length=0)
         missing = "levels are missing beside weak ones alone"

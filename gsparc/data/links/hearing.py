@@ -13,7 +13,7 @@ from gsparc.data.blocks import is_big
 from gsparc.data.checks.plausibility import APART_DB, find_marks, find_saturation
 from gsparc.data.errors import Caution
 from gsparc.data.limits import Limit, choice, number, or_null, or_word
-from gsparc.data.own_checks import Checker
+from gsparc.data.own_checks import MOST_DB, Checker
 from gsparc.data.schema import OTHER, Links
 from gsparc.data.selection import take_rows
 from gsparc.physics.decibels import to_decibels
@@ -21,7 +21,6 @@ from gsparc.physics.decibels import to_decibels
 POWERS = ("rssi", "rssi_db")
 BESIDE, LEAST_MARKS = 6, 12  # rows around a mark; marks that tell
 WEAK_SHARE = 0.62  # of marks beside rows that are weaker than half of the station's: not heard
-MOST_DB = 400  # of any level
 FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
 
 

@@ -9,15 +9,17 @@ were lost, in outages or at random, are missing beside strong ones, too.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.row_order import along_curve, hash_rows
 from gsparc.physics.decibels import to_decibels
+from gsparc.processes.stored import Stored, from_plain, to_plain
 
 if TYPE_CHECKING:
     from gsparc.data.schema import Measurements
@@ -26,6 +28,9 @@ FULL = 0.15  # of the moments, that hold as many as any: .03 at most where heari
 LEAST_MOMENTS = 20
 ABOVE_DB = 6.0  # of a neighbour's weakest, where a station drops out of lists, at most
 WHOLE = 0.5  # of the rows, those of moments that leave none out
+ALONE = 0.9  # of the moments, that hold one station where what is logged is the one that serves
+SERVED = 0.5  # of what chance leaves, that near moments hold the same one more often
+SWITCHES, HYSTERESIS_DB = 5, 3.0  # near moments of two, at least; what these differ by more than others
 RUN = 3  # such moments in a row: how alike neighbours are
 NEAREST = 30  # lists that tell which stations may be listed at a place
 FLOOR = 2.0  # per cent of a station's levels that may lie below its floor
@@ -62,11 +67,11 @@ Silent = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
-class StrongestLists:
-    """Lists of the strongest of T stations.
+class StrongestLists(Stored):
+    """Lists of the strongest of T stations; of the one that serves a list holds no more.
 
     Attributes:
-        length: stations of a full list.
+        length: stations of a full list; 1 where hardly any holds more.
         first: (M,) a row of each.
         level: (M, T) [dB], NaN where a station is not listed.
         place: (M, 3) [m].
@@ -88,12 +93,29 @@ class StrongestLists:
         table[which.reshape(-1), who] = level
         # By what they hold: the file's order is chance, and draws are by number.
         order = np.lexsort((hash_rows(np.nan_to_num(table)), along_curve(np.nan_to_num(at[first]))))
-        return cls(int(np.isfinite(table).sum(1).max()), first[order], table[order], at[first[order]])
+        sizes = np.isfinite(table).sum(1)
+        length = 1 if np.mean(sizes == 1) >= ALONE else int(sizes.max())
+        return cls(length, first[order], table[order], at[first[order]])
+
+    def state(self) -> dict[str, Any]:
+        """Return what `read` needs: of levels those that are, as most stations are in no list."""
+        moment, station = np.nonzero(np.isfinite(self.level))
+        levels = np.c_[moment, station], self.level[moment, station], self.level.shape[1]
+        return {**super().state(), "level": to_plain(levels)}
+
+    @classmethod
+    def read(cls, state: Mapping[str, Any]) -> Self:
+        """Return the lists whose `state()` this was."""
+        (links, values, count), rest = from_plain(state["level"]), {**state, "level": None}
+        lists = super().read(rest)
+        level = np.full((len(lists.first), count), np.nan)
+        level[tuple(links.T)] = values
+        return replace(lists, level=level)
 
     @property
     def full(self) -> np.ndarray:
         """(M,) bool."""
-        return np.isfinite(self.level).sum(1) == self.length
+        return (np.isfinite(self.level).sum(1) >= self.length) & (self.length > 0)
 
     def are_strongest(self) -> bool:
         """Tell whether many hold as many as any, fewer than there are, and stations drop out when weak.
@@ -103,15 +125,33 @@ class StrongestLists:
         of_places = [len(np.unique(self.place[rows], axis=0)) > 1 for rows in np.isfinite(self.level).T]
         if not all(of_places):
             level = self.level[:, of_places]
-            length = int(np.isfinite(level).sum(1).max(initial=0))
+            length = min(self.length, int(np.isfinite(level).sum(1).max(initial=0)))
             return replace(self, level=level, length=length).are_strongest()
         sizes = np.isfinite(self.level).sum(1)
         piled = self.full.mean() >= FULL and 2 * self.full.sum() > (sizes == self.length - 1).sum()
-        if len(sizes) < LEAST_MOMENTS or not 2 <= self.length < self.level.shape[1] or not piled:
+        if len(sizes) < LEAST_MOMENTS or not 1 <= self.length < self.level.shape[1] or not piled:
             return False
+        if self.length == 1:
+            return self.serve_one()
         above = self.beside - np.nanmin(self.level, 1)[:, None]
         above = above[np.isnan(self.level) & self.full[:, None] & np.isfinite(above)]
         return bool(len(above) and np.median(above) <= ABOVE_DB)
+
+    def serve_one(self) -> bool:
+        """Tell whether the one station of a moment is its strongest: a log of the serving cell.
+
+        Near moments then mostly hold the same, and where they do not both are about as strong: what is
+        measured one after the other, or where somebody chose to, changes more often and by more.
+        """
+        own, near = np.isfinite(self.level), np.isfinite(self.beside)
+        moments = np.flatnonzero(own.any(1) & near.any(1))
+        same = (own & near)[moments].any(1)
+        share = own[moments].mean(0)
+        change = np.abs(np.nanmax(self.beside[moments], 1) - np.nanmax(self.level[moments], 1))
+        chance = float((share**2).sum())
+        if same.mean() - chance < SERVED * (1 - chance) or (~same).sum() < SWITCHES:
+            return False
+        return bool(np.median(change[~same]) <= np.median(change[same]) + HYSTERESIS_DB)
 
     @cached_property
     def beside(self) -> np.ndarray:
@@ -190,6 +230,8 @@ def strongest_lists(data: Measurements) -> StrongestLists | None:
     if data.place is None or data.station is None or not data.site.several:
         return None
     heard = np.flatnonzero(data.censored_side() <= 0)
+    if not len(heard):
+        return None
     level, at = levels_db(data, heard), data.moving[heard]
     count = len(data.site.every_station)
     lists = StrongestLists.from_rows(data.place[heard], data.station[heard], level, at, count)

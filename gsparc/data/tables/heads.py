@@ -10,6 +10,7 @@ from unicodedata import combining, normalize
 
 import yaml
 
+from gsparc.data.limits import LONGEST_HEAD
 from gsparc.data.units import UNITS, Unit
 
 PERCENT = (
@@ -62,6 +63,8 @@ class Head:
 
 def parse_head(text: str) -> Head:
     """Read a head such as `RSRP [dBm]`, `tx_x_mm`, `Latitude (deg)`, `rssi_gateway7` or `csi_re_3`."""
+    if len(text) > LONGEST_HEAD:
+        return Head()
     plain, unit, strange = unit_of(text)
     words = words_of(plain)
     if not words:

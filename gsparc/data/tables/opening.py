@@ -17,6 +17,7 @@ import pandas as pd
 
 from gsparc.data.errors import Caution, DataError, Problems, absent, name_row_ranges, readable
 from gsparc.data.files import check_content, check_fetched, check_line_length
+from gsparc.data.limits import LIFTED_BY, MOST_CELLS, MOST_COLUMNS, most_text
 from gsparc.data.raw import ARRAY_SUFFIXES
 from gsparc.data.tables import is_table
 from gsparc.data.tables.cells import unfold_cells
@@ -61,9 +62,6 @@ THOUSANDS = r"\s*[-+]?[1-9]\d{0,2},\d{3}\s*"  # 448,262: a mark between thousand
 LOOKED_AT = 200  # lines and cells that decide about delimiter and decimal mark
 COMMENTS = ("#", "%", "//")
 PEEKED = 64  # bytes that tell what a file is
-MOST_BYTES = 2**30  # of a table of text
-MOST_COLUMNS = 10_000  # read in two seconds; a hundred thousand in a minute
-MOST_CELLS = 3 * 10**7  # of 90 bytes each in memory
 
 
 Lines = dict[int, str]  # those with something in them, by their numbers from 1
@@ -117,13 +115,13 @@ def _decoded(path: Path) -> tuple[str, str]:
     """The text of a file and the name of its encoding."""
     with path.open("rb") as file:
         packed = file.read(len(GZIP)) == GZIP
+    most = most_text(path.stat().st_size if packed else None)
     with (
         readable(path, "damaged or not compressed by gzip", (EOFError, zlib.error, gzip.BadGzipFile)),
         gzip.open(path) if packed else path.open("rb") as file,
     ):
-        content = file.read(MOST_BYTES + 1)
-    if len(content) > MOST_BYTES:
-        raise DataError(f"{path}: a table of text of more than {MOST_BYTES:,} bytes; write it as Parquet")
+        content = file.read(most + 1)
+    _check_bytes(path, len(content), most)
     check_content(path, content, "\n\r")
     for start, what in SHEET["others"].items():
         if content.lstrip().startswith(start.encode("latin-1")):
@@ -146,6 +144,13 @@ def _decoded(path: Path) -> tuple[str, str]:
     except UnicodeDecodeError:
         # Every byte means something in Latin-1; Windows-1252 is what spreadsheets write.
         return content.decode("cp1252", errors="replace"), "Windows-1252, as it is not UTF-8"
+
+
+def _check_bytes(path: Path, count: int, most: int) -> None:
+    if count > most:
+        unpacked = " when it is unpacked" if path.stat().st_size <= most else ""
+        advice = f"write it as Parquet, or set {LIFTED_BY}=N where memory has twenty times as many"
+        raise DataError(f"{path}: a table of text of more than {most:,} bytes{unpacked}; {advice}")
 
 
 def _lines(text: str, source: str) -> tuple[Lines, str]:
@@ -353,7 +358,7 @@ def read_sheet(path: str | Path, problems: Problems | None = None) -> Sheet:
         first = b"".join(file.read(PEEKED).removeprefix(codecs.BOM_UTF8).split())
     kind = next((kind for start, kind in STARTS.items() if first.startswith(start)), None)
     kind = "Parquet" if path.suffix.lower() == ".parquet" else kind
-    if kind == RECORDS and path.stat().st_size > MOST_BYTES:
-        raise DataError(f"{path}: records of more than {MOST_BYTES:,} bytes; write them as Parquet")
+    if kind == RECORDS:
+        _check_bytes(path, path.stat().st_size, most_text())
     sheet = unfold_cells(read_text(path) if kind is None else read_frame(path, kind))
     return replace(sheet, problems=Problems(path) if problems is None else problems)

@@ -15,9 +15,8 @@ import pandas as pd
 
 from gsparc.data.amplitudes import join_polar
 from gsparc.data.errors import Caution, list_first, suggest_name
-from gsparc.data.links.hearing import MOST_DB
 from gsparc.data.links.stations import PER_STATION
-from gsparc.data.own_checks import LOWEST_HZ
+from gsparc.data.own_checks import LOWEST_HZ, MOST_DB
 from gsparc.data.raw import Raw
 from gsparc.data.schema import ENDS, OTHER
 from gsparc.data.tables import heads, places

@@ -11,10 +11,10 @@ from xml.etree import ElementTree
 import numpy as np
 import pandas as pd
 
-from gsparc.data.files import check_content
+from gsparc.data.files import check_content, check_depth, refuse_repeated
+from gsparc.data.limits import MOST_VALUES
 
 POINTS = {"trkpt", "wpt", "Placemark"}  # of GPX and KML
-MOST_VALUES = 10_000  # of a cell
 DEGREES, METRES = ["longitude", "latitude", "height"], ["x", "y", "z"]  # as GeoJSON and KML order coordinates
 # Of cells with a place: whether latitudes come first; over how many degrees places that are none reach.
 PLACES = {"coordinates": (False, 360), "point": (False, 3), "pair": (True, 3)}
@@ -30,6 +30,7 @@ def read_records(path: Path) -> pd.DataFrame:
     """
     text = path.read_text(encoding="utf-8-sig")
     check_content(path, text, "[{<\n")
+    check_depth(path, text)
     frame = pd.json_normalize(_of_xml(text) if text.lstrip().startswith("<") else _of_json(text))
     while (name := next((name for name in frame if frame[name].map(_holds_records).any()), None)) is not None:
         frame = frame.explode(name, ignore_index=True)
@@ -64,7 +65,7 @@ def _holds_records(value: Any) -> bool:
 
 def _of_json(text: str) -> list[dict[str, Any]]:
     try:
-        content = json.loads(text, object_pairs_hook=_of_pairs)
+        content = json.loads(text, object_pairs_hook=refuse_repeated)
     except json.JSONDecodeError as whole:  # a record a line
         if "\n" not in text.strip():
             raise
@@ -81,17 +82,9 @@ def _of_json(text: str) -> list[dict[str, Any]]:
 
 def _of_line(line: str, number: int) -> Any:
     try:
-        return json.loads(line, object_pairs_hook=_of_pairs)
+        return json.loads(line, object_pairs_hook=refuse_repeated)
     except json.JSONDecodeError as fault:
         raise ValueError(f"line {number}, column {fault.colno}: {fault.msg}; is it cut off?") from None
-
-
-def _of_pairs(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    record = dict(pairs)
-    if len(record) < len(pairs):
-        twice = next(name for name, count in Counter(name for name, _ in pairs).items() if count > 1)
-        raise ValueError(f"{twice!r} is twice in one record")
-    return record
 
 
 def _of_columns(content: dict[str, Any]) -> list[dict[str, Any]]:

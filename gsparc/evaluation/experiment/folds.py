@@ -13,7 +13,7 @@ import numpy as np
 from hydra.utils import instantiate
 from lightning import Callback
 
-from gsparc.data.errors import Caution
+from gsparc.data.errors import Caution, Severe
 from gsparc.data.executor import run_each, uses_other_processes
 from gsparc.data.load import split_settings
 from gsparc.data.schema import Measurements
@@ -22,6 +22,7 @@ from gsparc.evaluation.console import to_dict
 from gsparc.models import checkpoint, fitting
 from gsparc.models.method import Method, MethodFactory
 from gsparc.models.per_station import wrap_per_station
+from gsparc.prediction.hearing import Hearing
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import NO_COST, Cost
 
@@ -66,6 +67,7 @@ class FoldFits:
         """Return what a summary says of the fits."""
         notes = [note for note in self.notes if not isinstance(note, Caution)]  # those were warnings
         facts = {"time/train_cpu_s": fmean(self.train_cpu_s), "model/learned": "\n".join(notes) or None}
+        facts["model/refused"] = "\n".join(note for note in self.notes if isinstance(note, Severe)) or None
         if self.cost.stages:
             facts |= {"time/cost": self.cost.describe(), "time/unused_s": self.cost.unused_s}
         return facts
@@ -114,6 +116,7 @@ def keep_fold(
     for note in report.notes:
         log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
     extra = fitting.run_extra(report, data, fold, context)
+    extra |= Hearing.from_learned(data, fold.learned()).to_extra()
     extra |= {"fold": number, "split_sha256": split.sha256, "run_id": run_id, "tested": len(fold.test)}
     extra["read_notes"] = [] if context.datamodule is None else [*map(str, context.datamodule.notes)]
     checkpoint.save(context.run_dir / checkpoint.MODEL, fitted, context.config_yaml, extra)

@@ -245,7 +245,7 @@ class ChannelField(ClosedForm):
                 alike.setdefault(key, []).append((model, here, places))
         return list(alike.values())
 
-    def left_out(self) -> LeftOutRows:
+    def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """See `ClosedForm`; in the phase and level of each row's own run.
 
         What rows have in common by their order alone is not predicted: no query has it.

@@ -174,7 +174,7 @@ class DirectionalGP(SourcesInFrame):
         gain = self.posterior.mean_gains(at) * gain[:, :, None]
         return SourcePaths(gain.mT, at.away, self.posterior.positions.points)
 
-    def left_out(self) -> LeftOutRows:
+    def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """Return receivers, each predicted from all others; its own visibility is left out, too."""
         return self._fitted_frame().to_left_out_rows(self.posterior.rows, self.posterior.predict_left_out())
 

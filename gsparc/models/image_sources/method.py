@@ -283,7 +283,7 @@ class ImageSourceGP(SourcesInFrame):
         gain = gain * point_wave(away, self.frame.carrier_hz).T[..., None]
         return SourcePaths(gain.movedim(0, -1), away, self.query.sources)
 
-    def left_out(self) -> LeftOutRows:
+    def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """Return receivers, each predicted from all others."""
         frame = self._fitted_frame()
         each = torch.stack([member.predict_left_out() for member in self.members])

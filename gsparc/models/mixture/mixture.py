@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from abc import abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, cast
@@ -192,6 +192,17 @@ class Mixture(LearnsTogether, ClosedForm):
         for member in self.members:
             member.condition(data, rows)
 
+    def members_data(self, data: Measurements) -> Measurements:
+        """See `HasMembers`; in the phase and level of the largest run."""
+        return self.runs.remove_factors(data)
+
+    def keep_members(self, kept: Sequence[ClosedForm]) -> None:
+        """See `HasMembers`; their weights keep their ratios."""
+        chosen = [number for number, one in enumerate(self.members) if one in kept]
+        names, weights = self.started.split("+"), np.array(self.weights)[chosen]
+        self.members, self.started = [self.members[i] for i in chosen], "+".join(names[i] for i in chosen)
+        self.weights = tuple((weights / weights.sum()).tolist())
+
     def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of fields whose parameters are few, such as those of powers without fringes."""
         if self.member is None or not self.member.forgets:
@@ -223,9 +234,9 @@ class Mixture(LearnsTogether, ClosedForm):
         variance, unknown = (each.to(mean.real.dtype) for each in (variance, unknown))
         return Prediction(mean, variance, unknown, torch.stack(parts).sum(0) if parts else None)
 
-    def left_out(self) -> LeftOutRows:
+    def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """Return the mean of all; what they disagree about is part of its variance."""
-        result = [member.left_out() for member in self.members]
+        result = [member.left_out(rows) for member in self.members]
         if len({one.mean.shape for one in result}) > 1:
             raise ValueError(f"{self.name}: of several tones or antennas one is kept of rows left out")
         parts = [(weight, one.mean, one.variance) for weight, one in zip(self.weights, result, strict=True)]

@@ -234,7 +234,7 @@ class MovingArrayField(Differentiable, ClosedForm):
         )
         self._left_error = torch.cat(errors)
 
-    def left_out(self) -> LeftOutRows:
+    def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """See `ClosedForm`; images."""
         if not len(self.rows):
             raise ValueError(f"{self.name}: condition it first, a stored one has no rows to leave out")

@@ -58,6 +58,7 @@ class CalibratedRayTracer(Checked, Method):
     name = "calibrated_raytracer"
     no_gradient = "rays are traced to a place anew"
     kinds: ClassVar[tuple[Kind, ...]] = ("rssi", "csi")
+    is_yardstick: ClassVar[bool] = True  # type: ignore[misc]
     scene: str | None = None
     start: Start = setting("generic", choice(*get_args(Start)))
     steps: int = setting(40, whole(0))

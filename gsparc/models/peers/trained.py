@@ -118,6 +118,7 @@ class TrainedPeer(Method):
     resumable: ClassVar[bool] = True  # type: ignore[misc]
     takes_effort: ClassVar[bool] = True  # type: ignore[misc]
     threads_pay: ClassVar[bool] = True  # type: ignore[misc]
+    is_yardstick: ClassVar[bool] = True  # type: ignore[misc]
     usual_steps: ClassVar[dict[Kind, int]]  # a minute of one core at its usual batches (docs/table.md)
     makes: ClassVar[type[Any]]  # a `Network` of a scene and these settings
     rates: ClassVar[dict[str, float]] = {}  # by the beginning of a parameter's name

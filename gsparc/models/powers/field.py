@@ -16,6 +16,7 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsparc.data.errors import Caution
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
@@ -26,6 +27,7 @@ from gsparc.models.image_sources.known.images import walls_in_frame
 from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, fit_fringes, resolves_wavelength
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, describe_weights, subtract_means
+from gsparc.models.powers.prior_map import PriorMap
 from gsparc.models.powers.settings import (
     LAW_NEEDS,
     MeanLaw,
@@ -37,7 +39,7 @@ from gsparc.models.target_rows import linear_moments, power_rows
 from gsparc.physics.decibels import from_decibels
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.posterior import Exact, approximation_label
-from gsparc.processes.powers import PowerProcess, condition_on_powers, trend_about_rows
+from gsparc.processes.powers import PowerProcess, PowerRows, condition_on_powers, trend_about_rows
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import QUERIES
 from gsparc.processes.stored import from_plain, to_plain
@@ -46,6 +48,8 @@ from gsparc.processes.trend import Trend
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.effort import Effort
 from gsparc.training.stopwatch import Stopwatch
+
+LEFT_OUT = "model.prior: the map is left out: rows left out are predicted as well without it"
 
 
 class PowerField(ClosedForm):
@@ -83,7 +87,7 @@ class PowerField(ClosedForm):
         if not len(rows):
             raise ValueError("a process of powers needs at least one row")
         self.site, self.fringes = data.site, None
-        notes = self._choose_priors(data, rows, context.counts)
+        notes = (*self._choose_priors(data, rows, context.counts), *self._judge_maps(power_rows(data, rows)))
         self.condition(data, rows)
         user_terms = tuple(one for one in self.trend.more if isinstance(one, UserTerm))
         if user_terms and self.powers is not None and isinstance(self.powers.posterior, Exact):
@@ -123,7 +127,29 @@ class PowerField(ClosedForm):
             if self.fringes is not None:  # their share was learned beside this process
                 return (found[0].description, *found[0].notes, note)
         self.priors, notes = mix_candidates(seen, found, self.seed, chosen_on)
+        own = tuple(term for term in terms if not isinstance(term.term, PriorMap))
+        if len(own) < len(terms) and not self._used_maps():
+            # Kernels were sought beside the map's: a map that is left out leaves what there is without it.
+            found = candidate_priors(seen, site, self.seed, chosen_on, own)
+            self.priors, notes = mix_candidates(seen, found, self.seed, chosen_on)
         return (*notes, *remarks)
+
+    def _used_maps(self) -> list[PriorMap]:
+        """Maps from before that the mean has a share of."""
+        terms = [part for _, prior in self.priors for part in prior.known_trend.more]
+        own = [part.term for part in terms if isinstance(part, UserTerm)]
+        return [term for term in own if isinstance(term, PriorMap)]
+
+    def _judge_maps(self, rows: PowerRows) -> list[Caution]:
+        """What must be said of maps from before: that one is left out, and what may be wrong with it."""
+        heard = rows.heard_rows
+        used, cautions = self._used_maps(), list[Caution]()
+        for term in self.own_terms:
+            if isinstance(term, PriorMap):
+                unused = "" if used else LEFT_OUT
+                fault = term.explain_misfit(heard.places + self.site.origin, heard.decibels)
+                cautions += [Caution(text) for text in (unused, fault) if text]
+        return cautions
 
     @property
     def trend(self) -> Trend:
@@ -179,7 +205,7 @@ class PowerField(ClosedForm):
         explained_power = from_decibels(explained[:, None]) if self.count_components() else None
         return Prediction(*linear_moments(mean, spread), share, explained_power)
 
-    def left_out(self) -> LeftOutRows:
+    def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """See `ClosedForm`; of rows where something was heard.
 
         Of very many rows each is predicted without all that was measured at its place.
@@ -188,17 +214,20 @@ class PowerField(ClosedForm):
             ValueError: before `condition`.
         """
         process = self.require_fitted(self.powers)
-        decibels, spread = process.left_out(self.at)
+        some = None if rows is None else np.flatnonzero(np.isin(self.known, rows))
+        decibels, spread = process.left_out(self.at, some)
+        known = self.known if some is None else self.known[some]
         if self.fringes is not None:
             posterior = process.posterior
             loud = (posterior.extra == 0).numpy() if isinstance(posterior, Exact) else self.at
             places = process.places[loud]
-            nearest = torch.from_numpy(cKDTree(places).query(places, k=2)[0][:, 1])
+            asked = places if some is None else places[some]
+            nearest = torch.from_numpy(cKDTree(places).query(asked, k=2)[0][:, 1])
             decibels, factor = self.fringes.blend_blind_solutions(
-                decibels, torch.from_numpy(places), nearest, self.known
+                decibels, torch.from_numpy(asked), nearest, known
             )
             spread = spread * factor
-        return LeftOutRows(self.known, *linear_moments(decibels.float(), spread.float()))
+        return LeftOutRows(known, *linear_moments(decibels.float(), spread.float()))
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""

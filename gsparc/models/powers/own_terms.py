@@ -67,8 +67,10 @@ class OwnTerms:
             return self.terms
         if data.site.several:
             return (*self.terms, NetworkMaps.from_file(self.prior, data))
-        station = data.site.name.rpartition(OF_STATION)[2] if OF_STATION in data.site.name else ""
-        return (*self.terms, PriorMap.from_levels(*read_prior_levels(self.prior, data, station)))
+        (station,), still = data.site.every_station.shown, data.site.every_station.position[0]
+        station = data.site.name.rpartition(OF_STATION)[2] if OF_STATION in data.site.name else station
+        levels = read_prior_levels(self.prior, data, station)
+        return (*self.terms, PriorMap.from_levels(*levels, still + data.site.origin))
 
 
 @dataclass(frozen=True)

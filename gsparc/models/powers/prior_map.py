@@ -7,25 +7,38 @@ lacks. Laws without the map stand beside it, and the likelihood of rows left out
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
+from gsparc.data.errors import group_warnings
 from gsparc.data.prior_levels import Files, read_prior_maps
 from gsparc.data.schema import Measurements
 from gsparc.processes.places import first_end, other_end
 from gsparc.processes.sectors import ROUND, SHARED, Sectors, sector_of
 from gsparc.processes.term import Columns
 
+if TYPE_CHECKING:
+    from gsparc.models.powers.together.terms import StationRows
+
 SHARE = (1.0, 0.3)  # mean and deviation of the weight of a map's levels
 NEAR = 4  # points of the map that tell of a place
 CLOSE = 1e-3  # [m]
+SPACING, DRAWN = 0.9, 10_000  # share of points with a neighbour as near; that tell how near, and of the law
+AREA = (
+    2.0,
+    4.0,
+)  # spacings to the nearest point up to which, and from which on not, a map tells
+LEAST_TOLD, SURE = 8, 2.0  # rows that tell of a slope; its deviations
+SLOPES = (0.4, 2.5)  # of levels by those of a map in the same unit of the same place
+FLAT_DB = 1.0  # between all levels of a map: powers that are no levels
 ALONG = 0.9  # of a map's levels, less a law of distance, that lie below those along the beam
 
 
@@ -33,20 +46,34 @@ ALONG = 0.9  # of a map's levels, less a law of distance, that lie below those a
 class PriorMap(Columns):
     """Levels of a map, between its points the mean of the nearest, weighed by distances to the power -2.
 
+    Outside the area of its points it is the law of distance that its own levels have.
+
     Attributes:
         points: (M, 2) of the end that moves [m], world.
         level: (M,) there, less their mean [dB].
         prior_db: see `Columns`.
+        spacing: of the points [m].
+        about: x and y of the end that stands [m]; level at 1 m of it [dB], and by decade.
     """
 
     points: Tensor
     level: Tensor
     prior_db: Sequence[float] | None = SHARE
+    spacing: float = math.inf  # older files say nothing of it
+    about: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     @classmethod
-    def from_levels(cls, points: np.ndarray, level: np.ndarray) -> Self:
-        """Return a map of levels (M,) [dB] at points (M, 2) [m]."""
-        return cls(torch.from_numpy(points.copy()), torch.from_numpy(level - level.mean()))
+    def from_levels(cls, points: np.ndarray, level: np.ndarray, still: np.ndarray) -> Self:
+        """Return a map of levels (M,) [dB] at points (M, 2) [m]; the end that stands is at (3,) or NaN."""
+        level = level - level.mean()
+        part = slice(None, None, max(1, len(points) // DRAWN))
+        about = (0.0, 0.0, 0.0, 0.0)
+        if np.isfinite(still[:2]).all() and len(level[part]) > 2:
+            decades = np.log10(np.linalg.norm(points[part] - still[:2], axis=1).clip(1.0))
+            slope, first = np.polynomial.Polynomial.fit(decades, level[part], 1).convert().coef[[1, 0]]
+            about = (*still[:2].tolist(), float(first), float(slope))
+        known = torch.from_numpy(points.copy()), torch.from_numpy(level)
+        return cls(*known, spacing=point_spacing(points), about=about)
 
     @cached_property
     def _tree(self) -> cKDTree:
@@ -56,10 +83,54 @@ class PriorMap(Columns):
     def columns(self, places: Tensor) -> Tensor:
         """See `Columns`."""
         at = places[:, :2]
+        inside, level = self.look_up(at)
+        x, y, first, by_decade = self.about
+        squared = (at - at.new_tensor([x, y])).square().sum(1).clamp_min(1.0)
+        outside = first + by_decade * squared.log10() / 2
+        return (inside * level + (1 - inside) * outside)[:, None].to(places.dtype)
+
+    def look_up(self, at: Tensor) -> tuple[Tensor, Tensor]:
+        """Return how far (n,) places (n, 2) [m] are within the map's area, 0 to 1, and levels (n,) [dB]."""
         near = self._tree.query(at.detach().numpy(), min(NEAR, len(self.points)))[1]
         near = torch.from_numpy(near.reshape(len(at), -1))
-        weight = 1 / ((self.points[near] - at[:, None]).square().sum(2) + CLOSE**2)
-        return ((weight * self.level[near]).sum(1) / weight.sum(1))[:, None].to(places.dtype)
+        squared = (self.points[near] - at[:, None]).square().sum(2) + CLOSE**2
+        weight, (within, beyond) = 1 / squared, AREA
+        inside = (beyond - squared[:, 0].sqrt() / self.spacing) / (beyond - within)
+        return inside.clamp(0.0, 1.0), (weight * self.level[near]).sum(1) / weight.sum(1)
+
+    def explain_misfit(self, places: np.ndarray, decibels: np.ndarray) -> str:
+        """Say what is wrong with a map by levels (n,) [dB] at world places (n, D) [m]; empty: nothing.
+
+        >>> at = np.c_[np.arange(20.0), np.zeros(20)]
+        >>> PriorMap.from_levels(at, at[:, 0], np.full(3, np.nan)).explain_misfit(at, -50 - at[:, 0])[:45]
+        'model.prior: levels fall by 1 dB where those '
+        """
+        inside, level = self.look_up(torch.from_numpy(places[:, :2]))
+        whole = (inside == 1).numpy()
+        if whole.sum() < LEAST_TOLD or (spread := float(level[whole].std())) == 0:
+            return ""
+        known, values = level.numpy()[whole], decibels[whole] - decibels[whole].mean()
+        known = (known - known.mean()) / spread
+        slope = float(known @ values) / len(known) / spread
+        error = float(np.std(values - slope * spread * known)) / spread / math.sqrt(len(known) - 2)
+        if slope + SURE * error < 0:
+            advice = "path losses? write minus them, or scale -1 of the band"
+            return f"model.prior: levels fall by {-slope:.1g} dB where those of the map rise by 1: {advice}"
+        low, high = slope - SURE * error, slope + SURE * error
+        if low <= SLOPES[1] and high >= SLOPES[0]:
+            return ""
+        advice = "in another unit, or of another place?"
+        if float(np.ptp(self.level)) < FLAT_DB:
+            advice = "linear powers? write 10 log10 of them, or the unit of the band, such as mW"
+        return f"model.prior: levels rise by {slope:.1g} dB where those of the map rise by 1: {advice}"
+
+
+def point_spacing(points: np.ndarray) -> float:
+    """Return how near points (M, 2) lie [m]: most have a neighbour as near; infinity of one point."""
+    if len(points) < 2:
+        return math.inf
+    nearest = cKDTree(points).query(points[:: max(1, len(points) // DRAWN)], 2)[0][:, 1]
+    return float(np.quantile(nearest, SPACING)) or math.inf
 
 
 def usual_loss(way: Tensor) -> Tensor:
@@ -96,11 +167,21 @@ class NetworkMaps(Columns):
         found = list[tuple[int, bool, PriorMap]]()
         for number, own, (world, levels) in read_prior_maps(path, data, data.site.every_station.shown):
             points, level = map(torch.from_numpy, (world - data.site.origin[:2], levels))
-            before = found[-1][2].points if found else points
+            before = found[-1][2] if found else None
             # Squares of one raster are stored once.
-            points = before if torch.equal(points, before) else points
-            found.append((number, own, PriorMap(points, level)))
+            if before is not None and torch.equal(points, before.points):
+                points, spacing = before.points, before.spacing
+            else:
+                spacing = point_spacing(points.numpy())
+            found.append((number, own, PriorMap(points, level, spacing=spacing)))
         return cls(tuple(found))
+
+    def explain_misfits(self, rows: StationRows, names: Sequence[str]) -> list[str]:
+        """Say what is wrong with maps of stations by rows of these, see `PriorMap.explain_misfit`."""
+        heard = rows.side == 0
+        own = [(names[n], level, heard & (rows.station == n)) for n, is_own, level in self.maps if is_own]
+        faults = [(name, level.explain_misfit(rows.places[at], rows.decibels[at])) for name, level, at in own]
+        return group_warnings([f"station {name}: {fault}" for name, fault in faults if fault])
 
     def put_under(self, network: Sectors, places: np.ndarray) -> Sectors:
         """Return a network about these maps, whose stations at (T, 3) have no other pattern and power."""
@@ -122,6 +203,7 @@ class NetworkMaps(Columns):
             own = (sector_of(places) == number).nonzero()[:, 0]
             if len(own):
                 at = places[own]
-                level = one.columns(at)[:, 0] + usual_loss(first_end(at) - other_end(at)) - self.level
+                inside, level = one.look_up(at[:, :2])
+                level = inside * (level + usual_loss(first_end(at) - other_end(at)) - self.level)
                 result = result.index_add(0, own, level.to(result))
         return result

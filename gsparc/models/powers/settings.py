@@ -51,6 +51,7 @@ MIXED_ON = 300  # the same of processes that are averaged: an error of one weigh
 WEIGHED_ON = 400  # the same where some rows were silent: each look factors several
 SILENT, LEAST_SILENT = 0.5, 30  # of these, for each row that was heard, and at least
 MAP_COST = 3.0  # nats that rows must say for a map that was there before
+MAP_PAYS = 0.05  # of the squared errors at rows left out that a map must take off
 LAW_NEEDS = 8  # rows that were heard, for a distance law
 LAW_ODDS = 3.0  # logarithm of the prior odds of a law over a constant about a known place: 20 to 1
 LEAST_FALL = 1.0  # exponent of a law that these odds speak for: below it, rows show no distance law
@@ -111,8 +112,12 @@ class KernelCandidate:
         """One line of the settings."""
         law = self.trend.law
         mean = "a constant" if law is None else f"a distance law of exponent {law.exponent:.3g}"
-        has_map = any(isinstance(one, UserTerm) and isinstance(one.term, PriorMap) for one in self.trend.more)
-        return f"{self.kernel.description}, mean: {mean}{' and a share of the map' * has_map}"
+        return f"{self.kernel.description}, mean: {mean}{' and a share of the map' * self.has_map}"
+
+    @property
+    def has_map(self) -> bool:
+        """Whether the mean has a share of a map from before."""
+        return any(isinstance(one, UserTerm) and isinstance(one.term, PriorMap) for one in self.trend.more)
 
 
 def candidate_priors(
@@ -178,6 +183,13 @@ def mix_candidates(
     for sides in SPANS:
         gram += _relative_gram([_errors_without_squares(one, sides) for one in posteriors]) / len(SPANS)
     share = best_weights(gram)
+    bare = np.flatnonzero([not one.has_map for one in candidates])
+    if 0 < len(bare) < len(candidates):
+        alone = np.zeros_like(share)
+        alone[bare] = best_weights(gram[np.ix_(bare, bare)])
+        # Both were chosen on these rows: what a map gains by chance is no gain elsewhere.
+        if share @ gram @ share > (1 - MAP_PAYS) * (alone @ gram @ alone):
+            share = alone
     mixture = [(float(share[k]), candidates[k]) for k in np.argsort(-share, kind="stable") if share[k]]
     texts = [f"{weight:.0%} of {one.description}" for weight, one in mixture]
     notes = dict.fromkeys(note for _, one in mixture for note in one.notes)

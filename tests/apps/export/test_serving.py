@@ -499,6 +499,15 @@ def test_levels_that_were_measured_change_the_answers_and_are_stored(told):
     assert post(json.dumps({**rows, "levels": rows["levels"][:5]}))[0] == 422
     status, body, _ = post(b'{"places": [[1, 2, 3]]}')
     assert status == 422 and b"levels" in body
+    for wrong, says in (
+        ('{"places": [], "levels": []}', b"holds nothing"),
+        ('{"places": [[1, 2, 1]], "levels": [[-90]], "levels": [[-60]]}', b"'levels' is twice"),
+        ('{"places": [[1, 2, 1], [2, 2, 1]], "levels": [[-90], [400]]}', b"row 1: a level"),
+        ('{"places": [[1, 2, 1], [2000000, 2, 1]], "levels": [[-90], [-90]]}', b"row 1: 2000 km"),
+        ('{"places": [[1, 2, 1], [2, 2, 1]], "levels": [[-90, -90]]}', b"found (1, 2)"),
+    ):
+        status, body, _ = post(wrong)
+        assert status == 422 and says in body, body
     assert post(json.dumps({name: part * 3 for name, part in rows.items()}))[0] == 413
     assert len(gsparc.load(path).rows) == 29
     with pytest.raises(SettingError, match="updates=true: whoever reaches it"):
@@ -517,6 +526,15 @@ def test_rows_that_a_full_disk_refused_were_answered_by_all_the_same(told):
     assert not predictor.versions and path.read_bytes() == before
     assert post(as_json([[1, 2, 1]]), path="/predict")[1] == answers
     assert post(ROW)[0] == 200 and len(gsparc.load(path).rows) == len(predictor.rows) == 1
+
+
+def test_rows_of_a_key_that_are_posted_twice_are_taken_once(told):
+    """A client that tried again after a lost answer told its rows twice."""
+    path, predictor, post = told
+    rows = {"places": [[1.0, 2.0, 1.0]], "levels": [[-90.0]]}
+    for key, status in (("a", 200), ("a", 409), ("b", 200), (None, 200), (None, 200)):
+        assert post(json.dumps(rows | ({"key": key} if key else {})))[0] == status
+    assert len(predictor.rows) == len(gsparc.load(path).rows) == 4
 
 
 def test_rows_that_another_process_told_the_file_were_overwritten(told):

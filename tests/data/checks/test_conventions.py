@@ -64,7 +64,6 @@ OF_CSI = {
     "fft_order": (WIDE, lambda a: {"csi": np.fft.ifftshift(a["csi"], axes=2)}),
     "reverse_tones": (WIDE, lambda a: {"csi": a["csi"][:, :, ::-1]}),
     "delays_removed": (WIDE, lambda a: {"csi": delay_removed(a)}),
-    "zeros_unmeasured": (WIDE, lambda a: {"csi": a["csi"] * (np.arange(16) != 8)}),
     "reverse_antennas": (LONG, lambda a: {"csi": a["csi"][:, ::-1]}),
     "exchange_axes": (LONG, lambda a: {"csi": a["csi"].swapaxes(1, 2)}),
     "array_mm": (SQUARE, lambda a: {"array_position": a["array_position"] * 1000}),

@@ -285,3 +285,55 @@ def test_what_lists_leave_out_depended_on_the_order_of_rows():
     first = unlisted(np.arange(rows))
     for order in (np.arange(rows)[::-1], np.random.default_rng(0).permutation(rows)):
         np.testing.assert_allclose(unlisted(order), first, rtol=1e-5, atol=1e-3)
+
+
+def serving(one, **more):
+    """The strongest cell alone at each moment of a drive."""
+    best = one.measured.argmax(1)
+    moment = np.arange(len(best))
+    arrays = {
+        "rx_position": one.moment, "station": best, "station_position": one.place,
+        "rssi_db": one.measured[moment, best],
+    }  # fmt: skip
+    return arrays | more
+
+
+@pytest.mark.parametrize("stands", [False, True])
+def test_a_log_of_the_serving_cell_was_learned_as_if_the_others_were_unknown(stands):
+    """`absent=silent` was advised for it; against the truth of all cells 10.8 dB, of lists of two 3.8."""
+    one, rng = network(2), np.random.default_rng(0)
+    arrays = serving(one)
+    rows = np.arange(len(one.moment))
+    if stands:  # at some moments the phone stands still, and now and then another cell serves
+        rows = np.sort(np.r_[rows, np.repeat(rows[::50], 8)])
+        arrays = {name: one if name == "station_position" else one[rows] for name, one in arrays.items()}
+        again = np.flatnonzero(np.r_[False, rows[1:] == rows[:-1]])[::4]
+        arrays["station"][again] = rng.integers(0, len(one.place), len(again))
+    reading = interpret(Raw(arrays), "drive")
+    data = reading.data
+    assert any(note.startswith("lists of the strongest alone of 30 stations: ") for note in reading.notes)
+    silent = data.censored > 0
+    assert (~silent).sum() >= len(one.moment) and silent.sum() == 2 * (~silent).sum()
+    level = 10 * np.log10(data.target[:, 0] * data.site.target_scale)
+    place = {tuple(at): i for i, at in enumerate(one.moment.round(3))}
+    moment = [place[tuple(at)] for at in (data.moving + data.site.origin).round(3)]
+    wrong = one.measured[moment, data.station][silent] > level[silent] + 1e-3
+    assert wrong.mean() < 0.02
+    said = sanity_warnings(link_levels(data), [])
+    assert not [text for text in said if "absent" in text]
+    reading = interpret(Raw(arrays, {"absent": "silent"}), "drive")
+    assert any(isinstance(note, Severe) and "leave absent out" in note for note in reading.notes)
+
+
+def test_one_station_at_each_moment_is_not_always_the_one_that_serves():
+    """Cells asked one after the other, or where somebody chose to, tell nothing of those that were not."""
+    one, rng = network(2), np.random.default_rng(0)
+    rows = np.arange(len(one.moment))
+    by_turns, second = rows % 30, np.argsort(-one.measured, 1)[rows, rng.integers(0, 5, len(rows))]
+    east = np.where(one.moment[:, 0] > np.median(one.moment[:, 0]), *one.measured.mean(0).argsort()[[0, -1]])
+    for chosen in (by_turns, second, east):
+        arrays = serving(one, station=chosen, rssi_db=one.measured[rows, chosen])
+        reading = interpret(Raw(arrays), "drive")
+        assert reading.data.censored is None and not [n for n in reading.notes if "strongest" in n]
+        said = sanity_warnings(link_levels(reading.data), [])
+        assert not [text for text in said if "absent" in text]

@@ -14,7 +14,7 @@ from gsparc.data.load import load, split_for
 from gsparc.data.target import TARGETS
 from gsparc.evaluation.scores import score_methods
 from gsparc.models.baselines.gp import GaussianProcess, principal_components
-from gsparc.processes.density import LeftOutDensity
+from gsparc.processes.density import left_out_density
 from gsparc.processes.fit_kernel import choose_left_out_kernel
 from gsparc.processes.kernel import Kernel
 from gsparc.training.context import FitContext
@@ -26,8 +26,8 @@ def test_chosen_kernel_is_a_minimum(campaign):
     kernel = choose_left_out_kernel(data.moving, scores.numpy(), 288, 1)
     places = torch.from_numpy(data.moving)
     at = {
-        step: LeftOutDensity.apply(
-            Kernel.from_length(kernel.length * step, kernel.noise).gram(places), scores, 288, False
+        step: left_out_density(
+            [(Kernel.from_length(kernel.length * step, kernel.noise).gram(places), scores)], 288, False
         )[0]
         for step in (0.8, 1.0, 1.25)
     }

@@ -1,5 +1,7 @@
 """A map from before any row: it helps where it is right, and is left out where it is not."""
 
+import re
+
 import numpy as np
 import pytest
 import rasterio
@@ -56,6 +58,28 @@ def rasters(tmp_path):
     return tmp_path
 
 
+def raster(
+    path, level, unit="", scale=1.0, offset=0.0, nodata=None, width=None, dtype="float64", names=("",)
+):
+    """A GeoTIFF of levels (M,) [dB] on the squares of the town, stored as (level - offset) / scale."""
+    stored = (level.reshape(len(AXIS), -1)[::-1, :width] - offset) / scale
+    how = {"height": len(AXIS), "width": stored.shape[1], "dtype": dtype, "driver": "GTiff", "nodata": nodata}
+    with rasterio.open(path, "w", count=len(names), transform=from_origin(0, 700, 10, 10), **how) as file:
+        for band, name in enumerate(names, 1):
+            file.write(stored.astype(dtype), band)
+            file.set_band_description(band, name)
+        file.scales, file.offsets, file.units = ([one] * len(names) for one in (scale, offset, unit))
+    return path
+
+
+SQUARES = np.stack(np.meshgrid(AXIS, AXIS), -1).reshape(-1, 2)
+FAR = SQUARES[:, 0] > 500
+
+
+def miss(model, asked):
+    return float(np.sqrt(np.mean((model.rssi(rx=asked)[:, 0] - measured(asked, 1)) ** 2)))
+
+
 def fit(rows, prior=None, **more):
     settings = {} if prior is None else {"prior": prior}
     return gsparc.fit(**{"rx": rows, "tx": POST, "rssi": measured(rows), "settings": settings, **more})
@@ -67,6 +91,94 @@ def test_a_map_helps_where_it_is_right_and_is_left_out_where_it_is_not(rasters, 
     found = [fit(rows, one and rasters / f"{one}.tif") for one in (None, "right", "wrong")]
     error = [np.sqrt(np.mean((one.rssi(rx=asked)[:, 0] - measured(asked, 1)) ** 2)) for one in found]
     assert error[1] < 0.7 * error[0] and error[2] < 1.05 * error[0], error
+
+
+@pytest.mark.parametrize(
+    "stored",
+    [{"scale": 0.01, "dtype": "int16"}, {"offset": 200.0}, {"unit": "dBW"}, {"unit": "mW"}],
+    ids=["scale", "offset", "dBW", "mW"],
+)
+def test_a_raster_is_read_by_its_own_scale_offset_and_unit(tmp_path, stored):
+    """Tags of bands were not read: levels a hundred times as large, and milliwatts, were taken for levels."""
+    level = planned(SQUARES)
+    kept = {"dBW": level - 30, "mW": 10 ** (level / 10)}.get(stored.get("unit"), level)
+    rows = draw(30, 3)
+    data = from_arrays({"rx_position": rows, "tx_position": np.array(POST), "rssi_db": measured(rows)})
+    found = read_prior_levels(raster(tmp_path / "map.tif", kept, **stored), data)[1]
+    np.testing.assert_allclose(np.sort(found), np.sort(level), atol=0.01)
+    height = raster(tmp_path / "height.tif", level, unit="m")
+    refused("its unit is m; levels are needed", read_prior_levels, height, data)
+
+
+@pytest.mark.parametrize("mark", [-9999.0, 1e30, 0.0, -200.0])
+def test_marks_that_no_tag_names_are_no_levels(tmp_path, mark, caplog):
+    """-9999 of 1,400 of 4,900 squares made a map worthless, 1e30 was refused as an own term."""
+    rows, asked = draw(40, 103), draw(400, 4)
+    level, files = planned(SQUARES), {}
+    for name, nodata in (("untagged", None), ("tagged", mark)):
+        files[name] = raster(tmp_path / f"{name}.tif", np.where(FAR, mark, level), nodata=nodata)
+    error = [miss(fit(rows, one), asked) for one in files.values()]
+    assert error[0] == pytest.approx(error[1]) and error[0] < 0.8 * miss(fit(rows), asked)
+    assert caplog.text.count("1400 levels are") == 1 and "untagged.tif" in caplog.text
+
+
+def test_outside_the_area_of_a_map_it_is_its_own_law_of_distance(tmp_path):
+    """Half of the town had the levels of the other half's edge, and was worse than no map."""
+    rows, asked = draw(40, 103), draw(400, 4)
+    assert miss(fit(rows, raster(tmp_path / "half.tif", planned(SQUARES), width=35)), asked) < 0.95 * miss(
+        fit(rows), asked
+    )
+    still, inner = np.array(POST), SQUARES[SQUARES[:, 0] < 350]
+    found = PriorMap.from_levels(inner, -30 * np.log10(np.linalg.norm(inner, axis=1)), still)
+    at = torch.tensor([[300.0, 300.0, 1], [600.0, 300.0, 1]], dtype=torch.float64, requires_grad=True)
+    near, far = found.columns(at)[:, 0]
+    assert float(near - far) == pytest.approx(
+        30 * np.log10(600**2 + 300**2) / 2 - 30 * np.log10(300 * 2**0.5), abs=0.1
+    )
+    assert torch.autograd.grad(far, at)[0][1, 0] < 0
+
+
+@pytest.mark.parametrize(
+    "levels, says",
+    [
+        (lambda level: -level, "path losses. write minus them, or scale -1"),
+        (lambda level: 10 ** (level / 10), "linear powers. write 10 log10 of them, or the unit"),
+        (lambda level: level / 10, "in another unit, or of another place"),
+    ],
+    ids=["losses", "milliwatts", "tenths"],
+)
+def test_a_map_whose_levels_rise_otherwise_than_rows_is_said(tmp_path, caplog, levels, says):
+    rows = draw(40, 103)
+    model = fit(rows, raster(tmp_path / "map.tif", levels(planned(SQUARES))))
+    assert any(re.search(says, record.message) for record in caplog.records if record.levelname == "WARNING")
+    assert miss(model, draw(400, 4)) < 1.01 * miss(fit(rows), draw(400, 4))
+    caplog.clear()
+    fit(rows, raster(tmp_path / "map.tif", planned(SQUARES)))
+    assert "model.prior" not in caplog.text
+
+
+def test_a_map_that_does_not_pay_at_rows_left_out_is_said_and_leaves_nothing_behind(rasters, caplog):
+    """Kernels were those of a map that was left out, and nobody said that it was."""
+    rows, asked = draw(40, 103), draw(50, 4)
+    found = fit(rows, rasters / "wrong.tif").rssi(rx=asked)
+    assert "the map is left out: rows left out are predicted as well without it" in caplog.text
+    np.testing.assert_allclose(found, fit(rows).rssi(rx=asked), atol=1e-4)
+
+
+def test_a_band_of_a_station_s_name_is_found_where_the_station_stands_alone(tmp_path, caplog):
+    """The first band was taken, of whatever name, and a table of one station had no name."""
+    rows, level = draw(40, 103), planned(SQUARES)
+    one = {"tx": None, "station_position": np.array([POST]), "rssi": measured(rows)[:, None]}
+    for names in (("b", "a"), ("power_db b", "power_db a")):
+        path = raster(tmp_path / "two.tif", level, names=names)
+        with rasterio.open(path, "r+") as file:
+            file.write(planned(SQUARES, 7).reshape(len(AXIS), -1)[::-1], 1)
+        caplog.clear()
+        fit(rows, path, station_name=["a"], **one)
+        assert "left out" not in caplog.text
+        refused(r"two\.tif: of b, a, not of c", fit, rows, path, station_name=["c"], **one)
+    fit(rows, raster(tmp_path / "two.tif", level, names=("rsrp", "sinr")))
+    assert "the first of its bands rsrp, sinr is taken" in caplog.text
 
 
 def test_a_model_keeps_the_map_that_it_was_given(rasters):
@@ -108,7 +220,7 @@ def test_places_and_powers_of_a_table_are_a_map_too(tmp_path, caplog):
 
 def test_levels_between_points_are_those_of_the_nearest_and_have_slopes():
     corners = np.array([[0.0, 0], [10, 0], [0, 10], [10, 10]])
-    found = PriorMap.from_levels(corners, np.array([0.0, 4, 8, 12]))
+    found = PriorMap.from_levels(corners, np.array([0.0, 4, 8, 12]), np.full(3, np.nan))
     at = torch.tensor([[0.0, 0, 1], [5, 5, 1]], dtype=torch.float64, requires_grad=True)
     level = found.columns(at)[:, 0]
     assert level.tolist() == pytest.approx([-6, 0], abs=1e-3)

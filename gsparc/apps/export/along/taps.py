@@ -145,7 +145,9 @@ def fit_taps(
 
     def ask(place: np.ndarray) -> np.ndarray:
         where: dict[str, Any] = site.name_moving(place)
-        return predictor.csi(**where)[:, :antennas]
+        answer = predictor.csi(**where)
+        measured = ~np.isnan(answer)  # constant antennas and tones have no channel, and no taps
+        return answer[:, measured.any((0, 2))][:, :antennas, measured.any((0, 1))]
 
     if np.ptp(tones) > rate_hz:
         raise ValueError(f"rate_hz={rate_hz:g}: the tones span {np.ptp(tones) / 1e6:g} MHz; give more")

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.data.ends import NOBODY, Ends, stations_at
-from gsparc.data.errors import DataError
+from gsparc.data.errors import Caution, DataError
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
@@ -102,7 +102,7 @@ class JointPowerField(ClosedForm):
         if network is None:
             self.own, remarks = learn_station_priors(used, self.seed)
         else:
-            used = relabel_by_site(used, network)
+            measured, used = used, relabel_by_site(used, network)
             names = data.site.every_station.shown
             evidence, prior, remarks = learn_network(used, network, names, self.seed)
             for maps in self.maps:
@@ -111,6 +111,7 @@ class JointPowerField(ClosedForm):
                     prior, remarks = own, said
                 # Second: a table shows the first few.
                 remarks.insert(1, describe_use(used_maps, len(maps.maps)))
+                remarks += map(Caution, maps.explain_misfits(measured, names))
             self.own = StationPriors(prior, {})
         most, largest = rows_per_station(len(used.stations)), int(np.bincount(used.station).max())
         if largest > most:
@@ -193,27 +194,31 @@ class JointPowerField(ClosedForm):
             noise[at] = inflation * kernel.amplitude * kernel.noise
         return JointLevels(mean, covariance, noise)
 
-    def left_out(self) -> LeftOutRows:
+    def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """See `ClosedForm`; of rows where something was heard.
 
         Raises:
             ValueError: before `condition`.
         """
         posterior, _ = self._require_posteriors()
-        means, spreads = [], []
+        means, spreads, known = [], [], []
         for number, process in posterior.processes.items():
-            error, variance = posterior.left_out(number)
-            loud = process.extra == 0
-            means.append((process.given_values()[:, 0] - error)[loud])
-            spreads.append(variance[loud])
+            asked = slice(None) if rows is None else np.isin(self.rows[number], rows)
+            some = (process.extra == 0).nonzero()[:, 0][asked]
+            error, variance = posterior.left_out(number, some)
+            means.append(process.given_values()[some, 0] - error)
+            spreads.append(variance)
+            known.append(self.rows[number][asked])
         moments = linear_moments(torch.cat(means).float(), torch.cat(spreads).float())
-        return LeftOutRows(torch.cat([*self.rows.values()]).numpy(), *moments)
+        return LeftOutRows(torch.cat(known).numpy(), *moments)
 
     def state(self) -> dict[str, Any]:
         """See `Method.state`."""
         heard = {str(number): prior.state() for number, prior in self.own.heard.items()}
         state: dict[str, Any] = {
-            "places": torch.from_numpy(self.places), "never": self.own.never.state(), "own": heard,
+            "places": torch.from_numpy(np.nan_to_num(self.places)),
+            "nowhere": np.flatnonzero(np.isnan(self.places).any(1)).tolist(),
+            "never": self.own.never.state(), "own": heard,
             "heard": self.heard.state(), "unheard": self.unheard.state(), "inflation": self.inflation,
             "seed": self.seed, "whole": self.whole,
             "rows": {str(number): rows for number, rows in self.rows.items()},
@@ -226,7 +231,9 @@ class JointPowerField(ClosedForm):
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
-        self.site, self.places, self.seed = site, state["places"].numpy(), int(state["seed"])
+        self.site, self.places, self.seed = site, state["places"].numpy().copy(), int(state["seed"])
+        # No place is no number, which no file holds; older files lack it.
+        self.places[state.get("nowhere", [])] = np.nan
         never = Prior.read(state["never"])
         heard = {int(number): Prior.read(part) for number, part in state["own"].items()}
         self.own = StationPriors(never, heard)

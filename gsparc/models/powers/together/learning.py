@@ -16,6 +16,7 @@ import torch
 from gsparc.models.baselines.distance_law import fit_law
 from gsparc.models.powers.settings import EVIDENCE_LOOKS
 from gsparc.models.powers.together.terms import SharedTerms, StationRows
+from gsparc.processes.density import left_out_density
 from gsparc.processes.fit_kernel import fit_kernel_by_evidence, fit_kernel_by_left_out
 from gsparc.processes.kernel import Kernel, distances, median_distance
 from gsparc.processes.places import extra_columns, first_end
@@ -107,7 +108,7 @@ def learn_station_priors(rows: StationRows, seed: int) -> tuple[StationPriors, l
         else:
             some = heard.select_station(number).thin_rows(ENDS_ON, seed).view(trend)
             _, kernel_here = fit_kernel_by_left_out([kernel], [some])
-        priors[number] = Prior(replace(kernel_here, amplitude=max(kernel_here.amplitude, LEAST_DB2)), trend)
+        priors[number] = Prior(_with_amplitude(kernel_here, kernel_here.amplitude), trend)
     notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
     return StationPriors(Prior(kernel, trend), priors), notes
 
@@ -134,16 +135,16 @@ def _fit_common_kernel(heard: StationRows, trend: Trend, seed: int) -> tuple[Ker
     far = distances(at, at)
     lengths = [length * median_distance(far) for length in START.lengths]
     start = Kernel.from_lengths(lengths, START.shares, START.noise)
-    _, kernel = fit_kernel_by_left_out([start], [*views.values()], start.bounds(far))
-    amplitudes = [float(view.left_out(kernel)[1]) for view in views.values()]
-    logs = np.log(np.maximum(amplitudes, LEAST_DB2))
-    count = np.array([len(view.values) for view in views.values()])
-    mean = float((count * logs).sum() / count.sum())
-    logs = (count * logs + ALIKE * mean) / (count + ALIKE)
-    return replace(kernel, amplitude=math.exp(mean)), {
-        number: Prior(replace(kernel, amplitude=math.exp(log)), trend)
-        for number, log in zip(views, logs, strict=True)
-    }
+    _, kernel = fit_kernel_by_left_out([start], [*views.values()], start.bounds(far), alike=ALIKE)
+    parts = [(view.gram(kernel), view.values) for view in views.values()]
+    kernels = (_with_amplitude(kernel, each) for each in left_out_density(parts, alike=ALIKE)[1].tolist())
+    priors = {number: Prior(own, trend) for number, own in zip(views, kernels, strict=True)}
+    return _with_amplitude(kernel, kernel.amplitude), priors
+
+
+def _with_amplitude(kernel: Kernel, amplitude: float) -> Kernel:
+    """A kernel of an amplitude, of levels that are equal of what is left."""
+    return replace(kernel, amplitude=max(amplitude, LEAST_DB2))
 
 
 def learn_shared_terms(rows: StationRows, priors: StationPriors, seed: int) -> tuple[SharedTerms, float, str]:

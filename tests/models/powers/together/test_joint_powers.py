@@ -368,3 +368,17 @@ def test_lists_of_the_strongest_were_all_that_settings_were_learned_from(monkeyp
     # 64 of shadowing and 4 of noise; of what is listed alone 37.
     assert 50 < priors.variance < 90
     assert any("settings of their own" in note for note in notes)
+
+
+def test_a_median_station_of_one_row_took_the_kernel_of_all_into_a_corner():
+    """Its residual was exactly 0: the slope was NaN, and 42 stations had next to no noise; +47 dBm of it."""
+    data = town(60)
+    rows = rows_of(data)
+    trend, _ = learning._fit_site_law(rows, 0)
+    single = rows.subset(np.arange(1))
+    places = np.r_[rows.places[1, :3], [30.0, 25.0, 6.0]][None]
+    level = trend.mean(torch.from_numpy(places)).numpy()
+    single = replace(single, places=places, decibels=level, station=np.array([6]))
+    before, after = (learn_station_priors(part, 0)[0].never.kernel for part in (rows, joined(rows, single)))
+    assert after.noise == pytest.approx(before.noise, rel=0.3)
+    assert after.lengths == pytest.approx(before.lengths, rel=0.3)
