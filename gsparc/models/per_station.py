@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.base.errors import Caution, group_warnings, list_first
+from gsparc.base.errors import Caution, Severe, group_warnings, list_first
 from gsparc.base.executor import run_all, uses_other_processes
 from gsparc.data.ends import NOBODY, SAME_PLACE_M, Ends, station_distances
 from gsparc.data.query import Query
@@ -216,11 +216,10 @@ class PerStation(Method):
             notes += [
                 type(note)(f"{name}: {note}") for note in reports[turn].notes if note not in learned
             ]
-        cautions = group_warnings([note for note in notes if isinstance(note, Caution)])
-        notes = [
-            *(note for note in notes if not isinstance(note, Caution)),
-            *map(Caution, cautions),
-        ]
+        cautions = [note for note in notes if isinstance(note, Caution)]
+        notes = [note for note in notes if not isinstance(note, Caution)]
+        for kind in (Severe, Caution):  # a severe one is said again at the end of a run
+            notes += map(kind, group_warnings([note for note in cautions if type(note) is kind]))
         cost = sum((one.cost for one in reports), Cost())
         return FitReport(watch.seconds, tuple(notes), cost, watch.cpu_elsewhere)
 

@@ -183,7 +183,7 @@ def test_wrong_counts_are_refused(campaign, folds, tmp_path):
 def test_a_poisoned_prediction_is_not_scored(campaign, folds, tmp_path):
     data, split = campaign("spectrum", 40), folds(40)
     (method,), _ = fit_all(Mean, data, split)
-    method.value[3] = torch.nan
+    method.value[:, 3] = torch.nan
     refused("NaN or Inf", evaluate, method, None, data, split, clock=QUICK)
 
 
