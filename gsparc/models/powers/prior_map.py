@@ -105,6 +105,8 @@ class PriorMap(Columns):
         >>> PriorMap.from_levels(at, at[:, 0], np.full(3, np.nan)).explain_misfit(at, -50 - at[:, 0])[:45]
         'model.prior: levels fall by 1 dB where those '
         """
+        if len(places) < LEAST_TOLD:
+            return ""
         inside, level = self.look_up(torch.from_numpy(places[:, :2]))
         whole = (inside == 1).numpy()
         if whole.sum() < LEAST_TOLD or (spread := float(level[whole].std())) == 0:

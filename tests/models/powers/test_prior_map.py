@@ -17,6 +17,7 @@ from gsparc.models.mixture.methods import Powers
 from gsparc.models.powers import prior_map
 from gsparc.models.powers.prior_map import NetworkMaps, PriorMap, describe_use
 from gsparc.models.powers.together.network import find_sectors
+from gsparc.models.powers.together.terms import rows_of_stations
 from gsparc.processes.sectors import NO_AZIMUTH
 
 POST = [0.0, 0.0, 20.0]
@@ -318,6 +319,18 @@ def test_a_wide_table_of_a_map_lost_cells_and_was_not_read_by_pci(tmp_path, by_p
     known = found.maps[7][2].level.numpy()
     np.testing.assert_allclose(known - known.mean(), level[:, 7] - level[:, 7].mean(), atol=1e-3)
     assert not caplog.text
+
+
+def test_a_network_s_map_that_falls_where_levels_rise_is_said_by_station(by_pci, tmp_path):
+    data, level = by_pci
+    cells, names = [f"{t // 3}-{t % 3}" for t in range(30)], data.site.every_station.shown
+    said = []
+    for sign in (1, -1):
+        maps = NetworkMaps.from_file(network_rasters(tmp_path / "all.tif", sign * level, cells), data)
+        rows = rows_of_stations(data, np.arange(len(data)), data.site.stations.position)
+        said.append(maps.explain_misfits(rows, names))
+    assert not any("losses" in text for text in said[0]) and any("path losses" in text for text in said[1])
+    assert len(said[1]) <= 6  # of 30 stations, of which some were hardly heard
 
 
 def test_cells_without_a_map_and_columns_of_no_cell_are_warned_of(tmp_path, by_pci, caplog):
