@@ -53,8 +53,8 @@ def check_updatable(site: Site) -> None:
     or both ends move.
     """
     if not site.maps_levels:
-        what = f"{site.target.called}{' of two moving ends' * site.target.is_level}"
-        raise ValueError(f"update: models of {what} cannot be updated: train again on all rows")
+        targets = f"{site.target.called}{' of two moving ends' * site.target.is_level}"
+        raise ValueError(f"update: models of {targets} cannot be updated: train again on all rows")
 
 
 def read_level_rows(data: Measurements, site: Site) -> LevelRows:
