@@ -73,7 +73,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "ckpt": path,
     }
     # At a known place
-    next_one = ", {nearest_m:.4g} m from the next" * (best["nearest_m"] is not None)
+    next_one = "" if best["nearest_m"] is None else ", {nearest_m:.4g} m from the next"
     sentence = "with a station at " + at + next_one + ": {coverage:.1%}, gaining "
     interval = "no interval is known: no station could be left out, or promised=false, left_out=0"
     if best["low"] is not None:
@@ -83,7 +83,8 @@ def task(config: DictConfig) -> dict[str, Any]:
             f"{100 * low[0]:.1f} to "
         )
         interval += f"{100 * high[0]:.1f} points"
-        interval += f", not significantly above {alike} of {len(low) - 1} others" * (len(low) > 1)
+        if len(low) > 1:
+            interval += f", not significantly above {alike} of {len(low) - 1} others"
     lines = [
         placing.assumption(predictor.site, placement.places[0, 2], where["antenna"]),
         f"now {placement.before:.1%} of the area, {placement.grid.step:.3g} m squares, with "

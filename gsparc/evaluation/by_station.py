@@ -215,5 +215,6 @@ def worst_stations(columns: Mapping[str, Any], method: str, later: bool = False)
             for itertuple in offset[:WORST].itertuples()
         )
         note += f"{'; ' * bool(note)}measured levels differ from predicted by one offset: {those}"
-        note += ": gsparc update learns that, but not from lists of the strongest" * later
+        if later:
+            note += ": gsparc update learns that, but not from lists of the strongest"
     return [Table.from_rows(title, table_columns, named[:WORST].to_dict("records"), note=note)]

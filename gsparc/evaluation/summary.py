@@ -236,7 +236,7 @@ def describe_model(facts: Mapping[str, Any]) -> list[str]:
     texts += notes.splitlines()[:MOST_LEARNED]
     lines = [f"  {text}" if number else f"{label}: {text}" for number, text in enumerate(texts)]
     folds = facts.get("split/folds") or 1
-    return [f"of the first of {folds} folds:"] * (folds > 1 and bool(lines)) + lines
+    return [f"of the first of {folds} folds:", *lines] if folds > 1 and lines else lines
 
 
 def run_conditions(facts: Mapping[str, Any]) -> list[str]:
@@ -336,9 +336,8 @@ def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]
         lead = Lead.from_facts(facts, f"baseline/{best}/{ahead}{end}")
         if lead is not None:
             judgements = judge_baseline(best, method, figure, lead, ahead == LISTED)
-            notes += [
-                f"{'without cells that may be off: ' * bool(end)}{note}" for note in judgements
-            ]
+            without_cells = "without cells that may be off: " if end else ""
+            notes += [f"{without_cells}{note}" for note in judgements]
         elif scores[best] > score_of(figure, value):
             notes.append(
                 f"the baseline {best} has the better {figure} here; how surely is not known"

@@ -148,9 +148,8 @@ def draw_spectra(examples: Examples, title: str) -> Figure:
             power = axis.imshow(image, vmin=0, vmax=1, cmap="inferno", **options)
         for place, axis in enumerate(line[1:-1]):
             psnr, ssim = (figures[name][place, number] for name in ("psnr_db", "ssim_gauss"))
-            axis.set_xlabel(
-                f"{psnr:.1f} dB" + f", SSIM {ssim:.3f}" * bool(np.isfinite(ssim)), fontsize=8
-            )
+            similarity = f", SSIM {ssim:.3f}" if np.isfinite(ssim) else ""
+            axis.set_xlabel(f"{psnr:.1f} dB{similarity}", fontsize=8)
         # Half of full scale, saturating: at +-1 usual errors of a few hundredths would be white.
         error = line[-1].imshow(image - true, vmin=-0.5, vmax=0.5, cmap="RdBu_r", **options)
         if np.isfinite(examples.confidence[number]):
@@ -269,9 +268,8 @@ def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Pat
         # A median: rows behind buildings are far below the pattern, and would lower a mean.
         gain = float((rest + trend.pattern_loss(at)).median())
         axis.plot(turn, gain - trend.pattern_loss(torch.from_numpy(around)), color=PALETTE[1])
-        title = f"{stations.shown[t]}, {azimuth[t]:.0f} deg" + f" (given {nominal[t]:.0f})" * int(
-            turned[t]
-        )
+        given = f" (given {nominal[t]:.0f})" if turned[t] else ""
+        title = f"{stations.shown[t]}, {azimuth[t]:.0f} deg{given}"
         axis.set(title=title, xlim=(-180, 180), xticks=range(-180, 181, 90))
     few = [stations.shown[t] for t in np.flatnonzero((azimuth != NO_AZIMUTH) & ~enough)]
     note = f"; too few rows to draw: {list_first(few, 6)}" if few else ""

@@ -165,7 +165,8 @@ def draw_sweep(rows: pd.DataFrame, title: str, path: Path, also: Sequence[str] =
         "mean"
     ].itertuples():
         labels[setting] = f"{shorten_setting(setting, 40)}: training {seconds:.3g} s"
-        labels[setting] += f", one query {ms:.3g} ms" * bool(np.isfinite(ms))
+        if np.isfinite(ms):
+            labels[setting] += f", one query {ms:.3g} ms"
     figure = draw_distributions(rows, names, labels)
     figure.suptitle(title, fontsize=9)
     save(figure, path, 100, also)

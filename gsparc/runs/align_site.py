@@ -178,9 +178,8 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray, whole: bool) 
     if not is_known.all():
         fault = _explain_unknown(data.site.name, ours, theirs, number < 0)
         if whole or not is_known.any():
-            raise ValueError(
-                fault + "; dataset.stations=[NAME,...] keeps the others" * bool(is_known.any())
-            )
+            advice = "; dataset.stations=[NAME,...] keeps the others" if is_known.any() else ""
+            raise ValueError(fault + advice)
         log.warning("%s: %d of %d rows are left out", fault, (~is_known).sum(), len(is_known))
         data = data.subset(np.flatnonzero(is_known))
     facts = replace(data.site, stations=theirs, static_position=site.static_position)

@@ -303,7 +303,7 @@ def _foreign(
         return None, 0, trained
     tested, learned = np.concatenate([fold.test for fold in chosen.folds]), 0
     unlisted = int((data.censored_side(tested) > 0).sum())
-    listed = f" ({len(tested) - unlisted} listed, {unlisted} unlisted)" * (unlisted > 0)
+    listed = f" ({len(tested) - unlisted} listed, {unlisted} unlisted)" if unlisted else ""
     for old, fold in zip(before.folds, chosen.folds, strict=True):
         # Rows of `val` decide steps and weights: they count as learned.
         rows = old.learned()
@@ -314,7 +314,8 @@ def _foreign(
             # rows at one place are taken for the same.
             gaps, _ = cKDTree(trained_data.moving[rows]).query(data.moving[fold.test])
             learned += int((gaps < SAME_ROW_M).sum())
-    origin += f" ({before.name})" * same
+    if same:
+        origin += f" ({before.name})"
     how = ("were " if same else "are at places that were ") + (
         "TRAINED on" if learned else "trained on"
     )

@@ -107,7 +107,7 @@ def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndar
         if name == "station_azimuth" and (values < 0).any() and (values[values < 0] == -1).all():
             values, meaning = np.where(values < 0, np.nan, values), f"{name}, -1 unknown"
         high = np.nanmedian(values) > UNSAID_DBM or not np.nan_to_num(values).any()
-        empty = "station_width", "station_thickness", *["station_power_db"] * bool(high)
+        empty = "station_width", "station_thickness", *(["station_power_db"] if high else [])
         if name in empty and (values == 0).any():
             values, meaning = np.where(values == 0, np.nan, values), f"{name}, 0 unknown"
         if name in TILTS and (values < 0).any() and not (values > 0).any():
@@ -234,7 +234,8 @@ def _doubt(
     elif fitting:
         fitting[2:] = ["dBm"] if kind == "power" and not refused else fitting[2:3]
         fault += f"; name its unit, as in '{unit_of(head)[0]} [{fitting[0]}]'"
-        fault += f", where {' or '.join(fitting)} would fit" * (len(fitting) > 1)
+        if len(fitting) > 1:
+            fault += f", where {' or '.join(fitting)} would fit"
     if refused:
         raise DataError(fault)
     sheet.notes.append(Caution(fault))

@@ -56,7 +56,7 @@ def read_times(sheet: Sheet, heads: Iterable[str]) -> tuple[np.ndarray, str] | N
     if times is None:
         return None
     seconds = times[0][np.isfinite(times[0])]
-    return times[0], times[1] + ", not in order of time" * bool((np.diff(seconds) < 0).any())
+    return times[0], times[1] + (", not in order of time" if (np.diff(seconds) < 0).any() else "")
 
 
 def _all_match(text: pd.Series, pattern: str) -> bool:
@@ -100,4 +100,4 @@ def _read_text(text: pd.Series) -> tuple[np.ndarray, str] | None:
         return None
     seconds = (moment - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy()
     doubt = day_first and first <= 12 and text.str.contains("/").any()
-    return seconds, "dates" + ", day before month? no day beyond 12 tells" * bool(doubt)
+    return seconds, "dates, day before month? no day beyond 12 tells" if doubt else "dates"

@@ -60,7 +60,7 @@ def say_effects(
         head = effect.head
         share = f"{effect.share:.0%} of what places and stations leave"
         if effect.kind == "number":
-            factor = f"*{abs(effect.size):g}" * (abs(effect.size) != 1)
+            factor = "" if abs(effect.size) == 1 else f"*{abs(effect.size):g}"
             power_text += f"{'+' if effect.size < 0 else '-'}{head}{factor}"
             how = f"{say_column('rssi_db', power_text)} takes it off"
             meaning = f"a number that adds {effect.size:g} dB each to the level"
@@ -68,9 +68,10 @@ def say_effects(
             devices.append(head)
             how = f"{say_column('device', '+'.join(devices))} takes each off"
             meaning = f"an offset of all levels for each value, up to {effect.size:.1f} dB: devices"
-            meaning += ", or floors" * all(word.lstrip("-").isdigit() for word in set(words[head]))
-            if "floors" in meaning and not {"z", "rx_z", "tx_z"} & set(chosen):
-                how += f"; of floors {say_column('z', f'{head}*3.2')} takes 3.2 m each"
+            if all(word.lstrip("-").isdigit() for word in set(words[head])):
+                meaning += ", or floors"
+                if not {"z", "rx_z", "tx_z"} & set(chosen):
+                    how += f"; of floors {say_column('z', f'{head}*3.2')} takes 3.2 m each"
         else:
             names.append(head)
             how = f"{say_column('station', '+'.join(names))} tells them apart"

@@ -203,7 +203,8 @@ def locate_by_model(
     status = "are promised" if config.calibrate or stored else "are not calibrated"
     claim = f"{share:.0%} {status}; {float(box.volume.sum()):.3g} {SIZES[size]} were searched"
     beyond = int(beyond_box(heard.place, box.box()).sum()) if placed else 0
-    claim += f", {beyond} true places lie outside" * bool(beyond)
+    if beyond:
+        claim += f", {beyond} true places lie outside"
     true = heard.place + origin if placed else None
     shown_at = [locating.to_world(answer, origin) for answer in located]
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")

@@ -609,7 +609,8 @@ class LearnedField(Method):
         text = f"{kind} through {text}" if self.choices.closed_form else text
         if self.choices.init == "vectors" and not self.steps and self.site is not None:
             enough = ENOUGH * len(self.site.array_geometry()[0])
-            text += f" ({enough} or more give the same answers)" * (count >= enough)
+            if count >= enough:
+                text += f" ({enough} or more give the same answers)"
         part = "all" if self.steps == self.steps_taken else self.steps or "none"
         return text + (
             f", {self.steps_taken} gradient steps, {part} kept"

@@ -110,13 +110,10 @@ def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) 
         none = " or without any power" if measured == "spectrum" else ""
         below = np.ones(1) if floor is None or not censored.any() else floor[censored]
         below = to_decibels(below) if measured == "rssi" else below
-        limits = f"{below.min():.4g}" + f" to {below.max():.4g}" * bool(np.ptp(below))
-        note = (
-            "not listed" + " or not heard" * bool(censored.sum() > unlisted)
-            if unlisted
-            else "not heard"
-        )
-        unheard = f"powers were {note}: below {limits} dB"
+        limits = f"{below.min():.4g}" + (f" to {below.max():.4g}" if np.ptp(below) else "")
+        reasons = ["not listed"] if unlisted else []
+        reasons += ["not heard"] if not unlisted or censored.sum() > unlisted else []
+        unheard = f"powers were {' or '.join(reasons)}: below {limits} dB"
         for flags, note in ((~keep, f"values are missing{none}"), (censored, unheard)):
             check.notes += [f"{flags.sum()} of {len(keep)} {note}"] if flags.any() else []
         arrays, side = take_rows(arrays, np.flatnonzero(keep), len(keep)), side[keep]

@@ -145,6 +145,6 @@ def split_by_carrier(check: Checker, stations: Stations, hopping: bool) -> Stati
         return stations
     several = np.bincount(first)[first] > 1  # a station of one carrier keeps its name
     called = zip(first, carrier, several, strict=True)
-    names = [stations.name[i] + f" at {c / 1e6:g} MHz" * bool(more) for i, c, more in called]
+    names = [stations.name[i] + (f" at {c / 1e6:g} MHz" if more else "") for i, c, more in called]
     arrays["station"] = which.reshape(-1).astype(np.int64)
     return replace(stations.subset(first, names), carrier_hz=carrier)
