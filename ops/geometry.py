@@ -207,11 +207,11 @@ class SphereGrid:
         (-0.5, 359.5, -0.5, 89.5)
         """
         across, up = math.degrees(self.azimuth_step), math.degrees(self.elevation_step)
-        left, low = (
+        first_edge, low = (
             math.degrees(self.first_azimuth) - across / 2,
             math.degrees(self.first_elevation) - up / 2,
         )
-        return left, left + self.width * across, low, low + self.height * up
+        return first_edge, first_edge + self.width * across, low, low + self.height * up
 
     @staticmethod
     def hemisphere(height: int = 90, width: int = 360) -> SphereGrid:

@@ -58,10 +58,10 @@ def name_row_ranges(rows: Sequence[str], count: int = 5) -> str:
     ]
     pieces = []
     for first, after in zip(starts, [*starts[1:], len(rows)], strict=True):
-        what, number = rows[first].rpartition(" ")[::2]
-        one = after - first == 1
+        noun, number = rows[first].rpartition(" ")[::2]
+        alone = after - first == 1
         pieces.append(
-            rows[first] if one else f"{what}s {number} to {rows[after - 1].rpartition(' ')[2]}"
+            rows[first] if alone else f"{noun}s {number} to {rows[after - 1].rpartition(' ')[2]}"
         )
     return list_first(pieces, count)
 

@@ -128,8 +128,8 @@ def run_all(
     work: Callable[[_Piece], _Result], pieces: Sequence[_Piece], what: str = ""
 ) -> list[_Result]:
     """Return what `work` makes of pieces in their order, whichever ends first; see `run_each`."""
-    found = dict(run_each(work, pieces, what))
-    return [found[number] for number in range(len(pieces))]
+    results = dict(run_each(work, pieces, what))
+    return [results[number] for number in range(len(pieces))]
 
 
 def _time_left(left: Mapping[float, int], spent: Mapping[float, Sequence[float]]) -> float:
@@ -173,8 +173,8 @@ def _in_threads(
         while begun:
             done, begun = wait(begun, return_when=FIRST_COMPLETED)
             begun |= {pool.submit(call, number) for number in islice(numbers, len(done))}
-            for one in done:
-                yield one.result()
+            for future in done:
+                yield future.result()
 
 
 def _jobs(calls: Iterable[Any], workers: int) -> Results:
@@ -241,5 +241,5 @@ def _on_ray(blob: bytes, pieces: Sequence[Any], numbers: Iterator[int]) -> Resul
             (first, *_), running = ray.wait(running)
             yield ray.get(first)
     finally:
-        for one in running:
-            ray.cancel(one, force=True)
+        for task in running:
+            ray.cancel(task, force=True)

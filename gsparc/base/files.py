@@ -146,7 +146,9 @@ def _expanded(node: yaml.Node, sizes: dict[int, float]) -> float:
     if id(node) not in sizes:
         sizes[id(node)] = math.inf  # of one inside itself
         inside = [] if isinstance(node, yaml.ScalarNode) else node.value
-        parts = [part for one in inside for part in (one if isinstance(one, tuple) else (one,))]
+        parts = [
+            part for entry in inside for part in (entry if isinstance(entry, tuple) else (entry,))
+        ]
         sizes[id(node)] = 1 + sum(_expanded(part, sizes) for part in parts)
     return sizes[id(node)]
 
@@ -248,17 +250,17 @@ def list_causes(error: BaseException | None) -> list[BaseException]:
     """Return an error, what caused it, and so on; each once,
     as one raised again may be its own context.
     """
-    found: list[BaseException] = []
-    while error is not None and error not in found:
-        found.append(error)
+    causes: list[BaseException] = []
+    while error is not None and error not in causes:
+        causes.append(error)
         error = error.__cause__ or error.__context__
-    return found
+    return causes
 
 
 def set_aside(folder: Path, *patterns: str) -> bool:
     """Rename files of an earlier run to `NAME.earlier`; return whether there were any."""
-    found = [path for pattern in patterns for path in folder.glob(pattern)]
-    return any([path.replace(f"{path}.earlier") for path in found])
+    files = [path for pattern in patterns for path in folder.glob(pattern)]
+    return any([path.replace(f"{path}.earlier") for path in files])
 
 
 def delete_partial_files(folder: Path) -> None:

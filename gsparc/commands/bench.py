@@ -32,17 +32,17 @@ def task(config: DictConfig) -> dict[str, Any]:
     check_arguments(config, device=choice("cpu", "cuda"))
     device = config.device
     backend_named(device)  # where there is no such device, its reason comes first
-    every = [
+    cases = [
         case
         for of in product(config.counts, config.projections)
         for case in kernel_cases(*of, device)
     ]
     # Emission and channels are the same under every projection: a dictionary keeps one of each.
-    every += [
+    cases += [
         loss_case(device),
         *(training_step_case(of, device=device) for of in config.projections),
     ]
-    chosen = {(case.name, case.size): case for case in every}
+    chosen = {(case.name, case.size): case for case in cases}
     rows, facts = [], {}
     for (name, size), case in chosen.items():
         seconds = median_s(case.kernel, clock)

@@ -27,7 +27,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     run_dir, settings = begin_run(config)
     paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
     opened = [Unseen.open(path, settings["dataset"], settings["split"]) for path in paths]
-    evidence, run_facts = Evidence.join([one.evidence for one in opened]), opened[0].facts
+    evidence, run_facts = Evidence.join([unseen.evidence for unseen in opened]), opened[0].facts
     promise = Guarantee(float(config.limit_db), float(config.alpha), float(config.delta))
     draws = int(config.draws), config.confidence, int(config.seed)
     divisions = [run_trials(evidence, promise, False, *draws)]
@@ -47,13 +47,13 @@ def task(config: DictConfig) -> dict[str, Any]:
     stored_lines = [] if few is None or config.store else [few]
     if config.store:
         how = promise, config.confidence, bool(config.spatial), int(config.seed)
-        for one in opened:
-            stored, bound = one.calibrate_and_store(*how)
+        for unseen in opened:
+            stored, bound = unseen.calibrate_and_store(*how)
             # An infinite threshold accepts nobody, and JSON has no infinity.
             threshold = stored.threshold if np.isfinite(stored.threshold) else None
             facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold
             # The confidence first, then what is promised of it: a line each.
-            stored_lines += [f"{one.path}: {part}" for part in bound.split("; ", 1)]
+            stored_lines += [f"{unseen.path}: {part}" for part in bound.split("; ", 1)]
     return finish_run(run_dir, facts, *calibration_tables(facts), lines=stored_lines)
 
 

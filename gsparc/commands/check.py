@@ -166,7 +166,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def picture(number: int) -> str | None:
         stems = [Path(path).resolve().stem for path in paths[: number + 1]]
         again = stems.count(stems[-1])  # files of one stem would be drawn over one another
-        name = stems[-1] + f"-{again}" * (again > 1)
+        name = f"{stems[-1]}-{again}" if again > 1 else stems[-1]
         return None if args.no_draw else args.draw or f"outputs/check/{name}.png"
 
     good = [

@@ -84,18 +84,18 @@ def write_comparison(
     write_samples(run_dir / "compare.csv", columns_of_csv(rows))
     write_samples(run_dir / "cells.csv", filled[CELL].to_dict("list"))
     (run_dir / "compare.md").write_text(markdown(blocks, ours), encoding="utf-8")
-    for dataset, here in rows[rows.draws].groupby("dataset", sort=False):
-        draw_splits(here, run_dir / f"{dataset}.png", figures)
+    for dataset, group in rows[rows.draws].groupby("dataset", sort=False):
+        draw_splits(group, run_dir / f"{dataset}.png", figures)
     if not rows.draws.all():
         draw_efforts(rows[~rows.draws], run_dir / "compare.png", ours, figures)
     # Of a method's efforts the largest.
     most = filled.sort_values("effort", kind="stable").drop_duplicates(
         [*PROBLEM, "method", "seed"], keep="last"
     )
-    for (dataset, split), here in most.assign(setting=most.method).groupby(PROBLEM, sort=False):
+    for (dataset, split), group in most.assign(setting=most.method).groupby(PROBLEM, sort=False):
         title, stem = f"{dataset}, split {split}", f"{dataset}-{split}"
-        draw_sweep(here, title, run_dir / f"{stem}-distributions.png", figures)
-        if (examples := join_examples(here)) is not None:
+        draw_sweep(group, title, run_dir / f"{stem}-distributions.png", figures)
+        if (examples := join_examples(group)) is not None:
             save(draw_spectra(examples, title), run_dir / f"{stem}-rows.png", 100, figures)
     best = {f"{title_of(block)}/first": block.method.iloc[0] for block in blocks}
     write_summary(run_dir / "summary.json", {"cells": len(filled), **best, **provenance()})

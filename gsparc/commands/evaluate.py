@@ -48,10 +48,10 @@ def evaluate_files(
     # Without the rows that the models learned from, baselines would have learned from others.
     if other and run.trained is None and (baselines is None or len(baselines)):
         baselines, without = (), "the file that the model was trained on is gone, or another"
-    seconds = [one.extra.get("train_s") for one in run.stored]
+    seconds = [stored.extra.get("train_s") for stored in run.stored]
     # One fold that does not say its seconds makes the mean of all unknown.
     train_s = None if None in seconds else [float(s) for s in seconds if s is not None]
-    hearing = [read_hearing(one.extra) for one in run.stored]
+    hearing = [read_hearing(stored.extra) for stored in run.stored]
     evaluation = evaluate(
         run.methods,
         train_s,

@@ -94,14 +94,14 @@ def task(config: DictConfig) -> dict[str, Any]:
     ends = None if promise is None else covered_between(field, predictor, promise)
     lines = map_notes(field, coverage, ends)
     size = f"height {field.grid.height:g} m, squares of {field.grid.step:.3g} m"
-    every = _layers(field)
+    layers = _layers(field)
     of_one = {f"power {station}" for station in field.stations}
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
     field.save(run_dir / "map.npz")
-    for layer in every:
+    for layer in layers:
         for suffix in SUFFIXES:
             name = file_name(layer, suffix)
-            if any(fnmatch(name, one) for one in wanted):
+            if any(fnmatch(name, pattern) for pattern in wanted):
                 folder = run_dir / "stations" if layer.name in of_one else run_dir
                 folder.mkdir(exist_ok=True)
                 draw_layer(field, layer, folder / name, title, floor)
@@ -115,7 +115,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         write_geotiff(run_dir / "map.tif", field)
     if tiff and field.grid.origin is not None:
         write_kmz(
-            run_dir / "map.kmz", field, [layer for layer in every if layer.name not in of_one]
+            run_dir / "map.kmz", field, [layer for layer in layers if layer.name not in of_one]
         )
     facts = {
         **field.summarise(),

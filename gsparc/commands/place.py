@@ -40,20 +40,21 @@ def task(config: DictConfig) -> dict[str, Any]:
             reopen_training(path, settings["dataset"]), int(config.left_out)
         )
     level, unit = float(config.threshold_db), predictor.site.level_unit
-    found = placing.place_station(
+    placement = placing.place_station(
         predictor, threshold_db=level, promise=promise, error=error, **where
     )
     columns = {
-        **coordinates(found.places, predictor),
-        "coverage": found.coverage,
-        "gain": found.gain,
-        **dict(zip(("low", "high", "gain_low", "gain_high"), found.between.T, strict=True)),
-        "nearest_m": found.nearest_m,
+        **coordinates(placement.places, predictor),
+        "coverage": placement.coverage,
+        "gain": placement.gain,
+        **dict(zip(("low", "high", "gain_low", "gain_high"), placement.between.T, strict=True)),
+        "nearest_m": placement.nearest_m,
     }
     write_samples(
-        run_dir / "place.csv", {name: v.tolist() for name, v in {**found.given, **columns}.items()}
+        run_dir / "place.csv",
+        {name: v.tolist() for name, v in {**placement.given, **columns}.items()},
     )
-    draw_placement(found, run_dir / "place.png", level, unit)
+    draw_placement(placement, run_dir / "place.png", level, unit)
     # Candidates come best first.
     best = {
         name: None if isnan(values[0]) else float(values[0]) for name, values in columns.items()
@@ -62,37 +63,38 @@ def task(config: DictConfig) -> dict[str, Any]:
     if predictor.site.georeference is not None:
         at = "{latitude:.6f}, {longitude:.6f} degrees, {z:.4g} m high"
     facts = {f"place/{name}": value for name, value in best.items()} | {
-        "place/before": found.before,
+        "place/before": placement.before,
         "place/after": best["coverage"],
-        "place/refused": found.refused,
-        "place/candidates": len(found.places),
+        "place/refused": placement.refused,
+        "place/candidates": len(placement.places),
         "place/threshold_db": level,
         "place/offset_db": error.offset_db,
         "place/left_out": error.stations,
         "ckpt": path,
     }
     # At a known place
-    next_one = ", {nearest_m:.4g} m from the next" * (best["nearest_m"] is not None)
+    next_one = "" if best["nearest_m"] is None else ", {nearest_m:.4g} m from the next"
     sentence = "with a station at " + at + next_one + ": {coverage:.1%}, gaining "
     interval = "no interval is known: no station could be left out, or promised=false, left_out=0"
     if best["low"] is not None:
-        low, high = found.between[:, 2:].T
-        alike = ((low <= found.gain[0]) & (found.gain[0] <= high))[1:].sum()
+        low, high = placement.between[:, 2:].T
+        alike = ((low <= placement.gain[0]) & (placement.gain[0] <= high))[1:].sum()
         interval = "90 % intervals {low:.1%} to {high:.1%}, of the gain " + (
             f"{100 * low[0]:.1f} to "
         )
         interval += f"{100 * high[0]:.1f} points"
-        interval += f", not significantly above {alike} of {len(low) - 1} others" * (len(low) > 1)
+        if len(low) > 1:
+            interval += f", not significantly above {alike} of {len(low) - 1} others"
     lines = [
-        placing.assumption(predictor.site, found.places[0, 2], where["antenna"]),
-        f"now {found.before:.1%} of the area, {found.grid.step:.3g} m squares, with {level:g} "
-        f"{unit} or more"
+        placing.assumption(predictor.site, placement.places[0, 2], where["antenna"]),
+        f"now {placement.before:.1%} of the area, {placement.grid.step:.3g} m squares, with "
+        f"{level:g} {unit} or more"
         + (
-            f"; {found.refused:.0%} of it was never tested, and is left out here"
-            if found.refused
+            f"; {placement.refused:.0%} of it was never tested, and is left out here"
+            if placement.refused
             else ""
         ),
-        sentence.format(**best) + f"{100 * found.gain[0]:.1f} points",
+        sentence.format(**best) + f"{100 * placement.gain[0]:.1f} points",
         interval.format(**best),
     ]
-    return finish_run(run_dir, facts, lines=lines, before=f"{len(found.places)} candidates; ")
+    return finish_run(run_dir, facts, lines=lines, before=f"{len(placement.places)} candidates; ")

@@ -76,14 +76,14 @@ def task(config: DictConfig) -> dict[str, Any]:
     )
     if predictor is not None and predictor.site.stations is not None:
         alike = config.goal == "all" and config.threshold_db is None
-        every = (
+        judged = (
             ("all stations alike (a map shows the strongest)") if alike else "the strongest station"
         )
-        every = every if stations is None else ", ".join(map(str, stations))
+        judged = judged if stations is None else ", ".join(map(str, stations))
         doubt = (
             "" if config.threshold_db is None else (f", where {config.threshold_db:g} is in doubt")
         )
-        before += f" of {every}{doubt}"
+        before += f" of {judged}{doubt}"
         if promise is not None and (each := promise.stations_of_place()) < len(
             predictor.site.stations
         ):

@@ -95,10 +95,10 @@ def _add_rows(
     for start in range(0, len(rows), size):
         refit = config.refit and start + size >= len(rows)
         key = content if start == 0 and not config.again else None
-        found = predictor.update(
+        added = predictor.update(
             rows.subset(slice(start, start + size)), refit=refit, key=key, **how
         )
-        row_count, skipped = row_count + len(found.rows), skipped + found.skipped
+        row_count, skipped = row_count + len(added.rows), skipped + added.skipped
     return row_count, skipped
 
 

@@ -124,5 +124,5 @@ def map_from_disk(dataset: h5py.Dataset) -> OnDisk:
 
 def rows_by(label: np.ndarray) -> Iterator[tuple[Any, np.ndarray]]:
     """Yield each different label of (n,), and the rows (k,) that have it."""
-    for one in np.unique(label).tolist():
-        yield one, np.flatnonzero(label == one)
+    for value in np.unique(label).tolist():
+        yield value, np.flatnonzero(label == value)

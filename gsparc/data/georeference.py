@@ -62,7 +62,7 @@ class Georeference:
                 360).
         """
         _refuse_invalid(latitude, longitude)
-        east, north = (np.array(one, np.float64, ndmin=1) for one in (longitude, latitude))
+        east, north = (np.array(degrees, np.float64, ndmin=1) for degrees in (longitude, latitude))
         return np.stack(self._projection(east, north), axis=-1)
 
     def to_degrees(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

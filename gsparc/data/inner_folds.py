@@ -108,9 +108,9 @@ def inner_folds(
         cut = _cut(where, settings, count, rng)
     else:
         which = np.arange(len(rows))  # folds of rows, not of places
-    folds = tuple(each_fold.map(lambda part: rows[np.isin(which, part)]) for each_fold in cut.folds)
+    folds = tuple(fold.map(lambda part: rows[np.isin(which, part)]) for fold in cut.folds)
     units = np.full(len(positions), NOT_TESTED)
-    tested = np.isin(rows, np.concatenate([one.test for one in folds]))
+    tested = np.isin(rows, np.concatenate([fold.test for fold in folds]))
     units[rows[tested]] = cut.unit[which][tested]
     return InnerFolds(cut.name, folds, units)
 
@@ -275,8 +275,8 @@ def _stations(
             Fold(np.flatnonzero(station != t), none, np.flatnonzero(station == t)) for t in range(2)
         ]
     elif together <= 1:
-        every = make_split(where, replace(settings, leave_out=0), station=station).folds
-        folds = [every[i] for i in rng.permutation(number)[:count]]
+        cuts = make_split(where, replace(settings, leave_out=0), station=station).folds
+        folds = [cuts[i] for i in rng.permutation(number)[:count]]
     else:
         folds = list(_draws(where, settings, count, rng, station))
     return InnerFolds(name, tuple(folds), station)

@@ -49,8 +49,8 @@ class Snapshots:
         run = data.runs_of(rows[first])
         empty = np.zeros((len(first), len(names) * target.shape[1], target.shape[2]), np.complex128)
         antenna, places = column * target.shape[1], data.moving[rows[first]]
-        one = cls(rows, moment, antenna, names, places, empty, tones - tones.mean(), run)
-        return replace(one, values=one.arrange(target))
+        snapshots = cls(rows, moment, antenna, names, places, empty, tones - tones.mean(), run)
+        return replace(snapshots, values=snapshots.arrange(target))
 
     def arrange(self, rows: np.ndarray) -> np.ndarray:
         """Return values (n, A, K) by moment and antenna of channels (S, a, K) of the same rows."""

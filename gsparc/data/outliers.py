@@ -123,9 +123,10 @@ def find_outliers(data: Measurements) -> dict[str, np.ndarray]:
 def outlier_warnings(data: Measurements) -> list[str]:
     """Say each kind of outlier in one sentence, with the names of the first rows."""
     advice = "if they are wrong, leave them out with split.leave_out=outliers"
-    found = find_outliers(data).items()
+    groups = find_outliers(data).items()
     return [
-        f"{list_first([data.row_names[i] for i in rows])}: {what}; {advice}" for what, rows in found
+        f"{list_first([data.row_names[i] for i in rows])}: {fault}; {advice}"
+        for fault, rows in groups
     ]
 
 

@@ -78,7 +78,7 @@ class Query:
             {"tx": self.tx, "rx": self.rx.position, **places},
             next(iter(places.values())).dtype,
         )
-        tx, rx, turned = (one.to(dtype) for one in (ends["tx"], ends["rx"], self.rx.rotation))
+        tx, rx, turned = (end.to(dtype) for end in (ends["tx"], ends["rx"], self.rx.rotation))
         return replace(self, tx=tx, rx=Pose(rx, turned))
 
     @staticmethod
@@ -93,12 +93,12 @@ class Query:
             places: local, in the precision of the query.
             station: (B,) int64, of several stations; None of one.
         """
-        every, count = site.every_station, len(places)
-        still = np.full(3, np.nan) if site.several else every.position[0]
+        stations, count = site.every_station, len(places)
+        still = np.full(3, np.nan) if site.several else stations.position[0]
         turned = np.eye(3) if site.rx_rotation is None else site.rx_rotation
         if station is not None:
-            still = every.position[station.numpy()]
-            turned = turned if every.rotation is None else every.rotation[station.numpy()]
+            still = stations.position[station.numpy()]
+            turned = turned if stations.rotation is None else stations.rotation[station.numpy()]
         end, turn = (torch.from_numpy(value).to(places.dtype) for value in (still, turned))
         if site.static_end == "rx" and end.ndim == 1:
             return Query(places, Pose(end, turn), station)

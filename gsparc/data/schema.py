@@ -96,7 +96,7 @@ class Stations:
         """Return stations of these numbers (n,), which may repeat, under `names` or their own."""
         optional = (self.rotation, self.carrier_hz, self.sector, self.array)
         rotation, carrier, sector, array = (
-            None if one is None else one[numbers] for one in optional
+            None if values is None else values[numbers] for values in optional
         )
         called = tuple(names or (self.name[i] for i in numbers))
         label = None if self.label is None else tuple(self.label[i] for i in numbers)
@@ -553,8 +553,8 @@ class Measurements:
         """Return the given rows as one batch."""
         rows = np.asarray(index)
         # One pose for the whole batch: kernels then plan the view once.
-        one = self.site.static_end == "rx" and not self.site.several
-        seen = rows[0] if one else rows
+        shared = self.site.static_end == "rx" and not self.site.several
+        seen = rows[0] if shared else rows
         rx = Pose(self._f32(self.rx_position[seen]), self._f32(self.rx_rotation[seen]))
         optional = ((name, getattr(self, name)) for name in ("mask", "uplink", "station", "run"))
         parts: dict[str, Any] = {
@@ -614,7 +614,7 @@ class Field:
         return [tuple(int(a) if a.isdigit() else a for a in part) for part in parts]
 
 
-FIELDS = {one["name"]: Field(**one) for one in read_shipped_table("gsparc.data", "fields.csv")}
+FIELDS = {row["name"]: Field(**row) for row in read_shipped_table("gsparc.data", "fields.csv")}
 
 POWER = "uint8 or floating point numbers"
 # Kinds of NumPy's dtypes that an array may be of, by the words of messages.

@@ -154,7 +154,9 @@ def select(
             _number(stations, station, f"dataset.stations={station}", source)
             for station in part.stations
         )
-        chosen = np.unique([t for each_number in numbers for t in _parts(stations, each_number)])
+        chosen = np.unique(
+            [t for station_number in numbers for t in _parts(stations, station_number)]
+        )
         arrays = dict(kept("dataset.stations", np.isin(arrays["station"], chosen)))
         arrays["station"], stations = (
             np.searchsorted(chosen, arrays["station"]),
@@ -212,15 +214,15 @@ def _there(stations: Stations | None, name: str, source: str) -> Stations:
 
 
 def _number(stations: Stations, wanted: str | int, option: str, source: str) -> int:
-    found = find_station(wanted, stations)
-    if found is None:
+    number = find_station(wanted, stations)
+    if number is None:
         hint = suggest_name(str(wanted), stations.name, 0.6) or (
             f"; there are {list_first(stations.shown, 9)}"
         )
         if Path(str(wanted)).is_file():
             hint = f"; a table of them is dataset.stations_file={wanted}"
         raise DataError(f"{option}: no station {wanted} in {source}{hint}")
-    return found
+    return number
 
 
 def _parts(stations: Stations, number: int) -> list[int]:

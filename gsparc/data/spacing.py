@@ -98,8 +98,8 @@ def _joined(places: np.ndarray, cell: float, reach: float) -> np.ndarray:
     _, first, which = np.unique(
         corner @ MIXING[: corner.shape[1]], return_index=True, return_inverse=True
     )
-    one, two = cKDTree(places[first]).query_pairs(reach, output_type="ndarray").T
-    graph = coo_array((np.ones(len(one)), (one, two)), (len(first), len(first)))
+    start, end = cKDTree(places[first]).query_pairs(reach, output_type="ndarray").T
+    graph = coo_array((np.ones(len(start)), (start, end)), (len(first), len(first)))
     return np.asarray(connected_components(graph)[1][which.reshape(-1)])
 
 

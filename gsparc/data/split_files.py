@@ -52,12 +52,12 @@ def read_split(path: str | Path, rows: int, dataset_sha256: str = "") -> Split:
     if stored_rows != rows:
         raise DataError(f"{path}: made for {stored_rows} rows, the dataset has {rows}")
     for i, fold in enumerate(folds):
-        every = np.concatenate([fold.train, fold.val, fold.test])
-        if len(np.unique(every)) != len(every):
+        rows_of_fold = np.concatenate([fold.train, fold.val, fold.test])
+        if len(np.unique(rows_of_fold)) != len(rows_of_fold):
             raise DataError(
                 f"{path}: fold {i} names a row twice (train, val and test must be disjoint)"
             )
-        if len(every) and (every.min() < 0 or every.max() >= rows):
+        if len(rows_of_fold) and (rows_of_fold.min() < 0 or rows_of_fold.max() >= rows):
             raise DataError(f"{path}: fold {i} names a row outside 0 to {rows - 1}")
     split = Split(name, folds)
     if not folds or split.sha256 != stored_hash:

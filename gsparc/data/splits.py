@@ -91,8 +91,9 @@ class Split:
     @property
     def title(self) -> str:
         """Return its name, and that no seed draws the test rows where the release names them."""
-        every = " (all rows of the file are asked)" * (self.name == "whole")
-        return self.name + every + " (test rows named by its files)" * self.of_release
+        asked = " (all rows of the file are asked)" if self.name == "whole" else ""
+        named = " (test rows named by its files)" if self.of_release else ""
+        return self.name + asked + named
 
     def check(self) -> None:
         """Refuse folds that teach nothing, or test nothing (DataError)."""

@@ -168,4 +168,4 @@ class Power(Target):
         return first.clamp_min(TINY_POWER) ** (1 - weight) * second.clamp_min(TINY_POWER) ** weight
 
 
-TARGETS: dict[Kind, Target] = {one.kind: one for one in (Spectrum(), Channel(), Power())}
+TARGETS: dict[Kind, Target] = {target.kind: target for target in (Spectrum(), Channel(), Power())}

@@ -50,8 +50,8 @@ class Unit:
 
 SCHEMA = {"length": "m", "angle": "deg", "frequency": "Hz", "power": "W", "level": "dBm"}
 _LISTED = [
-    Unit(one["name"], one["kind"], float(one["factor"]), float(one["offset"]))
-    for one in read_shipped_table("gsparc.data", "units.csv")
+    Unit(row["name"], row["kind"], float(row["factor"]), float(row["offset"]))
+    for row in read_shipped_table("gsparc.data", "units.csv")
 ]
 # Without case: nobody receives megawatts.
 UNITS = {unit.name.lower(): unit for unit in _LISTED} | {"μw": Unit("µW", "power", 1e-6)}

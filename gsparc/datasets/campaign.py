@@ -243,9 +243,9 @@ def _read_index(path: Path, count: int | None, problems: Problems, first: int) -
     again = ~np.isin(np.arange(len(rows)), np.unique(rows, return_index=True)[1]) & ~wrong
     expected = f"expected the number of a row like {first:05d}"
     expected += "" if count is None else f", at most {first + count - 1}"
-    for bad, what in ((wrong, expected), (again, "named before")):
+    for bad, fault in ((wrong, expected), (again, "named before")):
         named = (f"line {words[i][0]}: {words[i][1][:LONGEST]!r}" for i in np.flatnonzero(bad))
-        problems.add_rows(path, named, what)
+        problems.add_rows(path, named, fault)
     if not words and path.is_file():
         return problems.add(path, "no usable index in it; expected one number of a row per line")
     return np.sort(rows) if words and not wrong.any() else None

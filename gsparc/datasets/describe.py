@@ -56,7 +56,7 @@ def describe(data: Measurements) -> list[tuple[str, str]]:
             "runs",
             ""
             if data.run is None
-            else f"{data.run.max() + 1}" + ", of unknown factors" * (not powers),
+            else f"{data.run.max() + 1}{'' if powers else ', of unknown factors'}",
         ),
         ("phases", "" if phases is None else str(phases)),
         (

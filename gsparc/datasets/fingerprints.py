@@ -106,8 +106,8 @@ def read_fingerprints(path: str | Path, placed: bool = True) -> Fingerprints:
     wrong = np.argwhere((level > LOUDEST) | (level < FAINTEST))
     if len(wrong):
         row, column = wrong[0]
-        what = f"{level[row, column]:g} in row {row}, column {column}; NaN stands for not heard"
-        raise DataError(f"{path}, rss_dbm: expected {FAINTEST:g} to {LOUDEST:g} dBm, found {what}")
+        fault = f"{level[row, column]:g} in row {row}, column {column}; NaN stands for not heard"
+        raise DataError(f"{path}, rss_dbm: expected {FAINTEST:g} to {LOUDEST:g} dBm, found {fault}")
     numbers = {field: np.zeros(count, np.int64) for field in NUMBERS.values()}
     for name in NUMBERS.keys() & checked:
         numbers[NUMBERS[name]] = np.broadcast_to(checked[name], count).astype(np.int64)

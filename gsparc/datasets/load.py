@@ -161,7 +161,7 @@ def answerable(
             for t, n in zip(new, rows, strict=True)
         ]
         message = "split: %d test rows are left out, of stations with under %d training rows%s"
-        heard_now = f"; heard now: {list_first(names, 12)}" * bool(names)
+        heard_now = f"; heard now: {list_first(names, 12)}" if names else ""
         log.warning(message, len(rejects), splits.LEAST_ROWS, heard_now)
     return replace(split, folds=tuple(folds))
 

@@ -114,7 +114,14 @@ CAMPAIGNS: tuple[type[Campaign], ...] = (Techtile, Powder, BLE, NeWRF, TechtileP
 def dataset_by_arrays(raw: Raw) -> type[Campaign] | None:
     """Return the campaign that a file with these arrays is of; None: of none of them."""
     # By its arrays rather than its name: files are renamed, arrays are not.
-    return next((one for one in CAMPAIGNS if one.marks and one.marks <= set(raw.arrays)), None)
+    return next(
+        (
+            campaign
+            for campaign in CAMPAIGNS
+            if campaign.marks and campaign.marks <= set(raw.arrays)
+        ),
+        None,
+    )
 
 
 def dataset_by_path(path: Path) -> type[Campaign] | None:

@@ -61,13 +61,13 @@ def read_prior_maps(
         DataError: as `read_prior_levels`, of none of them.
     """
     own = [names_of_station(shown) for shown in stations]
-    every = {name for names in own for name in names if name}
+    known = {name for names in own for name in names if name}
     maps, faults = dict[str, Levels](), list[DataError]()
     several = not isinstance(path, str | Path) or Path(path).is_dir()
-    files = [Path(one) for one in ([path] if isinstance(path, str | Path) else path)]
+    files = [Path(file) for file in ([path] if isinstance(path, str | Path) else path)]
     files = sorted(files[0].glob("*.tif")) if len(files) == 1 and files[0].is_dir() else files
     for file in files:
-        for name, points, level in _read_file(file, data, every):
+        for name, points, level in _read_file(file, data, known):
             try:
                 named = name or file.stem * several
                 maps[named] = _near_rows(file, data, points, level)
@@ -77,19 +77,15 @@ def read_prior_maps(
         raise faults[0] if faults else DataError(f"model.prior={path}: no level is known in it")
     if stations == ("",) and len(maps) == 1:
         return [(0, True, next(iter(maps.values())))]
-    found = list[tuple[int, bool, Levels]]()
+    matches = list[tuple[int, bool, Levels]]()
     for number, names in enumerate(own):
         sites = [site_name(name) for name in names]
         match = next(
-            (
-                (each_name, each_name in names)
-                for each_name in (*names, *sites)
-                if each_name in maps
-            ),
+            ((name, name in names) for name in (*names, *sites) if name in maps),
             None,
         )
-        found += [] if match is None else [(number, match[1], maps[match[0]])]
-    if not found:
+        matches += [] if match is None else [(number, match[1], maps[match[0]])]
+    if not matches:
         shown = list_first(stations) or "one station"
         advice = (
             f"call bands of a GeoTIFF `{BAND} NAME`, columns of a table NAME, as the "
@@ -104,10 +100,10 @@ def read_prior_maps(
         raise DataError(
             f"model.prior={path}: of {list_first([*maps], 12)}, not of {shown}; {advice}"
         )
-    with_map = {number for number, *_ in found}
+    with_map = {number for number, *_ in matches}
     if lacking := [shown for number, shown in enumerate(stations) if number not in with_map]:
         log.warning("model.prior=%s: no map of %s", path, list_first(lacking))
-    return found
+    return matches
 
 
 def names_of_station(shown: str) -> tuple[str, ...]:
@@ -197,7 +193,7 @@ def _read_raster(
         raise DataError(f"model.prior={path}: needs rasterio; pip install 'gsparc[maps]'") from None
     with rasterio.open(path) as file:
         titles = [str(title or "") for title in file.descriptions]
-        one = {"": titles.index(BAND) if BAND in titles else 0}
+        single = {"": titles.index(BAND) if BAND in titles else 0}
         known = {*stations, *map(site_name, stations)}
         named = [t.removeprefix(f"{BAND} ") for t in titles]
         bands = {t: k for k, t in enumerate(named) if t != titles[k] or t in known}
@@ -216,9 +212,11 @@ def _read_raster(
                 f"model.prior={path}: it has a place on Earth, which the measurements do not state"
             )
         if crs is not None and origin is not None:
-            longitude, latitude = (np.asarray(one) for one in transform(crs, "EPSG:4326", x, y))
+            longitude, latitude = (
+                np.asarray(degrees) for degrees in transform(crs, "EPSG:4326", x, y)
+            )
             points = origin.from_degrees(latitude, longitude)
-        for name, band in (bands or one).items():
+        for name, band in (bands or single).items():
             stored = file.read(band + 1, masked=True).astype(float).filled(np.nan).ravel()
             values = stored * file.scales[band] + file.offsets[band]
             yield name, points, _to_decibels(path, values, str(file.units[band] or ""))

@@ -134,7 +134,7 @@ def load_rfid(
     if moving == "rx":  # neither its array nor the carrier is in the files
         site = replace(site, name=info.dataset, static_end="tx", array=None, carrier_hz=None)
     turned = info.rotation if moving == "tx" else np.eye(3)
-    still, rotation = (np.repeat(one[None], len(rows), axis=0) for one in (info.position, turned))
+    still, rotation = (np.repeat(pose[None], len(rows), axis=0) for pose in (info.position, turned))
     tx, rx = (positions[rows], still) if moving == "tx" else (still, positions[rows])
     data = Measurements(
         site,
@@ -192,8 +192,8 @@ def _sheet(path: Path, heads: list[str], problems: Problems) -> Sheet:
     sheet = read_sheet(path, problems)
     sheet = replace(sheet, frame=sheet.frame.rename(columns=str.lower))
     if sorted(sheet.heads) != sorted(heads):
-        found = ",".join(sheet.heads)
-        raise DataError(f"{path}, line 1: expected the header {','.join(heads)}, found {found}")
+        header = ",".join(sheet.heads)
+        raise DataError(f"{path}, line 1: expected the header {','.join(heads)}, found {header}")
     return sheet
 
 

@@ -69,9 +69,7 @@ def _attributes(path: Path, classes: set[str], names: tuple[str, ...]) -> np.nda
     objects: Any = read_pickle(path, classes, npy=True)
     errors = (AttributeError, KeyError, TypeError, ValueError)
     with readable(path, f"expected an array of objects with {', '.join(names)}", errors):
-        return np.array(
-            [[float(each_object.state[name]) for name in names] for each_object in objects]
-        )
+        return np.array([[float(entry.state[name]) for name in names] for entry in objects])
 
 
 class TechtilePower(Campaign):

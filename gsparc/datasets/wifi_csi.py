@@ -71,13 +71,13 @@ def read_wifi_csi(
     choice(*CHIPS).check("dataset.chip", chip)
     path = Path(path)
     table = _table(Path(places or (path if path.is_dir() else path.parent) / PLACES))
-    logs = [_placed(each_log, table, card, chip) for each_log in _logs(path, card)]
-    logs = [one for one in logs if len(one.csi)]
+    logs = [_placed(log_file, table, card, chip) for log_file in _logs(path, card)]
+    logs = [packets for packets in logs if len(packets.csi)]
     if not logs:
         raise DataError(
             f"{path}: no packet has a place in the table of places; see the warnings above"
         )
-    kinds = sorted({(str(one.csi.shape[1:]), one.carrier_hz) for one in logs}, key=str)
+    kinds = sorted({(str(packets.csi.shape[1:]), packets.carrier_hz) for packets in logs}, key=str)
     if len(kinds) > 1:
         variants = f"antennas, subcarriers and carriers {list_first(kinds)}"
         raise DataError(f"{path}: {variants}; give each a folder of its own")
@@ -87,11 +87,11 @@ def read_wifi_csi(
             f"{path}: neither it nor the places name the channel; say dataset.carrier_hz"
         )
     of_packets = ("time_s", "sender", "csi", "rssi_dbm", "position")
-    joined = [np.concatenate([getattr(one, name) for one in logs]) for name in of_packets]
+    joined = [np.concatenate([getattr(packets, name) for packets in logs]) for name in of_packets]
     heard = (joined[2] != 0).any(axis=(1, 2))  # a packet of zeros has no level in dB
     if not heard.all():
         log.warning("%s: %d packets whose channels are zero are left out", path, (~heard).sum())
-    time, sender, csi, rssi, position = (one[heard] for one in joined)
+    time, sender, csi, rssi, position = (column[heard] for column in joined)
     tone, csi = _filled(logs[0].tone, csi, path)
     csi, unit = _levelled(csi, rssi, path)
     names, station = np.unique(sender, return_inverse=True)
@@ -130,12 +130,12 @@ def _table(path: Path) -> pd.DataFrame:
 def _logs(path: Path, card: str | None) -> list[Path]:
     if path.is_file():
         return [path]
-    files = [each_path for each_path in sorted(path.rglob("*")) if each_path.name != PLACES]
+    files = [file for file in sorted(path.rglob("*")) if file.name != PLACES]
     endings = [ending for ending, of in SUFFIXES.items() if card in (None, of)]
     for ending in endings:  # tables may lie beside logs
-        found = [file for file in files if file.suffix.lower() == ending]
-        if found:
-            return found
+        logs = [file for file in files if file.suffix.lower() == ending]
+        if logs:
+            return logs
     raise DataError(f"{path}: no such log, or a folder without {', '.join(endings)}")
 
 
@@ -190,10 +190,10 @@ def _filled(tone: np.ndarray, csi: np.ndarray, path: Path) -> tuple[np.ndarray, 
     if not (in_band & right).all():
         wrong = list(tone[in_band & ~right])
         odd = f", and {list_first(wrong)}: their level is none" if wrong else ""
-        what = (
+        kept = (
             f"{(in_band & right).sum()} of {len(tone)} subcarriers; guard and unused ones left out"
         )
-        log.info("%s: %s%s", path, what, odd)
+        log.info("%s: %s%s", path, kept, odd)
     return tone[in_band & right], csi[..., in_band & right]
 
 

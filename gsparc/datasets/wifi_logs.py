@@ -88,18 +88,16 @@ def channel_hz(channel: int) -> float:
 
 def format_address(octets: np.ndarray) -> np.ndarray:
     """Return addresses (n, 6) as texts (n,) like `b8:3a:5a:b2:6e:70`."""
-    return np.array(
-        [":".join(f"{octet:02x}" for octet in each_octet) for each_octet in octets], str
-    )
+    return np.array([":".join(f"{octet:02x}" for octet in address) for address in octets], str)
 
 
 def _nexmon(path: Path, csiread: Any, chip: str) -> Packets:
     frames = list(_frames(path))
     sizes = sorted({size for size, _, _ in frames})
     if len(sizes) != 1 or sizes[0] not in POINTS:
-        found = ", ".join(map(str, sizes)) or "none"
+        listed = ", ".join(map(str, sizes)) or "none"
         raise DataError(
-            f"{path}: bytes of channels: {found}; expected those of one of 20, 40, 80 MHz"
+            f"{path}: bytes of channels: {listed}; expected those of one of 20, 40, 80 MHz"
         )
     silent = frames[0][1] == OLD_MAGIC
     log = (csiread.Nexmon if silent else csiread.NexmonPull256)(
@@ -107,18 +105,18 @@ def _nexmon(path: Path, csiread: Any, chip: str) -> Packets:
     )
     log.read()
     # Other cores and streams are packets of their own; the last packet may be cut short.
-    one = np.flatnonzero((log.core == 0) & (log.spatial == 0))
-    one = one[one < sum(whole for _, _, whole in frames)]
+    rows = np.flatnonzero((log.core == 0) & (log.spatial == 0))
+    rows = rows[rows < sum(whole for _, _, whole in frames)]
     spec, points = int(log.chan_spec[0]), sizes[0] // 4
     rssi = (
-        np.full(len(one), np.nan)
+        np.full(len(rows), np.nan)
         if silent
-        else log.rssi[one].astype(np.uint8).view(np.int8).astype(float)
+        else log.rssi[rows].astype(np.uint8).view(np.int8).astype(float)
     )
     return Packets(
-        log.sec[one] + log.usec[one] * (1e-9 if log.nano else 1e-6),
-        format_address(log.src_addr[one]),
-        log.csi[one, None],
+        log.sec[rows] + log.usec[rows] * (1e-9 if log.nano else 1e-6),
+        format_address(log.src_addr[rows]),
+        log.csi[rows, None],
         np.fft.fftfreq(points, 1 / points).round().astype(int),  # in the order of an FFT
         np.where(rssi < 0, rssi, np.nan),
         channel_hz(spec & 0xFF),

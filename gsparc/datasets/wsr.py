@@ -223,18 +223,18 @@ def _paired(
     robot: Log, other_robot: Log, sender: np.void
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Packets of one exchange by their counter, in both logs, and how late it was heard [s]."""
-    here = np.flatnonzero(robot.sender == sender)
+    packets = np.flatnonzero(robot.sender == sender)
     number, mine, theirs = np.intersect1d(
-        robot.number[here], other_robot.number, return_indices=True
+        robot.number[packets], other_robot.number, return_indices=True
     )
-    late, usual = robot.tick[here[mine]] - other_robot.tick[theirs], np.ones(len(number), bool)
+    late, usual = robot.tick[packets[mine]] - other_robot.tick[theirs], np.ones(len(number), bool)
     if len(number) < 2:
-        return here[:0], theirs[:0], late[:0]
+        return packets[:0], theirs[:0], late[:0]
     for _ in range(5):  # without the drift of the clocks; what waited for the channel is not usual
         fit = np.polynomial.Polynomial.fit(number[usual], late[usual], 1)
         rest = late - fit(number)
         usual = np.abs(rest) <= 4 * np.median(np.abs(rest)) + 1e-6
-    return here[mine], theirs, rest
+    return packets[mine], theirs, rest
 
 
 def remove_delay_slope(csi: np.ndarray) -> np.ndarray:

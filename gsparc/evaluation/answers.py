@@ -134,8 +134,8 @@ def predict_file(
         local = site.local_places(world)[predictions.place]
         predictions = _with_tested(predictions, local, power, tested)
         if refused := predictions.count_refused():
-            what = f"{refused} of {len(predictions)} predictions are refused (column refused)"
-            log.warning("%s: %s: too far from what was measured", places, what)
+            refusal = f"{refused} of {len(predictions)} predictions are refused (column refused)"
+            log.warning("%s: %s: too far from what was measured", places, refusal)
     write_answers(path, queries, predictions, site, power)
     facts: dict[str, Any] = {
         "predict/places": len(queries),
@@ -263,10 +263,10 @@ def predict_places(
     blocks: list[tuple[Predictor, np.ndarray]] = []
     silent: list[str] = []
     # By station: each may have a model of its own, whose matrices are then read once a block.
-    for one in np.unique(number):
-        chosen = np.flatnonzero(number == one)
+    for asked_station in np.unique(number):
+        chosen = np.flatnonzero(number == asked_station)
         try:
-            model = predictor.ask_station(int(one))
+            model = predictor.ask_station(int(asked_station))
         except ValueError as error:
             if named:
                 raise DataError(

@@ -55,7 +55,7 @@ def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
     # but is the strongest.
     most = np.where(data.censored_side(row) < 0, data.powers(row)[:, 0], np.nan)
     answers = scores.samples.get("served", scores.samples["prediction"])
-    every = pd.DataFrame(
+    table = pd.DataFrame(
         {
             "fold": scores.fold,
             "place": place[row],
@@ -65,12 +65,12 @@ def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
         }
     )
     # A station's rows of one place, of several visits, are one by their strongest.
-    links = every.groupby(["fold", "place", "station"]).max()
+    links = table.groupby(["fold", "place", "station"]).max()
     strongest = links == links.groupby(["fold", "place"]).transform("max")
     strongest["right"] = strongest.predicted & strongest.measured
     places = strongest.groupby(["fold", "place"])
-    found = places.sum()[(places.size() > 1) & places.measured.any()]
-    return {BEST_SERVER: float((found.right / found.predicted).mean())} if len(found) else {}
+    sums = places.sum()[(places.size() > 1) & places.measured.any()]
+    return {BEST_SERVER: float((sums.right / sums.predicted).mean())} if len(sums) else {}
 
 
 def unlisted_stations(scores: Scores, data: Measurements) -> pd.DataFrame:
@@ -88,9 +88,9 @@ def unlisted_stations(scores: Scores, data: Measurements) -> pd.DataFrame:
     moments, first = np.unique(data.place, return_index=True)
     square = number_squares(data.moving[first])[np.searchsorted(moments, shares.moment)]
     missed = 1 - shares.groupby(["station", square]).share.max().clip(upper=SURE)
-    found = shares.groupby("station").agg(moments=("share", "size"), expected=("share", "sum"))
-    found["chance"] = missed.groupby("station").prod()
-    return found[found.chance < BY_CHANCE]
+    table = shares.groupby("station").agg(moments=("share", "size"), expected=("share", "sum"))
+    table["chance"] = missed.groupby("station").prod()
+    return table[table.chance < BY_CHANCE]
 
 
 def newly_listed(old: Measurements, new: Measurements) -> pd.DataFrame:
@@ -130,12 +130,12 @@ def newly_listed(old: Measurements, new: Measurements) -> pd.DataFrame:
 
 def describe_new(old: Measurements, new: Measurements) -> str | None:
     """Return stations of `newly_listed` in words, the surest first; None without."""
-    found = newly_listed(old, new).sort_values("chance")
-    if not len(found):
+    stations = newly_listed(old, new).sort_values("chance")
+    if not len(stations):
         return None
-    names = np.array(new.site.every_station.shown)[found.index]
-    surely = np.where(found.chance < BY_CHANCE, "new", "new, or out of its reach before")
-    rows = zip(names, found.lists, found.expected, surely, found.chance, strict=True)
+    names = np.array(new.site.every_station.shown)[stations.index]
+    surely = np.where(stations.chance < BY_CHANCE, "new", "new, or out of its reach before")
+    rows = zip(names, stations.lists, stations.expected, surely, stations.chance, strict=True)
     return ", ".join(
         f"{n} (in {k} lists, for {e:.0f} of the earlier drive: {s}; chance {c:.0e})"
         for n, k, e, s, c in rows
@@ -144,11 +144,11 @@ def describe_new(old: Measurements, new: Measurements) -> str | None:
 
 def describe_never_listed(scores: Scores, data: Measurements) -> str | None:
     """Return stations of `unlisted_stations` in words, the surest first; None without."""
-    found = unlisted_stations(scores, data).sort_values("chance")
-    if not len(found):
+    stations = unlisted_stations(scores, data).sort_values("chance")
+    if not len(stations):
         return None
-    names = np.array(data.site.every_station.shown)[found.index.astype(int)]
-    rows = zip(names, found.expected, found.moments, found.chance, strict=True)
+    names = np.array(data.site.every_station.shown)[stations.index.astype(int)]
+    rows = zip(names, stations.expected, stations.moments, stations.chance, strict=True)
     return ", ".join(f"{n} (in {e:.0f} of {r:.0f} lists; chance {c:.0e})" for n, e, r, c in rows)
 
 
@@ -197,8 +197,8 @@ def worst_stations(columns: Mapping[str, Any], method: str, later: bool = False)
     table_columns += [
         Column(head, number_format("rmse_db"), of=name) for name, head in heads.items()
     ]
-    every = pd.DataFrame(columns, columns=None if columns else ["rows", "rmse_db"])
-    rows = every[every["rows"] >= FEW].sort_values("rmse_db", ascending=False, kind="stable")
+    stations = pd.DataFrame(columns, columns=None if columns else ["rows", "rmse_db"])
+    rows = stations[stations["rows"] >= FEW].sort_values("rmse_db", ascending=False, kind="stable")
     if len(rows) < 2:
         return []
     better = ", ".join(
@@ -215,5 +215,6 @@ def worst_stations(columns: Mapping[str, Any], method: str, later: bool = False)
             for itertuple in offset[:WORST].itertuples()
         )
         note += f"{'; ' * bool(note)}measured levels differ from predicted by one offset: {those}"
-        note += ": gsparc update learns that, but not from lists of the strongest" * later
+        if later:
+            note += ": gsparc update learns that, but not from lists of the strongest"
     return [Table.from_rows(title, table_columns, named[:WORST].to_dict("records"), note=note)]

@@ -94,7 +94,7 @@ def repeated_warnings() -> list[str]:
         f"{len(a)} like '{shorten(re.sub(PATH, '', a[0]), AGAIN, placeholder='')} ...'"
         for a in more
     ]
-    severe = dict.fromkeys(text for each_screen in screens for text in each_screen.severe)
+    severe = dict.fromkeys(text for screen in screens for text in screen.severe)
     return [*severe, *([f"repeated warnings: {', '.join(again)}"] if again else [])]
 
 

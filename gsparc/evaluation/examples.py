@@ -86,10 +86,14 @@ def join_examples(rows: pd.DataFrame) -> Examples | None:
         for name, run in zip(firsts.setting, firsts.run, strict=True)
     ]
     there = [(name, example) for name, example in examples if example is not None]
-    same = [(name, one) for name, one in there if np.array_equal(one.rows, there[0][1].rows)]
+    same = [
+        (name, example) for name, example in there if np.array_equal(example.rows, there[0][1].rows)
+    ]
     if not same:
         return None
     beside = set(distinct_baselines(rows).method) - set(firsts.method)
-    plain = {m: v for _, one in reversed(same) for m, v in one.predicted.items() if m in beside}
-    runs = {name: [*one.predicted.values()][-1] for name, one in same}
+    plain = {
+        m: v for _, example in reversed(same) for m, v in example.predicted.items() if m in beside
+    }
+    runs = {name: [*example.predicted.values()][-1] for name, example in same}
     return replace(same[-1][1], predicted=plain | runs)

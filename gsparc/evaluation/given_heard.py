@@ -78,7 +78,7 @@ def strongest_told(method: Method, lists: StrongestLists, asked: Measurements) -
     measured = np.full(level.shape, -np.inf)
     heard = np.flatnonzero(asked.censored_side() <= 0)
     np.maximum.at(measured, (which[heard], asked.stations_of(heard)), levels_db(asked, heard))
-    best, predicted_best = (one == one.max(1, keepdims=True) for one in (measured, level))
+    best, predicted_best = (levels == levels.max(1, keepdims=True) for levels in (measured, level))
     predicted_best &= np.isfinite(level)
     share = (best & predicted_best).sum(1) / np.maximum(predicted_best.sum(1), 1)
     return np.where(np.isfinite(measured.max(1)), share, np.nan)[which]

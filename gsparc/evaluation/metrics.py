@@ -68,8 +68,8 @@ class SampleMetric:
         """
         if not self.parts:
             raise ValueError("no sample was scored: the chosen subset is empty")
-        every = ((name, [part[name] for part in self.parts]) for name in self.parts[0])
-        return {name: np.concatenate(values).astype(np.float64) for name, values in every}
+        columns = ((name, [part[name] for part in self.parts]) for name in self.parts[0])
+        return {name: np.concatenate(values).astype(np.float64) for name, values in columns}
 
     def _score(self, prediction: Tensor, target: Tensor, mask: Tensor | None) -> dict[str, Any]:
         raise NotImplementedError

@@ -101,7 +101,8 @@ class Run:
         settings = {name: v for name, v in self.config.items() if name.startswith(RESOLVED)}
         # Choices of `auto` are words like `name=value` in one line of the summary.
         chosen = [
-            one.partition("=") for one in str(self.facts.get("model/choices") or "").split(", ")
+            choice.partition("=")
+            for choice in str(self.facts.get("model/choices") or "").split(", ")
         ]
         return settings | {name: value for name, _, value in chosen if value}
 
@@ -153,12 +154,12 @@ def frame(*folders: str | Path) -> pd.DataFrame:
         top = path / SUMMARY
         # A run with runs below it (folds) is one; a sweep's folder has a summary that is no run's.
         files = [top] if top.is_file() and _is_run(_facts(top)) else sorted(path.rglob(top.name))
-        every = {file.parent.resolve(): _facts(file) for file in files}
-        here = [folder for folder, facts in every.items() if _is_run(facts)]
-        if not here and not any(path.rglob("tradeoff.csv")):
+        facts_of = {file.parent.resolve(): _facts(file) for file in files}
+        run_folders = [folder for folder, facts in facts_of.items() if _is_run(facts)]
+        if not run_folders and not any(path.rglob("tradeoff.csv")):
             raise ValueError(f"{path}: no run in it (a run leaves summary.json with test figures)")
         # A folder may be given twice, also by one above it.
-        runs |= {folder: read_run(folder) for folder in here if folder not in runs}
+        runs |= {folder: read_run(folder) for folder in run_folders if folder not in runs}
     if not runs:
         raise ValueError("a swept front is no report: give the directory of a run too")
     return frame_of_runs(runs.values())
@@ -207,8 +208,10 @@ def average(rows: pd.DataFrame, by: list[str], names: list[str]) -> pd.DataFrame
         dict.fromkeys(names, float)
     )
     draws = table.groupby([*by, "draw"], dropna=False, sort=False)[names].mean().reset_index()
-    of_draws, every = (one.groupby(by, dropna=False, sort=False)[names] for one in (draws, table))
-    spread = {"std": every.std(), "least": every.min(), "largest": every.max()}
+    of_draws, of_rows = (
+        part.groupby(by, dropna=False, sort=False)[names] for part in (draws, table)
+    )
+    spread = {"std": of_rows.std(), "least": of_rows.min(), "largest": of_rows.max()}
     return pd.concat({"mean": of_draws.mean(), "error": of_draws.sem(), **spread}, axis=1)
 
 
@@ -313,9 +316,10 @@ def result_rows(facts: Mapping[str, Any], prefix: str = "test") -> list[dict[str
     ]
     # dict.fromkeys: a set of names would forget the order that the summary has them in.
     beside = dict.fromkeys(name.split("/")[1] for name in facts if name.startswith("baseline/"))
-    every = ((name, facts_under(facts, f"baseline/{name}")) for name in beside)
+    baselines = ((name, facts_under(facts, f"baseline/{name}")) for name in beside)
     rows += [
-        dict.fromkeys(model_facts) | shared | row_of_method(name, its, its) for name, its in every
+        dict.fromkeys(model_facts) | shared | row_of_method(name, its, its)
+        for name, its in baselines
     ]
     return [
         {**row, "baseline": row is not rows[0], "value": row.get(row["figure"])} for row in rows

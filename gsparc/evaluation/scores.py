@@ -182,15 +182,19 @@ def score_methods(
         raise ValueError(
             f"{len(methods)} methods for the {len(split.folds)} folds of split={split.name}"
         )
-    every, samples = [rows_to_score(fold, eval_on) for fold in split.folds], []
-    every = [rows[~np.isin(data.stations_of(rows), off)] for rows in every] if len(off) else every
+    scored_rows, samples = [rows_to_score(fold, eval_on) for fold in split.folds], []
+    scored_rows = (
+        [rows[~np.isin(data.stations_of(rows), off)] for rows in scored_rows]
+        if len(off)
+        else scored_rows
+    )
     missing: list[pd.DataFrame] = []
     learned_data, before = learned or (data, split)
     if hearing is None:
         hearing = [Hearing.from_learned(learned_data, fold.learned()) for fold in before.folds]
-    limited = any(map(len, hearing)) and not names_every_station(data, np.concatenate(every))
+    limited = any(map(len, hearing)) and not names_every_station(data, np.concatenate(scored_rows))
     are_lists = limited and strongest_lists(data) is not None
-    of_folds = zip(methods, every, split.folds, before.folds, hearing, strict=True)
+    of_folds = zip(methods, scored_rows, split.folds, before.folds, hearing, strict=True)
     for method, rows, fold, taught, silence in of_folds:
         runs = unseen_runs(data, fold, eval_on)
         # Before scoring: the phase is found on all rows of a run, chunks alone would each have one.
@@ -225,7 +229,7 @@ def score_methods(
             if told.lists is not None and are_lists:
                 scored["strongest_told"] = strongest_told(method, told.lists, queries)
                 missing.append(
-                    never_listed(method, told, data.subset(np.concatenate(every)), queries)
+                    never_listed(method, told, data.subset(np.concatenate(scored_rows)), queries)
                 )
             heard = told.given_heard(
                 method, queries.moving, queries.stations_of(), *level, queries.device
@@ -234,13 +238,13 @@ def score_methods(
             scored |= heard if method.uses_censored else {"heard_share": heard["heard_share"]}
         samples.append(scored)
     pooled = {name: np.concatenate([s[name] for s in samples]) for name in samples[0]}
-    row = np.concatenate(every)
+    row = np.concatenate(scored_rows)
     pooled |= errors_with_silent(pooled, row, data)
     if "heard_db" in pooled:
         pooled |= power_errors(from_decibels(pooled["heard_db"]), pooled["target"])
     return Scores(
         kind=data.site.scored,
-        fold=np.repeat(np.arange(len(every)), [len(rows) for rows in every]),
+        fold=np.repeat(np.arange(len(scored_rows)), [len(rows) for rows in scored_rows]),
         row=row,
         confidence=pooled.pop("confidence"),
         variance=pooled.pop("variance"),

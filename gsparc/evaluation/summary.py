@@ -94,8 +94,8 @@ def write_as_found(
     """
     so_far, written = list[_Found](), time.monotonic()
     try:
-        for one in found:
-            so_far.append(one)
+        for result in found:
+            so_far.append(result)
             if time.monotonic() - written > SAY_S:
                 write_samples(path, columns(so_far))
                 written = time.monotonic()
@@ -208,12 +208,12 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     if unlisted := facts.get(f"{prefix}/unlisted"):
         rest.append(f"cells that may be off: lists should hold them and none does: {unlisted}")
         without = {name: facts.get(f"{prefix}/{name}{WITHOUT_OFF}") for name in OF_LISTS}
-        if said := [
+        if cells := [
             f"{name} {value:{number_format(name)}}"
             for name, value in without.items()
             if value is not None
         ]:
-            rest.append(f"figures above count these cells; without them: {', '.join(said)}")
+            rest.append(f"figures above count these cells; without them: {', '.join(cells)}")
     if new := facts.get(f"{prefix}/new"):
         rest.append(f"new cells, which earlier lists should have held: {new}")
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
@@ -236,7 +236,7 @@ def describe_model(facts: Mapping[str, Any]) -> list[str]:
     texts += notes.splitlines()[:MOST_LEARNED]
     lines = [f"  {text}" if number else f"{label}: {text}" for number, text in enumerate(texts)]
     folds = facts.get("split/folds") or 1
-    return [f"of the first of {folds} folds:"] * (folds > 1 and bool(lines)) + lines
+    return [f"of the first of {folds} folds:", *lines] if folds > 1 and lines else lines
 
 
 def run_conditions(facts: Mapping[str, Any]) -> list[str]:
@@ -323,18 +323,21 @@ def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]
     """
     method, notes = str(facts.get("model/label") or facts.get("model/name")), list[str]()
     for ahead, figure in judged_by(facts, prefix).items():
-        every = [key for key in facts if key.startswith("baseline/")]
-        end = WITHOUT_OFF * any(key.endswith(f"/{figure}{WITHOUT_OFF}") for key in every)
+        keys_of_baselines = [key for key in facts if key.startswith("baseline/")]
+        end = WITHOUT_OFF * any(
+            key.endswith(f"/{figure}{WITHOUT_OFF}") for key in keys_of_baselines
+        )
         value = facts.get(f"{prefix}/{figure}{end}")
-        keys = [key for key in every if key.endswith(f"/{figure}{end}")]
+        keys = [key for key in keys_of_baselines if key.endswith(f"/{figure}{end}")]
         scores = {k.split("/")[1]: score_of(figure, facts[k]) for k in keys if facts[k] is not None}
         best = max(scores, key=lambda name: scores[name], default=None)
         if best is None or value is None:
             continue
         lead = Lead.from_facts(facts, f"baseline/{best}/{ahead}{end}")
         if lead is not None:
-            said = judge_baseline(best, method, figure, lead, ahead == LISTED)
-            notes += [f"{'without cells that may be off: ' * bool(end)}{note}" for note in said]
+            judgements = judge_baseline(best, method, figure, lead, ahead == LISTED)
+            without_cells = "without cells that may be off: " if end else ""
+            notes += [f"{without_cells}{note}" for note in judgements]
         elif scores[best] > score_of(figure, value):
             notes.append(
                 f"the baseline {best} has the better {figure} here; how surely is not known"
@@ -388,13 +391,13 @@ def run_git(folder: Path, *arguments: str) -> str | None:
 
 
 def _git() -> str | None:
-    here = Path(__file__).resolve()
+    source = Path(__file__).resolve()
     # None in an installed copy inside someone else's tree.
-    if run_git(here.parent, "ls-files", "--error-unmatch", here.name) is None:
+    if run_git(source.parent, "ls-files", "--error-unmatch", source.name) is None:
         return None
-    commit = run_git(here.parent, "rev-parse", "HEAD")
+    commit = run_git(source.parent, "rev-parse", "HEAD")
     # Untracked files are mostly results of runs: with them every tree would count as edited.
-    edited = commit and run_git(here.parent, "status", "--porcelain", "--untracked-files=no")
+    edited = commit and run_git(source.parent, "status", "--porcelain", "--untracked-files=no")
     return f"{commit}-dirty" if edited else commit
 
 

@@ -161,7 +161,7 @@ class Table:
             if any(isinstance(cell, Interval) for cell in cells):
                 for end in ("low", "high", "error"):
                     ends = [getattr(cell, end, None) for cell in cells]
-                    has_end = any(each_end is not None for each_end in ends)
+                    has_end = any(end_value is not None for end_value in ends)
                     parts |= {f"{column.name} {self.ends.get(end, end)}": ends} if has_end else {}
         # object: pandas would write whole numbers beside empty cells as 3.0.
         return pd.DataFrame(parts, dtype=object).to_csv(index=False, lineterminator="\n")

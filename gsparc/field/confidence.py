@@ -62,8 +62,8 @@ class ErrorModel(nn.Module):
         """Return variances (B,) of unknown shares (B,), and their shares (B,)
         of those far from all data.
         """
-        one = ONE.to(unknown.dtype)
-        share = torch.lerp(unknown, one, LEAST_UNKNOWN / (1 + LEAST_UNKNOWN)).pow(self.power)
+        certain = ONE.to(unknown.dtype)
+        share = torch.lerp(unknown, certain, LEAST_UNKNOWN / (1 + LEAST_UNKNOWN)).pow(self.power)
         return share * self.far, share
 
     def get_extra_state(self) -> Tensor:

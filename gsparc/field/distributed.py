@@ -79,13 +79,15 @@ class SummedGradients(DDPStrategy):
 @torch.no_grad()
 def sum_gradients(parameters: Iterable[Tensor]) -> None:
     """Replace every gradient by its sum over processes; one that no process has stays None."""
-    every = list(parameters)
-    gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in every]
+    trained = list(parameters)
+    gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in trained]
     # Sent along: a parameter without a gradient in this process may have one in another.
-    has = gradients[0].new_tensor([p.grad is not None for p in every])
+    has = gradients[0].new_tensor([p.grad is not None for p in trained])
     flat = process_sum(torch.cat([has, *(gradient.flatten() for gradient in gradients)]))
-    sums = flat[len(every) :].split([gradient.numel() for gradient in gradients])
-    for parameter, somewhere, result in zip(every, flat[: len(every)].tolist(), sums, strict=True):
+    sums = flat[len(trained) :].split([gradient.numel() for gradient in gradients])
+    for parameter, somewhere, result in zip(
+        trained, flat[: len(trained)].tolist(), sums, strict=True
+    ):
         parameter.grad = result.view_as(parameter).to(parameter.dtype) if somewhere else None
 
 

@@ -91,7 +91,7 @@ def requested_steps(context: FitContext, rows: int, model_steps: int | None = No
         )
     size = context.batch_size if context.datamodule is None else context.datamodule.batch_size
     of_epochs = None if epochs is None else epochs * -(-rows // size)
-    return min(one for one in (steps, of_epochs) if one is not None)
+    return min(limit for limit in (steps, of_epochs) if limit is not None)
 
 
 class ReportSteps(L.Callback):
@@ -140,8 +140,8 @@ def step_is_complete(trainer: L.Trainer) -> bool:
     """
     if trainer.validating:
         return trainer.state.fn == "fit"
-    every = trainer.val_check_batch
-    due = isinstance(every, int) and (trainer.fit_loop.total_batch_idx + 1) % every == 0
+    interval = trainer.val_check_batch
+    due = isinstance(interval, int) and (trainer.fit_loop.total_batch_idx + 1) % interval == 0
     return trainer.training and not (due and trainer.enable_validation)
 
 
@@ -237,16 +237,18 @@ def make_trainer(
         if isinstance(callback, L.callbacks.ModelCheckpoint) and callback.dirpath is None:
             callback.dirpath = str(folder)
     interval = make.keywords.get("val_check_interval")
-    every = interval if type(interval) is int else max(1, module.total_steps // LOOKS)
+    interval_steps = interval if type(interval) is int else max(1, module.total_steps // LOOKS)
     # A validation sees the figures of its own step.
     module.log_every = (
-        math.gcd(LOG_EVERY, every) if len(fold.val) else max(LOG_EVERY, every // LOOKS)
+        math.gcd(LOG_EVERY, interval_steps)
+        if len(fold.val)
+        else max(LOG_EVERY, interval_steps // LOOKS)
     )
     per_epoch = max(1, len(fold.train) // batches.batch_size)
     options: dict[str, Any] = {
         "log_every_n_steps": max(1, min(50, per_epoch) // module.log_every) * module.log_every,
         "check_val_every_n_epoch": None,  # validations are counted in steps
-        "val_check_interval": every if interval is None else interval,
+        "val_check_interval": interval_steps if interval is None else interval,
         # All validation rows, before the first step: where the curve begins
         "num_sanity_val_steps": -1,
     }
@@ -338,7 +340,10 @@ def _drop_unusable(
         else [c for c in callbacks if str(getattr(c, "monitor", "")).startswith("val/")]
     )
     if blind:
-        log.info("without validation rows: no %s", ", ".join(type(one).__name__ for one in blind))
+        log.info(
+            "without validation rows: no %s",
+            ", ".join(type(callback).__name__ for callback in blind),
+        )
     return [
         c for c in callbacks if c not in blind and (gaussians or not hasattr(c, "edits_gaussians"))
     ]

@@ -122,13 +122,13 @@ class GaussianModel(nn.Module):
         averaged = site.target.is_complex and settings.response.channel == "mean"
         signed = (site.target.is_complex and not averaged) or settings.response.array
         if signed and settings.emission.activation != "linear":
-            what = (
+            reason = (
                 "channels are signed"
                 if site.target.is_complex
                 else ("fields at an array are signed")
             )
             raise ValueError(
-                f"model.emission.activation={settings.emission.activation}: {what}, choose "
+                f"model.emission.activation={settings.emission.activation}: {reason}, choose "
                 "linear (or auto)"
             )
         self.settings = settings

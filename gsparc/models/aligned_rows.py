@@ -82,10 +82,10 @@ def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
     for data_ref, its, result in _LAST:
         if data_ref() is data and its == key:
             return result
-    target, noise, found = np.array(data.target), data.noise_variance, []
+    target, noise, alignments = np.array(data.target), data.noise_variance, []
     for rows in _group_snapshots(data, fit_rows):
         best, channels = align_rows(rows, site.unknown_factor, site), target[rows.rows]
-        found.append(best)
+        alignments.append(best)
         factors = rows.to_rows(best.factors)
         if site.unknown_factor == "phase+delay+gain":
             # Where gains are free rows have no level of their own: all are learned at unit power.
@@ -96,14 +96,16 @@ def align_phases(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:
                 noise[rows.rows] /= level**2
         target[rows.rows] = (channels * factors).astype(target.dtype)
     reference: Literal["carrier", "neighbours"] = (
-        "carrier" if all(one.phase_reference == "carrier" for one in found) else "neighbours"
+        "carrier"
+        if all(alignment.phase_reference == "carrier" for alignment in alignments)
+        else "neighbours"
     )
     log.info(
         "aligned %d rows by %s: each is predicted by the others to NMSE %.3g; phases over places "
         "are %s",
         len(fit_rows),
         describe_factor(site.unknown_factor),
-        float(np.mean([one.error for one in found])),
+        float(np.mean([alignment.error for alignment in alignments])),
         "the carrier's" if reference == "carrier" else "relative to neighbours",
     )
     turned = replace(
@@ -177,12 +179,12 @@ def align_rows(rows: Snapshots, unknown_factor: UnknownFactor, site: Site) -> Al
     if unknown_factor == "phase+delay+gain":
         values = values / _rms_of_rows(values)[:, None, None]
     length = site.wavelength or SPACINGS * (neighbour_distance(rows.places) or 1.0)
-    one = _Rows(rows.places, values, rows.tones, unknown_factor, length)
-    found = [one.refine_by_neighbours(one.align_along_tree(None))]
+    aligner = _Rows(rows.places, values, rows.tones, unknown_factor, length)
+    alignments = [aligner.refine_by_neighbours(aligner.align_along_tree(None))]
     direct = _direct_wave(rows, site)
     if direct is not None:
-        found.append(one.refine_by_waves(one.align_along_tree(direct)))
-    return min(found, key=lambda each: each.error)
+        alignments.append(aligner.refine_by_waves(aligner.align_along_tree(direct)))
+    return min(alignments, key=lambda each: each.error)
 
 
 @dataclass(frozen=True)
@@ -224,14 +226,14 @@ class _Rows:
         """Go on from these factors by a process of two lengths;
         return the round that tells rows best.
         """
-        kernel, found = initial_kernel(self.length, neighbour_distance(self.places)), []
+        kernel, alignments = initial_kernel(self.length, neighbour_distance(self.places)), []
         for _ in range(ROUNDS):
             factors = self._sweep_factors(factors, self._neighbour_weights(kernel), SWEEPS)
             error = self._left_out_error(factors, self._neighbour_weights(kernel))
-            found.append(Alignment(factors, error, "neighbours"))
+            alignments.append(Alignment(factors, error, "neighbours"))
             turned = (self.values * factors[:, None]).reshape(len(factors), -1)
             kernel = fit_two_lengths(self.places, turned, self.length, kernel)
-        return min(found, key=lambda each: each.error)
+        return min(alignments, key=lambda each: each.error)
 
     def refine_by_waves(self, factors: np.ndarray) -> Alignment:
         """Go on from these factors by waves from everywhere alike."""

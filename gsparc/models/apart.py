@@ -14,9 +14,9 @@ def keep_apart(
     [9, 5, 1]
     """
     numbers: list[int] = []
-    for one in order:
+    for number in order:
         if len(numbers) == limit:
             break
-        if not any(alike(one, other) for other in numbers):
-            numbers.append(one)
+        if not any(alike(number, other) for other in numbers):
+            numbers.append(number)
     return numbers

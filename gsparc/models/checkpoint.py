@@ -407,9 +407,9 @@ def find_non_finite(value: Any, where: str, *, infinite: bool = False) -> str | 
         return where if math.isnan(value) or (math.isinf(value) and not infinite) else None
     parts: Iterable[tuple[str, Any]] = ()
     if isinstance(value, Mapping):
-        parts = ((f"{where}.{key}", one) for key, one in value.items())
+        parts = ((f"{where}.{key}", entry) for key, entry in value.items())
     elif isinstance(value, (list, tuple)):
-        parts = ((f"{where}[{i}]", one) for i, one in enumerate(value))
+        parts = ((f"{where}[{i}]", entry) for i, entry in enumerate(value))
     each = (find_non_finite(part, name, infinite=infinite) for name, part in parts)
     return next((result for result in each if result is not None), None)
 

@@ -44,7 +44,7 @@ def take_off_devices(data: Measurements, fold: Fold) -> Measurements:
     order = np.random.default_rng(0).permutation(len(rows))
     some = first_rows(order, most, station, np.zeros(len(rows), bool))
     device, heard = data.device[rows][some], np.unique(data.device[rows][some])
-    each = [(device == one).astype(float) for one in heard[1:]]
+    each = [(device == number).astype(float) for number in heard[1:]]
     field = fit_level_field(data.moving[rows][some], level[some], station[some], each)
     offset = np.r_[0.0, field.slope]
     offset -= offset.mean()
@@ -52,7 +52,9 @@ def take_off_devices(data: Measurements, fold: Fold) -> Measurements:
     spread = float(offset.var(ddof=1)) if len(offset) > 1 else 0.0
     levels = np.tile([0.0, spread], (len(names) + 1, 1))
     levels[heard] = np.c_[offset, np.zeros(len(heard))]
-    notes = [f"{names[one]} {value:+.1f} dB" for one, value in zip(heard, offset, strict=True)]
+    notes = [
+        f"{names[number]} {value:+.1f} dB" for number, value in zip(heard, offset, strict=True)
+    ]
     log.info("devices: %s, beside their mean", list_first(notes, 6))
     return without_devices(data, replace(data.site, device_levels=levels))
 

@@ -138,7 +138,7 @@ def run_folder(path: Path, parts: str) -> Path:
     given as that or by what is in a part.
     """
     inside = path if path.is_dir() else path.parent
-    if any(re.fullmatch(parts, each_path.name) for each_path in inside.glob("*")):
+    if any(re.fullmatch(parts, file.name) for file in inside.glob("*")):
         return inside
     return next(
         (parent.parent for parent in (inside, *inside.parents) if re.fullmatch(parts, parent.name)),
@@ -221,9 +221,9 @@ class Origin:
             raise ValueError(
                 f"ckpt_path={stored.path}: does not say what it learned from; start without it"
             )
-        for name, group, what in _HASHED:
+        for name, group, noun in _HASHED:
             if origin[name] != hashes[name]:
-                differing += _list_differences(before, now, (group,)) or [f"other {what}"]
+                differing += _list_differences(before, now, (group,)) or [f"other {noun}"]
         if stored.site.sha256 == self.site.sha256:  # of other data, all of it may differ
             facts = {
                 name: (getattr(stored.site, name), getattr(self.site, name)) for name in UNHASHED
@@ -252,11 +252,19 @@ def _list_differences(
     """
     if not before or not now:
         return []
-    one, two = dict(dotted_settings(before)), dict(dotted_settings(now))
-    under = [k for k in {**one, **two} if any(k == key or k.startswith(f"{key}.") for key in keys)]
+    stored_settings, settings = dict(dotted_settings(before)), dict(dotted_settings(now))
+    under = [
+        k
+        for k in {**stored_settings, **settings}
+        if any(k == key or k.startswith(f"{key}.") for key in keys)
+    ]
     # `model.refit` lies under `model`, and may change all the same.
     under = [k for k in under if keys is CHANGEABLE or k not in CHANGEABLE]
-    return [f"{k}={one.get(k)} (here {two.get(k)})" for k in under if one.get(k) != two.get(k)]
+    return [
+        f"{k}={stored_settings.get(k)} (here {settings.get(k)})"
+        for k in under
+        if stored_settings.get(k) != settings.get(k)
+    ]
 
 
 def dotted_settings(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:

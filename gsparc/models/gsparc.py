@@ -67,7 +67,7 @@ def choose(data: Measurements, settings: Gsparc, quiet: bool = False) -> Method:
         (terms.array, ArrayProcess),
         (True, ImageProcess),
     )
-    method_class = next(one for called, one in table if called)
+    method_class = next(method for called, method in table if called)
     for remark in settings.own_terms.said if method_class is not Powers else ():
         raise ValueError(f"{remark} of received powers; the target is {site.kind} here")
     rendered = issubclass(method_class, ImageProcess)
@@ -142,11 +142,13 @@ class Gsparc(LearnsTogether):
 
     def create_as(self, target: str) -> Method:
         """See `MethodFactory`; under its own name."""
-        alike = {import_path(one): one for one in (UplinkField, CarrierField)}
+        alike = {import_path(solver): solver for solver in (UplinkField, CarrierField)}
         if target in alike:
             return alike[target]()
-        solved = {import_path(one): one for one in (ImageSources, Channels, Powers, Bearings)}
-        rendered = {import_path(one): one for one in (ArrayProcess, ImageProcess)}
+        solved = {
+            import_path(solver): solver for solver in (ImageSources, Channels, Powers, Bearings)
+        }
+        rendered = {import_path(solver): solver for solver in (ArrayProcess, ImageProcess)}
         alone = not self.rendered.settings.field.count
         method: Method
         if target in solved:

@@ -39,7 +39,7 @@ def error_products(predicted: Sequence[Tensor], target: Tensor) -> np.ndarray:
     """Return products (n, K, K) of the errors of K predictions (n, ...),
     means over real entries.
     """
-    missed = [to_real_entries((one - target).detach()) for one in predicted]
+    missed = [to_real_entries((mean - target).detach()) for mean in predicted]
     return torch.stack(
         [torch.stack([(a * b).mean(1) for b in missed], 1) for a in missed], 1
     ).numpy()
@@ -72,8 +72,8 @@ def choose_weights(
     if part.max() + 1 < few and all(gain < 2 * error for gain, error in gains):
         return np.full(count, 1 / count)
     part, mixed = part % PARTS, np.empty(len(gram))
-    for here in (part == number for number in range(int(part.max()) + 1)):
-        mixed[here] = mixture_errors(best_weights(gram[~here].mean(0)), gram[here])
+    for tested in (part == number for number in range(int(part.max()) + 1)):
+        mixed[tested] = mixture_errors(best_weights(gram[~tested].mean(0)), gram[tested])
     gain, error = mean_and_error(errors[:, winner] - mixed, unit)
     if gain > max(least * errors[:, winner].mean(), deviations * error) or (winner and least):
         return best_weights(gram.mean(0))
@@ -102,10 +102,10 @@ def best_weights(gram: np.ndarray) -> np.ndarray:
             np.sqrt(np.maximum(values / max(values.sum(), np.finfo(float).tiny), 0.0))[:, None]
             * vectors.T
         )
-        found = nnls(np.vstack([root, np.ones(len(used))]), np.append(np.zeros(len(used)), 1.0))[0]
-        large = found >= UNUSED * found.sum()
+        shares = nnls(np.vstack([root, np.ones(len(used))]), np.append(np.zeros(len(used)), 1.0))[0]
+        large = shares >= UNUSED * shares.sum()
         if large.all():
-            return np.bincount(used, found / found.sum(), len(gram))
+            return np.bincount(used, shares / shares.sum(), len(gram))
         used = used[large]
 
 
@@ -187,15 +187,18 @@ def weigh_members(
     if len(left_out) == len(members):
         # Only rows that every member was without can be compared.
         rows = np.asarray(
-            functools.reduce(np.intersect1d, [one.rows for one in left_out]), np.int64
+            functools.reduce(np.intersect1d, [member.rows for member in left_out]), np.int64
         )
     batch, predicted = data.batch(val), []
-    for one in members.values():
-        mean = one.predict(batch).mean
-        if one.held is not None and len(rows):
-            order = np.argsort(one.held.rows)
+    for method in members.values():
+        mean = method.predict(batch).mean
+        if method.held is not None and len(rows):
+            order = np.argsort(method.held.rows)
             mean = torch.cat(
-                [one.held.mean[order[np.searchsorted(one.held.rows, rows, sorter=order)]], mean]
+                [
+                    method.held.mean[order[np.searchsorted(method.held.rows, rows, sorter=order)]],
+                    mean,
+                ]
             )
         predicted.append(mean)
     rows = np.concatenate([rows, val])

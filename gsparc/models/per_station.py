@@ -194,14 +194,12 @@ class PerStation(Method):
         reports = [fit[1] for fit in fits]
         # The rest by the interrupted run, or another process
         for _, report, took_s, took_cpu_s in fits:
-            here = 0.0 if uses_other_processes() else took_cpu_s
-            watch.charge(max(report.seconds - took_s, 0.0), max(report.cpu_s - here, 0.0))
+            counted_s = 0.0 if uses_other_processes() else took_cpu_s
+            watch.charge(max(report.seconds - took_s, 0.0), max(report.cpu_s - counted_s, 0.0))
         heard = [
-            each_report
-            for each_report, number in zip(reports, numbers, strict=True)
-            if number != UNHEARD
+            report for report, number in zip(reports, numbers, strict=True) if number != UNHEARD
         ]
-        learned = pool_station_weights([note for one in heard for note in one.notes])
+        learned = pool_station_weights([note for report in heard for note in report.notes])
         notes += dict.fromkeys(learned.values())
         nan_stations = [
             t for t in range(len(data.site.every_station)) if not {t, UNHEARD} & {*numbers}
@@ -220,7 +218,7 @@ class PerStation(Method):
         notes = [note for note in notes if not isinstance(note, Caution)]
         for kind in (Severe, Caution):  # a severe one is said again at the end of a run
             notes += map(kind, group_warnings([note for note in cautions if type(note) is kind]))
-        cost = sum((one.cost for one in reports), Cost())
+        cost = sum((report.cost for report in reports), Cost())
         return FitReport(watch.seconds, tuple(notes), cost, watch.cpu_elsewhere)
 
     def _station_numbers(self, data: Measurements, fold: Fold, context: FitContext) -> list[int]:
@@ -332,8 +330,8 @@ class PerStation(Method):
 
     def joint_method(self) -> HasJoint | None:
         """See `Method.joint_method`."""
-        every = self.all_stations()
-        return None if every is None else every.joint_method()
+        shared = self.all_stations()
+        return None if shared is None else shared.joint_method()
 
     def add_carrier(self, frequency_hz: float) -> PerStation:
         """See `AddsCarriers`."""
@@ -361,14 +359,14 @@ class PerStation(Method):
         or two.
         """
         ends, stations = Ends.from_query(self.fitted_site, query), self.fitted_site.every_station
-        here = station_distances(torch.from_numpy(stations.position), ends.still) <= SAME_PLACE_M
-        for shared in here[here.sum(1) > 1][:1] if set(self._copies) != {UNHEARD} else ():
+        near = station_distances(torch.from_numpy(stations.position), ends.still) <= SAME_PLACE_M
+        for shared in near[near.sum(1) > 1][:1] if set(self._copies) != {UNHEARD} else ():
             # Sectors of one mast, or carriers.
             names = " and ".join(stations.shown[t] for t in shared.nonzero()[:, 0].tolist())
             raise ValueError(
                 f"{self.name}: {names} stand at one place, which does not tell them apart"
             )
-        for row in (~here.any(1)).nonzero()[:1, 0].tolist() if UNHEARD not in self._copies else ():
+        for row in (~near.any(1)).nonzero()[:1, 0].tolist() if UNHEARD not in self._copies else ():
             raise ValueError(
                 f"{self.name}: no station stands within {SAME_PLACE_M:g} m of row {row}"
             )
@@ -406,7 +404,7 @@ class PerStation(Method):
         result = [copy.facts() for copy in self._copies.values()]
         if not result:
             return super().facts()
-        return {name: _combine_facts([one[name] for one in result], name) for name in result[0]}
+        return {name: _combine_facts([facts[name] for facts in result], name) for name in result[0]}
 
     def __iter__(self) -> Iterator[tuple[int, Method]]:
         return iter(self._copies.items())

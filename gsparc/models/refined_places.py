@@ -59,8 +59,8 @@ def position_errors(
         return None
     if can_refine:
         return std
-    what = "channels with phases of the carrier and powers, of one end that moves"
-    log.warning("position_std is not used: it is for %s", what)
+    measured = "channels with phases of the carrier and powers, of one end that moves"
+    log.warning("position_std is not used: it is for %s", measured)
     return None
 
 

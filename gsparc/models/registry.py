@@ -63,10 +63,10 @@ def plain_methods() -> tuple[str, ...]:
     """Return names of plain methods, which others are shown beside, in the order of tables."""
     classes = ((name, import_target(path)) for name, path in all_methods().items())
     # A class of its own: what derives from a plain method is none.
-    found = {
+    orders = {
         name: vars(method).get("baseline_order") for name, method in classes if method is not None
     }
-    places = {name: place for name, place in found.items() if place is not None}
+    places = {name: place for name, place in orders.items() if place is not None}
     return tuple(sorted(places, key=places.__getitem__))
 
 

@@ -76,7 +76,7 @@ def judge_fit(
             name, method = method.name, Mean()
             method.fit(data, fold, FitContext())
             method.name = name
-    who = " and ".join(one.name for one in kept) or MEAN
+    who = " and ".join(member.name for member in kept) or MEAN
     texts = [f"{text}; {who} answers" for text in texts]
     cost = (
         report.cost + Cost({"rows left out": watch.seconds}) if report.cost.stages else report.cost
@@ -111,20 +111,20 @@ def _refuse_members(
     means = {name: _select_rows(answer, rows) for name, answer in answers.items()}
     kept, texts = list[tuple[float, Method]](), list[str]()
     groups: dict[bool, list[tuple[float, Method]]] = {False: [], True: []}
-    for weight, one in members:
-        wrong = find_non_finite(one.state(), "state") or find_non_finite(
-            means[id(one)], "row left out "
+    for weight, candidate in members:
+        wrong = find_non_finite(candidate.state(), "state") or find_non_finite(
+            means[id(candidate)], "row left out "
         )
         if wrong:
-            texts.append(f"{one.name} answers nothing: {wrong} is NaN or infinite")
+            texts.append(f"{candidate.name} answers nothing: {wrong} is NaN or infinite")
         else:
-            groups[_has_gaussians(one)].append((weight, one))
+            groups[_has_gaussians(candidate)].append((weight, candidate))
     if len(rows) < LEAST:
-        return [one for group in groups.values() for _, one in group], texts
+        return [member for group in groups.values() for _, member in group], texts
 
     def missed(those: Sequence[tuple[float, Method]]) -> np.ndarray:
         total = sum(weight for weight, _ in those)
-        parts = [weight / total * means[id(one)] for weight, one in those]
+        parts = [weight / total * means[id(member)] for weight, member in those]
         return _squared_errors(torch.stack(parts).sum(0), data, rows)
 
     held = max(answers.values(), key=lambda answer: answer.group is not None)
@@ -136,7 +136,7 @@ def _refuse_members(
             gain, unsure = mean_and_error(error - least, np.arange(len(rows)))
             if gain <= unsure and error.max() <= most:
                 kept, least = [*kept, *group], error
-                simpler = " and ".join(one.name for _, one in kept)
+                simpler = " and ".join(member.name for _, member in kept)
                 break
             worst = max(group, key=lambda pair: missed([pair]).mean())
             group.remove(worst)
@@ -148,7 +148,7 @@ def _refuse_members(
                     f", and {wild} are missed by more than {WILD} times what {MEAN} misses any by"
                 )
             texts.append(f"{worst[1].name} answers nothing: {at} {why}")
-    return [one for _, one in kept], texts
+    return [member for _, member in kept], texts
 
 
 def _has_gaussians(method: Method) -> bool:
@@ -208,11 +208,11 @@ def _errors_of_mean(
     if held.group is not None:
         error = np.zeros(len(rows))
         for number in np.unique(held.group):
-            here, others = (
+            own, others = (
                 np.isin(rows, held.rows[held.group == number]),
                 held.rows[held.group != number],
             )
-            error[here] = _squared_errors(_mean_at(data, others, rows[here]), data, rows[here])
+            error[own] = _squared_errors(_mean_at(data, others, rows[own]), data, rows[own])
         return error
     known = heard_rows(data, fold.learned())
     count = np.bincount(data.stations_of(known), minlength=len(data.site.every_station))

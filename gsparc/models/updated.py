@@ -223,7 +223,10 @@ def with_changes(method: Method, changes: Changes | None, own: int | None = None
         return view
     if isinstance(method, PerStation):
         result = copy(method)
-        result._copies = {number: _with_own(one, changes, number) for number, one in method}
+        result._copies = {
+            number: _with_own(copy_of_station, changes, number)
+            for number, copy_of_station in method
+        }
         return result
     alone = method.site is None or method.site.stations is None
     return _with_own(method, changes, own or 0 if alone else None)

@@ -167,11 +167,11 @@ def make_co_array(array: np.ndarray, wavelength: float) -> CoArray:
     which = rank[which]
     size = 2 * len(unique) - 1
     real, imag = np.zeros((m * m, size)), np.zeros((m * m, size))
-    every = np.arange(m * m)
-    real[every, which] = 1.0
+    pairs = np.arange(m * m)
+    real[pairs, which] = 1.0
     moved = which > 0
     # h_m conj(h_n) e^{-j k d.u}: Re cos + Im sin, and its conjugate twin sits at -d.
-    imag[every[moved], len(unique) - 1 + which[moved]] = sign[moved]
+    imag[pairs[moved], len(unique) - 1 + which[moved]] = sign[moved]
     differences = np.stack(
         [difference.reshape(-1, 3)[(which == i) & (sign >= 0)].mean(0) for i in range(len(unique))]
     )

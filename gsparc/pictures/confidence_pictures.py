@@ -31,8 +31,8 @@ def draw_confidences(
     """Save pictures of `PICTURES` by name, of the runs of a frame that state a confidence,
     if any.
     """
-    every: list[Row] = own_rows(rows).to_dict("records")  # type: ignore[assignment]
-    runs = [row for row in every if _states(row)]
+    records: list[Row] = own_rows(rows).to_dict("records")  # type: ignore[assignment]
+    runs = [row for row in records if _states(row)]
     for name in names if runs else ():
         # Powers have no ratio to an error.
         if name != "snr_brackets" or not lower_is_better(OF_KIND[runs[0]["kind"]].of_sample):
@@ -112,8 +112,8 @@ def _draw_accepted(runs: list[Row]) -> Figure:
             curve.plot(taus, share, **{**style, "linestyle": line}, label=_label(row) + end)
         if number == 0:
             above = relative >= PAPER_TAU
-            for part, colour, what in ((above, PALETTE[2], "above"), (~above, GREY, "below")):
-                label = f"{what} {PAPER_TAU} (paper), {part.mean():.0%}"
+            for part, colour, side in ((above, PALETTE[2], "above"), (~above, GREY, "below")):
+                label = f"{side} {PAPER_TAU} (paper), {part.mean():.0%}"
                 places.plot(
                     samples["x_m"][part],
                     samples["y_m"][part],
@@ -142,7 +142,7 @@ def _draw_brackets(runs: list[Row]) -> Figure:
     and the confidence by bracket.
     """
     figure, grid = panels(2.2 * WIDE, TALL * len(runs) + 0.3, len(runs), 2)
-    for (left, right), row in zip(grid, runs, strict=True):
+    for (errors_axis, scores_axis), row in zip(grid, runs, strict=True):
         data, name = row["run"].samples, OF_KIND[row["kind"]].of_sample
         stem, end = "baseline/", f"/{name}"
         beside = {
@@ -150,13 +150,13 @@ def _draw_brackets(runs: list[Row]) -> Figure:
             for k in data
             if k.startswith(stem) and k.endswith(end)
         }
-        every = {k: v[np.isfinite(v)] for k, v in {**beside, _label(row): data[name]}.items()}
-        how = {"tick_labels": list(every), "showfliers": False, "patch_artist": True}
-        boxes = left.boxplot(list(every.values()), **how)
+        samples = {k: v[np.isfinite(v)] for k, v in {**beside, _label(row): data[name]}.items()}
+        how = {"tick_labels": list(samples), "showfliers": False, "patch_artist": True}
+        boxes = errors_axis.boxplot(list(samples.values()), **how)
         for box, method in zip(boxes["boxes"], [*beside, row["method"]], strict=True):
             box.set(facecolor=style_of(method).colour, alpha=0.5)
-        left.tick_params(axis="x", labelrotation=30)
-        left.set(ylabel=f"{axis_of(name)} of a test row")
+        errors_axis.tick_params(axis="x", labelrotation=30)
+        errors_axis.set(ylabel=f"{axis_of(name)} of a test row")
         mask = np.isfinite(data[name])
         low, high = np.quantile(data[name][mask], OUTER)
         # Outermost are open
@@ -166,15 +166,15 @@ def _draw_brackets(runs: list[Row]) -> Figure:
         names = [f"{a:.0f}–{a + BRACKET_DB:.0f}" for a in starts]
         names[0], names[-1] = f"< {starts[0] + BRACKET_DB:.0f}", f"≥ {starts[-1]:.0f}"
         names = [f"{name}\n{count}" for name, count in zip(names, counts, strict=True)]
-        right.tick_params(axis="x", labelsize=7)
-        right.bar(names, sure, color=PALETTE[0], alpha=0.7)
-        right.axhline(PAPER_TAU, color=GREY, linestyle="--", label=f"threshold {PAPER_TAU}")
-        right.set(
+        scores_axis.tick_params(axis="x", labelsize=7)
+        scores_axis.bar(names, sure, color=PALETTE[0], alpha=0.7)
+        scores_axis.axhline(PAPER_TAU, color=GREY, linestyle="--", label=f"threshold {PAPER_TAU}")
+        scores_axis.set(
             xlabel=f"{axis_of(name)}, and the number of rows",
             ylabel="mean confidence",
             ylim=(0, 1.15),
         )
-        right.legend(loc="upper left")
+        scores_axis.legend(loc="upper left")
     return figure
 
 

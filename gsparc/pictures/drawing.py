@@ -136,8 +136,8 @@ def panels(
     figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(rows, columns, squeeze=False, **how)
-    for one in axes.flat if grid else ():
-        one.grid(alpha=0.3)
+    for axis in axes.flat if grid else ():
+        axis.grid(alpha=0.3)
     return figure, axes
 
 

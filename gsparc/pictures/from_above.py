@@ -140,10 +140,10 @@ def annotate(
 
 def scale_bar(axis: Any) -> None:
     """Draw a bar of a round length, about a fifth of the map wide."""
-    (left, right), (low, high) = axis.get_xlim(), axis.get_ylim()
-    decade = 10.0 ** np.floor(np.log10((right - left) / 5))
-    length = max(value for value in (1, 2, 5) if value * decade <= (right - left) / 5) * decade
-    x, y = left + 0.04 * (right - left), low + 0.05 * (high - low)
+    (west, east), (south, north) = axis.get_xlim(), axis.get_ylim()
+    decade = 10.0 ** np.floor(np.log10((east - west) / 5))
+    length = max(value for value in (1, 2, 5) if value * decade <= (east - west) / 5) * decade
+    x, y = west + 0.04 * (east - west), south + 0.05 * (north - south)
     axis.plot(
         [x, x + length],
         [y, y],
@@ -154,7 +154,9 @@ def scale_bar(axis: Any) -> None:
         path_effects=[withStroke(linewidth=6, foreground="white")],
     )
     unit, metres = next(
-        one for one in (("km", 1000), ("m", 1), ("cm", 0.01)) if length >= one[1] or one[1] < 1
+        scale
+        for scale in (("km", 1000), ("m", 1), ("cm", 0.01))
+        if length >= scale[1] or scale[1] < 1
     )
     axis.annotate(
         f"{length / metres:g} {unit}",

@@ -59,9 +59,9 @@ def draw_run(
         tracking.log_picture(loggers, "test rows", run_dir / "test.png")
     table = results_table(facts, str(facts["model/label"]), prefix=eval_on)
     tracking.log_table(loggers, "results", *table.texts())
-    found = method.objects()
-    if len(found):
-        draw_found(data, found, run_dir / "found.png", walls)
+    sources = method.objects()
+    if len(sources):
+        draw_found(data, sources, run_dir / "found.png", walls)
         tracking.log_picture(loggers, "found", run_dir / "found.png")
 
 
@@ -103,15 +103,15 @@ def draw_points(
     )
     # The faintest half percent are outliers of the logarithm; the strongest are what matters.
     low, high = np.percentile(true_db, [0.5, 100])
-    what = "channel gain" if channels else "received power"
+    quantity = "channel gain" if channels else "received power"
     axes[0].plot([low, high], [low, high], color="grey", linewidth=1)
     axes[0].scatter(true_db, guess_db, s=6, alpha=0.5, color=PALETTE[0], linewidths=0)
     axes[0].set(xlim=(low - 3, high + 3), ylim=(low - 3, high + 3), aspect="equal")
-    axes[0].set(xlabel=f"measured {what} [{unit}]", ylabel=f"predicted [{unit}]")
+    axes[0].set(xlabel=f"measured {quantity} [{unit}]", ylabel=f"predicted [{unit}]")
     # Errors of what lies below the axis would be those of nothing heard.
     heard = np.isfinite(guess_db) & (true_db > low)
     error = np.median(np.abs(guess_db - true_db)[heard]) if heard.any() else np.nan
-    axes[0].set_title(f"{what}, median error {error:.1f} dB")
+    axes[0].set_title(f"{quantity}, median error {error:.1f} dB")
     if channels:
         turn = np.degrees(np.angle(predicted.ravel() * target.ravel().conj()))
         axes[1].scatter(true_db, turn, s=6, alpha=0.5, color=PALETTE[0], linewidths=0)
@@ -128,34 +128,37 @@ def draw_spectra(examples: Examples, title: str) -> Figure:
 
     Under each prediction stand its PSNR and SSIM, and the confidence of the last one.
     """
-    every, edges = examples.predicted, examples.edges
+    predicted, edges = examples.predicted, examples.edges
     how: dict[str, Any] = {"sharex": True, "sharey": True, "grid": False}
-    count, across = len(examples.rows), len(every) + 2
+    count, across = len(examples.rows), len(predicted) + 2
     figure, axes = panels(max(1.75 * across, 8.5), 1.55 * count + 1.2, count, across, **how)
     options: dict[str, Any] = {"origin": "lower", "aspect": "auto", "extent": edges}
     metric = SpectrumMetrics()
-    for values in every.values():
+    for values in predicted.values():
         metric.update(torch.from_numpy(values), torch.from_numpy(examples.truth))
-    figures = {name: values.reshape(len(every), count) for name, values in metric.compute().items()}
+    figures = {
+        name: values.reshape(len(predicted), count) for name, values in metric.compute().items()
+    }
     for number, (line, true, row) in enumerate(
         zip(axes, examples.truth, examples.rows, strict=True)
     ):
         for axis, image in zip(
-            line, (true, *(values[number] for values in every.values())), strict=False
+            line, (true, *(values[number] for values in predicted.values())), strict=False
         ):
             power = axis.imshow(image, vmin=0, vmax=1, cmap="inferno", **options)
         for place, axis in enumerate(line[1:-1]):
             psnr, ssim = (figures[name][place, number] for name in ("psnr_db", "ssim_gauss"))
-            axis.set_xlabel(
-                f"{psnr:.1f} dB" + f", SSIM {ssim:.3f}" * bool(np.isfinite(ssim)), fontsize=8
-            )
+            similarity = f", SSIM {ssim:.3f}" if np.isfinite(ssim) else ""
+            axis.set_xlabel(f"{psnr:.1f} dB{similarity}", fontsize=8)
         # Half of full scale, saturating: at +-1 usual errors of a few hundredths would be white.
         error = line[-1].imshow(image - true, vmin=-0.5, vmax=0.5, cmap="RdBu_r", **options)
         if np.isfinite(examples.confidence[number]):
             line[-1].set_xlabel(f"confidence {examples.confidence[number]:.2f}", fontsize=8)
         line[0].set_yticks(np.arange(30 * np.ceil(edges[2] / 30), edges[3] + 1, 30))
         line[0].set_ylabel(f"row {row}", fontsize=9)
-    for axis, name in zip(axes[0], ("measured", *every, f"{[*every][-1]} - measured"), strict=True):
+    for axis, name in zip(
+        axes[0], ("measured", *predicted, f"{[*predicted][-1]} - measured"), strict=True
+    ):
         axis.set_title("\n".join(wrap(name, 22)), fontsize=9)
     for axis in axes[-1]:
         axis.set_xticks(np.arange(90 * np.ceil(edges[0] / 90), edges[1] + 1, 90))
@@ -183,36 +186,38 @@ def draw_calibration(
     evidence: Evidence, trials: Sequence[Trial], guarantee: Guarantee, title: str, path: Path
 ) -> None:
     """Save risk against coverage, and what came of the draws, as one PNG."""
-    figure, ((left, right),) = panels(11, 4.2, 1, 2)
+    figure, ((coverage_axis, trials_axis),) = panels(11, 4.2, 1, 2)
     loss = bounded_loss(evidence.error)
     coverage = np.arange(1, len(loss) + 1) / len(loss)
     for kind, score in evidence.scores.items():
         risk = risk_coverage(score, loss)
-        left.plot(coverage, risk, label=f"{NAMES[kind]}, area {risk.mean():.3g}")
+        coverage_axis.plot(coverage, risk, label=f"{NAMES[kind]}, area {risk.mean():.3g}")
     # Ordered by the errors themselves: no score can be below this curve.
     risk = risk_coverage(-loss, loss)
-    left.plot(coverage, risk, "k:", label=f"knowing the errors, area {risk.mean():.3g}")
-    left.set(
+    coverage_axis.plot(coverage, risk, "k:", label=f"knowing the errors, area {risk.mean():.3g}")
+    coverage_axis.set(
         xlabel="share of positions accepted", ylabel="mean error among them (|e|²/|h|², at most 1)"
     )
-    left.set_title(title)
+    coverage_axis.set_title(title)
     for trial, colour in zip(trials, PALETTE, strict=False):
         broken = trial.summarise()["broken_of_all"]
         label = f"{trial.how}: broken in {broken:.0%} of {len(trial.realised)} draws"
-        right.scatter(trial.coverage, trial.realised, s=9, alpha=0.4, color=colour, label=label)
+        trials_axis.scatter(
+            trial.coverage, trial.realised, s=9, alpha=0.4, color=colour, label=label
+        )
     # a draw that accepts nobody has no share of bad ones: NaN
     worst = max(guarantee.alpha, *(np.nan_to_num(trial.realised).max() for trial in trials))
-    right.set(xlim=(-0.02, 1.02), ylim=(-0.02 * worst, 1.1 * worst))
+    trials_axis.set(xlim=(-0.02, 1.02), ylim=(-0.02 * worst, 1.1 * worst))
     if not any(trial.coverage.any() for trial in trials):
-        right.text(0.5, 0.5 * worst, "no draw accepted anybody", ha="center")
-    right.axhline(guarantee.alpha, color="black", linewidth=1)
-    right.set_title(
+        trials_axis.text(0.5, 0.5 * worst, "no draw accepted anybody", ha="center")
+    trials_axis.axhline(guarantee.alpha, color="black", linewidth=1)
+    trials_axis.set_title(
         f"promise: at most {guarantee.alpha:.0%} bad, broken in at most {guarantee.delta:.0%}"
     )
-    right.set(
+    trials_axis.set(
         xlabel="share of test positions accepted", ylabel="realised share of bad ones among them"
     )
-    for axis in (left, right):
+    for axis in (coverage_axis, trials_axis):
         axis.legend(fontsize=8)
     save(figure, path)
 
@@ -263,9 +268,8 @@ def draw_sector_levels(method: Method, data: Measurements, fold: Fold, path: Pat
         # A median: rows behind buildings are far below the pattern, and would lower a mean.
         gain = float((rest + trend.pattern_loss(at)).median())
         axis.plot(turn, gain - trend.pattern_loss(torch.from_numpy(around)), color=PALETTE[1])
-        title = f"{stations.shown[t]}, {azimuth[t]:.0f} deg" + f" (given {nominal[t]:.0f})" * int(
-            turned[t]
-        )
+        given = f" (given {nominal[t]:.0f})" if turned[t] else ""
+        title = f"{stations.shown[t]}, {azimuth[t]:.0f} deg{given}"
         axis.set(title=title, xlim=(-180, 180), xticks=range(-180, 181, 90))
     few = [stations.shown[t] for t in np.flatnonzero((azimuth != NO_AZIMUTH) & ~enough)]
     note = f"; too few rows to draw: {list_first(few, 6)}" if few else ""

@@ -111,10 +111,10 @@ def draw_distributions(
     figure, ((*line,),) = panels(max(4.2 * len(names), WIDE), TALL, 1, len(names))
     for axes, name in zip(line, names, strict=True):
         for setting, group, style in _styled(rows):
-            every = [_values_of(row["run"], name) for row in group]
-            every = [values[np.isfinite(values)] for values in every]
-            count = max(map(len, every)) if name != TIMES else sum(map(len, every))
-            values, share = _shares(every)
+            samples = [_values_of(row["run"], name) for row in group]
+            samples = [values[np.isfinite(values)] for values in samples]
+            count = max(map(len, samples)) if name != TIMES else sum(map(len, samples))
+            values, share = _shares(samples)
             # DKW: P(sup |F_n - F| > e) <= 2 exp(-2 n e^2), Massart 1990 for the constant 2.
             half = np.sqrt(np.log(2 / (1 - BAND)) / (2 * max(count, 1)))
             axes.step(
@@ -165,7 +165,8 @@ def draw_sweep(rows: pd.DataFrame, title: str, path: Path, also: Sequence[str] =
         "mean"
     ].itertuples():
         labels[setting] = f"{shorten_setting(setting, 40)}: training {seconds:.3g} s"
-        labels[setting] += f", one query {ms:.3g} ms" * bool(np.isfinite(ms))
+        if np.isfinite(ms):
+            labels[setting] += f", one query {ms:.3g} ms"
     figure = draw_distributions(rows, names, labels)
     figure.suptitle(title, fontsize=9)
     save(figure, path, 100, also)
@@ -185,12 +186,12 @@ def _values_of(run: Run, name: str) -> np.ndarray:
 
 def _samples_of_rivals(rows: pd.DataFrame, name: str) -> dict[str, list[np.ndarray]]:
     """Per-sample figures of baselines by their names, an array for each draw."""
-    column, found = "mae_db" if name == "error_db" else name, dict[str, list[np.ndarray]]()
+    column, samples = "mae_db" if name == "error_db" else name, dict[str, list[np.ndarray]]()
     for base in _rivals(rows):
         values = base["run"].samples.get(f"baseline/{base['method']}/{column}", np.zeros(0))
         if np.isfinite(values).any():
-            found.setdefault(base["method"], []).append(values[np.isfinite(values)])
-    return found
+            samples.setdefault(base["method"], []).append(values[np.isfinite(values)])
+    return samples
 
 
 def _rivals(rows: pd.DataFrame) -> list[Row]:
@@ -207,8 +208,8 @@ def _styled(rows: pd.DataFrame) -> list[tuple[str, list[Row], dict[str, Any]]]:
     names = [str(group.method.iloc[0]) for group in groups.values()]
     unique = len(set(names)) == len(names)
     styles = [style_of(name).line if unique else numbered_style(i) for i, name in enumerate(names)]
-    every = zip(groups.items(), styles, strict=True)
-    return [(setting, group.to_dict("records"), style) for (setting, group), style in every]  # type: ignore[misc]
+    styled = zip(groups.items(), styles, strict=True)
+    return [(setting, group.to_dict("records"), style) for (setting, group), style in styled]  # type: ignore[misc]
 
 
 def shorten_setting(text: str, most: int = 32) -> str:
@@ -251,13 +252,14 @@ def draw_efforts(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] 
 
     `rows` are as of `average_cells`.
     """
-    groups = [here for _, here in rows.groupby("dataset", sort=False)]
+    groups = [group for _, group in rows.groupby("dataset", sort=False)]
     columns = max(group.split.nunique() for group in groups) + bool(rows.query_ms.any())
     size = (max(PANEL * columns, 6.0), 0.9 * PANEL * len(groups) + 0.9)
     figure, grid = panels(*size, len(groups), columns, sharey="row")
-    for line, here in zip(grid, groups, strict=True):
+    for line, dataset_rows in zip(grid, groups, strict=True):
         splits = [
-            (cells, "train_cpu_s", split) for split, cells in here.groupby("split", sort=False)
+            (cells, "train_cpu_s", split)
+            for split, cells in dataset_rows.groupby("split", sort=False)
         ]
         first = splits[0][0]
         wanted = [
@@ -267,7 +269,7 @@ def draw_efforts(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] 
         for axis, (cells, horizontal, shows) in zip(line, wanted, strict=False):
             _panel(axis, cells, horizontal, ours)
             label = "training, CPU [s]" if horizontal == "train_cpu_s" else "one query [ms]"
-            axis.set(title=f"{here.dataset.iloc[0]}, {shows}", xlabel=label)
+            axis.set(title=f"{dataset_rows.dataset.iloc[0]}, {shows}", xlabel=label)
         line[0].set_ylabel(score_heading(first.figure.iloc[0]))
         if lower_is_better(first.figure.iloc[0]):
             line[0].invert_yaxis()  # of the whole line: better is up in every panel
@@ -284,7 +286,7 @@ def _panel(axis: Any, rows: pd.DataFrame, horizontal: str, ours: str) -> None:
         cells = cells.sort_values("effort", na_position="first")
         style = style_of(str(name)).marked | {"markersize": 11 if name == ours else 6, "capsize": 2}
         x, spread = cells[horizontal].clip(lower=LEAST_S), cells.spread_db.fillna(0.0)
-        level = [shown(*one) for one in zip(cells.figure, cells.score_db, strict=True)]
+        level = [shown(*score) for score in zip(cells.figure, cells.score_db, strict=True)]
         axis.errorbar(x, level, spread, label=name, **style)
     set_log_axis(axis, 1.5)
 
@@ -302,15 +304,15 @@ def draw_splits(rows: pd.DataFrame, path: Path, also: Sequence[str] = ()) -> Non
     )
     for axis, split in zip(grid[0], splits, strict=True):
         # The largest effort
-        here = rows[rows.split == split].drop_duplicates("method", keep="last")
-        here = here.fillna({"value_error": 0.0}).set_index("method")
-        most = (here.value + here.value_error).max()
-        best = here.score_db.idxmax()
+        cells = rows[rows.split == split].drop_duplicates("method", keep="last")
+        cells = cells.fillna({"value_error": 0.0}).set_index("method")
+        most = (cells.value + cells.value_error).max()
+        best = cells.score_db.idxmax()
         for number, name in enumerate(names):
-            if name not in here.index:
+            if name not in cells.index:
                 axis.text(0.02 * most, number, "not possible", va="center", fontsize=8, color="0.5")
                 continue
-            row = here.loc[name]
+            row = cells.loc[name]
             bar = {
                 "color": style_of(name).colour,
                 "alpha": 1.0 if name == best else 0.45,
@@ -324,9 +326,9 @@ def draw_splits(rows: pd.DataFrame, path: Path, also: Sequence[str] = ()) -> Non
                 va="center",
                 fontsize=7.5,
             )
-        draws = int(here.seeds.max())
+        draws = int(cells.seeds.max())
         axis.set(title=f"{split}, {draws} draw{'s' * (draws > 1)}", xlim=(0, 1.5 * most))
-        axis.set_xlabel(axis_of(here.figure.iloc[0]))
+        axis.set_xlabel(axis_of(cells.figure.iloc[0]))
         axis.set_yticks(np.arange(len(names)), names)
         axis.grid(axis="y", visible=False)
     grid[0, 0].set_ylim(len(names) - 0.4, -0.6)
@@ -364,16 +366,16 @@ def draw_study(rows: pd.DataFrame, title: str, path: Path) -> None:
     figure, grid = panels(5 * len(wanted), 4, 1, len(wanted))
     figure.suptitle(title, fontsize=11)
     name = rows.figure.iloc[0]
-    for axes, (what, label, x, factor, y) in zip(grid[0], wanted, strict=True):
+    for axes, (change, label, x, factor, y) in zip(grid[0], wanted, strict=True):
         for variant, part in rows.groupby("variant", sort=False):
-            clean, part = part[part.what == "none"], part[part.what == what]
+            clean, part = part[part.what == "none"], part[part.what == change]
             if part.empty:
                 continue
             spread = part.spread.fillna(0.0) if y == ACCURACY else None
             line, *_ = axes.errorbar(
                 factor * part[x], part[y], spread, marker="o", capsize=2, label=variant
             )
-            if len(clean) and what != "none" and y == ACCURACY:
+            if len(clean) and change != "none" and y == ACCURACY:
                 axes.axhline(
                     clean.value.iloc[0], color=line.get_color(), linestyle=":", linewidth=1
                 )

@@ -65,10 +65,10 @@ def draw_floor_plan(outcome: Outcome, path: Path) -> None:
             dark = places[~reached, :2].T
             axis.scatter(*dark, s=size, c="lightgrey", label="nothing arrives" if first else None)
         draw_stations(axis, survey.transmitters[:, :2], "transmitter" if first else None, color="r")
-        left, right, south, north = axis.axis()
+        west, east, south, north = axis.axis()
         if len(triangles):
             draw_walls(axis, triangles)
-        set_bounds(axis, (left, south), (right, north), **({} if first else {"ylabel": ""}))
+        set_bounds(axis, (west, south), (east, north), **({} if first else {"ylabel": ""}))
     legend_below(figure)  # beside the title it would cover the last effects
     figure.suptitle(f"{outcome.data.site.name}: {len(places)} receivers\n{outcome.effects}")
     save(figure, path)

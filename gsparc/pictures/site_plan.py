@@ -149,12 +149,14 @@ def draw_site(
         how: dict[str, Any] = {"width_ratios": [width, 6.0]}
         figure, axes = panels(width + 6.0, max(height, 2.2 * len(jumping)), len(jumping), 2, **how)
         place = axes[0, 0].get_gridspec()[:, 0]
-        for one in axes[:, 0]:
-            one.remove()
+        for panel in axes[:, 0]:
+            panel.remove()
         axis = figure.add_subplot(place)
         axis.grid(alpha=0.3)
-        for one, t in zip(axes[:, 1], jumping, strict=True):
-            _draw_level(one, levels, t, [step for u, step in steps if u == t], data.site.level_unit)
+        for panel, t in zip(axes[:, 1], jumping, strict=True):
+            _draw_level(
+                panel, levels, t, [step for u, step in steps if u == t], data.site.level_unit
+            )
     _draw_map(axis, data, places, low, high, jumping)
     legend_below(figure, 4)
     figure.suptitle(_title(data, places))
@@ -224,8 +226,8 @@ def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> Non
     place, site = static_positions(data), data.site
     if not len(place):
         return
-    what = ENDS[site.still_end]
-    label = f"the {what}" if len(place) == 1 else f"{len(place)} stations ({what}s)"
+    noun = ENDS[site.still_end]
+    label = f"the {noun}" if len(place) == 1 else f"{len(place)} stations ({noun}s)"
     draw_stations(axis, place, label, zorder=2)
     if jumping:
         draw_stations(axis, place[list(jumping)], "its level jumps", zorder=2, color="red")

@@ -44,9 +44,9 @@ def calibrated_box(*places: np.ndarray) -> np.ndarray:
     array([[-1., -1., -1.],
            [11.,  6.,  1.]])
     """
-    every = np.concatenate(places)
-    margin = MARGIN * np.ptp(every, axis=0).max()
-    return np.stack([every.min(axis=0) - margin, every.max(axis=0) + margin])
+    joined = np.concatenate(places)
+    margin = MARGIN * np.ptp(joined, axis=0).max()
+    return np.stack([joined.min(axis=0) - margin, joined.max(axis=0) + margin])
 
 
 def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:
@@ -140,12 +140,12 @@ class Trusted(Stored):
         if kind in RIVALS and places is None:
             raise ValueError(f"confidence={kind}: needs a position, and an uplink has none")
         if (score := self.score(kind, prediction, places)) is None:
-            what = (
+            fault = (
                 "has no confidence of its own"
                 if kind == "learned"
                 else ("states no error variance")
             )
-            raise ValueError(f"confidence={kind}: this model {what}")
+            raise ValueError(f"confidence={kind}: this model {fault}")
         return as_confidence(kind, score).astype(np.float32)
 
     def score(self, kind: str, said: Prediction, places: np.ndarray | None) -> np.ndarray | None:

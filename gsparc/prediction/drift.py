@@ -134,7 +134,9 @@ class Watch(Stored):
                 if result.kind[name]:
                     each[result.every + 1 + name] = row["back"]
                 raised = [
-                    key for key, one in each.items() if result._advance(key, number, one, rows)
+                    key
+                    for key, ratio_of_key in each.items()
+                    if result._advance(key, number, ratio_of_key, rows)
                 ]
                 if raised:
                     result = result._note(row, raised[-1], stations, extent)
@@ -148,8 +150,8 @@ class Watch(Stored):
     ) -> np.ndarray:
         """Rows from number `first` on in their order, with what each misses in deviations."""
         parts = [np.zeros(0, ROW)]
-        for station, each_station in stations.items():
-            later = each_station[each_station.number >= int(self.begun[station])]
+        for station, rows_of_station in stations.items():
+            later = rows_of_station[rows_of_station.number >= int(self.begun[station])]
             start = int((later.number < first).sum())
             if start == len(later):
                 continue
@@ -249,7 +251,7 @@ def _find_kind(alarm: Alarm, rows: LaterRows, extent: float, cells: int) -> int:
         return 0 if alarm.kind == RETURNED else DEVICE
     likely = evidence([rows], extent, 0.0)[0, 0] + SHARE.log()
     # Of few cells an offset would look alike.
-    there = [one.name == "local" or (one.name != "none" and cells >= SPREAD) for one in KINDS]
+    there = [kind.name == "local" or (kind.name != "none" and cells >= SPREAD) for kind in KINDS]
     return int(torch.where(torch.tensor(there), likely, -math.inf).argmax())
 
 

@@ -82,7 +82,9 @@ class JointMixin:
                     + np.eye(len(stations)) * np.where(listed[part], joint.noise, UNREAD)[:, None]
                 )
                 reduction = field @ np.linalg.solve(read, field)
-                variance, reduction = (one.diagonal(axis1=1, axis2=2) for one in (field, reduction))
+                variance, reduction = (
+                    matrices.diagonal(axis1=1, axis2=2) for matrices in (field, reduction)
+                )
                 noise = variance * (variance - reduction) / np.maximum(reduction, 1 / UNREAD)
                 # k stations tell as much as k measurements of one at best.
                 more[part] = np.maximum(noise, joint.noise / len(stations)) - joint.noise

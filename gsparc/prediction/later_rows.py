@@ -53,8 +53,8 @@ def check_updatable(site: Site) -> None:
     or both ends move.
     """
     if not site.maps_levels:
-        what = f"{site.target.called}{' of two moving ends' * site.target.is_level}"
-        raise ValueError(f"update: models of {what} cannot be updated: train again on all rows")
+        targets = site.target.called + (" of two moving ends" if site.target.is_level else "")
+        raise ValueError(f"update: models of {targets} cannot be updated: train again on all rows")
 
 
 def read_level_rows(data: Measurements, site: Site) -> LevelRows:
@@ -119,7 +119,7 @@ def read_level_arrays(
             check.refuse(name, "nothing was measured; expected numbers")
     if at is None or values is None or check.problems:
         first, *others = dict.fromkeys(check.problems)
-        raise DataError(first + f" (and {len(others)} more)" * bool(others))
+        raise DataError(f"{first} (and {len(others)} more)" if others else first)
     row, station = np.nonzero(~np.isnan(values) & ~silent)
     level = to_decibels(unit.stored(torch.from_numpy(values)).numpy()[row, station])
     names = np.array(check.row_names)[row]

@@ -87,11 +87,11 @@ def score_answers(
     miss, power = ((x.abs().square().flatten(1).sum(1)) for x in (said.mean - true, true))
     # A silent row has no relative error: any miss of it counts as huge.
     error = (miss / power.clamp_min(1e-30)).double().numpy()
-    every = {kind: rivals.score(kind, said, places) for kind in KINDS}
+    score_of = {kind: rivals.score(kind, said, places) for kind in KINDS}
     # Scores with a NaN rank nothing.
     scores = {
         kind: score
-        for kind, score in every.items()
+        for kind, score in score_of.items()
         if score is not None and not np.isnan(score).any()
     }
     return Evidence(rows, places, error, scores)
@@ -177,8 +177,8 @@ def held_out_levels(
     far = nearest_distances(
         data.moving[train_rows], data.stations_of(train_rows), data.moving[rows], station
     )
-    every = HeldOutLevels(level, mean, spread, far, block, station, side)
-    return every.subset(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread))
+    levels = HeldOutLevels(level, mean, spread, far, block, station, side)
+    return levels.subset(np.isfinite(level) & np.isfinite(mean) & np.isfinite(spread))
 
 
 def nearest_distances(

@@ -49,7 +49,7 @@ def store_points(path: Path, points: Sequence[Mapping[str, Any]], inputs: Reduct
     """Store points, rows of a trade-off, in a checkpoint, replacing earlier ones;
     see `update_extra`.
     """
-    found = [
+    operating = [
         Operating(
             p["label"],
             dict(p["settings"]),
@@ -60,7 +60,7 @@ def store_points(path: Path, points: Sequence[Mapping[str, Any]], inputs: Reduct
         )
         for p in points
     ]
-    checkpoint.update_extra(path, {KEY: {"points": to_plain(found), "measured": inputs}})
+    checkpoint.update_extra(path, {KEY: {"points": to_plain(operating), "measured": inputs}})
 
 
 def stored_points(extra: dict[str, Any]) -> tuple[list[Operating], ReductionInputs]:
@@ -104,17 +104,17 @@ def choose_within_budget(
     places = draw.uniform(low, high, (QUERIES, len(low)))
     calls = {i: Predictor(way, site).cycle_places(places) for i, way in enumerate(ways)}
     times = time_interleaved(calls, CLOCK, {i: point.threads for i, point in enumerate(points)})
-    here = {i: float(np.quantile(ms, QUANTILE)) for i, ms in times.items()}
-    fitting = [i for i in here if here[i] <= budget_ms]
+    latencies = {i: float(np.quantile(ms, QUANTILE)) for i, ms in times.items()}
+    fitting = [i for i in latencies if latencies[i] <= budget_ms]
     if not fitting:
-        fastest = min(here, key=lambda i: here[i])
+        fastest = min(latencies, key=lambda i: latencies[i])
         raise ValueError(
             f"budget_ms={budget_ms:g}: no operating point of {stored.path} is that fast on this "
             "machine; the "
-            f"fastest ({points[fastest].label}) takes {here[fastest]:.3g} ms{advice}"
+            f"fastest ({points[fastest].label}) takes {latencies[fastest]:.3g} ms{advice}"
         )
     # The most accurate of those that fit; of equally accurate ones the fastest.
-    best = max(fitting, key=lambda i: (points[i].score, -here[i]))
+    best = max(fitting, key=lambda i: (points[i].score, -latencies[i]))
     torch.set_num_threads(points[best].threads)
     log.info("%s: %s, %.3g ms here", stored.path, points[best].label, np.median(times[best]))
     return ways[best], points[best]

@@ -121,8 +121,8 @@ def say_tiny_extent(queries: QueryPlaces, world: dict[End, np.ndarray], site: Si
     side = float((high - low).max())
     if not 0 < wide <= SPECK * side:
         return None
-    here = f"all places lie within {wide:.2g} m of each other, those measured within {side:.3g} m"
-    return f"{here}: degrees or km as x and y?"
+    extent = f"all places lie within {wide:.2g} m of each other, those measured within {side:.3g} m"
+    return f"{extent}: degrees or km as x and y?"
 
 
 def rows_and_stations(
@@ -151,14 +151,14 @@ def rows_and_stations(
         raise DataError(f"station={wanted}: no such station{suggest_or_list(wanted, called)}")
     if queries.station is None:
         # Each row about every station, those of one row side by side.
-        every = np.arange(len(stations)) if only is None else np.array([only])
-        return np.repeat(rows, len(every)), np.tile(every, len(rows))
+        numbers_asked = np.arange(len(stations)) if only is None else np.array([only])
+        return np.repeat(rows, len(numbers_asked)), np.tile(numbers_asked, len(rows))
     # By name alone: a number is a name, or wrong.
     numbers = {name: find_station(name, stations) for name in called}
     plain = queries.station if queries.plain is None else queries.plain
     words = zip(queries.station.tolist(), plain.tolist(), strict=True)
-    found = (numbers.get(word, numbers.get(short)) for word, short in words)
-    number = np.array([-1 if one is None else one for one in found], np.int64)
+    matches = (numbers.get(word, numbers.get(short)) for word, short in words)
+    number = np.array([-1 if match is None else match for match in matches], np.int64)
     if (number < 0).any():
         row = int(np.argmax(number < 0))
         word = str(queries.station[row])

@@ -188,14 +188,14 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
             )
         if not (np.isfinite(frequency_hz) and frequency_hz > 0):
             raise ValueError(f"frequency_hz={frequency_hz}: expected a frequency above 0 [Hz]")
-        if len(here := np.flatnonzero(np.isclose(carriers, frequency_hz, rtol=1e-6))) == 1:
-            return self.ask_station(int(here[0]))
+        if len(matches := np.flatnonzero(np.isclose(carriers, frequency_hz, rtol=1e-6))) == 1:
+            return self.ask_station(int(matches[0]))
         both = self.method, self._whole
-        if not all(isinstance(one, AddsCarriers) for one in both):
+        if not all(isinstance(answerer, AddsCarriers) for answerer in both):
             raise ValueError(
                 f"frequency_hz={frequency_hz:g}: {self.method.name} has no other carriers"
             )
-        method, whole = (cast(AddsCarriers, one).add_carrier(frequency_hz) for one in both)
+        method, whole = (cast(AddsCarriers, method).add_carrier(frequency_hz) for method in both)
         return self._view(method, whole, method.fitted_site, self._unit).ask_station(len(carriers))
 
     def _view(
@@ -322,16 +322,14 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         if has_station or not self.site.target.is_level or self.site.stations is None:
             return ask(self)
         # One call for all stations where the method has one, else a call for each.
-        every = self.method.all_stations() if isinstance(self.method, PerStation) else None
-        if every is not None:
-            return ask(self._view(every, None, station_site(self.site, 0), self._unit))
+        shared = self.method.all_stations() if isinstance(self.method, PerStation) else None
+        if shared is not None:
+            return ask(self._view(shared, None, station_site(self.site, 0), self._unit))
         stations = self._each_station()
         answers = [None if predictor is None else ask(predictor) for predictor in stations]
-        answer = next(one for one in answers if one is not None)
+        answer = next(present for present in answers if present is not None)
         # A station without an answer: NaN in the shape of the others', NumPy or torch alike.
-        columns = [
-            answer * np.nan if each_answer is None else each_answer for each_answer in answers
-        ]
+        columns = [answer * np.nan if own_answer is None else own_answer for own_answer in answers]
         return (
             torch.cat(columns, dim=-1)
             if isinstance(answer, Tensor)

@@ -117,9 +117,9 @@ def split_choose_calibrate_test(
     order = rng.permutation(unit.max(initial=-1) + 1)
     first, second = (round(share * len(order)) for share in np.cumsum(SHARES))
     if not 0 < first < second < len(order):
-        what = "patches of the plane" if spatial else "positions"
+        units = "patches of the plane" if spatial else "positions"
         raise ValueError(
-            f"{len(order)} {what} cannot be parted into those to choose on, to calibrate on and "
+            f"{len(order)} {units} cannot be parted into those to choose on, to calibrate on and "
             "to test on: "
             f"take more test rows{', or spatial=false' * spatial}"
         )

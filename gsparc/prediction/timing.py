@@ -148,9 +148,9 @@ def time_beside_copy(
     """Return `SPEED` of calls by name, timed in turns with one another and a copy;
     see `time_interleaved`.
     """
-    every: dict[Any, Call] = {COPY: reference_copy(), **calls}
+    timed: dict[Any, Call] = {COPY: reference_copy(), **calls}
     # A copy of memory is made by one thread.
-    times = time_interleaved(every, clock, None if threads is None else {COPY: 1} | dict(threads))
+    times = time_interleaved(timed, clock, None if threads is None else {COPY: 1} | dict(threads))
     copy_ms = float(np.median(times.pop(COPY)))
     rows = ((name, *p50_p95(ms), len(ms)) for name, ms in times.items())
     return {

@@ -399,7 +399,7 @@ class UpdateMixin:
                 torch.zeros_like(missed),
                 torch.from_numpy(rows.side[index] != 0),
             )
-        return {name: one for name, one in result.items() if len(one)}
+        return {name: rows for name, rows in result.items() if len(rows)}
 
 
 def read_versions(extra: Mapping[str, Any]) -> tuple[Version, ...]:

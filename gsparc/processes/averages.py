@@ -71,7 +71,7 @@ def mixture_moments(parts: Sequence[tuple[float, Tensor, Tensor]]) -> MeanVarian
     """
     if len(parts) == 1:
         return MeanVariance(*parts[0][1:])
-    mean = torch.stack([share * each_part for share, each_part, _ in parts]).sum(0)
+    mean = torch.stack([share * mean_of_part for share, mean_of_part, _ in parts]).sum(0)
     deviations = (
         (part - mean).abs().square().reshape(len(mean), -1).mean(1) for _, part, _ in parts
     )

@@ -246,17 +246,17 @@ def evidence(
         extent, common, scale: see `Belief`.
         looked: rows of a station, at most.
     """
-    every = [rows.spread(extent, looked) for rows in stations]
-    most = max(len(rows) for rows in every)
+    spread = [rows.spread(extent, looked) for rows in stations]
+    most = max(len(rows) for rows in spread)
     # Stations of fewer rows get rows of endless noise, which tell nothing of kinds.
-    missed = torch.stack([_padded(_values(rows, common).T, most) for rows in every]).mT
+    missed = torch.stack([_padded(_values(rows, common).T, most) for rows in spread]).mT
     parts = (
-        torch.stack([_padded(getattr(rows, n), most) for rows in every])
+        torch.stack([_padded(getattr(rows, n), most) for rows in spread])
         for n in ("places", "doubt")
     )
     places, doubt = parts
-    noise = torch.stack([_padded(rows.noise, most, UNTOLD) for rows in every])[:, None]
-    faded = torch.stack([_padded(rows.faded, most) for rows in every])[:, None]
+    noise = torch.stack([_padded(rows.noise, most, UNTOLD) for rows in spread])[:, None]
+    faded = torch.stack([_padded(rows.faded, most) for rows in spread])[:, None]
     noise = NOISES[:, None] + noise + faded + TINY
     gram = covariance_by_kind(places, places, doubt, doubt, extent, scale)[:, None].repeat(
         1, len(NOISES), 1, 1, 1

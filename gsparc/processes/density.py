@@ -174,7 +174,7 @@ def density_without_groups(
     errors = [left_out_residuals(inverse, inverse @ values, groups) for groups in parts]
     variance = torch.cat([error.variance for error in errors])
     amplitude = (
-        (torch.cat([each_error.residual for each_error in errors])[:, 0].square() / variance)
+        (torch.cat([error.residual for error in errors])[:, 0].square() / variance)
         .mean()
         .clamp_min(FLAT)
     )

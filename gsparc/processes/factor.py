@@ -84,7 +84,7 @@ class Factor:
         if failing == "raise":
             raise NotDefiniteError("a covariance is not positive definite")
         if covariance.dim() > 2:
-            return cls(torch.stack([cls.from_gram(one).lower for one in covariance]))
+            return cls(torch.stack([cls.from_gram(matrix).lower for matrix in covariance]))
         exact = covariance.to(torch.complex128 if covariance.is_complex() else torch.float64)
         exact = exact.clone() if exact is covariance else exact
         bound, added = ROUNDING * float(exact.diagonal().real.sum()), 0.0
@@ -188,14 +188,14 @@ def whiten_in_float32(factors: Sequence[Factor], values: Sequence[Tensor]) -> li
 
     Rounding moves their squares by 1e-6 where the noise is a hundredth of the signal's variance.
     """
-    if is_differentiated(*values) or max(len(each_factor.lower) for each_factor in factors) > ALONE:
+    if is_differentiated(*values) or max(len(factor.lower) for factor in factors) > ALONE:
         return [factor.whiten(part) for factor, part in zip(factors, values, strict=True)]
     single, result = [part.float().numpy() for part in values], []
     # OpenBLAS multiplies few columns in a third of torch's time.
     with BLAS.limit(limits=1):
-        for one, part in zip(factors, single, strict=True):
+        for own, part in zip(factors, single, strict=True):
             result.append(
-                np.concatenate([band @ part[: band.shape[1]] for band in one._inverse_in_float32])
+                np.concatenate([band @ part[: band.shape[1]] for band in own._inverse_in_float32])
             )
     return [torch.from_numpy(part).to(values[0].dtype) for part in result]
 

@@ -47,8 +47,8 @@ def first_rows(order: np.ndarray, most: int, group: np.ndarray, silent: np.ndarr
         silent: (n,) bool, rows where nothing was heard.
     """
     chosen = [order[:0]]
-    for one in np.unique(group):
-        rows = order[group[order] == one]
+    for number in np.unique(group):
+        rows = order[group[order] == number]
         loud, quiet = rows[~silent[rows]], rows[silent[rows]]
         if len(rows) > most:
             share = max(round(most * len(loud) / len(rows)), min(len(loud), most // 2))

@@ -215,9 +215,9 @@ def fit_kernel_by_evidence(
 
     def negative_log_evidence(at: Tensor) -> Tensor:
         kernel, total = start.with_values(at[:-1]), at.new_zeros(())
-        for view, side, found in zip(views, sides, last, strict=True):
+        for view, side, before in zip(views, sides, last, strict=True):
             gram = at[-1].exp() * view.gram(kernel)
-            total = total + NegativeLogEvidence.apply(gram, view.values[:, 0], side, found)  # type: ignore[no-untyped-call]
+            total = total + NegativeLogEvidence.apply(gram, view.values[:, 0], side, before)  # type: ignore[no-untyped-call]
         return total / count
 
     best = np.append(start.parameters().numpy(), math.log(start.amplitude))

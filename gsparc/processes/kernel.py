@@ -315,8 +315,8 @@ class Kernel(Stored):
             parts = [
                 f"{part} ({share:.0%})" for part, share in zip(parts, self.shares, strict=True)
             ]
-        ends = [" of each end" * isinstance(term, EndShadowing) for term in self.signals]
-        kind = "exponential " * isinstance(self.terms[0], ExponentialShadowing)
+        ends = [" of each end" if isinstance(term, EndShadowing) else "" for term in self.signals]
+        kind = "exponential " if isinstance(self.terms[0], ExponentialShadowing) else ""
         word = "lengths" if len(parts) > 1 else "length"
         text = " and ".join(part + end for part, end in zip(parts, ends, strict=True))
         return f"{kind}{word} {text}, noise {self.noise:.3g} of the signal's variance"

@@ -64,7 +64,7 @@ def _padded_blocks(
     """Yield numbers (c,) of sets of rows, their rows (c, m), which of these are valid,
     and `K^-1` of them.
     """
-    size = torch.tensor([len(each_set) for each_set in sets])
+    size = torch.tensor([len(members) for members in sets])
     order = size.argsort()
     while len(order):
         # The largest that is left, and as many as memory takes with it.
@@ -82,7 +82,9 @@ def left_out_around(inverse: Tensor, weights: Tensor, rows: Tensor, near: Tensor
     and variances.
     """
     residual, variance = weights[rows].clone(), inverse.diagonal()[rows].real.clone()
-    for part, index, valid, block in _padded_blocks(inverse, [one.nonzero()[:, 0] for one in near]):
+    for part, index, valid, block in _padded_blocks(
+        inverse, [mask.nonzero()[:, 0] for mask in near]
+    ):
         unit = ((index == rows[part, None]) & valid).to(inverse.dtype)
         share = block.solve(unit[..., None])[..., 0] * valid
         residual[part] = torch.einsum("cm,cmr->cr", share.to(weights.dtype), weights[index])
@@ -121,4 +123,4 @@ def rows_of_groups(number: np.ndarray) -> list[Tensor]:
     >>> rows_of_groups(np.array([7, 3, 7]))
     [tensor([1]), tensor([0, 2])]
     """
-    return [torch.from_numpy(np.flatnonzero(number == one)) for one in np.unique(number)]
+    return [torch.from_numpy(np.flatnonzero(number == value)) for value in np.unique(number)]

@@ -76,8 +76,8 @@ def fit_level_field(
     """
     count, wide = len(level), float(np.ptp(place, axis=0).max())
     table = np.column_stack([level, *columns])
-    parts = [np.flatnonzero(group == one) for one in np.unique(group)]
-    found = []
+    parts = [np.flatnonzero(group == value) for value in np.unique(group)]
+    fields = []
     for length in (max(reach * wide, 1e-9) for reach in REACHES):
         for nugget in nuggets:
             gram, logarithms, means = np.zeros((table.shape[1],) * 2), 0.0, []
@@ -102,7 +102,7 @@ def fit_level_field(
                 more = float(np.log1p(spread * weight).sum()) + math.log(values.sum())
                 more += len(slope) * math.log(count)
                 score = -0.5 * (count * math.log(variance) + logarithms + more)
-                found.append(
+                fields.append(
                     LevelField(score, replace(kernel, amplitude=variance), table[:, 1:], slope)
                 )
-    return max(found, key=lambda one: one.score)
+    return max(fields, key=lambda one: one.score)

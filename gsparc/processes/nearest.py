@@ -251,21 +251,21 @@ def condition_on_nearest(
         cover: see `trend_mean_and_covariance`.
     """
     # The mean of n measurements has an n-th of their noise.
-    noise, every = prior.kernel.noise / values.count, values
+    noise, all_values = prior.kernel.noise / values.count, values
     if pseudo_values is not None and pseudo_variance is not None:
         noise = torch.cat([noise, prior.kernel.noise + pseudo_variance])
-        every = PlaceValues(
+        all_values = PlaceValues(
             np.concatenate([values.places, pseudo_values.places]),
             torch.cat([values.values, pseudo_values.values]),
             torch.cat([values.count, pseudo_values.count]),
         )
-    near = Neighbourhood.from_places(every.places, seed)
+    near = Neighbourhood.from_places(all_values.places, seed)
     if prior.trend is None:
-        none = torch.zeros(0, every.values.shape[1], dtype=torch.float64)
-        return Nearest(prior, near, every.values, noise, none, none[:, :0], neighbours)
-    places = torch.from_numpy(every.places)
-    rest = every.values - prior.mean(places)
-    terms, spread = trend_mean_and_covariance(prior, every.places, rest, noise, seed, cover)
+        none = torch.zeros(0, all_values.values.shape[1], dtype=torch.float64)
+        return Nearest(prior, near, all_values.values, noise, none, none[:, :0], neighbours)
+    places = torch.from_numpy(all_values.places)
+    rest = all_values.values - prior.mean(places)
+    terms, spread = trend_mean_and_covariance(prior, all_values.places, rest, noise, seed, cover)
     return Nearest(prior, near, rest, noise, terms, spread, neighbours)
 
 
@@ -354,12 +354,12 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
     count, start = len(values.places), prior.kernel
     if count <= NEIGHBOURS:
         return start, f"settings of {count} places, as they were"
-    every = torch.from_numpy(values.places)
-    rest = values.values - prior.mean(every)
+    places = torch.from_numpy(values.places)
+    rest = values.values - prior.mean(places)
     about, _ = trend_mean_and_covariance(
         prior, values.places, rest, start.noise / values.count, seed, FEW
     )
-    rest = rest - prior.columns(every) @ about
+    rest = rest - prior.columns(places) @ about
     level = Neighbourhood.from_places(values.places, seed).level
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]
     parts = []
@@ -367,7 +367,7 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
         row = covering_rows(values.places[members], LOOKED_AT // len(sets), seed)
         parts.append(members[rows_with_nearest(values.places[members], row, LOOKED_BY)])
     rows = np.concatenate(parts)
-    near = distances(every[rows], every[rows])
+    near = distances(places[rows], places[rows])
     sample = NeighbourSample(near, rest[rows], values.count[rows])
     scale = pdist(values.places[sets[0][:: -(-len(sets[0]) // LOOKED_AT)]])
     long, shares = start.lengths[-1], (0.5, 0.5)

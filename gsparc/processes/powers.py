@@ -93,7 +93,7 @@ class PowerRows:
         """
         rng = np.random.default_rng(seed)
         order = np.concatenate(
-            [rng.permutation(np.flatnonzero(one)) for one in (~self.silent, self.silent)]
+            [rng.permutation(np.flatnonzero(mask)) for mask in (~self.silent, self.silent)]
         )
         return self.subset(first_rows(order, count, np.zeros(len(order)), self.silent))
 

@@ -95,7 +95,7 @@ class Sectors(Trend):
 
     def known_mean(self, places: Tensor) -> Tensor:
         """Return what `more` terms have as their mean (n,) [dB]."""
-        return sum((one.mean(places) for one in self.more), places.new_zeros(len(places)))
+        return sum((term.mean(places) for term in self.more), places.new_zeros(len(places)))
 
     def powers_at(  # type: ignore[override]
         self, places: Tensor, shared: Tensor, levels: Tensor, own: Tensor | None = None

@@ -119,7 +119,7 @@ class SharedTermsPosterior:
             at = at[there]
             spread = prior.kernel.amplitude * prior.variance(term[at])
             if white:
-                reduction = torch.stack([one.square().sum(1) for one in white])
+                reduction = torch.stack([root.square().sum(1) for root in white])
                 spread = (spread - reduction[there]).clamp_min(0.0)
             mean = mean.index_add(0, at, more[there])
             variance = variance.index_add(0, at, spread + shared.square().sum(2)[there])
@@ -139,7 +139,7 @@ class SharedTermsPosterior:
             matrix + kernel.noise * torch.eye(groups[1], dtype=matrix.dtype)
         )
         # Rows take variance away; weights that are not fully known give some back.
-        for root, sign in (*((one, -1) for one in white), (shared[0], 1)):
+        for root, sign in (*((root, -1) for root in white), (shared[0], 1)):
             each = root.unflatten(0, groups)
             matrix = matrix + sign * each @ each.mT
         mean = self.never.mean(flat)[:, 0] + more[0]
@@ -155,8 +155,8 @@ class SharedTermsPosterior:
         if self._alike and numbers == sorted(self.processes) and max(map(len, at)) <= ROUNDED:
             yield tuple(numbers), pad_sequence(at, batch_first=True, padding_value=-1)
             return
-        for each_number, queries in zip(numbers, at, strict=True):
-            yield from (((each_number,), part[None]) for part in queries.split(QUERIES))
+        for station, queries in zip(numbers, at, strict=True):
+            yield from (((station,), part[None]) for part in queries.split(QUERIES))
 
     def _condition(
         self,
@@ -189,15 +189,12 @@ class SharedTermsPosterior:
                 part[:, : len(factor.lower)].T for factor, part in zip(factors, cross, strict=True)
             ]
             if rounded:
-                white = [one.T for one in whiten_in_float32(factors, parts)]
+                white = [root.T for root in whiten_in_float32(factors, parts)]
             else:
-                white = [
-                    each_factor.whiten(part).T
-                    for each_factor, part in zip(factors, parts, strict=True)
-                ]
+                white = [factor.whiten(part).T for factor, part in zip(factors, parts, strict=True)]
             if len(self.mean):
                 projections = [
-                    one.double() @ block.columns for one, block in zip(white, blocks, strict=True)
+                    root.double() @ block.columns for root, block in zip(white, blocks, strict=True)
                 ]
                 shared = shared - torch.cat(projections)
         if len(self.mean):

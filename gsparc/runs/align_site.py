@@ -33,9 +33,11 @@ def align_to_site(data: Measurements, site: Site, *, whole: bool = False) -> Mea
     """
     ours = data.site
     for name in ("kind", "static_end", "grid"):
-        here, there = getattr(ours, name), getattr(site, name)
-        if here != there:
-            raise ValueError(f"the model was trained with {name} {there}, {ours.name} has {here}")
+        ours_value, site_value = getattr(ours, name), getattr(site, name)
+        if ours_value != site_value:
+            raise ValueError(
+                f"the model was trained with {name} {site_value}, {ours.name} has {ours_value}"
+            )
     data = _about(data, site)
     if site.unknown_factor != "none":  # few rows of another file may not tell
         data = replace(data, site=replace(data.site, unknown_factor=site.unknown_factor))
@@ -56,7 +58,7 @@ def align_to_site(data: Measurements, site: Site, *, whole: bool = False) -> Mea
     same_units = ours.level_unit == site.level_unit and ours.target_scale == site.target_scale
     if same_units and not shift.any() and rescale == 1:
         return data
-    there = replace(
+    site_value = replace(
         ours,
         origin=site.origin,
         box=ours.box + shift,
@@ -67,7 +69,7 @@ def align_to_site(data: Measurements, site: Site, *, whole: bool = False) -> Mea
     )
     return replace(
         data,
-        site=there,
+        site=site_value,
         tx=data.tx + shift,
         rx_position=data.rx_position + shift,
         target=_times(data.target, rescale),
@@ -83,7 +85,7 @@ def _with_entries(data: Measurements, site: Site) -> Measurements:
     """
     if not site.target.is_complex or (data.site.measured is None and site.measured is None):
         return data
-    have, want = (one.measured for one in (data.site, site))
+    have, want = (described.measured for described in (data.site, site))
     shape = data.target.shape[1:] if have is None else have.shape
     want = np.ones(shape, bool) if want is None else want
     if want.shape != shape:
@@ -92,7 +94,7 @@ def _with_entries(data: Measurements, site: Site) -> Measurements:
             f"{shape}"
         )
     known = np.ones(data.target.shape, bool) if data.mask is None else data.mask
-    target, mask = (np.zeros((len(data), *shape), one.dtype) for one in (data.target, known))
+    target, mask = (np.zeros((len(data), *shape), array.dtype) for array in (data.target, known))
     for whole, part in ((target, data.target), (mask, known)):
         whole[:, np.ones(shape, bool) if have is None else have] = part.reshape(len(data), -1)
     rows, columns = want.any(1), want.any(0)
@@ -176,9 +178,8 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray, whole: bool) 
     if not is_known.all():
         fault = _explain_unknown(data.site.name, ours, theirs, number < 0)
         if whole or not is_known.any():
-            raise ValueError(
-                fault + "; dataset.stations=[NAME,...] keeps the others" * bool(is_known.any())
-            )
+            advice = "; dataset.stations=[NAME,...] keeps the others" if is_known.any() else ""
+            raise ValueError(fault + advice)
         log.warning("%s: %d of %d rows are left out", fault, (~is_known).sum(), len(is_known))
         data = data.subset(np.flatnonzero(is_known))
     facts = replace(data.site, stations=theirs, static_position=site.static_position)

@@ -36,10 +36,10 @@ def add_settings_of_run(words: Sequence[str]) -> list[str]:
         return [*words]
     files = (hydra_dir / "overrides.yaml", hydra_dir / "hydra.yaml")
     its, hydra = (yaml.safe_load(file.read_text(encoding="utf-8")) for file in files)
-    lines = [one for one in its if not {_key(one), _key(one).partition(".")[0]} & values.keys()]
+    lines = [line for line in its if not {_key(line), _key(line).partition(".")[0]} & values.keys()]
     # Of runs that seconds ended
     lines = [line for line in lines if _key(line).rpartition(".")[2] not in GONE]
-    lines = [_found_from(Path(hydra["hydra"]["runtime"]["cwd"]), each_line) for each_line in lines]
+    lines = [_found_from(Path(hydra["hydra"]["runtime"]["cwd"]), line) for line in lines]
     if {"-m", "--multirun"} & {*words}:
         return [*lines, *words]
     lines.append("hydra.mode=RUN")  # it may be a job of a multirun

@@ -150,27 +150,25 @@ def evaluate(
     same = FittedBaseline(methods, scores, tuple(seconds or ()))
     told = eval_on, learned, hearing
     fits = {n: same if n == shared else fit_baseline(n, data, split, *told) for n in names}
-    others = {f"baseline/{name}": each_fit for name, each_fit in fits.items()}
+    others = {f"baseline/{name}": fit for name, fit in fits.items()}
     facts: dict[str, Any] = {}
-    every = {eval_on: scores, **{room: other.scores for room, other in others.items()}}
+    scores_of = {eval_on: scores, **{room: other.scores for room, other in others.items()}}
     # The first fold's methods alone are timed: folds differ in rows, hardly in cost.
     contenders = {"time": methods[0], **{room: other.methods[0] for room, other in others.items()}}
     fields = [
-        each_method
-        for each_method in (method.without_process() for method in methods)
-        if each_method is not None
+        field for field in (method.without_process() for method in methods) if field is not None
     ]
     # Only where each fold kept its field: figures of some folds would be of other rows
     # than those beside.
     if len(fields) == len(methods):
-        every[FIELD] = score_methods(fields, data, split, eval_on, learned, hearing=hearing)
+        scores_of[FIELD] = score_methods(fields, data, split, eval_on, learned, hearing=hearing)
         contenders[FIELD] = fields[0]
-    nearest = every.get("baseline/nearest")
-    for room, one in every.items():
-        figures = {**pool_figures(one, data, split), "skill": _skill(one, nearest)}
+    nearest = scores_of.get("baseline/nearest")
+    for room, rival in scores_of.items():
+        figures = {**pool_figures(rival, data, split), "skill": _skill(rival, nearest)}
         facts |= {f"{room}/{figure}": value for figure, value in figures.items()}
     judged = judged_by({**facts, "dataset/kind": data.site.scored}, eval_on)
-    cells = {"": every}
+    cells = {"": scores_of}
     if off := [int(number) for number in unlisted_stations(scores, data).index]:
         # Rows of lists that they do not fill are judged by other levels:
         # it is no choice of rows alone.
@@ -179,8 +177,8 @@ def evaluate(
             room: score_methods(fitted, data, split, eval_on, learned, off=off, hearing=hearing)
             for room, fitted in fitted_of.items()
         }
-        for room, one in cells[WITHOUT_OFF].items():
-            rest = pool_figures(one, data, split)
+        for room, rival in cells[WITHOUT_OFF].items():
+            rest = pool_figures(rival, data, split)
             facts |= {f"{room}/{name}{WITHOUT_OFF}": rest.get(name) for name in OF_LISTS}
     for (end, scored), (room, other), (ahead, figure) in product(
         cells.items(), others.items(), judged.items()
@@ -202,12 +200,14 @@ def evaluate(
     )
     facts["split/unseen_runs"] = sum(len(unseen_runs(data, fold, eval_on)) for fold in split.folds)
     facts |= _about(methods, seconds, data, split)
-    if FIELD in every:
+    if FIELD in scores_of:
         facts[f"{FIELD}/train_s"] = facts["time/train_s"]
     beside = {f"{room}/": other.scores for room, other in others.items()}
     columns = _columns(scores, data)
-    for stem, one in beside.items():
-        columns |= {f"{stem}{name}": values for name, values in paired_values(one.samples).items()}
+    for stem, rival in beside.items():
+        columns |= {
+            f"{stem}{name}": values for name, values in paired_values(rival.samples).items()
+        }
     beside_it = {name: fit.methods[0] for name, fit in fits.items() if fit is not same}
     example_methods = beside_it | {methods[0].name: methods[0]}
     rows = rows_to_score(split.folds[0], eval_on)
@@ -224,13 +224,15 @@ def _about(
 
     Steps are means over folds, the rest of `model/*` is of the first.
     """
-    first, every = methods[0], [method.facts() for method in methods]
+    first, facts_of_folds = methods[0], [method.facts() for method in methods]
     keys = [
         k
         for k in ("model/steps", "model/steps_taken")
-        if len(every) > 1 and every[0].get(k) is not None
+        if len(facts_of_folds) > 1 and facts_of_folds[0].get(k) is not None
     ]
-    model_facts = every[0] | {key: np.mean([facts[key] for facts in every]) for key in keys}
+    model_facts = facts_of_folds[0] | {
+        key: np.mean([facts[key] for facts in facts_of_folds]) for key in keys
+    }
     return {
         "model/name": first.name,
         "model/label": common_label(first.name, methods),
@@ -257,15 +259,17 @@ def time_methods(
     timing them would take minutes.
     """
     clock = clock or ClockSettings()
-    one = time_beside_copy(query_calls(methods, data, rows), clock)
+    single = time_beside_copy(query_calls(methods, data, rows), clock)
     # A batch is many queries already
     fewer = replace(clock, rounds=max(clock.least, clock.rounds // 5))
     quick = {
-        name: m for name, m in methods.items() if one[name]["query_ms"] * BATCH < SLOWEST_BATCH_MS
+        name: m
+        for name, m in methods.items()
+        if single[name]["query_ms"] * BATCH < SLOWEST_BATCH_MS
     }
     # Without a copy beside them, which empties the caches.
     many = time_interleaved(query_calls(quick, data, rows, BATCH), fewer)
-    first = next(iter(one.values()))
+    first = next(iter(single.values()))
     shape = " x ".join(str(n) for n in data.target.shape[1:])
     facts: dict[str, float | int | str | None] = {
         "time/copy_ms": first["query_ms"] / first["to_copy"],
@@ -276,7 +280,7 @@ def time_methods(
             "out; warm, plans made before; no file, no picture"
         ),
     }
-    for room, times in one.items():
+    for room, times in single.items():
         facts |= {f"{room}/{fact}": times[name] for name, fact in timing.FACTS.items()}
         together = float(np.median(many[room])) / BATCH if room in many else None
         facts[f"{room}/render_ms_batch{BATCH}"] = together
@@ -315,10 +319,10 @@ def _skill(scores: Scores, nearest: Scores | None) -> float | None:
     if nearest is None:
         return None
     # Rows without a target are NaN in both, so that the means are over the same rows.
-    every = (one.samples for one in (scores, nearest))
+    pairs = (scores_of_method.samples for scores_of_method in (scores, nearest))
     mse, bar = (
-        float(np.nanmean(one["error_db"] ** 2 if "error_db" in one else one["mse"]))
-        for one in every
+        float(np.nanmean(samples["error_db"] ** 2 if "error_db" in samples else samples["mse"]))
+        for samples in pairs
     )
     return 1 - mse / bar if bar > 0 else None
 

@@ -105,8 +105,12 @@ class FitInputs:
         """
         names = ("settings", "files", *(("data", "split") if self.data else ("unread",)))
         now, before = ({name: of.get(name) or {} for name in names} for of in (vars(self), record))
-        one, other = dict(dotted_settings(now)), dict(dotted_settings(before))
-        differing = [name for name in other | one if one.get(name) != other.get(name)]
+        settings_now, settings_before = dict(dotted_settings(now)), dict(dotted_settings(before))
+        differing = [
+            name
+            for name in settings_before | settings_now
+            if settings_now.get(name) != settings_before.get(name)
+        ]
         return differing if reuse else differing + edited(record)
 
 

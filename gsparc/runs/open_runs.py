@@ -138,16 +138,16 @@ def open_files(
         ValueError: unreadable checkpoint or data, wrong kind of data, wrong number of checkpoints.
     """
     loaded = [loading.load(path) for path in paths]
-    stored = [one for _, one in loaded]
+    stored = [model for _, model in loaded]
     # Folds of two runs are of two splits: a test row of one may have taught the other.
-    if len({one.extra.get("run_id") for one in stored}) > 1:
+    if len({model.extra.get("run_id") for model in stored}) > 1:
         raise ValueError(f"{', '.join(map(str, paths))}: of different runs; give the folds of one")
     data = align_to_site(module_of(stored[0], dataset).measurements, stored[0].site)
     other = data.site.sha256 != stored[0].site.sha256
     # Other data than the model's were never learned from, so that all rows can be tested.
     if other and others_whole and all(value is None for value in (split or {}).values()):
-        none, every = np.zeros(0, np.int64), np.arange(len(data))
-        folds = (Fold(none, none, every),) * len(stored)
+        none, all_rows = np.zeros(0, np.int64), np.arange(len(data))
+        folds = (Fold(none, none, all_rows),) * len(stored)
         chosen = Split("whole", folds)
     else:
         chosen = _folds(split_for(_settings("split", stored[0], split), data), stored)
@@ -241,8 +241,8 @@ def _settings(
 def _folds(split: Split, stored: Sequence[checkpoint.StoredModel]) -> Split:
     """The folds the checkpoints were trained on: all of them in order, or those each file names."""
     # Files of some folds can be opened alone where each says its number; older ones are counted.
-    named = all("fold" in one.extra for one in stored)
-    numbers = [int(one.extra["fold"]) if named else index for index, one in enumerate(stored)]
+    named = all("fold" in model.extra for model in stored)
+    numbers = [int(model.extra["fold"]) if named else index for index, model in enumerate(stored)]
     if not named and len(stored) != len(split.folds):
         raise ValueError(
             f"split={split.name} has {len(split.folds)} folds: "
@@ -262,8 +262,8 @@ def were_trained_on(stored: Sequence[checkpoint.StoredModel], split: Split) -> b
     A finished model has the hash of its whole split, an interrupted training that of its own rows.
     """
     answers = []
-    for one, fold in zip(stored, split.folds, strict=True):
-        whole, rows = one.extra.get("split_sha256"), one.extra.get("origin", {}).get("rows")
+    for model, fold in zip(stored, split.folds, strict=True):
+        whole, rows = model.extra.get("split_sha256"), model.extra.get("origin", {}).get("rows")
         if whole is None and rows is None:
             return None
         answers.append(rows == hash_indices((fold,)) if whole is None else whole == split.sha256)
@@ -280,28 +280,30 @@ def _foreign(
     same_split = were_trained_on(stored, chosen)
     if same and same_split:
         return None, 0, None
-    what = "another split" if same else f"other data than {data.site.name} (content hashes differ)"
-    unplaced = [one for one in (data.site, stored[0].site) if one.georeference is None]
+    origin = (
+        "another split" if same else f"other data than {data.site.name} (content hashes differ)"
+    )
+    unplaced = [site for site in (data.site, stored[0].site) if site.georeference is None]
     if not same and len(unplaced) == 1:
-        what += (
+        origin += (
             f"; metres of {unplaced[0].name} are about an unknown origin, the others' about degrees"
         )
         return (
-            (f"{what}: whether these test rows lie where it was TRAINED cannot be told"),
+            (f"{origin}: whether these test rows lie where it was TRAINED cannot be told"),
             None,
             None,
         )
     trained = _trained(stored, data)
     if trained is None:
-        what = "rows that it does not name" if same and same_split is None else what
-        return f"{what}; these test rows may have been TRAINED on", None, None
+        origin = "rows that it does not name" if same and same_split is None else origin
+        return f"{origin}; these test rows may have been TRAINED on", None, None
     trained_data, before = trained
     # The same rows under another name or seed of split.
     if same and hash_indices(before.folds) == hash_indices(chosen.folds):
         return None, 0, trained
     tested, learned = np.concatenate([fold.test for fold in chosen.folds]), 0
     unlisted = int((data.censored_side(tested) > 0).sum())
-    listed = f" ({len(tested) - unlisted} listed, {unlisted} unlisted)" * (unlisted > 0)
+    listed = f" ({len(tested) - unlisted} listed, {unlisted} unlisted)" if unlisted else ""
     for old, fold in zip(before.folds, chosen.folds, strict=True):
         # Rows of `val` decide steps and weights: they count as learned.
         rows = old.learned()
@@ -312,12 +314,13 @@ def _foreign(
             # rows at one place are taken for the same.
             gaps, _ = cKDTree(trained_data.moving[rows]).query(data.moving[fold.test])
             learned += int((gaps < SAME_ROW_M).sum())
-    what += f" ({before.name})" * same
+    if same:
+        origin += f" ({before.name})"
     how = ("were " if same else "are at places that were ") + (
         "TRAINED on" if learned else "trained on"
     )
     return (
-        (f"{what}: {learned or 'none'} of these {len(tested)} test rows{listed} {how}"),
+        (f"{origin}: {learned or 'none'} of these {len(tested)} test rows{listed} {how}"),
         learned,
         trained,
     )

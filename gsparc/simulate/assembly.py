@@ -88,7 +88,7 @@ def assemble_dataset(
     if survey.georeference is not None:
         about |= {f"origin_{name}": value for name, value in asdict(survey.georeference).items()}
     about["antennas"] = json.dumps(
-        [str(getattr(each_engine, "antenna", "isotropic")) for each_engine in survey.engines]
+        [str(getattr(engine, "antenna", "isotropic")) for engine in survey.engines]
     )
     if convergence is not None:
         about |= {"convergence_error": convergence.nmse, **convergence.attributes()}
@@ -180,9 +180,9 @@ def _arrays(campaign: CampaignSettings, survey: Survey, rows: ShardRows) -> dict
 
 def _ends(survey: Survey) -> dict[str, np.ndarray]:
     """Positions in the schema of one transmitter, or of several stations."""
-    one = len(survey.engines) == 1
+    single = len(survey.engines) == 1
     arrays = {"rx_position": survey.receivers}
-    if one:
+    if single:
         arrays["tx_position"] = survey.engine.transmitter
     else:
         arrays |= {"station_position": survey.transmitters, "station": survey.station}

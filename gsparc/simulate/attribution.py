@@ -184,9 +184,7 @@ def list_effect_sets(full: Effects, removable: tuple[str, ...]) -> list[Effects]
     """
     sets = {full}
     for name in removable:
-        sets |= {
-            less for less in (_without(each_set, name) for each_set in sets) if less is not None
-        }
+        sets |= {less for less in (_without(effects, name) for effects in sets) if less is not None}
     return sorted(sets, key=lambda s: (-len(s.enabled), -s.depth, not s.polarisation))
 
 

@@ -144,8 +144,8 @@ class Replay:
         for name, logarithms in materials.items():
             # As in `apply_materials`
             pair = [dr.opaque(mi.Float, float(value)) for value in logarithms]
-            for one in pair:
-                dr.enable_grad(one)
+            for logarithm in pair:
+                dr.enable_grad(logarithm)
             there[name].relative_permittivity = 1 + dr.exp(pair[0])
             there[name].conductivity = dr.exp(pair[1])
             free += pair
@@ -153,7 +153,7 @@ class Replay:
         level = 10 / math.log(10) * dr.log(power + TINY_W)
         value, by_level = slopes(dr.detach(level).numpy().astype(np.float64))
         dr.backward(dr.sum(level * mi.Float(by_level.astype(np.float32))))
-        gradient = np.array([dr.grad(one).numpy()[0] for one in free], dtype=np.float64)
+        gradient = np.array([dr.grad(logarithm).numpy()[0] for logarithm in free], dtype=np.float64)
         apply_materials(
             self.tracer, {name: Material.from_logarithms(pair) for name, pair in materials.items()}
         )  # without gradients
@@ -238,7 +238,7 @@ def calibrate(
     gain, scale = fit_gain_and_scale(measured_db[reached] - to_decibels(traced[reached]))
     if not steps:
         return RoomCalibration(dict(start), gain, scale, 0)
-    centre = np.concatenate([one.logarithms() for one in start.values()])
+    centre = np.concatenate([material.logarithms() for material in start.values()])
     deviation = np.tile(PRIOR, len(start))
     best = (np.inf, centre, gain, scale)
     spent = 0

@@ -127,14 +127,14 @@ class TracedPaths:
             (len(self), ports * len(elements), len(frequency_hz)), dtype=np.complex128
         )
         for r, (start, stop) in enumerate(zip(self.offsets[:-1], self.offsets[1:], strict=True)):
-            one = slice(start, stop)
+            paths = slice(start, stop)
             # cycles, not radians, and reduced in float64 before the exponential
-            tones = np.exp(-2j * np.pi * np.mod(np.outer(self.delay[one], frequency_hz), 1.0))
+            tones = np.exp(-2j * np.pi * np.mod(np.outer(self.delay[paths], frequency_hz), 1.0))
             steered = np.exp(
-                2j * np.pi / wavelength * (elements @ self.direction[one].T.astype(np.float64))
+                2j * np.pi / wavelength * (elements @ self.direction[paths].T.astype(np.float64))
             )
             for port in range(ports):
-                block = (steered * self.gain[one, port]) @ tones
+                block = (steered * self.gain[paths, port]) @ tones
                 channels[r, port * len(elements) : (port + 1) * len(elements)] = block
         return channels
 

@@ -105,10 +105,10 @@ def _record(cell: str, named: bool) -> dict[str, Any] | None:
             with suppress(ValueError, SyntaxError, RecursionError, MemoryError):
                 return dict(read(cell))
     if point := POINT.fullmatch(cell):
-        return {"point": [float(one) for one in (point[1] or "").split()]}
+        return {"point": [float(number) for number in (point[1] or "").split()]}
     pair = PAIR.fullmatch(cell)
     numbers = re.split(r"[,;\s]+", pair[1]) if pair else []
-    fine = named or (numbers and all(FINE.search(each_number) for each_number in numbers))
+    fine = named or (numbers and all(FINE.search(number) for number in numbers))
     return {"pair": [float(number) for number in numbers]} if fine and numbers else None
 
 
@@ -119,10 +119,10 @@ def _numbers(cell: Any) -> np.ndarray | None:
         cell = re.split(r"[,;\s]+", inside[1].strip()) if inside else [cell]
         if not inside and not re.search(r"\d\s*\*?[ij]\s*\)?\s*$", cell[0]):
             return None
-        cell = [re.sub(r"[()*\s]", "", one).replace("i", "j") for one in cell]
+        cell = [re.sub(r"[()*\s]", "", text).replace("i", "j") for text in cell]
     if not isinstance(cell, list | np.ndarray) or not len(cell):
         return None
     try:
-        return np.array([complex(one) for one in cell])
+        return np.array([complex(text) for text in cell])
     except (TypeError, ValueError):
         return None

@@ -111,8 +111,8 @@ Chosen = dict[str, tuple[Column, ...]]
 
 def used_heads(chosen: Chosen) -> set[str | None]:
     """Return the heads of all columns that are used."""
-    columns = [column for one in chosen.values() for column in one]
-    return {column.head for each_column in columns for column in (each_column, *each_column.plus)}
+    columns = [column for group in chosen.values() for column in group]
+    return {column.head for first in columns for column in (first, *first.plus)}
 
 
 def choose_columns(
@@ -216,8 +216,8 @@ def choose_columns(
 
 def _finest(sheet: Sheet, columns: list[Column]) -> list[Column]:
     """The first column that tells all stations apart that several do; all where none does."""
-    every = len(set(sheet.joined(column.head for column in columns).tolist()))
-    fine = [c for c in columns if len(set(sheet.joined([c.head]).tolist())) == every]
+    count = len(set(sheet.joined(column.head for column in columns).tolist()))
+    fine = [c for c in columns if len(set(sheet.joined([c.head]).tolist())) == count]
     return columns if columns[0].label == JOINED or len(columns) < 2 else fine[:1] or columns
 
 
@@ -239,7 +239,8 @@ def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Colu
         for head in more:
             longer = [*columns, replace(first, head=head)]
             fewer, many = (
-                len(set(sheet.joined(c.head for c in one).tolist())) for one in (columns, longer)
+                len(set(sheet.joined(c.head for c in parts_of_name).tolist()))
+                for parts_of_name in (columns, longer)
             )
             # A column that tells rows rather than stations apart has nearly as many values
             # as there are rows.
@@ -348,7 +349,7 @@ def _sum_of_columns(sheet: Sheet, role: str, text: str) -> Column | None:
     """A column times a factor, as in `pathloss*-1`, with others and numbers: `asu*2-113`,
     `rssi-tx_power`.
     """
-    for cut in [len(text), *(found.start() for found in re.finditer(r"[-+]", text))]:
+    for cut in [len(text), *(sign.start() for sign in re.finditer(r"[-+]", text))]:
         times = re.fullmatch(r"(.+)\*([-+]?\d*\.?\d+)", text[:cut].strip())
         head = _head(sheet, times[1].strip() if times else text[:cut].strip()) if cut else None
         if head is None:
@@ -445,7 +446,9 @@ def _one_unit(sheet: Sheet, chosen: Chosen) -> None:
     for kind in SCHEMA:
         # Kinds rather than quantities: a position in mm
         # beside another axis without a unit mixes both.
-        columns = [c for one in chosen.values() for c in one if c.head and KINDS[c.role] == kind]
+        columns = [
+            c for group in chosen.values() for c in group if c.head and KINDS[c.role] == kind
+        ]
         turned = [c for c in columns if c.unit is not None and c.unit.changes and not c.unit.times]
         # To watts or milliwatts?
         silent = [c for c in columns if c.unit is None or c.unit.name == "dB"]
@@ -490,16 +493,16 @@ def _note(columns: tuple[Column, ...]) -> str:
     first = columns[0]
     kind = KINDS[first.role]
     unit = f" [{first.schema_unit}]" if kind in SCHEMA else ""
-    what = f"{_names(columns)} taken as {first.role}{unit}"
+    text = f"{_names(columns)} taken as {first.role}{unit}"
     if first.label == JOINED:
-        return f"{what}: their values together name one"
+        return f"{text}: their values together name one"
     if len(columns) > 1:
         labels = [column.label for column in columns]
         of = "frequencies" if first.role in (*CHANNELS, *POLAR) else "stations"
-        what += f" of the {of} {', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''}"
-        what += " (dBm? set unit=dBm)" if unit == " [dB]" else ""
+        text += f" of the {of} {', '.join(labels[:3])}{', ...' if len(labels) > 3 else ''}"
+        text += " (dBm? set unit=dBm)" if unit == " [dB]" else ""
     turned = first.unit is not None and first.unit.changes
-    return what + (
+    return text + (
         f", {first.unit.name} turned into {first.schema_unit}" if turned and first.unit else ""
     )
 

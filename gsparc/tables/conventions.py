@@ -243,11 +243,15 @@ def convert_conventions(data: Measurements, names: Iterable[str]) -> Measurement
     # In the table's order, not the user's: axes are exchanged before what runs along them is
     # turned.
     for name in [name for name in CONVENTIONS if name in chosen]:
-        one = CONVENTIONS[name]
-        if one.trait not in traits(data):
+        convention = CONVENTIONS[name]
+        if convention.trait not in traits(data):
             shape = data.target.shape[1:]
-            raise DataError(f"dataset.{name}: {one.words}: cannot be of rows of shape {shape}")
-        data = _in_blocks(data, one.change) if is_big(data.target) else one.change(data)
+            raise DataError(
+                f"dataset.{name}: {convention.words}: cannot be of rows of shape {shape}"
+            )
+        data = (
+            _in_blocks(data, convention.change) if is_big(data.target) else convention.change(data)
+        )
     return data
 
 

@@ -136,9 +136,9 @@ def _decoded(path: Path) -> tuple[str, str]:
         content = file.read(most + 1)
     _check_bytes(path, len(content), most)
     check_content(path, content, "\n\r")
-    for start, what in SHEET["others"].items():
+    for start, format_name in SHEET["others"].items():
         if content.lstrip().startswith(start.encode("latin-1")):
-            raise DataError(f"{path}: not a table of text but {what}")
+            raise DataError(f"{path}: not a table of text but {format_name}")
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         try:
             return content.decode("utf-16"), "UTF-16"
@@ -192,8 +192,8 @@ MOST_BROKEN = 20  # lines of a cell: of more, a quotation mark was not closed
 
 def _in_one_line(cell: re.Match[str]) -> str:
     """A quoted cell with `BROKEN` for breaks of lines; as it is where they are too many."""
-    one, count = re.subn(BREAK, BROKEN, cell[0])
-    return one if count < MOST_BROKEN else cell[0]
+    line, count = re.subn(BREAK, BROKEN, cell[0])
+    return line if count < MOST_BROKEN else cell[0]
 
 
 MINUS = re.compile(r"(?<![^\s,;|\"'])[\u2212\u2013\u2010\u2011\ufe63\uff0d](?=\s?[\d.,])")

@@ -163,7 +163,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
                 "axes exchanged"
             )
             check.refuse("csi", f"{fits}; say dataset.exchange_axes=true")
-        named = [one for one in named if one != "exchange_axes"]  # it is done here
+        named = [name for name in named if name != "exchange_axes"]  # it is done here
         values, mask = values.swapaxes(1, 2), None if mask is None else mask.swapaxes(1, 2)
     frequency, carrier = check.read_frequencies(values.shape[2] if facts.is_complex else None)
     # Transposed images: their grid is that of the axes as they will be.
@@ -183,7 +183,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     offsets = check.read_ragged(rows)
     release_split = check.read_split(rows)
     check.check_range(measured, values, mask)
-    if all(each_end is not None for each_end in (*ends.values(), rotation)):
+    if all(end is not None for end in (*ends.values(), rotation)):
         _static(check, links, ends, rotation)
     check.problems.raise_if_any()
     assert rotation is not None

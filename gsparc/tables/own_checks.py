@@ -167,13 +167,13 @@ class Checker:
         turned = array.ndim > 1 and (
             len(array) == 3 or any(_fits(array.shape[::-1], s) for s in wanted)
         )
-        here = " or ".join(map(str, wanted))
-        here = f", here {here}" if any(wanted) and "None" not in here else ""
+        sizes = " or ".join(map(str, wanted))
+        sizes = f", here {sizes}" if any(wanted) and "None" not in sizes else ""
         layout = (
             FIELDS[name].shape if name in FIELDS else " or ".join(map(str, shapes)).replace("'", "")
         )
         fault = f"found {array.shape}{'; transposed?' if turned else ''}"
-        self.refuse(name, f"expected shape {layout}{here}, {fault}")
+        self.refuse(name, f"expected shape {layout}{sizes}, {fault}")
         return False
 
     def read_positions(self, name: str, rows: int | None) -> np.ndarray | None:

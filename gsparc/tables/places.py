@@ -67,8 +67,8 @@ def read_places(
             continue
         if len(present) == 1:
             missing = next(role for role in roles if role not in chosen)
-            found = f"column {chosen[present[0]][0].head!r} is {present[0]}, and none is {missing}"
-            return sheet.refuse(f"{found}; say {say_column(missing, 'COLUMN')}")
+            fault = f"column {chosen[present[0]][0].head!r} is {present[0]}, and none is {missing}"
+            return sheet.refuse(f"{fault}; say {say_column(missing, 'COLUMN')}")
         absent = np.zeros(len(sheet), bool)
         if unknown:
             present = [
@@ -131,8 +131,8 @@ def place_by_row(path: str | Path, columns: Mapping[str, object], end: str) -> d
     sheet = read_sheet(path)
     roles = [f"{before}{axis}" for before in ENDS[:-1] for axis in AXES]
     settings = {key: value for key, value in columns.items() if OTHER_NAMES.get(key, key) in roles}
-    here = {key: head for key, head in settings.items() if head in sheet.heads}
-    chosen = choose_columns(sheet, here, {}, [*roles, "station"])
+    heads_of_sheet = {key: head for key, head in settings.items() if head in sheet.heads}
+    chosen = choose_columns(sheet, heads_of_sheet, {}, [*roles, "station"])
     if any(role in chosen for role in roles):
         return {}
     row_key = BY_ROW
@@ -159,8 +159,8 @@ def _times(sheet: Sheet, station: np.ndarray) -> list[str]:
     alone, empty = moments == len(moment) and len(set(station)) > 1, int((moment == "").sum())
     # Clocks of whole seconds repeat now and then; those of days, or of each row, tell nothing.
     if empty or alone or 2 * links < len(moment):
-        found = f"{named} has {moments} values in {len(moment)} rows, {empty} empty"
-        raise DataError(f"{fault} {found}; {wanted}")
+        values = f"{named} has {moments} values in {len(moment)} rows, {empty} empty"
+        raise DataError(f"{fault} {values}; {wanted}")
     return heads
 
 
@@ -310,14 +310,14 @@ class StationList:
         and that of each such head.
         """
         renamed = self.use_names_of(np.array([*parts, *parts.values()]))
-        found = {
-            head: one
+        matches = {
+            head: name
             for head, part in parts.items()
-            for one in (part, head)
-            if one in renamed.names
+            for name in (part, head)
+            if name in renamed.names
         }
         # One head alone may be called like a station by chance, unless by its own name.
-        return (renamed, found) if len(found) > 1 or renamed.label is None else (self, {})
+        return (renamed, matches) if len(matches) > 1 or renamed.label is None else (self, {})
 
     def add_missing(self, words: np.ndarray, notes: list[str]) -> StationList:
         """Add those of words (S,) that it lacks, if few, at unknown places, with a note;
@@ -388,9 +388,9 @@ def read_stations(sheet: Sheet) -> StationList | None:
             sheet.refuse("no coordinates; expected columns x, y, z or latitude, longitude, height")
         return None
     names = sheet.joined(c.head for c in chosen["station"])
-    every = {"+".join(heads): tuple(sheet.joined(heads).tolist()) for heads in aliases}
-    unique = {head: each for head, each in every.items() if len(set(each)) == len(each)}
-    repeated = {head: each for head, each in every.items() if len(set(each)) < len(each)}
+    values_of = {"+".join(heads): tuple(sheet.joined(heads).tolist()) for heads in aliases}
+    unique = {head: each for head, each in values_of.items() if len(set(each)) == len(each)}
+    repeated = {head: each for head, each in values_of.items() if len(set(each)) < len(each)}
     by = ["+".join(c.head or "" for c in chosen["station"]), *unique]
     # Names that repeat, like sites in a list of sectors,
     # give way to those of a column without copies.

@@ -268,7 +268,7 @@ def _datasets(
     with h5py.File(path, "r") as file:
         # h5py hands out bytes when a name is not UTF-8
         items = {
-            str(_plain(name)): one for name, one in file.items() if isinstance(one, h5py.Dataset)
+            str(_plain(name)): item for name, item in file.items() if isinstance(item, h5py.Dataset)
         }
         arrays = {name: item for name, item in items.items() if item.size is not None}
         # What lies in one piece takes nothing that is not in the file.
@@ -370,11 +370,11 @@ def check_array_sizes(path: Path, stated: Stated, to_disk: bool = False) -> None
     rows = Counter(shape[0] for shape, _ in stated.values() if shape)
     name, (shape, size) = max(stated.items(), key=lambda item: item[1][1], default=("", ((), 0)))
     total, packed, disk = (
-        sum(one for _, one in stated.values()),
+        sum(size for _, size in stated.values()),
         path.stat().st_size,
         tempfile.gettempdir(),
     )
-    copied = sum(one for _, one in stated.values() if one >= BIG) * to_disk
+    copied = sum(size for _, size in stated.values() if size >= BIG) * to_disk
     most, room = min(max(BIG, MOST_PACKED * packed), LARGEST), max(BIG, machine_memory() / 2)
     memory = total - copied
     faults = {

@@ -92,8 +92,10 @@ def _name_levels(sheet: Sheet, stations: Collection[str]) -> tuple[Sheet, dict[s
     roles = {head: heads.parse_head(head).role for head in sheet.heads}
     free = [head for head, role in roles.items() if role in (*heads.LEVELS, "station", None)]
     parts = {head: (heads.station_in_head(head), head) for head in free}
-    found = {head: name for head, names in parts.items() for name in names if name in stations}
-    others = [head for head in free if found and head not in found and roles[head] in heads.LEVELS]
+    levels = {head: name for head, names in parts.items() for name in names if name in stations}
+    others = [
+        head for head in free if levels and head not in levels and roles[head] in heads.LEVELS
+    ]
     if others:
         which = list_first([*map(repr, others)])
         sheet.notes.append(
@@ -101,9 +103,9 @@ def _name_levels(sheet: Sheet, stations: Collection[str]) -> tuple[Sheet, dict[s
         )
     frame = sheet.frame.drop(columns=others)
     # A single column is of no station by itself
-    if len(found) == 1 and "station" not in roles.values():
-        frame = frame.assign(station=next(iter(found.values())))
-    return replace(sheet, frame=frame), found
+    if len(levels) == 1 and "station" not in roles.values():
+        frame = frame.assign(station=next(iter(levels.values())))
+    return replace(sheet, frame=frame), levels
 
 
 # Arbitrary strength units (3GPP TS 27.007, 8.5); LTE counts up to 97
@@ -144,11 +146,11 @@ class Builder:
         """Add seconds of columns of times."""
         if not named:
             return
-        if (found := read_times(self.sheet, named)) is None:
+        if (times := read_times(self.sheet, named)) is None:
             return self.refuse("holds no times; expected seconds, dates or a clock", named[0])
-        self.arrays["time_s"], what = found
+        self.arrays["time_s"], meaning = times
         quoted = " and ".join(map(repr, named))
-        self.notes.append(f"column{'s' * (len(named) > 1)} {quoted} taken as time_s: {what}")
+        self.notes.append(f"column{'s' * (len(named) > 1)} {quoted} taken as time_s: {meaning}")
 
     def _measurement(self) -> str | None:
         """Add the measurement; its quantity."""
@@ -252,9 +254,13 @@ class Builder:
         tones: dict[int, Column] = {}
         for column in self.chosen.get(part, ()):
             label = column.label.strip(" _.:()[]")
-            said = MEASURED.fullmatch(label)
-            if said and said[2].lower() in UNITS and UNITS[said[2].lower()].kind == "frequency":
-                label = f"{UNITS[said[2].lower()].factor * float(said[1]):.0f}"
+            frequency = MEASURED.fullmatch(label)
+            if (
+                frequency
+                and frequency[2].lower() in UNITS
+                and UNITS[frequency[2].lower()].kind == "frequency"
+            ):
+                label = f"{UNITS[frequency[2].lower()].factor * float(frequency[1]):.0f}"
             # A sign belongs to the number: tones -1 and 1 lie on both sides of the carrier.
             if not re.fullmatch(r"[-+]?\d+|", label):
                 fault = f"{label!r} is no number of a tone; name columns csi_re_-2, csi_re_1, ..."
@@ -266,8 +272,8 @@ class Builder:
 
     def _ends(self, measured: str | None) -> None:
         """Add positions and stations."""
-        every = places.read_ends(self.sheet, self.chosen, strict=False)
-        ends = dict(every)
+        all_ends = places.read_ends(self.sheet, self.chosen, strict=False)
+        ends = dict(all_ends)
         # Said beside what is wrong with levels: one look at the file mends both.
         coordinates = {
             f"{end}{axis}" for end in heads.ENDS[:-1] for axis in heads.AXES if axis != "z"
@@ -288,7 +294,7 @@ class Builder:
         stations = self._stations(measured, ends)
         if self.sheet.problems:
             return
-        stay = next((end for end in every if end not in ends), "")
+        stay = next((end for end in all_ends if end not in ends), "")
         moving, where = self._moving(ends, stay)
         # Where there are no stations
         others = {str(OTHER[moving]): ends.popitem()[1]} if ends else {}

@@ -38,7 +38,9 @@ def read_records(path: Path) -> pd.DataFrame:
         name := next((name for name in frame if frame[name].map(_holds_records).any()), None)
     ) is not None:
         frame = frame.explode(name, ignore_index=True)
-        inner = pd.json_normalize([one if isinstance(one, dict) else {} for one in frame.pop(name)])
+        inner = pd.json_normalize(
+            [record if isinstance(record, dict) else {} for record in frame.pop(name)]
+        )
         frame = frame.join(inner.add_prefix(f"{name}."))
     frame = unfold_places(frame)
     lengths = frame.map(lambda value: len(value) if isinstance(value, list) else 0).max()
@@ -56,8 +58,13 @@ def unfold_places(frame: pd.DataFrame) -> pd.DataFrame:
     """Return lists of coordinates, in columns called as in `PLACES`, as a column for each."""
     for name in [name for name in frame if name.rpartition(".")[2] in PLACES]:
         before, dot, how = name.rpartition(".")
-        padded = [([*one] if isinstance(one, list) else []) + 3 * [None] for one in frame.pop(name)]
-        places = pd.DataFrame([one[:3] for one in padded]).apply(pd.to_numeric, errors="coerce")
+        padded = [
+            ([*values] if isinstance(values, list) else []) + 3 * [None]
+            for values in frame.pop(name)
+        ]
+        places = pd.DataFrame([values[:3] for values in padded]).apply(
+            pd.to_numeric, errors="coerce"
+        )
         (turned, most), across = PLACES[how], places[[0, 1]]
         degrees = (across.abs().max() <= 360).all() and (
             np.ptp(across.dropna(), axis=0) < most
@@ -70,7 +77,7 @@ def unfold_places(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _holds_records(value: Any) -> bool:
-    return isinstance(value, list) and any(isinstance(one, dict) for one in value)
+    return isinstance(value, list) and any(isinstance(entry, dict) for entry in value)
 
 
 def _of_json(text: str) -> list[dict[str, Any]]:
@@ -80,14 +87,16 @@ def _of_json(text: str) -> list[dict[str, Any]]:
         if "\n" not in text.strip():
             raise
         content = [_of_line(line, n) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
-        if len(content) < 2 or not all(isinstance(one, dict) for one in content):
+        if len(content) < 2 or not all(isinstance(record, dict) for record in content):
             raise whole from None
     if isinstance(content, dict):
         lists = [value for value in content.values() if _holds_records(value)]
         content = lists[0] if len(lists) == 1 else _of_columns(content) or [content]
     if not _holds_records(content):
         raise ValueError("no records: expected [{...}, ...], or one {...} a line")
-    return [one if isinstance(one, dict) else {} for one in content]  # rows keep their numbers
+    return [
+        record if isinstance(record, dict) else {} for record in content
+    ]  # rows keep their numbers
 
 
 def _of_line(line: str, number: int) -> Any:
@@ -121,17 +130,17 @@ def _of_columns(content: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _of_xml(text: str) -> list[dict[str, Any]]:
-    points = [one for one in ElementTree.fromstring(text).iter() if _tag(one) in POINTS]
+    points = [element for element in ElementTree.fromstring(text).iter() if _tag(element) in POINTS]
     if not points:
         raise ValueError("no points of GPX or KML")
     records = []
     for point in points:
         record: dict[str, Any] = dict(point.attrib)
-        for one in point.iter():
-            value = next((child.text for child in one if _tag(child) == "value"), one.text)
-            name = one.get("name", _tag(one))
-            if name == "coordinates" and one.text:
-                record[name] = np.fromstring(one.text, sep=",").tolist()
+        for element in point.iter():
+            value = next((child.text for child in element if _tag(child) == "value"), element.text)
+            name = element.get("name", _tag(element))
+            if name == "coordinates" and element.text:
+                record[name] = np.fromstring(element.text, sep=",").tolist()
             elif value and value.strip() and name != "value":
                 record[name] = value.strip()
         records.append(record)

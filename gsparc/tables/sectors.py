@@ -91,12 +91,12 @@ def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndar
         sheet: the list.
         used: heads that are read as something else.
     """
-    found: dict[str, np.ndarray] = {}
+    columns: dict[str, np.ndarray] = {}
     notes, unread, heads = sheet.notes, [], []
     for head in [head for head in sheet.heads if head not in used]:
         name = sector_quantity(head)
         values, written, unit = _read_cells(sheet, head, name)
-        if name is None or name in found or not np.isfinite(values).any():
+        if name is None or name in columns or not np.isfinite(values).any():
             unread.append(repr(head))
             continue
         meaning = name if unit is None or name != "carrier_hz" else f"{name} in {unit.name}"
@@ -107,7 +107,7 @@ def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndar
         if name == "station_azimuth" and (values < 0).any() and (values[values < 0] == -1).all():
             values, meaning = np.where(values < 0, np.nan, values), f"{name}, -1 unknown"
         high = np.nanmedian(values) > UNSAID_DBM or not np.nan_to_num(values).any()
-        empty = "station_width", "station_thickness", *["station_power_db"] * bool(high)
+        empty = "station_width", "station_thickness", *(["station_power_db"] if high else [])
         if name in empty and (values == 0).any():
             values, meaning = np.where(values == 0, np.nan, values), f"{name}, 0 unknown"
         if name in TILTS and (values < 0).any() and not (values > 0).any():
@@ -116,20 +116,20 @@ def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndar
             )
             values = -values
         _doubt(sheet, head, name, values, written, unit is None)
-        found[name] = values
+        columns[name] = values
         heads.append(f"{head!r} as {meaning}")
-    parts = [found.pop(name) for name in TILTS if name in found]
+    parts = [columns.pop(name) for name in TILTS if name in columns]
     if parts:
         total = np.nansum(parts[-2:] if len(parts) < 3 else parts[:1], axis=0)
-        found["station_tilt"] = np.where(np.isnan(parts).all(0), np.nan, total)
+        columns["station_tilt"] = np.where(np.isnan(parts).all(0), np.nan, total)
     for name, turned in (("earfcn", earfcn_hz), ("band", band_hz)):
-        if name in found:
-            carrier = turned(found.pop(name))
+        if name in columns:
+            carrier = turned(columns.pop(name))
             if np.isfinite(carrier).all():
-                found.setdefault("carrier_hz", carrier)
-                in_mhz = [f"{one / MHZ:g} MHz" for one in np.unique(carrier)]
+                columns.setdefault("carrier_hz", carrier)
+                in_mhz = [f"{hertz / MHZ:g} MHz" for hertz in np.unique(carrier)]
                 notes.append(f"{sheet.source}: carriers by {name}: {list_first(in_mhz, 4)}")
-            elif "carrier_hz" not in found:
+            elif "carrier_hz" not in columns:
                 notes.append(
                     Caution(f"{sheet.source}: {name}: some of it names no frequency; not read")
                 )
@@ -138,7 +138,7 @@ def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndar
     if unread:
         heads_ = f"column{'s' * (len(unread) > 1)} {list_first(unread, 8)}"
         notes.append(Caution(f"{sheet.source}: not read: {heads_}"))
-    return found
+    return columns
 
 
 def _read_cells(
@@ -159,15 +159,15 @@ def _read_cells(
     unit = unit_of(head)[1] or UNITS.get(words_of(head)[-1])
     written, values = np.where(units == "", numbers, np.nan), np.full(len(units), np.nan)
     if name == "carrier_hz" and unit is None:  # their range is narrower than the steps of units
-        hertz = [UNITS[each_name] for each_name in ("hz", "khz", "mhz", "ghz")]
-        unit = next((one for one in hertz if _fits(one, written, name)), hertz[0])
+        hertz = [UNITS[name] for name in ("hz", "khz", "mhz", "ghz")]
+        unit = next((candidate for candidate in hertz if _fits(candidate, written, name)), hertz[0])
     for text in np.unique(units):
-        one = UNITS.get(text) if text else unit or UNITS["m"]
+        stated = UNITS.get(text) if text else unit or UNITS["m"]
         kinds = (
             (RANGES[name][3], *["level"] * (name == "station_power_db")) if name in RANGES else ()
         )
-        if one is not None and (one.kind in kinds or not (text or unit)):
-            values[units == text] = _convert(one, numbers[units == text])
+        if stated is not None and (stated.kind in kinds or not (text or unit)):
+            values[units == text] = _convert(stated, numbers[units == text])
     return values, written, unit
 
 
@@ -215,7 +215,9 @@ def _doubt(
     rest = values[~off & np.isfinite(values)]
     middle = float(np.median(rest)) if off.sum() <= FEW * len(values) and len(rest) else np.nan
     others = [
-        one for one in UNITS.values() if one.kind == kind and (one.changes or kind == "power")
+        other
+        for other in UNITS.values()
+        if other.kind == kind and (other.changes or kind == "power")
     ]
     least_usual, written = USUAL.get(name, (least,))[0], written[off]
     trials = {other.name: _convert(other, written) for other in others}
@@ -223,7 +225,7 @@ def _doubt(
         key: (v >= least_usual) & (v <= high) & ~(abs(v - middle) > spread)
         for key, v in trials.items()
     }
-    fitting = [each_key for each_key, holds in usual.items() if holds.all()]
+    fitting = [key for key, holds in usual.items() if holds.all()]
     cells = [f"{values[i]:g} in {sheet.rows[i]}" for i in np.flatnonzero(off)]
     fault = f"{sheet.source}: column {head!r} holds {list_first(cells, 3)}; expected {name} of "
     fault += f"{low:g} to {high:g}" + ("" if np.isnan(middle) else f", {middle:g} of most")
@@ -232,7 +234,8 @@ def _doubt(
     elif fitting:
         fitting[2:] = ["dBm"] if kind == "power" and not refused else fitting[2:3]
         fault += f"; name its unit, as in '{unit_of(head)[0]} [{fitting[0]}]'"
-        fault += f", where {' or '.join(fitting)} would fit" * (len(fitting) > 1)
+        if len(fitting) > 1:
+            fault += f", where {' or '.join(fitting)} would fit"
     if refused:
         raise DataError(fault)
     sheet.notes.append(Caution(fault))

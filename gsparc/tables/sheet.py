@@ -160,8 +160,8 @@ class Sheet:
                 if any("," in c or "." in c for c in cells)
                 else ""
             )
-            what = f"is no finite number{hint}; or leave it empty"
-            return self.problems.add_rows(self.describe_column(head), rows, what)
+            fault = f"is no finite number{hint}; or leave it empty"
+            return self.problems.add_rows(self.describe_column(head), rows, fault)
         return values
 
     def _read(

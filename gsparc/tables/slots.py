@@ -21,14 +21,14 @@ def find_slots(heads: tuple[str, ...]) -> dict[str, dict[str, str]]:
     """Return heads of each slot by what they hold, by the slot's name;
     empty where there are not several.
     """
-    found: dict[str, dict[str, str]] = {}
+    parts_of: dict[str, dict[str, str]] = {}
     for head in heads:
         words = words_of(unit_of(head)[0])
         kinds = [HOLDS[word] for word in words if word in HOLDS]
         name = " ".join(word for word in words if word not in {*HOLDS, "cell", "dbm"})
-        if len(kinds) == 1 and kinds[0] not in found.setdefault(name, {}):
-            found[name][kinds[0]] = head
-    slots = {name: parts for name, parts in found.items() if set(parts) >= NEEDED}
+        if len(kinds) == 1 and kinds[0] not in parts_of.setdefault(name, {}):
+            parts_of[name][kinds[0]] = head
+    slots = {name: parts for name, parts in parts_of.items() if set(parts) >= NEEDED}
     return slots if len(slots) >= LEAST else {}
 
 

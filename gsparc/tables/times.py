@@ -52,11 +52,11 @@ def read_times(sheet: Sheet, heads: Iterable[str]) -> tuple[np.ndarray, str] | N
     they do. None where some are no times.
     """
     text = pd.Series(sheet.joined(heads))
-    found = _read_numbers(text, " ".join(heads)) or _read_text(text)
-    if found is None:
+    times = _read_numbers(text, " ".join(heads)) or _read_text(text)
+    if times is None:
         return None
-    seconds = found[0][np.isfinite(found[0])]
-    return found[0], found[1] + ", not in order of time" * bool((np.diff(seconds) < 0).any())
+    seconds = times[0][np.isfinite(times[0])]
+    return times[0], times[1] + (", not in order of time" if (np.diff(seconds) < 0).any() else "")
 
 
 def _all_match(text: pd.Series, pattern: str) -> bool:
@@ -100,4 +100,4 @@ def _read_text(text: pd.Series) -> tuple[np.ndarray, str] | None:
         return None
     seconds = (moment - pd.Timestamp(0, tz="UTC")).dt.total_seconds().to_numpy()
     doubt = day_first and first <= 12 and text.str.contains("/").any()
-    return seconds, "dates" + ", day before month? no day beyond 12 tells" * bool(doubt)
+    return seconds, "dates, day before month? no day beyond 12 tells" if doubt else "dates"

@@ -60,21 +60,22 @@ def say_effects(
         head = effect.head
         share = f"{effect.share:.0%} of what places and stations leave"
         if effect.kind == "number":
-            factor = f"*{abs(effect.size):g}" * (abs(effect.size) != 1)
+            factor = "" if abs(effect.size) == 1 else f"*{abs(effect.size):g}"
             power_text += f"{'+' if effect.size < 0 else '-'}{head}{factor}"
             how = f"{say_column('rssi_db', power_text)} takes it off"
-            what = f"a number that adds {effect.size:g} dB each to the level"
+            meaning = f"a number that adds {effect.size:g} dB each to the level"
         elif effect.kind == "device":
             devices.append(head)
             how = f"{say_column('device', '+'.join(devices))} takes each off"
-            what = f"an offset of all levels for each value, up to {effect.size:.1f} dB: devices"
-            what += ", or floors" * all(word.lstrip("-").isdigit() for word in set(words[head]))
-            if "floors" in what and not {"z", "rx_z", "tx_z"} & set(chosen):
-                how += f"; of floors {say_column('z', f'{head}*3.2')} takes 3.2 m each"
+            meaning = f"an offset of all levels for each value, up to {effect.size:.1f} dB: devices"
+            if all(word.lstrip("-").isdigit() for word in set(words[head])):
+                meaning += ", or floors"
+                if not {"z", "rx_z", "tx_z"} & set(chosen):
+                    how += f"; of floors {say_column('z', f'{head}*3.2')} takes 3.2 m each"
         else:
             names.append(head)
             how = f"{say_column('station', '+'.join(names))} tells them apart"
-            what = "another transmitter for each value"
+            meaning = "another transmitter for each value"
             how = "a file for each value takes them apart" if wide else how
-        notes.append(Caution(f"column {head!r} is not used and explains {share}: {what}? {how}"))
+        notes.append(Caution(f"column {head!r} is not used and explains {share}: {meaning}? {how}"))
     return notes

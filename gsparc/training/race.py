@@ -74,8 +74,8 @@ class Race:
         """
         now = mean_square(missed)
         self.note(name, now)
-        _, here, there = np.intersect1d(self.rows, rows, return_indices=True)
-        best, candidate = (each.detach().flatten(1) for each in (self.missed[here], missed[there]))
+        _, own, theirs = np.intersect1d(self.rows, rows, return_indices=True)
+        best, candidate = (each.detach().flatten(1) for each in (self.missed[own], missed[theirs]))
         if now <= STALLED * (before[-1] if before else math.inf):
             return now
         difference, whole = best - candidate, max(float(best.abs().square().sum()), 1e-30)

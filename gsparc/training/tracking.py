@@ -128,14 +128,14 @@ def _job_tags() -> dict[str, Any]:
     if not HydraConfig.initialized():
         return {}
     hydra = HydraConfig.get()
-    tags = [str(one) for group in TAGS if (one := hydra.runtime.choices.get(group))]
+    tags = [str(choice) for group in TAGS if (choice := hydra.runtime.choices.get(group))]
     if hydra.mode != RunMode.MULTIRUN:
         return {"name": "-".join(tags), "tags": tags}
     overrides, file = [], Path(hydra.sweep.dir) / "multirun.yaml"
     if file.exists():  # of Hydra's own sweeper
         overrides = yaml.safe_load(file.read_text(encoding="utf-8"))["hydra"]["overrides"]["task"]
-    every = OverridesParser.create().parse_overrides(overrides)
-    varies = {one.key_or_group: one.is_sweep_override() for one in every}
+    parsed = OverridesParser.create().parse_overrides(overrides)
+    varies = {override.key_or_group: override.is_sweep_override() for override in parsed}
     changes = " ".join(
         o for o in hydra.overrides.task if varies.get(o.lstrip("+~").partition("=")[0], True)
     )

@@ -54,8 +54,8 @@ class RayLauncher(Launcher):
         # Workers take over this process's number of threads, and count as so many cores.
         torch.set_num_threads(jobs[0].get("threads") or 1)
         executor.use_engine(executor.Engine("ray", self.workers, self.address))
-        found = dict(executor.run_each(done, jobs, "jobs"))
-        return [found[number] for number in range(len(jobs))]
+        results = dict(executor.run_each(done, jobs, "jobs"))
+        return [results[number] for number in range(len(jobs))]
 
 
 target = {

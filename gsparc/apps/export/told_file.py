@@ -51,12 +51,12 @@ class ToldFile:
                         f"{self.path}: holds a model of other stations now; start the server again"
                     )
                     raise checkpoint.CheckpointError(other)
-            found = told.update(**rows)
+            answer = told.update(**rows)
             file.store(versions_extra(told.versions))
         self._sha256 = file.stored.sha256
         with asked:
             vars(predictor).update(vars(told))
-        return found
+        return answer
 
 
 def _facts(site: Site) -> tuple[Any, ...]:

@@ -59,8 +59,8 @@ def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, pat
         axes[0, column].set_title(f"{modulation.upper()}, one layer, {title}", fontsize=10)
         # 10 % is the target of rate adaptation in 5G NR (TS 38.214, 5.2.2.1).
         axes[0, column].axhline(0.1, color="grey", linewidth=0.6)
-        for row, each_name in enumerate(("block error rate", "bit error rate")):
-            axes[row, column].set(yscale="log", xlabel="Eb/N0 [dB]", ylabel=each_name)
+        for row, ylabel in enumerate(("block error rate", "bit error rate")):
+            axes[row, column].set(yscale="log", xlabel="Eb/N0 [dB]", ylabel=ylabel)
             axes[row, column].grid(alpha=0.3, which="both")
     axes[0, 0].plot([], [], "v", color="grey", fillstyle="none", label="none failed: 95 % limit")
     axes[0, 0].legend(fontsize=7)
@@ -73,28 +73,28 @@ def draw_rates(
     """Draw throughput over noise, and the confidence of right and wrong choices,
     `least` of it accepted.
     """
-    figure, ((left, right),) = panels(11, 4, 1, 2)
+    figure, ((curves, bars),) = panels(11, 4, 1, 2)
     for name, (style, label) in RATES.items():
         mean = [getattr(rate, name).mean() / 1e6 for rate in rates]
-        left.plot([each_rate.snr_db for each_rate in rates], mean, style, label=label)
-    left.set(
+        curves.plot([rate.snr_db for rate in rates], mean, style, label=label)
+    curves.set(
         xlabel="median signal-to-noise ratio [dB]", ylabel="mean throughput of one layer [Mbit/s]"
     )
-    left.set_title(title)
-    left.legend()
+    curves.set_title(title)
+    curves.legend()
     middle = rates[len(rates) // 2]
     # Misses of three and more are rare: one box for them.
     miss = np.minimum(np.abs(middle.chosen - middle.oracle), 3)
     groups = {name: confidence[miss == value] for value, name in enumerate(("0", "1", "2", "more"))}
     present = {f"{name}\n(n={len(group)})": group for name, group in groups.items() if len(group)}
-    right.boxplot(list(present.values()), tick_labels=list(present))
-    right.set(xlabel=f"MCS error at {middle.snr_db:.0f} dB", ylabel="confidence")
+    bars.boxplot(list(present.values()), tick_labels=list(present))
+    bars.set(xlabel=f"MCS error at {middle.snr_db:.0f} dB", ylabel="confidence")
     if np.isfinite(least):
-        right.axhline(least, color="grey", linestyle="--", label=f"accepted from {least:.2g} on")
-        right.legend()
+        bars.axhline(least, color="grey", linestyle="--", label=f"accepted from {least:.2g} on")
+        bars.legend()
     share = middle.chosen_bps.mean(), middle.oracle_bps.mean()
     of = "{:.1f} of {:.1f} Mbit/s".format(*(value / 1e6 for value in share))
-    right.set_title(f"at {middle.snr_db:.0f} dB: {of}")
+    bars.set_title(f"at {middle.snr_db:.0f} dB: {of}")
     save(figure, path)
 
 

@@ -67,12 +67,12 @@ class LinkStudy:
         promise = Guarantee(**settings["promise"])
         how = settings["confidence"], settings["spatial"], int(settings["seed"])
         kind, threshold, self.test, aside = calibrate_threshold(evidence, promise, *how)
-        every, setting = as_confidence(kind, evidence.scores[kind]), settings["threshold"]
+        confidences, setting = as_confidence(kind, evidence.scores[kind]), settings["threshold"]
         self.least = confidence_threshold(kind, threshold) if setting is None else float(setting)
-        self.confidence = every[self.test]
+        self.confidence = confidences[self.test]
         self.accepted = self.confidence >= self.least
         # Rates are tuned on rows set aside from the test, and on those that would be accepted.
-        rows = aside[every[aside] >= self.least]
+        rows = aside[confidences[aside] >= self.least]
         self.aside = rows if len(rows) else aside
         states_variance = bool(grid.variance.isfinite().all())
         if not states_variance:
@@ -112,10 +112,10 @@ class LinkStudy:
         """
         if self.data.target.shape[1] == 1:
             return {}
-        every = predict_channels(self.method, self.data, self.fold.test, self.tones)
+        channels = predict_channels(self.method, self.data, self.fold.test, self.tones)
         # `test` are numbers into the fold's test rows, as `accepted` are into `test`.
         accepted = np.isin(np.arange(len(self.fold.test)), self.test[self.accepted])
-        return study.beam_facts(every.true, every.predicted, accepted)
+        return study.beam_facts(channels.true, channels.predicted, accepted)
 
     def rates(self) -> tuple[list[Rates], dict[str, Any]]:
         """Return rate adaptation at every noise level and its facts."""

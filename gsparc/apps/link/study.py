@@ -79,7 +79,7 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
         loss = beam_loss_db(there, guess).numpy()
         best = beam_gain(there, there).mean()
         gain = torch.maximum(beam_gain(there, guess).mean(), LEAST * best)
-        here = {
+        figures = {
             "gain_db": float(to_decibels(best)),
             "predicted_gain_db": float(to_decibels(gain)),
             "loss_db": float(to_decibels(best / gain)),
@@ -92,7 +92,7 @@ def beam_facts(true: Tensor, predicted: Tensor, accepted: np.ndarray) -> dict[st
                 for share in (50, 90, 95, 99)
             },
         }
-        facts |= {f"beams/{count}/{name}": value for name, value in here.items()}
+        facts |= {f"beams/{count}/{name}": value for name, value in figures.items()}
     return facts
 
 

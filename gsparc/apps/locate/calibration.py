@@ -66,5 +66,5 @@ def calibrate_level(
     return replace(
         trust,
         level=level,
-        worst=max(each_snapshot.least_misfit(trust) for each_snapshot in snapshots),
+        worst=max(snapshot.least_misfit(trust) for snapshot in snapshots),
     )

@@ -41,7 +41,7 @@ class Cells:
     def halve(self) -> Cells:
         """Return the cells halved along every axis."""
         live = self.edge.max(0) > 0
-        corners = np.array([*product(*((-0.25, 0.25) if one else (0.0,) for one in live))])
+        corners = np.array([*product(*((-0.25, 0.25) if halved else (0.0,) for halved in live))])
         centre = self.centre[:, None] + corners * self.edge[:, None]
         edge = np.broadcast_to(self.edge[:, None] / 2, centre.shape)
         return Cells(centre.reshape(-1, 3), edge.reshape(-1, 3))

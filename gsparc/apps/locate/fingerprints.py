@@ -49,14 +49,14 @@ def locate_fingerprints(config: DictConfig, run_dir: Path) -> Report:
         reference, heard = map(rows.subset, split_fingerprints(rows, how, *cut, int(config.seed)))
     heard = heard.subset(sample_rows(config, len(heard.level)))
     both = fingerprint_snapshots(heard), fingerprint_snapshots(reference)
-    place, each_ms, fit_s = locate_by_neighbours(METHOD, *both[::-1])
+    place, query_ms, fit_s = locate_by_neighbours(METHOD, *both[::-1])
     facts = {
         "dataset/name": Path(chosen.file).stem,
         "dataset/sha256": sha256(rows.level.tobytes()).hexdigest(),
         "split/name": how,
         "split/train": len(reference.level),
         "time/fit_s": fit_s,
-        "time/locate_ms": each_ms,
+        "time/locate_ms": query_ms,
     }
     return report(run_dir, config, METHOD, *both, columns_of_places(place, heard.position), facts)
 

@@ -191,10 +191,10 @@ def locate_by_model(
     def columns(located: Sequence[Located]) -> dict[str, Any]:
         first = slice(len(located))
         table = {} if heard.row is None else {"row": heard.row[first]}
-        world = np.array([one.place for one in located]) + origin
+        world = np.array([answer.place for answer in located]) + origin
         table |= columns_of_places(world, heard.place[first] + origin, run.predictor)
-        about = {name: [getattr(one, name) for one in located] for name in ABOUT}
-        about = {size: [one.area for one in located]} | about
+        about = {name: [getattr(answer, name) for answer in located] for name in ABOUT}
+        about = {size: [answer.area for answer in located]} | about
         return table | {head: values for head, values in about.items() if values[0] is not None}
 
     located = write_as_found(locator.locate(heard), run_dir / "locate.csv", columns)
@@ -203,12 +203,13 @@ def locate_by_model(
     status = "are promised" if config.calibrate or stored else "are not calibrated"
     claim = f"{share:.0%} {status}; {float(box.volume.sum()):.3g} {SIZES[size]} were searched"
     beyond = int(beyond_box(heard.place, box.box()).sum()) if placed else 0
-    claim += f", {beyond} true places lie outside" * bool(beyond)
+    if beyond:
+        claim += f", {beyond} true places lie outside"
     true = heard.place + origin if placed else None
-    shown_at = [locating.to_world(one, origin) for one in located]
+    shown_at = [locating.to_world(answer, origin) for answer in located]
     draw_posteriors(shown_at, true, trained.place + origin, run_dir / "posteriors.png")
-    each_ms = float(np.median([one.seconds for one in located]) * 1e3)
-    facts = {**run.facts(), "locate/calibrated_on": count, "time/locate_ms_p50": each_ms}
+    query_ms = float(np.median([answer.seconds for answer in located]) * 1e3)
+    facts = {**run.facts(), "locate/calibrated_on": count, "time/locate_ms_p50": query_ms}
     group = run.group_places(trained.place, int(config.calibrate) or 3, int(config.seed))
     return report(
         run_dir, config, run.methods[0].name, heard, trained, columns(located), facts, claim, group
@@ -257,8 +258,8 @@ def draw_posteriors(
     for axis in axes.flat[len(some) :]:
         axis.axis("off")
     for axis, number in zip(axes.flat, some, strict=False):
-        one = found[number]
-        cells, density = one.posterior.cells, one.posterior.log_density
+        answer = found[number]
+        cells, density = answer.posterior.cells, answer.posterior.log_density
         order = np.argsort(density)  # cells above one another: the likeliest is seen
         corners = cells.centre[order, :2] - cells.edge[order, :2] / 2
         boxes = [Rectangle(*box) for box in zip(corners, *cells.edge[order, :2].T, strict=True)]
@@ -266,14 +267,14 @@ def draw_posteriors(
         shade = np.maximum(density[order], density.max() - 12)
         axis.add_collection(PatchCollection(boxes, cmap="Blues", linewidth=0, array=shade))
         axis.plot(*known[:, :2].T, ".", color="0.7", markersize=1, label="learned from")
-        axis.plot(*one.place[:2], "x", color=PALETTE[1], label="located")
+        axis.plot(*answer.place[:2], "x", color=PALETTE[1], label="located")
         if true is not None:
             axis.plot(
                 *true[number, :2], "o", markerfacecolor="none", color="black", label="heard at"
             )
         axis.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
         axis.set_title(
-            f"snapshot {number}: {one.modes} mode{'s' if one.modes > 1 else ''}", fontsize=9
+            f"snapshot {number}: {answer.modes} mode{'s' if answer.modes > 1 else ''}", fontsize=9
         )
     axes.flat[0].legend(fontsize=7)
     save(figure, path)

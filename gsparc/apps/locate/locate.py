@@ -63,8 +63,8 @@ def locate(
         if where is None
         else tuple(map(tuple, np.atleast_2d(read_places("where", where)).tolist()))
     )
-    found = _locator(predictor, places, Nuisances(phase_known, offset_db), share).locate(heard)
-    return [to_world(one, site.origin) for one in found]
+    answers = _locator(predictor, places, Nuisances(phase_known, offset_db), share).locate(heard)
+    return [to_world(answer, site.origin) for answer in answers]
 
 
 # What a model says of the coarse grid is most of the time of the first snapshot

@@ -127,8 +127,8 @@ class Locator:
         box = self.cells.box()
 
         def one(number: int) -> Located:
-            started, one, doubt = time.perf_counter(), heard.subset(np.array([number])), ""
-            search = self.search_cells(one, self.trust)
+            started, snapshot, doubt = time.perf_counter(), heard.subset(np.array([number])), ""
+            search = self.search_cells(snapshot, self.trust)
             unlike = search.least_misfit(self.trust) > self.trust.worst
             volume = search.cells.volume
             likely = search.cells.subset(
@@ -137,7 +137,7 @@ class Locator:
             # What may be as likely beyond the edge touches it; 1 % for rounding.
             if unlike or beyond_box(likely.centre, box, 0.51 * likely.edge).any():
                 doubt = DOUBTS["unlike"] * unlike
-                wide = self._further.search_cells(one, self.trust)
+                wide = self._further.search_cells(snapshot, self.trust)
                 if beyond_box(wide.posterior(self.trust).peak()[None], box)[0]:
                     search, doubt = wide, DOUBTS["beyond"]
             posterior, mass, volume = (
@@ -151,7 +151,7 @@ class Locator:
             inside = int(posterior.mass_above(true) <= mass) if np.isfinite(true).all() else None
             return Located(*estimate, seconds, doubt, inside)
 
-        yield from (found for _, found in run_each(one, range(len(heard)), "snapshots"))
+        yield from (answer for _, answer in run_each(one, range(len(heard)), "snapshots"))
 
 
 def learn_trust(
@@ -184,18 +184,18 @@ def learn_trust(
         pairs[number] for number in np.random.default_rng(seed).permutation(len(pairs))[:HELD_OUT]
     ]
     places = np.concatenate([heard.place for _, heard in pairs])
-    found, trust = list[PlaceSearch](), locator.trust
+    searches, trust = list[PlaceSearch](), locator.trust
 
     def search(count: int) -> list[PlaceSearch]:
-        pieces = [(*pair, one) for pair, one in zip_longest(pairs[:count], found)]
+        pieces = [(*pair, before) for pair, before in zip_longest(pairs[:count], searches)]
         return run_all(
             lambda one: one[0].search_cells(one[1], trust, one[2]), pieces, "left-out snapshots"
         )
 
     # Some first, as the rest is sought faster under a trust that is nearly right.
     for count in (TRUSTED, HELD_OUT):
-        found = search(count)
-        trust = calibrate_trust(found, places[: len(found)], trust)
+        searches = search(count)
+        trust = calibrate_trust(searches, places[: len(searches)], trust)
     # Which cells are halved depends on the trust: the level is one of cells as they will be.
     trust = calibrate_level(trust, search(HELD_OUT), places, share)
     log.info(

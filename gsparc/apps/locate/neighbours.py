@@ -46,7 +46,9 @@ def locate_by_neighbours(
     if not np.isfinite(features).any():
         raise ValueError(f"{name}: no row that could be learned from holds a value")
     floor = np.nanmin(features) - BELOW * (np.nanmax(features) - np.nanmin(features))
-    features, queries = (np.where(np.isfinite(one), one, floor) for one in (features, queries))
+    features, queries = (
+        np.where(np.isfinite(levels), levels, floor) for levels in (features, queries)
+    )
     count = _count(PLAIN[name], features, places, group)
     nearest = KNeighborsRegressor(count, weights="distance", algorithm="brute").fit(
         features, places

@@ -66,20 +66,20 @@ class PlacePosterior:
 
     def log_density_at(self, place: np.ndarray) -> float:
         """Log density at a place (3,) itself, not of its cell."""
-        here = self.cells.index_of(place)
+        cell = self.cells.index_of(place)
         if not self.spread:
-            return float(self.sharp[here])
-        rest = 0.0 if self._blurred[here] else np.exp(self.sharp[here])
+            return float(self.sharp[cell])
+        rest = 0.0 if self._blurred[cell] else np.exp(self.sharp[cell])
         return float(np.log(self._parts(place[None])[0].sum() + rest + LEAST))
 
     def mass_above(self, place: np.ndarray) -> float:
         """Return the mass of all cells more likely than a place (3,),
         and half of that of those as likely.
         """
-        here, mass = self.log_density_at(place), self.mass
+        level, mass = self.log_density_at(place), self.mass
         # Half of those as likely, so that equal densities have a level in the middle of their mass.
         return float(
-            mass[self.log_density > here].sum() + 0.5 * mass[self.log_density == here].sum()
+            mass[self.log_density > level].sum() + 0.5 * mass[self.log_density == level].sum()
         )
 
     @cached_property

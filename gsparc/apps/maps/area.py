@@ -110,7 +110,7 @@ def lay_grid(
     nx, ny = (max(int(n), 1) for n in count)
     x, y = (low[i] + step * (0.5 + np.arange(n)) for i, n in enumerate((nx, ny)))
     # By rows: a million places at once take memory.
-    rows = [np.column_stack([x, np.full(nx, one)]) for one in y]
+    rows = [np.column_stack([x, np.full(nx, height)]) for height in y]
     inside = np.array([np.ones(nx, bool) if contains is None else contains(row) for row in rows])
     within = np.zeros_like(inside)
     if buildings is not None:

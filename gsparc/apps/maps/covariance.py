@@ -76,14 +76,14 @@ def error_covariances(
     Raises:
         ValueError: the model has no process.
     """
-    covariances, every = [], choose_stations(predictor, None)[0]
+    covariances, all_names = [], choose_stations(predictor, None)[0]
     names = predictor.site.every_station.name
-    ask = {name: predictor.ask_station(names.index(name)) for name in every}
-    answers = {name: predict_levels(ask[name], places, other_end) for name in every}
-    each = len(every) if promise is None else min(promise.stations_of_place(), len(every))
-    level = np.nan_to_num([answers[name][0] for name in every], nan=-np.inf)
+    ask = {name: predictor.ask_station(names.index(name)) for name in all_names}
+    answers = {name: predict_levels(ask[name], places, other_end) for name in all_names}
+    each = len(all_names) if promise is None else min(promise.stations_of_place(), len(all_names))
+    level = np.nan_to_num([answers[name][0] for name in all_names], nan=-np.inf)
     listed = (level >= np.sort(level, 0)[-each]).T
-    more = predictor.noise_by_others(places, [names.index(name) for name in every], listed).T
+    more = predictor.noise_by_others(places, [names.index(name) for name in all_names], listed).T
     levels, spreads = np.array([answers[name] for name in stations]).swapaxes(0, 1)
     for name, worth in zip(stations, weigh_goal(levels, spreads, goal, threshold_db), strict=True):
         number, asking = names.index(name), ask[name]
@@ -99,7 +99,7 @@ def error_covariances(
             )
             ratio = error**2 / (np.maximum(covariance.diagonal(), 0) + noise)
             weight = np.clip(np.nan_to_num(ratio, nan=1.0), *BETWEEN)
-        measured = noise + more[every.index(name)]
+        measured = noise + more[all_names.index(name)]
         covariances.append(ErrorCovariance(covariance, noise, measured, worth * weight))
     return covariances
 
@@ -143,5 +143,5 @@ def prior_covariances(places: np.ndarray, length_m: float | None) -> list[ErrorC
     variance, scaled = SHADOWING_DB**2, np.sqrt(3) * cdist(places, places) / length
     # Matern-3/2 about a level that is as uncertain: Rasmussen and Williams 2006, eq. 4.17.
     prior = variance * ((1 + scaled) * np.exp(-scaled) + 1)
-    one = np.ones(len(places))
-    return [ErrorCovariance(prior, variance * NOISE, variance * NOISE * one, one)]
+    ones = np.ones(len(places))
+    return [ErrorCovariance(prior, variance * NOISE, variance * NOISE * ones, ones)]

@@ -41,7 +41,9 @@ def draw_strongest(
     as held-out blocks say. See `covered_between`;
     without a promise only each square's own spread is right.
     """
-    level, error = (one.reshape(len(one), -1) for one in (field.power_db, field.expected_error_db))
+    level, error = (
+        layer.reshape(len(layer), -1) for layer in (field.power_db, field.expected_error_db)
+    )
     cells = np.flatnonzero(np.isfinite(level).any(0))
     square = cells[evenly_spaced(len(cells), SQUARES)]
     few = np.nan_to_num(level[:, square].astype(np.float64), nan=-np.inf)

@@ -290,10 +290,10 @@ def sinr(
     known, first, cell = _strongest(power_db)
     signal = linear[first, cell]
     same = True if carrier is None else carrier[:, None] == carrier[first]
-    every = load @ (linear * same) - load[first] * signal
+    received = load @ (linear * same) - load[first] * signal
     noise = 0.0 if noise_db is None else from_decibels(noise_db)
     # The sum less its own part may round below 0 where one station is alone.
-    rest = np.maximum(every, 0.0) + noise
+    rest = np.maximum(received, 0.0) + noise
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = to_decibels(signal / rest)
     return np.where(known & (rest > 0), ratio, np.nan)
@@ -418,7 +418,7 @@ def raster_profile(raster: FieldMap, **bands: Any) -> dict[str, Any]:
     """
     from rasterio.transform import from_origin
 
-    (left, _, _, high), origin = raster.grid.extent, raster.grid.origin
+    (west, _, _, north), origin = raster.grid.extent, raster.grid.origin
     # Without a title programs show it as "unknown".
     form = "+proj=aeqd +datum=WGS84 +lat_0={0!r} +lon_0={1!r} +title=equidistant_about_{0}_{1}"
     place = None if origin is None else form.format(origin.latitude, origin.longitude)
@@ -428,7 +428,7 @@ def raster_profile(raster: FieldMap, **bands: Any) -> dict[str, Any]:
         "height": len(raster.grid.y),
         "crs": place,
         **bands,
-        "transform": from_origin(left, high, raster.grid.step, raster.grid.step),
+        "transform": from_origin(west, north, raster.grid.step, raster.grid.step),
         "compress": "deflate",
         "tiled": True,
     }

@@ -59,7 +59,7 @@ def _geometries(path: str | Path) -> list[Any]:
 
         return [from_wkt(line).__geo_interface__ for line in text.splitlines() if line.strip()]
     content = json.loads(text)
-    return [one.get("geometry", one) for one in content.get("features", [content])]
+    return [feature.get("geometry", feature) for feature in content.get("features", [content])]
 
 
 def _in_degrees(places: np.ndarray, origin: Georeference) -> Iterator[tuple[str, np.ndarray]]:

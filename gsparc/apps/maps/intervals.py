@@ -119,11 +119,11 @@ def calibrate(evidence: HeldOutLevels, share: float = 0.9) -> IntervalScales:
     which = np.searchsorted(first, used.distance, side="right")
     bins = [used.subset(which == number) for number in range(count)]
     middle, typical = np.array(
-        [(np.median(one.distance), np.median(one.spread_db)) for one in bins]
+        [(np.median(part.distance), np.median(part.spread_db)) for part in bins]
     ).T
     scales, weight = (
-        np.array([_half_and_rms(one, level) for one in bins]).T,
-        [len(each_bin) for each_bin in bins],
+        np.array([_half_and_rms(part, level) for part in bins]).T,
+        [len(part) for part in bins],
     )
     half, rms = (
         isotonic_regression(scale * typical, weights=weight).x / typical for scale in scales

@@ -32,9 +32,9 @@ def write_kmz(path: str | Path, field: FieldMap, layers: Sequence[Layer]) -> Non
 
     profile = raster_profile(field)
     size = profile["width"], profile["height"]
-    left, right, low, high = field.grid.extent
+    x_low, x_high, y_low, y_high = field.grid.extent
     to, width, height = calculate_default_transform(
-        profile["crs"], DEGREES, *size, left, low, right, high
+        profile["crs"], DEGREES, *size, x_low, y_low, x_high, y_high
     )
     west, south, east, north = array_bounds(height, width, to)
     box = {"north": north, "south": south, "east": east, "west": west}

@@ -115,15 +115,15 @@ def predict_map(
     calibration = uncalibrated(share) if promise is None else promise.calibration(share)
     notes += _notes_of_threshold(threshold_db, promise, level)
     values: dict[str, Any] = field_map.empty_layers(len(names), grid.inside.shape)
-    every, stride = np.flatnonzero(grid.inside), 1
-    if tolerance_db > 0 and len(every) > ALL_CELLS and promise is not None:
+    inside, stride = np.flatnonzero(grid.inside), 1
+    if tolerance_db > 0 and len(inside) > ALL_CELLS and promise is not None:
         # Cells asked about everywhere are no farther apart than what was measured.
         stride = max(int(neighbour_distance(promise.known[:, -3:-1]) / grid.step / 2), 1)
     alike, computed = _fill_levels(
         values, predictor, grid, other_end, names, numbers, stride, tolerance_db
     )
-    if computed < len(names) * len(every):
-        most = f"{computed} of {len(names) * len(every)} levels were predicted"
+    if computed < len(names) * len(inside):
+        most = f"{computed} of {len(names) * len(inside)} levels were predicted"
         notes.append(f"{most}, the others interpolated to about {tolerance_db:g} dB (tolerance_db)")
     bands = about["bands"]
     carrier = np.unique(bands or ("",) * len(names), return_inverse=True)[1].reshape(-1)
@@ -139,7 +139,7 @@ def predict_map(
     )
     values["overlap"] = np.full(grid.inside.shape, np.nan, np.float32)
     flat = {name: array.reshape(*array.shape[:-2], -1) for name, array in values.items()}
-    for cells in _chunks(every, BANDS):
+    for cells in _chunks(inside, BANDS):
         mean, spread = (
             flat[name][:, cells].astype(np.float64) for name in ("power_db", "expected_error_db")
         )
@@ -262,11 +262,11 @@ def choose_stations(
             )
         return [""], []
     names: list[str] = []
-    for one in wanted if wanted is not None else stations.name:
-        number = find_station(one, stations)
+    for station in wanted if wanted is not None else stations.name:
+        number = find_station(station, stations)
         if number is None:
             raise DataError(
-                f"{key}: no station {one!r}{suggest_or_list(str(one), all_names(stations))}"
+                f"{key}: no station {station!r}{suggest_or_list(str(station), all_names(stations))}"
             )
         names.append(stations.name[number])
     if not names:
@@ -311,9 +311,9 @@ def _asker(
 
     def one(cells: np.ndarray) -> np.ndarray:
         if (
-            every := joint_levels(model, grid.places(cells), numbers) if joint else None
+            levels := joint_levels(model, grid.places(cells), numbers) if joint else None
         ) is not None:
-            return every.reshape(len(cells), -1)
+            return levels.reshape(len(cells), -1)
         return np.column_stack(predict_levels(model, grid.places(cells), other_end))
 
     name = f" of {names[0]}" if len(names) == 1 and names[0] else ""

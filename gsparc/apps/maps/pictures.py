@@ -85,8 +85,8 @@ class Layer:
         """
         if not self.words:
             return colormaps[self.legend.colours](np.linspace(0, 1, 256))
-        every = np.arange(len(self.words)) if self.group is None else self.group
-        number = np.unique(every, return_inverse=True)[1]
+        groups = np.arange(len(self.words)) if self.group is None else self.group
+        number = np.unique(groups, return_inverse=True)[1]
         where = np.append(number, np.nan)[np.nan_to_num(self.values, nan=len(number)).astype(int)]
         tint = assign_colours(where, int(number.max()) + 1)[number]  # fewer than plain stations
         colours, rank = (
@@ -130,11 +130,13 @@ def assign_colours(classes: np.ndarray, count: int) -> np.ndarray:
     beside += beside.T
     result = np.full(count, -1)
     # Large areas first, which have most neighbours, then the rest by what is left.
-    for one in np.argsort(-np.bincount(number.reshape(-1), minlength=count)[:count], kind="stable"):
+    for area in np.argsort(
+        -np.bincount(number.reshape(-1), minlength=count)[:count], kind="stable"
+    ):
         used = result >= 0
-        near = np.bincount(result[used], beside[one, :count][used], MOST_COLOURS)
+        near = np.bincount(result[used], beside[area, :count][used], MOST_COLOURS)
         # Fewest borders of one colour first, of these the colour that is used least.
-        result[one] = np.lexsort((np.bincount(result[used], minlength=MOST_COLOURS), near))[0]
+        result[area] = np.lexsort((np.bincount(result[used], minlength=MOST_COLOURS), near))[0]
     return result
 
 
@@ -217,9 +219,9 @@ def draw_layer(
     field: FieldMap, layer: Layer, path: Path, title: str, plan: FloorPlan | None = None
 ) -> None:
     """Save one layer, over a floor plan, in the format of the file's ending."""
-    left, right, low, high = field.grid.extent
+    west, east, south, north = field.grid.extent
     width, height = (
-        side / max(right - left, high - low) * INCHES for side in (right - left, high - low)
+        side / max(east - west, north - south) * INCHES for side in (east - west, north - south)
     )
     figure, axes = panels(
         max(width, 0.45 * INCHES) + 2.0, max(height, 0.4 * INCHES) + 1.2, grid=False
@@ -243,7 +245,7 @@ def draw_layer(
         figure.colorbar(image, ax=axis, shrink=0.85, pad=0.02, extend=ends, label=legend.label)
     if layer.unsure is not None:
         _hatch(axis, field, *layer.unsure)
-    from_above.set_bounds(axis, (left, low), (right, high), field.grid.origin, title=title)
+    from_above.set_bounds(axis, (west, south), (east, north), field.grid.origin, title=title)
     draw_measured_places(axis, field)
     from_above.scale_bar(axis)
     if field.refused.any():
@@ -318,10 +320,10 @@ def draw_floor_plan(axis: Any, plan: FloorPlan) -> None:
 
 def draw_measured_places(axis: Any, field: FieldMap) -> None:
     """Mark measured points and stations; those outside the map are left out."""
-    left, right, low, high = field.grid.extent
+    west, east, south, north = field.grid.extent
     from_above.draw_measured(axis, field.places)
     positions = field.station_place
-    inside = (positions >= [left, low]).all(1) & (positions <= [right, high]).all(1)
+    inside = (positions >= [west, south]).all(1) & (positions <= [east, north]).all(1)
     faces = np.isfinite(field.azimuth) if len(field.azimuth) else np.zeros(len(positions), bool)
     if (inside & ~faces).any():
         from_above.draw_stations(axis, positions[inside & ~faces])
@@ -340,8 +342,8 @@ def draw_measurement_plan(
     plan: FloorPlan | None,
 ) -> None:
     """Draw the expected error before and after, the chosen places, and how it falls."""
-    left, right, low, high = batch.grid.extent
-    wide, tall = np.array([right - left, high - low]) / max(right - left, high - low)
+    west, east, south, north = batch.grid.extent
+    wide, tall = np.array([east - west, north - south]) / max(east - west, north - south)
     figure, ((before, after, curve),) = panels(
         11 * max(wide, 0.5) + 4.5,
         5.0 * max(tall, 0.5) + 1.0,
@@ -361,7 +363,7 @@ def draw_measurement_plan(
         image = np.full(batch.grid.inside.shape, np.nan)
         image[batch.grid.inside] = values
         mesh = _cells(axis, batch.grid, image, plan, cmap="cividis", **limits)
-        from_above.set_bounds(axis, (left, low), (right, high), batch.grid.origin, title=title)
+        from_above.set_bounds(axis, (west, south), (east, north), batch.grid.origin, title=title)
         from_above.scale_bar(axis)
     if promise is not None and predictor is not None:
         places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
@@ -383,9 +385,9 @@ def draw_measurement_plan(
 
 def draw_placement(placing: Placement, path: Path, threshold_db: float, unit: str = "dB") -> None:
     """Save the goal at every candidate, the stations that stand, and the best place, as PNG."""
-    left, right, low, high = placing.grid.extent
+    west, east, south, north = placing.grid.extent
     figure, ((axis,),) = panels(
-        8.5, 6.5 * max((high - low) / (right - left), 0.5) + 1.0, grid=False
+        8.5, 6.5 * max((north - south) / (east - west), 0.5) + 1.0, grid=False
     )
     dots = axis.scatter(
         *placing.places[:, :2].T, c=placing.coverage, s=60, marker="s", cmap="viridis"
@@ -396,7 +398,7 @@ def draw_placement(placing: Placement, path: Path, threshold_db: float, unit: st
     from_above.draw_stations(
         axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18
     )
-    from_above.set_bounds(axis, (left, low), (right, high), placing.grid.origin)
+    from_above.set_bounds(axis, (west, south), (east, north), placing.grid.origin)
     from_above.scale_bar(axis)
     from_above.legend_below(figure)
     save(figure, path, 100)

@@ -137,8 +137,8 @@ class NewStationError:
         # With silent rows: of lists those alone that were heard are the strong ones.
         errors = (part.distribution() for part in parts)
         mean, square = np.array([[mass @ e, mass @ e**2] for e, mass in errors]).T
-        stated = [np.square(each_part.spread_db).mean() for each_part in parts]
-        within = np.average(square - mean**2, weights=[one.heard.sum() for one in parts])
+        stated = [np.square(part.spread_db).mean() for part in parts]
+        within = np.average(square - mean**2, weights=[part.heard.sum() for part in parts])
         return cls(float(np.sqrt(np.mean(mean**2 * stated))), float(np.sqrt(within)), len(parts))
 
 
@@ -197,10 +197,10 @@ def place_station(
         DataError: as there; or all of the area is too far from what was measured.
     """
     grid, candidates, columns = lay_candidates(predictor, area, antenna=antenna, **where)
-    left, right, south, north = grid.extent
+    west, east, south, north = grid.extent
     now = predict_map(
         predictor,
-        [left, south, right, north],
+        [west, south, east, north],
         height_m=grid.height,
         step_m=grid.step,
         threshold_db=threshold_db,
@@ -314,10 +314,10 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
     chosen = np.random.default_rng(learned.context.seed).permutation(heard)[:most]
     parts: list[HeldOutLevels] = []
     # Without validation rows: the site left out is the test, all else is learned from.
-    for one in chosen:
-        at_site = site == one
+    for site_number in chosen:
+        at_site = site == site_number
         inner = Fold(rows[~at_site], rows[:0], rows[at_site])
-        parts.append(leave_out(learned, inner, np.full(int(at_site.sum()), one)))
+        parts.append(leave_out(learned, inner, np.full(int(at_site.sum()), site_number)))
     parts = [part for part in parts if part.heard.any()]  # of silent rows alone no error is known
     return NewStationError.from_evidence(parts) if parts else NewStationError()
 
@@ -334,11 +334,11 @@ def _candidates(grid: Grid, sites: Any, predictor: Predictor, height: float, cou
             end
         ], columns
     if sites is not None:
-        every, _ = walkable_places(sites, grid, "sites")
+        places, _ = walkable_places(sites, grid, "sites")
     else:
         # So many more lie in an area that the lattice missed
-        every, count = grid.places(), 2 * count
-    few = every[evenly_spaced(len(every), count)]
+        places, count = grid.places(), 2 * count
+    few = places[evenly_spaced(len(places), count)]
     return np.column_stack([few[:, :2], np.full(len(few), height)]), {}
 
 

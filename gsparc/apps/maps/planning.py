@@ -164,10 +164,14 @@ def plan_measurements(
         unknown, first, wanted, count, least_gain_db, tour, before_db
     )
     order = np.array(
-        [chosen.index(one) for one in (tour.walk[1:-1] if route else chosen)], np.int64
+        [chosen.index(cell) for cell in (tour.walk[1:-1] if route else chosen)], np.int64
     )
     path = ways.path_through(tour.walk[0 if len(begin) else 1 : -1]) if route else np.zeros((0, 2))
-    scatter = float(np.sqrt(np.mean([one.noise * one.weight[wanted].mean() for one in unknown])))
+    scatter = float(
+        np.sqrt(
+            np.mean([covariance.noise * covariance.weight[wanted].mean() for covariance in unknown])
+        )
+    )
     return MeasurementPlan(
         places[first:][np.array(chosen, np.int64)[order]],
         np.array(expected)[order],
@@ -200,13 +204,13 @@ def coarse_grid(
         far = cKDTree(promise.known[:, -3:]).query(local)[0].reshape(fine.inside.shape)
         # No farther than a promise reaches: where nothing is said, measuring cannot be weighed.
         fine = replace(fine, inside=fine.inside & (far <= promise.calibration().reach))
-    left, right, low, high = fine.extent
+    west, east, south, north = fine.extent
     share = fine.inside.mean()
-    step = float(np.sqrt((right - left) * (high - low) * share / count))
-    x, y = (np.arange(a + step / 2, b, step) for a, b in ((left, right), (low, high)))
+    step = float(np.sqrt((east - west) * (north - south) * share / count))
+    x, y = (np.arange(a + step / 2, b, step) for a, b in ((west, east), (south, north)))
     column, row = (
         ((v - a) / fine.step).astype(int).clip(0, n - 1)
-        for v, a, n in ((x, left, len(fine.x)), (y, low, len(fine.y)))
+        for v, a, n in ((x, west, len(fine.x)), (y, south, len(fine.y)))
     )
     inside = fine.inside[np.ix_(row, column)]
     if not inside.any():
@@ -220,8 +224,8 @@ def walkable_places(
     """Return places (n, 3) in polygons or along lines of a file, and these lines; None:
     it holds none.
     """
-    left, right, south, north = grid.extent
-    area, lines = read_shapes(path, key, grid.origin, True, max(right - left, north - south))
+    west, east, south, north = grid.extent
+    area, lines = read_shapes(path, key, grid.origin, True, max(east - west, north - south))
     from shapely import contains_xy
 
     points, streets = [np.zeros((0, 2))], None
@@ -230,8 +234,8 @@ def walkable_places(
         # Four times too many, since bounds of a corridor's polygon are mostly empty.
         step = max(grid.step / 2, float(np.sqrt((high - low).prod() / (4 * CANDIDATES))))
         x, y = (np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True))
-        every = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
-        points.append(every[contains_xy(area, every)])
+        lattice = np.stack(np.meshgrid(x, y), -1).reshape(-1, 2)
+        points.append(lattice[contains_xy(area, lattice)])
     if lines:
         streets = StreetGraph.from_lines(lines, grid.step / 2)
         # One of each step's square: a street with many bends has no more of them.
@@ -265,7 +269,9 @@ def choose_greedily(
     expected: list[float] = []
     while len(chosen) < count:
         # Sums of variances taken away over stations: one walk measures all of them.
-        gains = np.sum([one.variance_reductions(wanted)[first:] for one in unknown], axis=0)
+        gains = np.sum(
+            [covariance.variance_reductions(wanted)[first:] for covariance in unknown], axis=0
+        )
         possible = free & tour.reachable()[: len(free)]
         if not possible.any():
             why = "no place is left" if not free.any() else "no other place fits in the walk"
@@ -279,8 +285,8 @@ def choose_greedily(
                 expected,
                 (f"the next place gains {gain:.2g} dB, less than {least_gain_db:g} dB"),
             )
-        for one in unknown:
-            one.condition_on(first + best)
+        for covariance in unknown:
+            covariance.condition_on(first + best)
         error = error_after
         chosen.append(best)
         expected.append(error)
@@ -291,4 +297,4 @@ def choose_greedily(
 
 def mean_error(unknown: list[ErrorCovariance]) -> np.ndarray:
     """Return the root of the mean variance over stations at each place (S,) [dB]."""
-    return np.sqrt(np.mean([one.variances() for one in unknown], axis=0))
+    return np.sqrt(np.mean([covariance.variances() for covariance in unknown], axis=0))

@@ -219,7 +219,9 @@ def map_notes(
         level = f"{field.threshold_db:g} {field.unit} or more of some station (mean of 1 - outage)"
         ends = "" if covered is None else "; 90 % interval {:.1%} to {:.1%}".format(*covered)
         refused_share = (field.grid.inside & field.refused).sum() / max(field.grid.inside.sum(), 1)
-        only = f"; {refused_share:.0%} of the area is refused and not counted" * bool(refused_share)
+        only = (
+            f"; {refused_share:.0%} of the area is refused and not counted" if refused_share else ""
+        )
         notes.append(f"{1 - float(outage):.1%} of the predicted squares have {level}{ends}{only}")
     if field.unit == "dB":
         notes.append("levels are in dB, as the data name no unit: if they are dBm, say unit=dBm")

@@ -74,26 +74,26 @@ class Ways:
         if streets is None:
             return cls(places, length, length < 0, np.zeros(len(places), np.int64), None)
         off, near = cKDTree(streets.node).query(places)
-        found = [dijkstra(streets.length, directed=False, indices=one)[near] for one in near]
-        ways = np.array(found) + off + off[:, None]
+        lengths = [dijkstra(streets.length, directed=False, indices=node)[near] for node in near]
+        ways = np.array(lengths) + off + off[:, None]
         along = ((off == 0) | (off == 0)[:, None]) & np.isfinite(ways)
         return cls(places, np.where(along, ways, length), along, near, streets)
 
     def path_through(self, order: np.ndarray) -> np.ndarray:
         """Return the corners (m, 2) [m] of the way through places in an order (n,)."""
         corners = [self.places[order[:1]]]
-        for one, two in pairwise(order):
-            if self.streets is not None and self.along[one, two]:
+        for start, end in pairwise(order):
+            if self.streets is not None and self.along[start, end]:
                 before = dijkstra(
-                    self.streets.length, False, self.near[one], return_predecessors=True
+                    self.streets.length, False, self.near[start], return_predecessors=True
                 )[1]
-                way = [self.near[two]]
+                way = [self.near[end]]
                 while before[way[-1]] >= 0:
                     way.append(before[way[-1]])
                 corners.append(self.streets.node[way[::-1]])
-            corners.append(self.places[[two]])
-        every = np.concatenate(corners)
-        return every[np.append(True, np.diff(every, axis=0).any(1))] if len(every) else every
+            corners.append(self.places[[end]])
+        path = np.concatenate(corners)
+        return path[np.append(True, np.diff(path, axis=0).any(1))] if len(path) else path
 
 
 class Tour:
@@ -133,10 +133,10 @@ class Tour:
             gain = (
                 now[:, None] + now - length[np.ix_(before, before)] - length[np.ix_(after, after)]
             )
-            one, two = np.unravel_index(np.triu(gain, 2).argmax(), gain.shape)
-            if gain[one, two] < 1e-6 or two <= one:
+            start, end = np.unravel_index(np.triu(gain, 2).argmax(), gain.shape)
+            if gain[start, end] < 1e-6 or end <= start:
                 return
-            self.walk[one + 1 : two + 1] = self.walk[one + 1 : two + 1][::-1].copy()
+            self.walk[start + 1 : end + 1] = self.walk[start + 1 : end + 1][::-1].copy()
 
     def _added(self) -> np.ndarray:
         """What each place adds to the walk before each stop, or at its end: (stops + 1, S + 1)

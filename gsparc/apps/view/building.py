@@ -131,10 +131,12 @@ def _square(plane: np.ndarray, middle: np.ndarray, side: float) -> np.ndarray:
     length = np.linalg.norm(plane[:3])
     normal = plane[:3] / length
     foot = middle - (normal @ middle - plane[3] / length) * normal
-    one = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
-    one /= np.linalg.norm(one)
-    two = np.cross(normal, one)
-    return foot + side / 2 * np.array([-one - two, one - two, one + two, two - one])
+    along = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
+    along /= np.linalg.norm(along)
+    across = np.cross(normal, along)
+    return foot + side / 2 * np.array(
+        [-along - across, along - across, along + across, across - along]
+    )
 
 
 def _mesh(
@@ -165,11 +167,11 @@ class Sphere:
         """Return directions of a site of spectra; not more than `DIRECTIONS`."""
         assert site.grid is not None
         directions = site.grid.directions().numpy()
-        every = max(
+        stride = max(
             1, int(np.ceil(np.sqrt(directions.shape[0] * directions.shape[1] / DIRECTIONS)))
         )
         high, wide = directions.shape[:2]
-        row, column = (a.reshape(-1) for a in np.mgrid[0:high:every, 0:wide:every])
+        row, column = (a.reshape(-1) for a in np.mgrid[0:high:stride, 0:wide:stride])
         turn = np.eye(3) if site.rx_rotation is None else site.rx_rotation
         radius = RADIUS * extent
         offsets = radius * directions[row, column] @ turn.T

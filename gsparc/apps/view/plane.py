@@ -61,8 +61,8 @@ def refine_plane(
             yield None
         done |= chosen
         block = level[row - row % stride, column - column % stride]
-        every = np.where(np.isfinite(level), level, block)
-        yield Plane(grid, np.where(grid.inside, every, np.nan), stride)
+        filled = np.where(np.isfinite(level), level, block)
+        yield Plane(grid, np.where(grid.inside, filled, np.nan), stride)
         stride //= 2
 
 
@@ -76,12 +76,12 @@ def plane_sheet(
     """
     clear = np.where(np.isfinite(values), round(255 * OPACITY), 0)[..., None].astype(np.uint8)
     image = np.concatenate([legend.to_colours(values), clear], axis=-1)
-    left, right, low, high = grid.extent
+    west, east, south, north = grid.extent
     return PlacedPicture(
         name,
-        np.array([left, high, grid.height - beneath]),
-        np.array([right - left, 0.0, 0.0]),
-        np.array([0.0, low - high, 0.0]),
+        np.array([west, north, grid.height - beneath]),
+        np.array([east - west, 0.0, 0.0]),
+        np.array([0.0, south - north, 0.0]),
         image[::-1],
     )
 
@@ -93,10 +93,10 @@ def weakest_place(plane: Plane, seen: Sequence[np.ndarray] = ()) -> np.ndarray |
     None where there is none.
     """
     level = np.where(plane.grid.inside, plane.level_db, np.nan)
-    left, right, low, high = plane.grid.extent
+    west, east, south, north = plane.grid.extent
     for x, y, _ in seen:
         distance = np.hypot(plane.grid.x - x, plane.grid.y[:, None] - y)
-        level[distance < APART * max(right - left, high - low)] = np.nan
+        level[distance < APART * max(east - west, north - south)] = np.nan
     if not np.isfinite(level).any():
         return None
     return plane.grid.places(np.array([int(np.nanargmin(level))]))[0]

@@ -28,12 +28,12 @@ def explain_level(answer: Answer, moving: str, tree: cKDTree | None) -> list[str
         moving: the end that was dragged.
         tree: of measured places, world (n, 3) [m]; None without data, or where both ends moved.
     """
-    here, there = answer.ends[moving], answer.ends.get("rx" if moving == "tx" else "tx")
+    place, there = answer.ends[moving], answer.ends.get("rx" if moving == "tx" else "tx")
     lines = []
     if there is not None:
-        lines.append(f"{float(np.linalg.norm(here - there)):.3g} m from the other end")
+        lines.append(f"{float(np.linalg.norm(place - there)):.3g} m from the other end")
     if tree is not None:
-        distance = float(tree.query(here)[0])
+        distance = float(tree.query(place)[0])
         lines.append(
             "measured here" if distance < 1e-3 else f"nearest measurement: {distance:.3g} m away"
         )

@@ -105,8 +105,8 @@ class Viewed:
             values, side = levels.measured_levels(data, rows)
             # What lay below its level was not heard: it has no colour, only a place.
             values[side > 0] = np.nan
-            what = "received power" if data.site.target.is_level else "power of a channel"
-            label = f"measured {what} [{self.site.level_unit}]"
+            quantity = "received power" if data.site.target.is_level else "power of a channel"
+            label = f"measured {quantity} [{self.site.level_unit}]"
         return Measured(places, values, label)
 
 

@@ -133,14 +133,14 @@ def fetched_path(choice: str, setting: str = "file") -> Path:
     """
     sets = [public_set for public_set in public_sets().values() if public_set.dataset == choice]
     say = f"say dataset.{setting}={setting.upper()} for dataset={choice}"
-    here = next((each_set for each_set in sets if each_set.sources), None)
-    if here is not None and not (missing := here.missing()):
-        return here.folder / here.opens
-    if here is None:
-        by_hand = [f"get it from {one.by_hand} and " for one in sets]
+    fetched = next((public_set for public_set in sets if public_set.sources), None)
+    if fetched is not None and not (missing := fetched.missing()):
+        return fetched.folder / fetched.opens
+    if fetched is None:
+        by_hand = [f"get it from {public_set.by_hand} and " for public_set in sets]
         raise DataError(f"dataset.{setting} is not set; {''.join(by_hand)}{say}")
-    part = f", of which {len(missing)} are missing" if len(missing) < len(here.sources) else ""
-    how = f"get it with `gsparc data {here.name}` ({here.size_text}{part})"
+    part = f", of which {len(missing)} are missing" if len(missing) < len(fetched.sources) else ""
+    how = f"get it with `gsparc data {fetched.name}` ({fetched.size_text}{part})"
     raise DataError(f"dataset.{setting} is not set; {how}, or {say}")
 
 

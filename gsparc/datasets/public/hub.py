@@ -34,16 +34,21 @@ def fetch_from_hub(repository: str, part: str, folder: Path) -> Path:
     first = json.loads(facts.read_text(encoding="utf-8")) if facts.is_file() else {}
     if "sha256" not in first:
         first["revision"] = _download(repository, part, folder, first.get("revision"), facts)
-    size, found = _sum_of(place)
-    if "sha256" in first and found != first["sha256"]:
-        what = (
-            f"{size:,} bytes, SHA-256 {found}, are not those of the first fetch ({first['sha256']})"
+    size, sha256 = _sum_of(place)
+    if "sha256" in first and sha256 != first["sha256"]:
+        fault = (
+            f"{size:,} bytes, SHA-256 {sha256}, are not those of the first fetch "
+            f"({first['sha256']})"
         )
-        raise DataError(f"{place}: {what}; delete {folder} and fetch again")
+        raise DataError(f"{place}: {fault}; delete {folder} and fetch again")
     log.info(
-        "%s at %s: %s bytes, SHA-256 %s", repository, first["revision"][:10], f"{size:,}", found
+        "%s at %s: %s bytes, SHA-256 %s",
+        repository,
+        first["revision"][:10],
+        f"{size:,}",
+        sha256,
     )
-    write_whole(facts, json.dumps({**first, "bytes": size, "sha256": found}) + "\n")
+    write_whole(facts, json.dumps({**first, "bytes": size, "sha256": sha256}) + "\n")
     return place
 
 

@@ -88,7 +88,7 @@ def recover_vectors(
         better = solutions[1] < cost[rows]
         state[rows[better]], cost[rows[better]] = solutions[0][better], solutions[1][better]
 
-    every = torch.arange(n)
+    numbers = torch.arange(n)
     order = torch.from_numpy(np.random.default_rng(seed).permutation(n))
     for turn, starts in enumerate(STARTS):
         unsolved = order[cost[order] > enough[order]]
@@ -102,7 +102,7 @@ def recover_vectors(
         for rows in unsolved.split(max(1, AT_ONCE // starts)):
             drawn = problem.draw_flat_starts(rows, starts, generator)
             keep_better(rows, _minimise(problem, rows, drawn, enough))
-        while len(rows := every[cost > enough]):
+        while len(rows := numbers[cost > enough]):
             solved = (cost <= enough).numpy()
             near = _nearest_solved(positions, rows.numpy(), solved)
             if near is None:
@@ -116,7 +116,7 @@ def recover_vectors(
         log.debug(
             "%d of %d spectra unsolved after %d starts each", int((cost > enough).sum()), n, starts
         )
-    for rows in every.split(AT_ONCE):
+    for rows in numbers.split(AT_ONCE):
         keep_better(
             rows, _minimise(problem, rows, state[rows], torch.zeros_like(enough), SCREENING)
         )

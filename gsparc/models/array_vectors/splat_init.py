@@ -166,12 +166,14 @@ def set_emissions(model: GaussianModel, process: VectorProcess, receiver: Pose) 
     response = model.response
     assert isinstance(response, ArrayResponse)
     view = gaussian_vectors(model, receiver)  # (N, M)
-    left, size, right = torch.linalg.svd(view.to(torch.complex128), full_matrices=False)
+    left_vectors, size, right_vectors = torch.linalg.svd(
+        view.to(torch.complex128), full_matrices=False
+    )
     # Tikhonov's inverse: what the array hardly sees gets no large emissions.
     damped = size / (size.square() + (RIDGE * size[:1]).square()).clamp_min(
         torch.finfo(size.dtype).tiny
     )
-    readout = process.weights @ ((right.mH * damped) @ left.mH)  # (E, N)
+    readout = process.weights @ ((right_vectors.mH * damped) @ left_vectors.mH)  # (E, N)
     model.emission.weight2.copy_(torch.view_as_real(readout.T.contiguous()))
     model.emission.bias2.zero_()
     response.background = process.background

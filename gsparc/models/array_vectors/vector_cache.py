@@ -68,8 +68,7 @@ def recover_cached(
         parts = zip(*(getattr(recovery, name) for name in names), strict=True)
         each = (watch.seconds - began) / len(part)
         cache.update(
-            (row, (each_part, each, watch))
-            for row, each_part in zip(part.tolist(), parts, strict=True)
+            (row, (vector, each, watch)) for row, vector in zip(part.tolist(), parts, strict=True)
         )
     return RecoveredVectors(
         *map(np.stack, zip(*(cache[row][0] for row in rows.tolist()), strict=True))

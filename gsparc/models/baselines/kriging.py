@@ -93,10 +93,10 @@ def fit_variogram(positions: np.ndarray, values: np.ndarray, seed: int = 0) -> V
     start = [float(gamma[0]) / 2, spread, limit / 5]
     start = [min(max(s, a), b) for s, a, b in zip(start, low, high, strict=True)]
     weight = np.sqrt(number[filled])
-    found = least_squares(
+    optimum = least_squares(
         lambda p: weight * (variogram(distance, *p) - gamma), start, bounds=(low, high)
     )
-    return Variogram(*found.x.tolist())
+    return Variogram(*optimum.x.tolist())
 
 
 class Kriging(Interpolator):

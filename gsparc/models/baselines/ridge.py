@@ -61,9 +61,9 @@ class Ridge(UplinkMethod):
                     best = value, penalty, unit
         assert best is not None
         # Validation rows chose the penalty, and are learned from after that.
-        every = fold.learned()
+        learned = fold.learned()
         self.unit = best[2]
-        self.maps = _solve_ridge(*self._normal_equations(data, every, self.unit), best[1])
+        self.maps = _solve_ridge(*self._normal_equations(data, learned, self.unit), best[1])
         note = f"ridge: penalty {best[1]:g}, rows {'of unit power' if best[2] else 'as they are'}"
         return FitReport(started.seconds, (note,))
 

@@ -47,9 +47,9 @@ class CarriersAlone(Stored):
         for number in (
             (torch.bincount(station, minlength=count) >= LEAST_ROWS).nonzero()[:, 0].tolist()
         ):
-            here = station == number
-            centred = values[here] - values[here].mean(0)
-            kernel = choose_left_out_kernel(places[here].numpy(), centred.numpy(), entries)
+            own = station == number
+            centred = values[own] - values[own].mean(0)
+            kernel = choose_left_out_kernel(places[own].numpy(), centred.numpy(), entries)
             priors[number] = Prior(kernel)
         return cls._from_priors(priors, places, values, station)
 
@@ -64,11 +64,11 @@ class CarriersAlone(Stored):
     ) -> Self:
         means, processes = values.new_zeros(len(priors), values.shape[1]), list[Exact | None]()
         for number, prior in enumerate(priors):
-            here = station == number
-            means[number] = values[here].mean(0) if prior else 0.0
-            centred = values[here] - means[number]
+            own = station == number
+            means[number] = values[own].mean(0) if prior else 0.0
+            centred = values[own] - means[number]
             processes.append(
-                None if prior is None else Exact.from_values(prior, places[here], centred)
+                None if prior is None else Exact.from_values(prior, places[own], centred)
             )
         return cls(means, tuple(processes))
 
@@ -98,9 +98,9 @@ class CarriersAlone(Stored):
         mean = places.new_full((len(places), self.means.shape[1]), torch.nan)
         variance = places.new_full((len(places),), torch.nan)
         for number in station.unique().tolist():
-            one, here = self.processes[number], station == number
-            if one is not None:
-                found = one.answer(places[here], float64=True)
-                mean[here] = self.means[number] + found.mean
-                variance[here] = one.prior.kernel.amplitude * found.variance
+            process, own = self.processes[number], station == number
+            if process is not None:
+                answer = process.answer(places[own], float64=True)
+                mean[own] = self.means[number] + answer.mean
+                variance[own] = process.prior.kernel.amplitude * answer.variance
         return MeanVariance(mean, variance)

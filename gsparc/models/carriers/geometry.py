@@ -130,8 +130,8 @@ def _choose_planes(
     """Return those (K, 4) of planes (Q, 4) whose looks explain the target (n, D), powers,
     and the rest.
     """
-    planes, energy, every = NO_PLANES, float(target.square().sum()), looks(tried)
-    atoms, images = every[:, :1], every[:, 1:]
+    planes, energy, tried_looks = NO_PLANES, float(target.square().sum()), looks(tried)
+    atoms, images = tried_looks[:, :1], tried_looks[:, 1:]
     powers, residual = _solve(atoms, target)
     while len(planes) < PLANES:
         # Of an image only what known paths cannot imitate tells: orthogonal least squares.
@@ -200,8 +200,8 @@ class ExpectedSpectra:
         angle = directions.float() @ self.turns.T
         response = torch.polar(powers.float().sqrt()[..., None].expand_as(angle), angle)
         result = []
-        for one in response:
-            vectors = phases @ one
+        for row in response:
+            vectors = phases @ row
             image = self.renderer(torch.cat([vectors, torch.zeros(DRAWS, 1)], 1)).flatten(1)
             image = image if self.exponent == 2 else image.square()
             result.append(normalise_spectrum(image, self.normalisation).mean(0))

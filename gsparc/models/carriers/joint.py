@@ -53,10 +53,14 @@ class Covariance(Stored):
         """Return covariances (n, m) of rows (n, 4) and (m, 4): places [m], and log2 of carriers."""
         distance = distances(a[:, :3], b[:, :3])
         octaves = (a[:, None, 3] - b[None, :, 3]).abs()
-        here, alike = matern32(distance, SAME_PLACE_M), matern32(octaves, OCTAVES)
+        same_place, alike = matern32(distance, SAME_PLACE_M), matern32(octaves, OCTAVES)
         around, carrier_term = matern32(distance, self.length), self.own * matern32(octaves, ALONE)
         # Of a carrier alone: its mean image, and what varies over places.
-        return self.shared * around + carrier_term * (1 + around) + here * (1 + self.near * alike)
+        return (
+            self.shared * around
+            + carrier_term * (1 + around)
+            + same_place * (1 + self.near * alike)
+        )
 
     def gram(self, rows: Tensor, noise: Tensor | float) -> Tensor:
         """Return covariances (n, n) of rows (n, 4) with theirs (n,) of `row_noise`."""
@@ -104,8 +108,10 @@ def row_noise(images: Tensor, groups: list[Tensor]) -> Tensor:
     free = torch.tensor([len(rows) - 1.0 for rows in groups], dtype=torch.float64)
     usual = squared.sum().clamp_min(1e-9) / free.sum().clamp_min(1.0)
     noise = images.new_ones(len(images))
-    for rows, one in zip(groups, (squared / usual + USUAL) / (free + USUAL), strict=True):
-        noise[rows] = one
+    for rows, noise_of_group in zip(
+        groups, (squared / usual + USUAL) / (free + USUAL), strict=True
+    ):
+        noise[rows] = noise_of_group
     return noise
 
 
@@ -129,8 +135,8 @@ def choose_joint(
         entries: pixels.
     """
     both, best, result = torch.cat([images, paths], 1), math.inf, None
-    for one in _candidates(float((rows[:, :3].amax(0) - rows[:, :3].amin(0)).norm()) or 1.0):
-        inverse = Factor.from_gram(one.gram(rows, noise)).inverse
+    for candidate in _candidates(float((rows[:, :3].amax(0) - rows[:, :3].amin(0)).norm()) or 1.0):
+        inverse = Factor.from_gram(candidate.gram(rows, noise)).inverse
         solved = inverse @ both
         away = left_out_residuals(inverse, solved, groups)
         # Residuals are linear in what is taken off: the best weight is a quotient.
@@ -142,10 +148,12 @@ def choose_joint(
             _without_paths(each, weight) for each in (away, left_out_residuals(inverse, solved))
         )
         # As of ratios in decibels: what is told well counts as much as what is not.
-        error = sum(float(one.square().sum(1).clamp_min(1e-9).log().mean()) for one in (new, seen))
+        error = sum(
+            float(missed.square().sum(1).clamp_min(1e-9).log().mean()) for missed in (new, seen)
+        )
         if error < best:
             scaled = replace(
-                one, amplitude=float((new.square().sum(1) / away.variance).mean()) / entries
+                candidate, amplitude=float((new.square().sum(1) / away.variance).mean()) / entries
             )
             carrier = _without_paths(left_out_residuals(inverse, solved, carriers), weight)
             best, result = error, JointChoice(scaled, weight, new, seen, carrier)

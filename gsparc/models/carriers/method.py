@@ -100,7 +100,7 @@ class CarrierField(OneArray):
         power = [
             images[rows].unflatten(1, (grid.height, grid.width)) ** self.exponent for rows in groups
         ]
-        seen = torch.stack([lags.to_lags(one).mean(0) for one in power])
+        seen = torch.stack([lags.to_lags(powers).mean(0) for powers in power])
         self.paths = find_paths(lags, seen, self.places, *self.pose())
         few = _at_covering_places(data.tx[fit_rows], CHOSEN_ON)
         targets = training_targets(data, fit_rows[few])
@@ -153,14 +153,15 @@ class CarrierField(OneArray):
     ) -> None:
         """Set settings by some rows (n,) whose places and carriers (n,) are numbered."""
         at, count, entries = self.rows[rows], len(self._stations), len(self.mean)
-        places, carriers = (rows_of_groups(one.numpy()) for one in (place, station))
+        places, carriers = (rows_of_groups(numbers.numpy()) for numbers in (place, station))
         joint = choose_joint(at, values, paths, noise, places, carriers, entries)
         self.covariance, self.weight = joint.covariance, joint.weight
         self.alone = CarriersAlone.learn(at[:, :3], values, station, count, entries)
         has_process = self.alone.has_process(station)
         missed, unit = self.alone.left_out(station)[has_process], place[has_process]
         new, seen = (
-            _second_share(one[has_process], missed, unit) for one in (joint.new, joint.seen)
+            _second_share(unexplained[has_process], missed, unit)
+            for unexplained in (joint.new, joint.seen)
         )
         self.shares = new, seen
         # One carrier alone tells nothing of others.
@@ -181,16 +182,19 @@ class CarrierField(OneArray):
         carrier = self._stations.carrier_hz
         assert carrier is not None
         rows = torch.cat([at, torch.from_numpy(np.log2(carrier))[station][:, None]], 1)
-        cross, one = self.covariance.between(rows, self.rows), self.covariance
+        cross, covariance = self.covariance.between(rows, self.rows), self.covariance
         value = cross @ self.left
         if self.weight:  # else the paths, which are most of a query, explain nothing
             value = value + self.weight * self._expected_values(places)[which]
         measured = self.alone.has_process(station)
         value = torch.where(measured[:, None], value, self.carried * value)
-        variance = (one.prior - (cross @ self._inverse_of_rows() * cross).sum(1)).clamp(
-            0, one.prior
+        variance = (covariance.prior - (cross @ self._inverse_of_rows() * cross).sum(1)).clamp(
+            0, covariance.prior
         )
-        unknown, error = variance / one.prior, one.amplitude * (variance + one.noise)
+        unknown, error = (
+            variance / covariance.prior,
+            covariance.amplitude * (variance + covariance.noise),
+        )
         near = torch.cdist(places, self.places).amin(1)[which] < SAME_PLACE_M
         share = torch.tensor(self.shares, dtype=torch.float64)[near.long()] * measured
         if share.any():
@@ -238,7 +242,9 @@ class CarrierField(OneArray):
         """Components (n, P) float64 of what paths to places (n, 3) are expected to look like."""
         if self._thin is None:
             some = Separable(*self.pixels).subsample_pixels(self.stride)
-            mean, axes = (some.images(one).flatten(1) for one in (self.middle[None], self.axes))
+            mean, axes = (
+                some.images(images).flatten(1) for images in (self.middle[None], self.axes)
+            )
             self._thin = mean[0], torch.linalg.pinv(axes)
         mean, to_values = self._thin
         return ((self.expected(self.paths, places) - mean) @ to_values).double()

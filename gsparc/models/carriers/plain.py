@@ -55,8 +55,8 @@ class DirectBeam(OneArray):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        one = torch.ones(len(self.places), 1).double()
+        ones = torch.ones(len(self.places), 1).double()
         beam = self.expected(
-            SharedPaths(NO_PLANES, *self.pose(), self.places, one), query.tx.cpu().double()
+            SharedPaths(NO_PLANES, *self.pose(), self.places, ones), query.tx.cpu().double()
         )
         return Prediction(self.answer_images(self.mean.lerp(beam, BEAM), query))

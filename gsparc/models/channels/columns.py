@@ -171,13 +171,13 @@ def group_channels(data: Measurements, rows: np.ndarray, by_antenna: bool) -> tu
             measured = mine if data.mask is None else mine[data.mask[rows][entries].all((1, 2))]
             if not len(measured):
                 continue
-            here = torch.from_numpy(measured)
-            chosen = target[here][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(
-                len(here), -1
+            measured_rows = torch.from_numpy(measured)
+            chosen = target[measured_rows][:, list(slot.antennas)][:, :, list(slot.tones)].reshape(
+                len(measured_rows), -1
             )
-            places = slot.antenna_places(moving[here], turned[here])
+            places = slot.antenna_places(moving[measured_rows], turned[measured_rows])
             when = torch.from_numpy(run[measured]), torch.from_numpy(order[rows[measured]])
-            groups.append(Group(slot, places, here, chosen, *when))
+            groups.append(Group(slot, places, measured_rows, chosen, *when))
     return tuple(groups)
 
 
@@ -200,15 +200,22 @@ def _slots_of_station(
         torch.from_numpy(site.every_station.position[station]),
         float(site.carriers[station]),
     )
-    every = tuple(range(antennas))
+    all_antennas = tuple(range(antennas))
     if not by_antenna:
         return [
-            Slot(station, every, tuple(range(tones)), centre, ORIGIN, 2 * math.pi * carrier / LIGHT)
+            Slot(
+                station,
+                all_antennas,
+                tuple(range(tones)),
+                centre,
+                ORIGIN,
+                2 * math.pi * carrier / LIGHT,
+            )
         ]
     # The longest way between places bounds how far two tones' phases turn against each other.
     reach = float(np.linalg.norm(np.ptp(data.moving[rows], axis=0)))
     frequency = site.tones() if len(site.tones()) == tones else np.full(tones, carrier)
-    elements: list[tuple[tuple[int, ...], Tensor, Tensor]] = [(every, centre, ORIGIN)]
+    elements: list[tuple[tuple[int, ...], Tensor, Tensor]] = [(all_antennas, centre, ORIGIN)]
     if site.array is not None and antennas == len(site.array) and antennas > 1:
         offsets = torch.from_numpy(np.asarray(site.array, np.float64))
         rotation = torch.from_numpy(np.asarray(data.rx_rotation[rows[0]], np.float64))

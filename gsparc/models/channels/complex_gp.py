@@ -151,7 +151,7 @@ class ComplexGP(ClosedForm):
         self, data: Measurements, known: np.ndarray, kernel: Kernel | None = None
     ) -> list[str]:
         """Rows (n,) with one factor, settings chosen on some unless given; factors of runs."""
-        places, notes, every = torch.from_numpy(data.moving[known]), [], torch.arange(len(known))
+        places, notes, order = torch.from_numpy(data.moving[known]), [], torch.arange(len(known))
         target = (
             torch.from_numpy(np.asarray(data.target[known]))
             .reshape(len(known), -1)
@@ -160,7 +160,7 @@ class ComplexGP(ClosedForm):
         runs = data.runs_of(known)
         names, run = np.unique(runs, return_inverse=True)
         slot = replace(ANY, wavenumber=2 * math.pi / self._wavelength)
-        rows = Group(slot, places, every, target, torch.from_numpy(run), every.double())
+        rows = Group(slot, places, order, target, torch.from_numpy(run), order.double())
         if kernel is None:
             few = rows.thin_rows(CHOSEN_ON)
             if len(few) < len(rows):
@@ -258,8 +258,8 @@ def choose_waves(groups: tuple[Group, ...], runs: int) -> tuple[Kernel, Tensor]:
     candidates = wave_kernels(2 * math.pi / groups[0].slot.wavenumber)
     for _, kernels in groupby(candidates, lambda one: one.signals[0]):
         first, *others = kernels
-        one = cast(IsotropicWaves, first.signals[0])
-        waves = [replace(one, wavenumber=group.slot.wavenumber) for group in groups]
+        isotropic = cast(IsotropicWaves, first.signals[0])
+        waves = [replace(isotropic, wavenumber=group.slot.wavenumber) for group in groups]
         alike = [
             wave.covariance(rows.places, rows.places)
             for wave, rows in zip(waves, groups, strict=True)

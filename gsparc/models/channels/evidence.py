@@ -207,11 +207,12 @@ def fit_terms(
         bounds=bounds,
         options={"maxiter": steps, "ftol": SETTLED},
     )
-    found = torch.from_numpy(optimum.x)
+    parameters = torch.from_numpy(optimum.x)
     fitted = tuple(
-        term.with_values(values) for term, values in zip(terms, found.split(sizes), strict=True)
+        term.with_values(values)
+        for term, values in zip(terms, parameters.split(sizes), strict=True)
     )
-    return fitted, sum(solve_group(part, (part.design @ found).exp()).nll for part in parts)
+    return fitted, sum(solve_group(part, (part.design @ parameters).exp()).nll for part in parts)
 
 
 def left_out_errors(part: BasisGroup, power: Tensor, groupings: list[Grouping]) -> list[Tensor]:

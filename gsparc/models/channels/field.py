@@ -224,10 +224,10 @@ class ChannelField(ClosedForm):
         for alike in self._group_by_places(ends):
             slot_places = [SlotPlaces(model.group.slot, places) for model, _, places in alike]
             crosses = prior.end_covariances(slot_places, [model.group for model, _, _ in alike])
-            for (model, here, _), at, cross in zip(alike, slot_places, crosses, strict=True):
+            for (model, own, _), at, cross in zip(alike, slot_places, crosses, strict=True):
                 if images is not None:
                     at.slot.write_entries(
-                        share, here, model.given.mean(images.covariance(at, model.group))
+                        share, own, model.given.mean(images.covariance(at, model.group))
                     )
                 # In float64 slopes of variances are asked for, which a rounded root would spoil.
                 removed = (
@@ -238,13 +238,13 @@ class ChannelField(ClosedForm):
                 whole = prior.variance(at) + prior.disturbance_variance
                 posterior_variance = model.scale * (whole - removed).clamp_min(0)
                 add_slot(
-                    at.slot, here, model.given.mean(cross), posterior_variance, model.scale * whole
+                    at.slot, own, model.given.mean(cross), posterior_variance, model.scale * whole
                 )
         unheard = torch.tensor(
-            [one not in self.stations for one in ends.station.tolist()], dtype=torch.bool
+            [number not in self.stations for number in ends.station.tolist()], dtype=torch.bool
         )
         for place in ends.still[unheard].detach().unique(dim=0):
-            here = torch.nonzero(unheard & (ends.still == place).all(1)).flatten()
+            own = torch.nonzero(unheard & (ends.still == place).all(1)).flatten()
             if self.common is None:
                 raise ValueError(
                     "waves: one static end was learned from, which tells nothing of another"
@@ -255,9 +255,9 @@ class ChannelField(ClosedForm):
                 # Antennas of the new end stand about its place as those of the known one do.
                 middle = torch.from_numpy(self.site.every_station.position[slot.station])
                 slot = replace(slot, end=slot.end + place - middle)
-                at = SlotPlaces(slot, slot.antenna_places(ends.moving[here], ends.turned[here]))
+                at = SlotPlaces(slot, slot.antenna_places(ends.moving[own], ends.turned[own]))
                 common, posterior_variance, whole = self.common.predict(prior, at)
-                add_slot(slot, here, common[:, None].expand(-1, outputs), posterior_variance, whole)
+                add_slot(slot, own, common[:, None].expand(-1, outputs), posterior_variance, whole)
         return mean, share, after, before
 
     def _group_by_places(self, ends: Ends) -> list[list[tuple[GroupWeights, Tensor, Tensor]]]:
@@ -266,13 +266,15 @@ class ChannelField(ClosedForm):
         """
         alike: dict[tuple[Any, ...], list[tuple[GroupWeights, Tensor, Tensor]]] = {}
         for number in ends.station.unique().tolist():
-            here = torch.nonzero(ends.station == number).flatten()
+            own = torch.nonzero(ends.station == number).flatten()
             for model in self.stations.get(number, ()):
                 slot, learned = model.group.slot, model.group
-                places = slot.antenna_places(ends.moving[here], ends.turned[here])
-                here_and_there = (to_numpy(one).tobytes() for one in (places, learned.places[:1]))
-                key = slot.wavenumber, learned.displacement_key, *here_and_there
-                alike.setdefault(key, []).append((model, here, places))
+                places = slot.antenna_places(ends.moving[own], ends.turned[own])
+                fingerprints = (
+                    to_numpy(positions).tobytes() for positions in (places, learned.places[:1])
+                )
+                key = slot.wavenumber, learned.displacement_key, *fingerprints
+                alike.setdefault(key, []).append((model, own, places))
         return list(alike.values())
 
     def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:

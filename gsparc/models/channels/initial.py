@@ -136,16 +136,16 @@ def find_terms(
         ValueError: the data are no channels of a known carrier with one static end.
     """
     start, factors, note = _fit_isotropic(data, rows, effort)
-    every = group_channels(data, rows, True)
-    every = tuple(
-        normalise_power(replace(g, target=g.target / factors[g.run][:, None])) for g in every
+    all_groups = group_channels(data, rows, True)
+    all_groups = tuple(
+        normalise_power(replace(g, target=g.target / factors[g.run][:, None])) for g in all_groups
     )
     most = effort.term_rows
-    groups, cache = thin_groups(every, COLUMNS, most), Cache()
+    groups, cache = thin_groups(all_groups, COLUMNS, most), Cache()
     if compress_groups(groups[:1], start, cache)[0].is_uncompressed:
-        groups = thin_groups(every, DENSE_COLUMNS, min(most, DENSE_ROWS))
-    notes, wavelength = [note], 2 * math.pi / every[0].slot.wavenumber
-    search = _Search(replace(settings, rows=most), groups, every, wavelength, cache)
+        groups = thin_groups(all_groups, DENSE_COLUMNS, min(most, DENSE_ROWS))
+    notes, wavelength = [note], 2 * math.pi / all_groups[0].slot.wavenumber
+    search = _Search(replace(settings, rows=most), groups, all_groups, wavelength, cache)
     steps = [search._measure(start, search._compress(start))]
     search.add_terms(steps, notes)
     return steps[-1].prior, tuple(notes)
@@ -181,9 +181,9 @@ def _fit_isotropic(
     extent = float(torch.linalg.vector_norm(everywhere.max(0).values - everywhere.min(0).values))
     reach, none = BEYOND * max(extent, wavelength), ORIGIN
     frame = Frame(everywhere.mean(0), reach, length, GAINS[0] * wavelength, none)
-    one = torch.ones(1, dtype=torch.float64)
+    ones = torch.ones(1, dtype=torch.float64)
     note = f"waves: isotropic field, envelope {length:.3g} m, noise {noise:.2g} of its power"
-    return ChannelPrior((Isotropic(frame, one), Noise(frame, noise * one))), factors, note
+    return ChannelPrior((Isotropic(frame, ones), Noise(frame, noise * ones))), factors, note
 
 
 def _drop_weak_directions(prior: ChannelPrior) -> ChannelPrior:

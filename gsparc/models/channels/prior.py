@@ -28,10 +28,10 @@ class ChannelPrior(Stored):
         return next((term for term in self.terms if isinstance(term, kind)), None)
 
     def __getitem__(self, kind: type[T]) -> T:
-        found = self.find_term(kind)
-        if found is None:
+        term = self.find_term(kind)
+        if term is None:
             raise KeyError(kind.__name__)
-        return found
+        return term
 
     def with_terms(self, *terms: ChannelTerm) -> ChannelPrior:
         """Return the prior with these in place of their kinds;
@@ -98,8 +98,10 @@ class ChannelPrior(Stored):
             alike.setdefault((group.displacement_key, group.slot.wavenumber), []).append(number)
         result: list[Tensor] = [torch.empty(0)] * len(groups)
         for numbers in alike.values():
-            here = [groups[number] for number in numbers]
-            for number, covariance in zip(numbers, self.end_covariances(here, here), strict=True):
+            alike_groups = [groups[number] for number in numbers]
+            for number, covariance in zip(
+                numbers, self.end_covariances(alike_groups, alike_groups), strict=True
+            ):
                 result[number] = covariance
         return result
 

@@ -166,12 +166,12 @@ class DirectionalGP(SourcesInFrame):
             if turn % REFIT_EVERY == REFIT_EVERY - 1:
                 self._refit_powers_and_kernel()
             now = self.posterior
-            one = (
+            gains = (
                 now.mean_gains(now.arrival_at_rows(probability))
                 * now.unobstructed_waves[:, :, None]
             )
             seen, odds = visibility.seen.float(), rates.log_odds_seen(rays, probability)
-            flip = entries_to_flip(seen[rows], odds[rows], *now.conditioned.left_out(), one)
+            flip = entries_to_flip(seen[rows], odds[rows], *now.conditioned.left_out(), gains)
             if not bool(flip.any()):
                 break
             seen[rows] = torch.where(flip, 1 - seen[rows], seen[rows])

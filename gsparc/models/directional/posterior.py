@@ -268,7 +268,8 @@ class SightedSources:
         buffer = torch.empty_like(real)
         for k, coherent in zip(uncertain.tolist(), retained, strict=True):
             query, other = (
-                torch.view_as_real(one[:, k].contiguous()) for one in (power * waves, self.waves)
+                torch.view_as_real(components[:, k].contiguous())
+                for components in (power * waves, self.waves)
             )
             real.addcmul_(torch.mm(query, other.T, out=buffer), coherent)
             turned = torch.stack([query[:, 1], -query[:, 0]], 1)

@@ -213,7 +213,7 @@ def _are_distinct(points: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 def _initial_error(rays: Rays, rng: np.random.Generator) -> float | None:
     """Sigma [rad] of the rays of the point of largest evidence, or None without one."""
-    found: list[tuple[float, float]] = []
+    trials: list[tuple[float, float]] = []
     if len(rays) > ERROR_SAMPLE:
         rays = rays.select_rays(np.sort(rng.choice(len(rays), ERROR_SAMPLE, replace=False)))
     for error in ERRORS:
@@ -224,8 +224,8 @@ def _initial_error(rays: Rays, rng: np.random.Generator) -> float | None:
         top = int(np.maximum(_log_ratio(squared_error, error), 0).sum(1).argmax())
         evidence = _refine_point(rays, proposed[top], error)[1]
         if evidence > MIN_EVIDENCE:
-            found.append((evidence, error))
-    return max(found)[1] if found else None
+            trials.append((evidence, error))
+    return max(trials)[1] if trials else None
 
 
 def _refine_point(rays: Rays, point: np.ndarray, error: float) -> tuple[np.ndarray, float]:
@@ -279,12 +279,20 @@ def _midpoints(
     couples = rng.integers(len(groups), size=(pairs, 2))
     points = []
     for a, b in couples[couples[:, 0] != couples[:, 1]]:
-        one, two = rays.direction[groups[a]], rays.direction[groups[b]]
-        here, there = rays.places[owners[a]], rays.places[owners[b]]
-        s, t, gap = closest_ranges_and_gap(here, one, there, two)
+        direction, other_direction = rays.direction[groups[a]], rays.direction[groups[b]]
+        place, other_place = rays.places[owners[a]], rays.places[owners[b]]
+        s, t, gap = closest_ranges_and_gap(place, direction, other_place, other_direction)
         near = gap < 3 * error * np.hypot(s, t)
         i, j = np.nonzero(near)
-        points.append((here + s[i, j, None] * one[i] + there + t[i, j, None] * two[j]) / 2)
+        points.append(
+            (
+                place
+                + s[i, j, None] * direction[i]
+                + other_place
+                + t[i, j, None] * other_direction[j]
+            )
+            / 2
+        )
     midpoints = np.concatenate([rays.places[:0], *points])
     midpoints = midpoints[np.linalg.norm(midpoints - rays.places.mean(0), axis=1) < REACH_M]
     if len(midpoints) > limit:

@@ -75,9 +75,9 @@ def rough_gains(rows: Rows, candidates: Tensor, alpha: Tensor) -> Tensor:
             phase = cycles.sub_(cycles.round()).mul_(2 * math.pi)
             loss = distance.reciprocal_()
             cosine, sine = phase.cos().mul_(loss), phase.sin_().mul_(loss)
-            here, across = alpha.real[mine], alpha.imag[mine]
-            real += cosine @ here - sine @ across
-            imag += cosine @ across + sine @ here
+            real_part, imaginary_part = alpha.real[mine], alpha.imag[mine]
+            real += cosine @ real_part - sine @ imaginary_part
+            imag += cosine @ imaginary_part + sine @ real_part
             power += loss.square_().sum(1)
         scores.append((real.square() + imag.square()).sum(1) / power)
     return torch.cat(scores)

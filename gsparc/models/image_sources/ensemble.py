@@ -84,7 +84,9 @@ def run_searches(
 
     def is_unwanted(number: int) -> bool:
         """Tell whether those before it are all that is wanted."""
-        before = [errors[one] for one in takewhile(errors.__contains__, range(number))]
+        before = [
+            errors[number_before] for number_before in takewhile(errors.__contains__, range(number))
+        ]
         # As where each row has its own phase
         in_vain = sum(error > IN_VAIN for error in before) >= 2
         return stopped.is_set() or in_vain or reached_noise_floor(before, noise_floor)
@@ -141,8 +143,8 @@ def run_searches(
         wait(running, return_when=FIRST_EXCEPTION)
         members = [
             m
-            for number, one in enumerate(running)
-            if (m := one.result()) and not is_unwanted(number)
+            for number, future in enumerate(running)
+            if (m := future.result()) and not is_unwanted(number)
         ]
     finally:
         stopped.set()

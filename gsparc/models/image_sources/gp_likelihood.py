@@ -78,9 +78,9 @@ class CircularGains:
         """
         real, imag = slope.real.contiguous(), slope.imag.contiguous()
         slopes = torch.empty_like(scaled)
-        for k, one in enumerate(correlation):
+        for k, block in enumerate(correlation):
             pair = torch.stack([scaled[:, k].real, scaled[:, k].imag], 1)
-            a, b = (real * one) @ pair, (imag * one) @ pair
+            a, b = (real * block) @ pair, (imag * block) @ pair
             slopes[:, k] = torch.complex(a[:, 0] - b[:, 1], a[:, 1] + b[:, 0])
         return 2 * slopes
 
@@ -132,11 +132,11 @@ class PhasedGains(CircularGains):
         """See `CircularGains`."""
         n, slopes = len(scaled), torch.empty_like(scaled)
         blocks = slope.view(2, n, 2, n)
-        for k, one in enumerate(correlation):
+        for k, block in enumerate(correlation):
             pair = torch.stack(stack_real_imag(scaled[:, k]), 1) * quadrature_variances(
                 self.quadrature
             )
-            by = (blocks * one[None, :, None, :]).view(2 * n, 2 * n) @ pair
+            by = (blocks * block[None, :, None, :]).view(2 * n, 2 * n) @ pair
             # p = (Re, Im) and q = (-Im, Re): the derivatives by Re and Im collect both
             slopes[:, k] = torch.complex(by[:n, 0] + by[n:, 1], by[n:, 0] - by[:n, 1])
         return slopes
@@ -214,10 +214,10 @@ class GainPosterior:
 
     def nll_without_source(self, k: int) -> float:
         """Return `nll` of the scene without source k, of circular gains."""
-        one, source = CircularGains(self.rows), self.scene.sources[k]
+        gains, source = CircularGains(self.rows), self.scene.sources[k]
         correlation = self.scene.visibility.correlation(self.rows.places, source)
-        one.add_source(self.waves[:, k] * self.scene.log_amplitude[k].exp(), correlation)
-        return Conditioned.from_gram(self.covariance - one.matrix, self.rows.target).nll
+        gains.add_source(self.waves[:, k] * self.scene.log_amplitude[k].exp(), correlation)
+        return Conditioned.from_gram(self.covariance - gains.matrix, self.rows.target).nll
 
     # ---- of gains of fixed phases ----
     @property
@@ -256,7 +256,7 @@ def estimate_phases(
     posterior = GainPosterior(rows, replace(scene, noise_floor=JITTER))
     # The mean gain but for its power and constant share, which are positive and do not turn it.
     gain = (posterior.waves.mH @ posterior.conditioned.weights).sum(1)
-    one = rows.target.shape[1] == 1
+    single = rows.target.shape[1] == 1
     return replace(
-        scene, phase=gain.angle(), quadrature=quadrature if one else 1.0, noise_floor=noise_floor
+        scene, phase=gain.angle(), quadrature=quadrature if single else 1.0, noise_floor=noise_floor
     )

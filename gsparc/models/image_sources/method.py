@@ -340,7 +340,8 @@ class ImageSourceGP(SourcesInFrame):
             places, tones
         )
         parts = [
-            (share, one, variance) for share, one in zip(self.weights.tolist(), stack, strict=True)
+            (share, mean, variance)
+            for share, mean in zip(self.weights.tolist(), stack, strict=True)
         ]
         return Moments(*mixture_moments(parts), prior)
 

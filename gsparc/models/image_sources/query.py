@@ -195,13 +195,13 @@ class RowVariance:
         """Variance and prior (m,) of visible waves (m, K) before phases;
         see `varying_correlations`.
         """
-        here = torch.view_as_real(arriving * self.phasor)  # (m, K, 2)
+        steered = torch.view_as_real(arriving * self.phasor)  # (m, K, 2)
         # (K, m, 2, n)
         there = torch.addcmul(self.level, varying[:, :, None, self.place_of], self.there)
         # Real and imaginary parts of queries with those of rows, (m, 2, 2, n); those in quadrature
         # are the same products, the other way round and with signs.
-        product = torch.bmm(here.mT, there.flatten(2).transpose(0, 1)).unflatten(2, (2, -1))
+        product = torch.bmm(steered.mT, there.flatten(2).transpose(0, 1)).unflatten(2, (2, -1))
         cross = torch.addcmul(self.along * product, product.flip(1, 2), self.across)
-        prior = here.square().sum(2) @ self.power + self.noise
+        prior = steered.square().sum(2) @ self.power + self.noise
         reduction = (cross.flatten(2).flatten(0, 1) @ self.root).square().sum(1)
         return (prior - reduction.view(-1, 2).sum(1)).clamp_min(0), prior

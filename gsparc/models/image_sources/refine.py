@@ -98,8 +98,8 @@ def _cost_and_gradient(
     waves = moved.unobstructed_waves(rows) * scene.visible_share(rows.position)
     amplitude, noise = moved.log_amplitude.detach().exp(), math.exp(moved.log_noise)
     scaled, gains = waves.detach() * amplitude, GainPosterior(rows, scene).empty_covariance()
-    for k, one in enumerate(correlation):
-        gains.add_source(scaled[:, k], one)
+    for k, block in enumerate(correlation):
+        gains.add_source(scaled[:, k], block)
     conditioned = gains.add_noise_and_condition(noise + scene.noise_floor)
     by_waves = gains.grad_waves(conditioned.nll_gradient, scaled, correlation)
     by_amplitude = (scaled.conj() * by_waves).sum(0).real

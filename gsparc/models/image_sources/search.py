@@ -211,18 +211,18 @@ class Search:
                 break
             spread = partial(self._antenna_images, parent)
             spacing = 0.5 * self.wavelength
-            found = find_sources_in_box(
+            sources = find_sources_in_box(
                 posterior, self.box, spacing, FREE_PER_ROUND, self.generator, spread
             )
-            found = [source for source in found if source[1] >= FREE_SCORE]
-            for position, _, amplitude in found:
+            sources = [source for source in sources if source[1] >= FREE_SCORE]
+            for position, _, amplitude in sources:
                 sequence, plane = self._best_parent_and_plane(position, posterior)
                 planes = torch.cat([self.scene.planes, plane[None]])
                 self.scene = replace(self.scene, planes=planes).add_sequences(
                     [(*sequence, len(planes) - 1)], amplitude[None]
                 )
-            if found:
-                return len(found)
+            if sources:
+                return len(sources)
         return 0
 
     def _reflectable(self, scene: SourceScene) -> list[int]:

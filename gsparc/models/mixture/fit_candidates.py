@@ -84,9 +84,9 @@ def fit_candidates(
             if field.held is not None:
                 target = data.site.target.in_error_unit(data.batch(field.held.rows).target)
                 mean = data.site.target.in_error_unit(field.held.mean)
-                one = Race.from_mean(field.held.rows, mean, target, add_to_curve)
-                add_to_curve(name, mean_square(one.missed))
-                race = one if race is None or one.error < race.error else race
+                rival = Race.from_mean(field.held.rows, mean, target, add_to_curve)
+                add_to_curve(name, mean_square(rival.missed))
+                race = rival if race is None or rival.error < race.error else race
         except ValueError as error:
             if isinstance(error, FellBehind):  # a `ValueError`, too
                 reports[name] = FitReport(watch.seconds - began)

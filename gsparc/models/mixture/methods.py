@@ -34,9 +34,8 @@ class ImageSources(Mixture):
         searched = ("sources", "rays") if data.directions is not None else ("sources",)
         placed = (str(self.init.name),) if self.init.name in CANDIDATES else searched
         # Offsets are known to sources alone.
-        return _candidates(
-            *placed, *["diffuse"] * (self.init.snapshot == "none" and self.adds_process)
-        )
+        adds_diffuse = self.init.snapshot == "none" and self.adds_process
+        return _candidates(*placed, *(["diffuse"] if adds_diffuse else []))
 
     def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""
@@ -119,7 +118,7 @@ class Bearings(Mixture):
         """See `Mixture`."""
         if not self.adds_process:
             return {"bearings": partial(make_bearings, components=0)}
-        return _candidates("bearings", *["process"] * (len(data) <= PROCESS_ROWS))
+        return _candidates("bearings", *(["process"] if len(data) <= PROCESS_ROWS else []))
 
     def why_not(self, data: Measurements) -> str | None:
         """See `Mixture`."""

@@ -178,14 +178,14 @@ class Mixture(LearnsTogether, ClosedForm):
             if several
             else None
         )
-        found, reports = fit_candidates.fit_candidates(
+        fitted, reports = fit_candidates.fit_candidates(
             parts, init, self.switches, data, fold, context, watch, cut
         )
         # Searches have errors of their own, and of few squares nothing is sure:
         # a mixture need not be.
-        sure = 0.0 if set(found).intersection((*fit_candidates.SEARCHES, "neighbours")) else 1.0
-        chosen = weigh_members(found, data, fold.val, cut, sure)
-        self.members, self.weights = [found[name] for name in chosen], tuple(chosen.values())
+        sure = 0.0 if set(fitted).intersection((*fit_candidates.SEARCHES, "neighbours")) else 1.0
+        chosen = weigh_members(fitted, data, fold.val, cut, sure)
+        self.members, self.weights = [fitted[name] for name in chosen], tuple(chosen.values())
         self.started = "+".join(chosen)
         self.site, self.init_s = data.site, watch.seconds
         self.explained = self._explained_share(data, fold, several)
@@ -216,7 +216,9 @@ class Mixture(LearnsTogether, ClosedForm):
         batch = data.batch(fold.val)
         result = self.predict(batch).explained
         assert result is not None
-        prediction, target = (data.site.target.in_error_unit(one) for one in (result, batch.target))
+        prediction, target = (
+            data.site.target.in_error_unit(values) for values in (result, batch.target)
+        )
         return explained_variance(prediction, target, not data.site.target.is_complex)
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
@@ -268,11 +270,13 @@ class Mixture(LearnsTogether, ClosedForm):
         # Members are in closed form, and state both.
         moments = [(weight, pair.mean, cast(Tensor, pair.variance)) for weight, pair in pairs]
         mean, variance = mixture_moments(moments)
-        unknown = torch.stack([weight * cast(Tensor, one.unknown) for weight, one in pairs]).sum(0)
+        unknown = torch.stack(
+            [weight * cast(Tensor, prediction.unknown) for weight, prediction in pairs]
+        ).sum(0)
         parts = [
-            weight * each_pair.explained
-            for weight, each_pair in pairs
-            if each_pair.explained is not None
+            weight * prediction.explained
+            for weight, prediction in pairs
+            if prediction.explained is not None
         ]
         variance, unknown = (each.to(mean.real.dtype) for each in (variance, unknown))
         return Prediction(mean, variance, unknown, torch.stack(parts).sum(0) if parts else None)
@@ -280,13 +284,13 @@ class Mixture(LearnsTogether, ClosedForm):
     def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """Return the mean of all; what they disagree about is part of its variance."""
         result = [member.left_out(rows) for member in self.members]
-        if len({one.mean.shape for one in result}) > 1:
+        if len({answers.mean.shape for answers in result}) > 1:
             raise ValueError(
                 f"{self.name}: of several tones or antennas one is kept of rows left out"
             )
         parts = [
-            (weight, one.mean, one.variance)
-            for weight, one in zip(self.weights, result, strict=True)
+            (weight, answers.mean, answers.variance)
+            for weight, answers in zip(self.weights, result, strict=True)
         ]
         return LeftOutRows(result[0].rows, *mixture_moments(parts))
 
@@ -364,7 +368,7 @@ class Mixture(LearnsTogether, ClosedForm):
     def objects(self) -> SiteObjects:
         """Return those of the heaviest member that found any."""
         result = [self.members[i].objects() for i in np.argsort(self.weights)[::-1]]
-        return next((one for one in result if len(one)), result[0])
+        return next((listed for listed in result if len(listed)), result[0])
 
     def facts(self) -> dict[str, float | int | str | None]:
         """See `Method.facts`."""

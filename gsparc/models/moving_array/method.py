@@ -159,9 +159,9 @@ class MovingArrayField(Differentiable, ClosedForm):
         if not len(rows):
             raise ValueError(f"{self.name}: the training set is empty")
         targets, self.seen = training_targets(data, rows), len(rows)
-        spectra, one = self._make_spectra(data.moving[rows], targets), self.found
+        spectra, trend = self._make_spectra(data.moving[rows], targets), self.found
         modelled = self._fit_trend(
-            spectra, one.sources, self._fit_powers(spectra, one.sources), one.kernel
+            spectra, trend.sources, self._fit_powers(spectra, trend.sources), trend.kernel
         )
         self._fit_residual(spectra, modelled, self.residual.kernel, targets)
 

@@ -102,7 +102,7 @@ class PowerField(ClosedForm):
             *self._judge_maps(power_rows(data, rows)),
         )
         self.condition(data, rows)
-        user_terms = tuple(one for one in self.trend.more if isinstance(one, UserTerm))
+        user_terms = tuple(term for term in self.trend.more if isinstance(term, UserTerm))
         if user_terms and self.powers is not None and isinstance(self.powers.posterior, Exact):
             notes = (*describe_weights(self.powers.posterior, user_terms), *notes)
         return FitReport(watch.seconds, notes)
@@ -131,8 +131,8 @@ class PowerField(ClosedForm):
             about = "a distance law" if has_law else f"a constant, with fewer than {LAW_NEEDS} rows"
             note = f"losses in {len(walls.sizes)} known walls and floors, mean: {about}"
             return (note, *notes, *best.notes)
-        found, remarks = candidate_priors(seen, site, self.seed, chosen_on, terms), list[str]()
-        self.priors = ((1.0, found[0].prior),)
+        candidates, remarks = candidate_priors(seen, site, self.seed, chosen_on, terms), list[str]()
+        self.priors = ((1.0, candidates[0].prior),)
         # A level that silent rows are below is no power that waves could be fitted to.
         if (
             self.waves
@@ -145,21 +145,21 @@ class PowerField(ClosedForm):
             self.fringes, note = fit_fringes(
                 seen.subset(order),
                 rows[order],
-                found[0].prior,
+                candidates[0].prior,
                 site.wavelength,
                 self.seed,
                 effort.fringes,
             )
             remarks.append(note)
             if self.fringes is not None:  # their share was learned beside this process
-                return (found[0].description, *found[0].notes, note)
-        self.priors, notes = mix_candidates(seen, found, self.seed, chosen_on)
+                return (candidates[0].description, *candidates[0].notes, note)
+        self.priors, notes = mix_candidates(seen, candidates, self.seed, chosen_on)
         own = tuple(term for term in terms if not isinstance(term.term, PriorMap))
         if len(own) < len(terms) and not self._used_maps():
             # Kernels were sought beside the map's: a map that is left out leaves what there is
             # without it.
-            found = candidate_priors(seen, site, self.seed, chosen_on, own)
-            self.priors, notes = mix_candidates(seen, found, self.seed, chosen_on)
+            candidates = candidate_priors(seen, site, self.seed, chosen_on, own)
+            self.priors, notes = mix_candidates(seen, candidates, self.seed, chosen_on)
         return (*notes, *remarks)
 
     def _used_maps(self) -> list[PriorMap]:

@@ -163,7 +163,7 @@ def fit_fringes(
         fold[part] = k
     fold[order[:probes]] = -1
     index = np.sort(order[: probes + count])
-    every, rows, numbers, group, fold = (
+    all_rows, rows, numbers, group, fold = (
         rows,
         rows.subset(index),
         numbers[index],
@@ -176,8 +176,8 @@ def fit_fringes(
     if count < ROWS_PER_WAVE * columns.shape[1]:
         return None, f"no fringes: {count} rows are too few for {columns.shape[1]} coherent waves"
     error, distance = (
-        each_distance[index]
-        for each_distance in _errors_and_distances(every, [*parts, order[:probes]], plain, seed)
+        values[index]
+        for values in _errors_and_distances(all_rows, [*parts, order[:probes]], plain, seed)
     )
     weights: list[np.ndarray] = []
     fringes: Fringes | None = None
@@ -225,11 +225,11 @@ def _excess_variance(powers: np.ndarray, fold: np.ndarray, blind: np.ndarray) ->
     as many as there are.
     """
     counts = _blind_solutions(fold, blind)
-    number, every = counts.sum(1), len(blind)
+    number, total = counts.sum(1), len(blind)
     mean = (powers * counts).sum(1) / number
     spread = ((powers - mean[:, None]) ** 2 * counts).sum(1) / np.maximum(number - 1, 1)
     # Errors of solutions are independent: the mean of m has variance s^2 / m.
-    return spread * (1 / number - 1 / every)
+    return spread * (1 / number - 1 / total)
 
 
 def _errors_and_distances(

@@ -33,13 +33,13 @@ def to_terms(terms: Any) -> tuple[Columns, ...]:
     `ValueError` for what is none.
     """
     result = tuple(terms) if isinstance(terms, Sequence) else (terms,)
-    for one in result:
-        if not isinstance(one, Columns):
-            raise ValueError(f"model.terms: {one!r} is not a gsparc.processes.term.Columns")
-        if type(one).__module__ == MAIN:
+    for term in result:
+        if not isinstance(term, Columns):
+            raise ValueError(f"model.terms: {term!r} is not a gsparc.processes.term.Columns")
+        if type(term).__module__ == MAIN:
             advice = "a saved model opens only where it is defined; move it to a file"
             log.warning(
-                "model.terms: %s is of a notebook or script: %s", type(one).__name__, advice
+                "model.terms: %s is of a notebook or script: %s", type(term).__name__, advice
             )
     return result
 
@@ -181,7 +181,7 @@ def add_terms_to_trend(rows: PowerRows, trend: Trend, terms: tuple[UserTerm, ...
 def set_term_unit(trend: Trend, deviation: float) -> Trend:
     """Return a trend whose users' terms are relative to a process of this deviation [dB]."""
     terms = (
-        replace(one, unit=deviation) if isinstance(one, UserTerm) else one for one in trend.more
+        replace(term, unit=deviation) if isinstance(term, UserTerm) else term for term in trend.more
     )
     return replace(trend, more=tuple(terms)) if trend.more else trend
 
@@ -218,16 +218,16 @@ def describe_weights(posterior: Exact, terms: tuple[UserTerm, ...]) -> list[Lear
     ).numpy()
     sizes = [term.columns(at[:1]).shape[1] for term in terms]
     parts = np.split(numbers[:, -sum(sizes) :], np.cumsum(sizes)[:-1], 1)
-    classes = [type(each_term.term).__name__ for each_term in terms]
+    classes = [type(term.term).__name__ for term in terms]
     # Several of one class are told apart by their order.
     order = [classes[: k + 1].count(name) for k, name in enumerate(classes)]
     counted = zip(classes, order, strict=True)
     names = [f"{name} {n}" if classes.count(name) > 1 else name for name, n in counted]
     return [
         LearnedWeights.from_numbers(
-            name, one.weight_prior[1] * part + [[one.weight_prior[0]], [0]] * 2
+            name, term.weight_prior[1] * part + [[term.weight_prior[0]], [0]] * 2
         )
-        for name, one, part in zip(names, terms, parts, strict=True)
+        for name, term, part in zip(names, terms, parts, strict=True)
     ]
 
 
@@ -238,10 +238,10 @@ def pool_station_weights(notes: Sequence[str]) -> dict[str, str]:
     Rows of stations are independent given the weight (random effects: R. DerSimonian, N. Laird,
     Controlled Clinical Trials 7 (1986)).
     """
-    found, result = [note for note in notes if isinstance(note, LearnedWeights)], dict[str, str]()
-    for key in {(one.name, one.numbers.shape): None for one in found}:
-        same = [one for one in found if (one.name, one.numbers.shape) == key]
-        means, deviation, before, wide = np.stack([one.numbers for one in same], 1)  # (S, Q) each
+    weights, result = [note for note in notes if isinstance(note, LearnedWeights)], dict[str, str]()
+    for key in {(note.name, note.numbers.shape): None for note in weights}:
+        same = [note for note in weights if (note.name, note.numbers.shape) == key]
+        means, deviation, before, wide = np.stack([note.numbers for note in same], 1)  # (S, Q) each
         deviation, wide = np.maximum(deviation, CERTAIN), np.maximum(wide, CERTAIN)
         # What rows say alone: the prior is taken out of each, and counts once.
         precision = np.maximum(deviation**-2.0 - wide**-2.0, TINY)
@@ -266,8 +266,8 @@ def pool_station_weights(notes: Sequence[str]) -> dict[str, str]:
                 f"; prior_db=[{mean[0]:.3g}, {np.hypot(error, between)[0]:.2g}] tells each "
                 "of the others"
             )
-        one = np.stack([mean, error, before[0], wide[0]])
+        moments = np.stack([mean, error, before[0], wide[0]])
         result |= dict.fromkeys(
-            same, LearnedWeights.from_numbers(key[0], one, f"{rest})" * (len(same) > 1))
+            same, LearnedWeights.from_numbers(key[0], moments, f"{rest})" * (len(same) > 1))
         )
     return result

@@ -192,19 +192,19 @@ class NetworkMaps(Columns):
         """Read the map of each station, or of its site; `DataError` where there is none,
         see there.
         """
-        found = list[tuple[int, bool, PriorMap]]()
+        maps = list[tuple[int, bool, PriorMap]]()
         for number, own, (world, levels) in read_prior_maps(
             path, data, data.site.every_station.shown
         ):
             points, level = map(torch.from_numpy, (world - data.site.origin[:2], levels))
-            before = found[-1][2] if found else None
+            before = maps[-1][2] if maps else None
             # Squares of one raster are stored once.
             if before is not None and torch.equal(points, before.points):
                 points, spacing = before.points, before.spacing
             else:
                 spacing = point_spacing(points.numpy())
-            found.append((number, own, PriorMap(points, level, spacing=spacing)))
-        return cls(tuple(found))
+            maps.append((number, own, PriorMap(points, level, spacing=spacing)))
+        return cls(tuple(maps))
 
     def explain_misfits(self, rows: StationRows, names: Sequence[str]) -> list[str]:
         """Say what is wrong with maps of stations by rows of these,
@@ -230,8 +230,8 @@ class NetworkMaps(Columns):
         table[aimed] = ROUND.double()
         still = torch.from_numpy(places[:, :2])
         levels = [
-            each_map.level + usual_loss(each_map.points - still[number])
-            for number, _, each_map in self.maps
+            prior_map.level + usual_loss(prior_map.points - still[number])
+            for number, _, prior_map in self.maps
         ]
         level = float(np.quantile(torch.cat(levels).numpy(), ALONG))
         return replace(network, table=table, more=(replace(self, level=level),))
@@ -243,11 +243,11 @@ class NetworkMaps(Columns):
     def mean(self, places: Tensor) -> Tensor:
         """See `Columns`; of places of sectors (n, 7), 0 of one without a map."""
         result = places.new_zeros(len(places))
-        for number, _, each_map in self.maps:
+        for number, _, prior_map in self.maps:
             own = (sector_of(places) == number).nonzero()[:, 0]
             if len(own):
                 at = places[own]
-                inside, level = each_map.look_up(at[:, :2])
+                inside, level = prior_map.look_up(at[:, :2])
                 level = inside * (level + usual_loss(first_end(at) - other_end(at)) - self.level)
                 result = result.index_add(0, own, level.to(result))
         return result

@@ -133,7 +133,8 @@ class KernelCandidate:
     def has_map(self) -> bool:
         """Whether the mean has a share of a map from before."""
         return any(
-            isinstance(one, UserTerm) and isinstance(one.term, PriorMap) for one in self.trend.more
+            isinstance(term, UserTerm) and isinstance(term.term, PriorMap)
+            for term in self.trend.more
         )
 
 
@@ -156,25 +157,25 @@ def candidate_priors(
     if not MIXED_FROM <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
         return [choose_candidate(rows, trends, seed, max_rows)]
     if rows.silent.any():
-        found = [choose_candidate(rows, [one], seed, max_rows, MIXED_ON) for one in trends]
-        return sorted(found, key=lambda one: -one.score)
-    found = [choose_candidate(rows, trends, seed, max_rows, MIXED_ON)]
+        candidates = [choose_candidate(rows, [trend], seed, max_rows, MIXED_ON) for trend in trends]
+        return sorted(candidates, key=lambda one: -one.score)
+    candidates = [choose_candidate(rows, trends, seed, max_rows, MIXED_ON)]
     # Other laws have a kernel like it: a short walk from there, not one from anywhere.
     others = [
-        replace(found[0], **each_trend._asdict())
-        for each_trend in trends
-        if each_trend.trend is not found[0].trend
+        replace(candidates[0], **other._asdict())
+        for other in trends
+        if other.trend is not candidates[0].trend
     ]
-    found += [_refine_kernel(rows, other, seed, max_rows) for other in others]
+    candidates += [_refine_kernel(rows, other, seed, max_rows) for other in others]
     # One row of a place: levels that repeat there to the digit would speak for no noise.
     once = np.sort(np.unique(rows.places, axis=0, return_index=True)[1])
     few = rows.subset(once).draw_subset(MIXED_ON, seed)
     squares = [list(rows_of_groups(number_squares(few.places, sides))) for sides in SPANS]
     gaps = [
-        _fit_one_length(few, one.trend, 0.0, one.notes, ExponentialShadowing, squares)
-        for one in found
+        _fit_one_length(few, candidate.trend, 0.0, candidate.notes, ExponentialShadowing, squares)
+        for candidate in candidates
     ]
-    return [*found, *_kriged(rows, trends[0]), max(gaps, key=lambda one: one.score)]
+    return [*candidates, *_kriged(rows, trends[0]), max(gaps, key=lambda one: one.score)]
 
 
 def _kriged(rows: PowerRows, mean: MeanLaw) -> list[KernelCandidate]:
@@ -183,11 +184,11 @@ def _kriged(rows: PowerRows, mean: MeanLaw) -> list[KernelCandidate]:
     """
     if len(rows.places) > CHOSEN_ON:  # there a third of the seconds, for nothing
         return []
-    found = fit_variogram(rows.places, rows.decibels[:, None])
-    if not found.sill > LEAST_SILL * found.nugget:
+    variogram = fit_variogram(rows.places, rows.decibels[:, None])
+    if not variogram.sill > LEAST_SILL * variogram.nugget:
         return []
-    noise = max(found.nugget / found.sill, NOISE_SPAN[0])
-    kernel = Kernel.from_length(found.range, noise, found.sill, ExponentialShadowing)
+    noise = max(variogram.nugget / variogram.sill, NOISE_SPAN[0])
+    kernel = Kernel.from_length(variogram.range, noise, variogram.sill, ExponentialShadowing)
     return [KernelCandidate(-math.inf, mean.trend, kernel, 0.0, mean.notes)]
 
 
@@ -210,8 +211,8 @@ def mix_candidates(
     # Of all rows: drawn ones are farther apart than those that will answer.
     values = rows.measured_rows.means_at_places()
     near = [
-        condition_on_nearest(each_candidate.prior, values, seed, cover=FEW).left_out().mean
-        for each_candidate in candidates
+        condition_on_nearest(candidate.prior, values, seed, cover=FEW).left_out().mean
+        for candidate in candidates
     ]
     gram = AMONG_ROWS * _relative_gram([(values.values - mean)[:, 0].numpy() for mean in near])
     for sides in SPANS:
@@ -219,7 +220,7 @@ def mix_candidates(
             [_errors_without_squares(posterior, sides) for posterior in posteriors]
         ) / len(SPANS)
     share = best_weights(gram)
-    bare = np.flatnonzero([not one.has_map for one in candidates])
+    bare = np.flatnonzero([not candidate.has_map for candidate in candidates])
     if 0 < len(bare) < len(candidates):
         alone = np.zeros_like(share)
         alone[bare] = best_weights(gram[np.ix_(bare, bare)])
@@ -229,9 +230,9 @@ def mix_candidates(
     mixture = [
         (float(share[k]), candidates[k]) for k in np.argsort(-share, kind="stable") if share[k]
     ]
-    texts = [f"{weight:.0%} of {one.description}" for weight, one in mixture]
-    notes = dict.fromkeys(note for _, one in mixture for note in one.notes)
-    return tuple((weight, one.prior) for weight, one in mixture), (*texts, *notes)
+    texts = [f"{weight:.0%} of {candidate.description}" for weight, candidate in mixture]
+    notes = dict.fromkeys(note for _, candidate in mixture for note in candidate.notes)
+    return tuple((weight, candidate.prior) for weight, candidate in mixture), (*texts, *notes)
 
 
 def _relative_gram(errors: list[np.ndarray]) -> np.ndarray:
@@ -290,10 +291,7 @@ def _choose_on_part(
     scores = [candidate.score for candidate in candidates]
     if both:
         weighed = _select_doubtful(weighed, candidates[-1])
-        scores = [
-            _fit_by_evidence(weighed, each_candidate, REFINED).score
-            for each_candidate in candidates
-        ]
+        scores = [_fit_by_evidence(weighed, candidate, REFINED).score for candidate in candidates]
     best = candidates[int(np.argmax(scores))]
     if len(few.places) >= TWO_LENGTHS_NEED:
         scale = median_distance(few.view(best.trend).apart)

@@ -137,7 +137,9 @@ class ImageProcess(LearnedField):
             answers = (self.predict(batch).mean, process.predict(batch).mean, batch.target)
             triples.append([data.site.target.in_error_unit(answer).detach() for answer in answers])
         if left_out is not None:
-            triples.append([torch.from_numpy(one) for one in left_out.beside_process(self._apart)])
+            triples.append(
+                [torch.from_numpy(values) for values in left_out.beside_process(self._apart)]
+            )
         prediction, _, target = triples[0]
         self.explained = explained_variance(prediction, target, not data.site.target.is_complex)
         gram = np.concatenate([error_products(both, target) for *both, target in triples])

@@ -198,11 +198,11 @@ class LearnedField(Method):
             result = gradient_stage.read_trainer_result(trainer, watch)
             self._end_stage(stage, result, watch.seconds - began)
         self.frozen = self._doubled = None
-        what, count = (
+        label, count = (
             (f"final, {self.steps} of {self.steps_taken} steps kept"),
             self.count_components(),
         )
-        context.log_curve(watch.seconds, what, step=self.steps_taken, num_gaussians=count)
+        context.log_curve(watch.seconds, label, step=self.steps_taken, num_gaussians=count)
         return FitReport(watch.seconds, self._ended, cpu_s=watch.cpu_elsewhere)
 
     def describe_fit(self, data: Measurements, effort: Effort, steps: int | None = None) -> str:
@@ -296,9 +296,9 @@ class LearnedField(Method):
             if solved and (self._paying == 0 or not steps):
                 # No step was surely better, or none was asked for: the start,
                 # solved again on all rows.
-                self.steps, every = 0, _train_on_all(fold) if self.refit else fold
-                yield Stage("final", every, replace(context, resume=None), 0)
-                self._weigh_process(data, every)
+                self.steps, last_fold = 0, _train_on_all(fold) if self.refit else fold
+                yield Stage("final", last_fold, replace(context, resume=None), 0)
+                self._weigh_process(data, last_fold)
                 return
             if not steps:
                 yield Stage("train", watched, context, 0)
@@ -547,8 +547,8 @@ class LearnedField(Method):
         if self.model is None or not self.count_components():
             raise ValueError(f"{self.name}: nothing here is rendered from Gaussians")
         model, square = self.model, torch.zeros(self.count_components())
-        for one in query.split(1):  # features of all would be gigabytes
-            square += model.emissions(one.tx, one.rx)[0].square().sum(1)
+        for row in query.split(1):  # features of all would be gigabytes
+            square += model.emissions(row.tx, row.rx)[0].square().sum(1)
         return model.gaussians.to_cloud(
             (square / max(len(query), 1)).sqrt(), "emission of a Gaussian"
         )
@@ -609,7 +609,8 @@ class LearnedField(Method):
         text = f"{kind} through {text}" if self.choices.closed_form else text
         if self.choices.init == "vectors" and not self.steps and self.site is not None:
             enough = ENOUGH * len(self.site.array_geometry()[0])
-            text += f" ({enough} or more give the same answers)" * (count >= enough)
+            if count >= enough:
+                text += f" ({enough} or more give the same answers)"
         part = "all" if self.steps == self.steps_taken else self.steps or "none"
         return text + (
             f", {self.steps_taken} gradient steps, {part} kept"
@@ -661,7 +662,7 @@ def _validation_distance(data: Measurements, fold: Fold) -> float | None:
 
 def _static_end_position(data: Measurements, row: int) -> dict[str, Tensor]:
     """Where the end that never moves stands, local coordinates [m]."""
-    one = data.batch(np.array([row]))
+    row_query = data.batch(np.array([row]))
     if data.site.static_end == "rx":
-        return {"rx_position": one.rx.position, "rx_rotation": one.rx.rotation}
-    return {"tx_position": one.tx[0]}
+        return {"rx_position": row_query.rx.position, "rx_rotation": row_query.rx.rotation}
+    return {"tx_position": row_query.tx[0]}

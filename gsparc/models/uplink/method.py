@@ -99,8 +99,11 @@ class UplinkField(UplinkMethod):
             result = self._search_snapshots(batch.uplink, batch.noise_variance)
             views = [(slice(None), slice(None))]
             for _ in range(pieces if tones > PIECE_TONES else 0):
-                one, first = int(rng.integers(antennas)), int(rng.integers(tones - PIECE_TONES + 1))
-                views.append((slice(one, one + 1), slice(first, first + PIECE_TONES)))
+                antenna, first = (
+                    int(rng.integers(antennas)),
+                    int(rng.integers(tones - PIECE_TONES + 1)),
+                )
+                views.append((slice(antenna, antenna + 1), slice(first, first + PIECE_TONES)))
             everything = result.sources.channels(whole)
             for some, band in views:
                 aperture = Aperture(whole.places[some], whole.tones[band])
@@ -154,9 +157,9 @@ class UplinkField(UplinkMethod):
         mean = mean_delay(uplink)
         straight = uplink * phasor(mean[:, None] * aperture.tones)[:, None]
         chunks = zip(straight.split(CHUNK), noise.split(CHUNK), strict=True)
-        found, residuals = zip(*(self.search(*chunk) for chunk in chunks), strict=True)
+        searched, residuals = zip(*(self.search(*chunk) for chunk in chunks), strict=True)
         sources = Sources(
-            *map(torch.cat, zip(*(vars(part).values() for part in found), strict=True))
+            *map(torch.cat, zip(*(vars(part).values() for part in searched), strict=True))
         )
         return SearchedSnapshots(
             replace(sources, delay=sources.delay + mean[:, None]),

@@ -81,9 +81,9 @@ def make_sections(
         examples = join_examples(study)
         named = [] if examples else [("test.png", "")]
         pictures = [
-            (f"{setting}{what}", _png(run.folder / name))
+            (f"{setting}{suffix}", _png(run.folder / name))
             for setting, run in zip(firsts.setting[:MOST_PICTURES], firsts.run, strict=False)
-            for name, what in (*named, ("sectors.png", ": sectors"))
+            for name, suffix in (*named, ("sectors.png", ": sectors"))
             if (run.folder / name).is_file()
         ]
         sheets = [table for table in (build(study) for build in builders) if table.rows]
@@ -109,8 +109,8 @@ def warnings(rows: pd.DataFrame) -> list[str]:
         )
         facts = scored.run[scored.setting == best].iloc[0].facts
         for ahead, figure in judged_by(facts).items():
-            every = tables.leads_of_baselines(rows[rows.run.isin(scored.run)], best, figure)
-            leads = {name: lead for name, lead in every.items() if lead}
+            leads_by_name = tables.leads_of_baselines(rows[rows.run.isin(scored.run)], best, figure)
+            leads = {name: lead for name, lead in leads_by_name.items() if lead}
             if leads:
                 name = max(leads, key=lambda one: leads[one].ahead_db)
                 remarks += summary.judge_baseline(name, best, figure, leads[name], ahead == LISTED)

@@ -108,7 +108,13 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
         draw_confidences(
             settings.pictures, group, section.title, folder, stem.removeprefix("sweep")
         )
-        console.print(*(one.without(*WIDE) for one in (table, table_of_leads(group)) if one.rows))
+        console.print(
+            *(
+                shown_table.without(*WIDE)
+                for shown_table in (table, table_of_leads(group))
+                if shown_table.rows
+            )
+        )
         seeds = {run.config.get("split.seed") for run in fits.run}
         if fits.split.iloc[0] == "random" and len(seeds) > 1 == fits.draw.nunique():
             log.warning("split.seed moves validation rows alone: %s", REDRAW)

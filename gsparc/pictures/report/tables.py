@@ -230,16 +230,18 @@ def differing_settings(rows: pd.DataFrame) -> dict[str, str]:
     `init=sphere, ...`.
     """
     firsts = own_rows(rows).groupby("setting", sort=False).run.first()
-    every = {setting: run.resolved for setting, run in firsts.items()}
+    resolved = {setting: run.resolved for setting, run in firsts.items()}
     # Names of all runs: a setting may be in one alone.
-    names = dict.fromkeys(name for one in every.values() for name in one)
+    names = dict.fromkeys(name for settings in resolved.values() for name in settings)
     # As text: lists of settings cannot be put into a set.
-    vary = [n for n in names if len({str(one.get(n)) for one in every.values()}) > 1]
+    vary = [n for n in names if len({str(settings.get(n)) for settings in resolved.values()}) > 1]
     if "model._target_" in vary:  # each model has settings of its own, which its name stands for
         vary = [n for n in vary if not n.startswith("model.")]
     return {
-        str(setting): ", ".join(f"{n}={one.get(n)}" for n in vary if not firsts[setting].swept(n))
-        for setting, one in every.items()
+        str(setting): ", ".join(
+            f"{n}={settings.get(n)}" for n in vary if not firsts[setting].swept(n)
+        )
+        for setting, settings in resolved.items()
     }
 
 
@@ -255,13 +257,15 @@ def table_of_worst(rows: pd.DataFrame) -> Table:
     for fit in fits.to_dict("records"):
         if name not in fit["run"].samples:
             continue
-        every = pd.DataFrame(fit["run"].samples)
+        samples = pd.DataFrame(fit["run"].samples)
         # Decibels of quality are negated, so that the worst samples have the largest error.
-        error = every[name].abs() if name == "error_db" else -every[name]
-        for row in every.loc[error.nlargest(WORST).index].to_dict("records"):
+        error = samples[name].abs() if name == "error_db" else -samples[name]
+        for row in samples.loc[error.nlargest(WORST).index].to_dict("records"):
             place = ", ".join(f"{row[axis]:.2f}" for axis in ("x_m", "y_m", "z_m"))
             figures = row[name], *([row.get(rival)] if beside else []), row["confidence"]
-            lines.append([*(one.value(fit) for one in who), str(row["name"]), place, *figures])  # type: ignore[arg-type]
+            lines.append(
+                [*(column.value(fit) for column in who), str(row["name"]), place, *figures]
+            )  # type: ignore[arg-type]
     hard = "; the Gaussian process there shows whether it is hard for all" if beside else ""
     note = f"The moving end's position{hard}."
     return Table("The three worst places", columns, lines, note)

@@ -327,9 +327,7 @@ def plan_cells(
                 f"like {names[0] if names else 'rfid/random/gp/any/any'}"
             )
     return [
-        each_cell
-        for each_cell in cells
-        if not only or any(fnmatchcase(str(each_cell[1]), part) for part in only)
+        cell for cell in cells if not only or any(fnmatchcase(str(cell[1]), part) for part in only)
     ]
 
 

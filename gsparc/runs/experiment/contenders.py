@@ -64,7 +64,8 @@ class Contender:
     def reads(self, problem: Problem) -> str:
         """Return what it is given beside places; "" for nothing."""
         return (
-            [what for where, what in self.given.items() if fnmatchcase(problem.name, where)] or [""]
+            [option for where, option in self.given.items() if fnmatchcase(problem.name, where)]
+            or [""]
         )[-1]
 
     def overrides(self, effort: float | None) -> list[str]:

@@ -102,13 +102,13 @@ def folds_to_resume(
     if path is None or folds == 1:
         return [path] * folds
     run = fitting.run_folder(path, fitting.FOLDS)
-    every = [run / f"fold{number}" for number in range(folds)]
+    folders = [run / f"fold{number}" for number in range(folds)]
     # A file that belongs to no fold says nothing of where the other folds stand.
-    if path.is_file() and not {*every} & {*path.parents} and not list(run.glob("fold*")):
+    if path.is_file() and not {*folders} & {*path.parents} and not list(run.glob("fold*")):
         raise ValueError(
             f"ckpt_path={path}: split={split.name} has {folds} folds, give the run's folder"
         )
-    return [folder if folder.is_dir() else None for folder in every]
+    return [folder if folder.is_dir() else None for folder in folders]
 
 
 def fold_contexts(
@@ -121,8 +121,8 @@ def fold_contexts(
     contexts = (
         [whole.for_part(f"fold{number}") for number in range(count)] if count > 1 else [whole]
     )
-    every = zip(contexts, resumes or [None] * count, strict=True)
-    return [replace(context, resume=resume) for context, resume in every]
+    resumed = zip(contexts, resumes or [None] * count, strict=True)
+    return [replace(context, resume=resume) for context, resume in resumed]
 
 
 def checkpoints(contexts: Sequence[FitContext]) -> tuple[Path, ...]:
@@ -218,10 +218,10 @@ def fit_folds(
     by_fold: dict[int, tuple[Method, FitReport]] = {}
     try:
         # Folds may end in any order: kept at once, so that an interrupt loses only those at work.
-        for number, one in run_each(fitted, range(len(split.folds)), "folds"):
-            by_fold[number] = one
+        for number, fit in run_each(fitted, range(len(split.folds)), "folds"):
+            by_fold[number] = fit
             if keep is not None:
-                keep(number, *of_fold(number), *one)
+                keep(number, *of_fold(number), *fit)
     except KeyboardInterrupt as stopped:
         if len(contexts) == 1:
             raise
@@ -235,7 +235,7 @@ def fit_folds(
         # Notes of the first fold stand for all: the others differ in numbers.
         methods,
         tuple(report.seconds for report in reports),
-        tuple(each_report.cpu_s for each_report in reports),
+        tuple(report.cpu_s for report in reports),
         reports[0].notes,
-        sum((one.cost for one in reports), NO_COST),
+        sum((report.cost for report in reports), NO_COST),
     )

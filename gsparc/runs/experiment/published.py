@@ -29,7 +29,7 @@ def read_published(file: str | Path) -> pd.DataFrame:
     rows = rows.reindex(columns=[*dict.fromkeys([*rows, *ROW])])
     rows[WORDS] = rows[WORDS].astype(object).fillna("").astype(str)
     rows["spread_db"] = rows.score_error_db.fillna(rows.score_std_db)
-    rows["score_db"] = [shown(*one) for one in zip(rows.figure, rows.score_db, strict=True)]
+    rows["score_db"] = [shown(*score) for score in zip(rows.figure, rows.score_db, strict=True)]
     several = rows.draws > 1
     rows = rows.assign(seeds=rows.draws.where(several, rows.seeds), draws=several)
     rows["results"] = [[] for _ in range(len(rows))]
@@ -44,11 +44,11 @@ def beside_published(rows: pd.DataFrame, published: pd.DataFrame) -> pd.DataFram
     of the runs measured here.
     """
     key = [*GROUP, "tested"]
-    row_keys = {tuple(one) for one in rows[key].fillna(-1.0).to_numpy()}
-    here = {tuple(one) for one in rows[[*PROBLEM, "tested"]].to_numpy()}
+    row_keys = {tuple(row) for row in rows[key].fillna(-1.0).to_numpy()}
+    tested_problems = {tuple(row) for row in rows[[*PROBLEM, "tested"]].to_numpy()}
     wanted = [
-        tuple(one) not in row_keys and (one[0], one[1], one[-1]) in here
-        for one in published[key].fillna(-1.0).to_numpy()
+        tuple(row) not in row_keys and (row[0], row[1], row[-1]) in tested_problems
+        for row in published[key].fillna(-1.0).to_numpy()
     ]
     extra_rows = published[np.array(wanted, bool)]
     return pd.concat([rows, extra_rows], ignore_index=True) if len(extra_rows) else rows

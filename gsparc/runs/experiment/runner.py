@@ -177,18 +177,16 @@ def run_jobs(
     Raises:
         ValueError: none can be done; why the first cannot.
     """
-    found = {
-        str(each_job.name): each_job.row()
-        for each_job in jobs
-        if read_finished(each_job.folder, each_job.state, each_job.reuse)
+    rows = {
+        str(job.name): job.row() for job in jobs if read_finished(job.folder, job.state, job.reuse)
     }
-    missing = [one for one in jobs if str(one.name) not in found]
-    log.info("%d cells, %d already done", len(jobs), len(found))
+    missing = [job for job in jobs if str(job.name) not in rows]
+    log.info("%d cells, %d already done", len(jobs), len(rows))
     if train and missing:
-        every = _duration(sum(job.expected_s for job in missing))
+        total = _duration(sum(job.expected_s for job in missing))
         longest = sorted(missing, key=lambda job: -job.expected_s)
         each = list_first([f"{job.name} {_duration(job.expected_s)}" for job in longest], LONGEST)
-        log.info("about %s of an idle core; longest: %s", every, each)
+        log.info("about %s of an idle core; longest: %s", total, each)
     # monotonic: setting the machine's clock ends no comparison.
     started = time.monotonic()
 
@@ -198,21 +196,21 @@ def run_jobs(
             log.warning("max_hours: %s is not started", one.name)
         return not late
 
-    here, refused = missing if train else [], list[str]()
+    waiting, refused = missing if train else [], list[str]()
     how: dict[str, Any] = {"cost": lambda one: one.expected_s, "wanted": fits, "refused": refused}
     try:
         for job, _ in run_list(
-            partial(_fit_once, fit), here, "cells", name=lambda one: str(one.name), **how
+            partial(_fit_once, fit), waiting, "cells", name=lambda one: str(one.name), **how
         ):
-            found[str(job.name)] = row = job.row()
+            rows[str(job.name)] = row = job.row()
             value = format(row["value"], number_format(row["figure"]))
             log.info("%s: %s %s after %.1f s", job.name, row["figure"], value, row["train_s"])
     except KeyboardInterrupt:
         message = "interrupted; finished cells are kept: the same command goes on with the others"
         raise KeyboardInterrupt(message) from None
-    if refused and not found:
+    if refused and not rows:
         raise ValueError(refused[0])
-    return as_frame(found[str(one.name)] for one in jobs if str(one.name) in found)
+    return as_frame(rows[str(job.name)] for job in jobs if str(job.name) in rows)
 
 
 def time_queries(
@@ -221,18 +219,25 @@ def time_queries(
     """Return `SPEED` of models by name; slow ones have clocks of their own."""
     methods: dict[str, Method] = {name: loading.load(file)[0] for name, file in files.items()}
     calls = timing.query_calls(methods, data, split.folds[0].test)
-    found: dict[str, dict[str, float]] = {}
+    latencies: dict[str, dict[str, float]] = {}
 
     def timed(names: Iterable[str], clock: ClockSettings) -> None:
-        found.update(time_beside_copy({name: calls[name] for name in names}, clock))
+        latencies.update(time_beside_copy({name: calls[name] for name in names}, clock))
 
     # One call sorts them by speed; slow ones take two, as the first may build what later ones keep.
     timed(calls, ONCE)
-    timed([name for name, one in found.items() if SLOW_MS < one["query_ms"] <= ENDLESS_MS], ONCE)
-    speeds = {name: one["query_ms"] for name, one in found.items()}
+    timed(
+        [
+            name
+            for name, latency in latencies.items()
+            if SLOW_MS < latency["query_ms"] <= ENDLESS_MS
+        ],
+        ONCE,
+    )
+    speeds = {name: latency["query_ms"] for name, latency in latencies.items()}
     timed([name for name, ms in speeds.items() if ms <= SLOW_MS], fast)
     timed([name for name, ms in speeds.items() if SLOW_MS < ms <= ENDLESS_MS], SLOW)
-    return {name: found[name] for name in methods}
+    return {name: latencies[name] for name in methods}
 
 
 def time_by_dataset(filled: pd.DataFrame) -> pd.DataFrame:
@@ -242,18 +247,19 @@ def time_by_dataset(filled: pd.DataFrame) -> pd.DataFrame:
     Of that alone: models of fewer measurements answer faster. `filled` is the frame of `run_jobs`.
     """
     rows = []
-    for dataset, here in filled.groupby("dataset", sort=False):
-        fits = here[
-            (here.split == here.split.iloc[0]) & here.run.map(lambda run: bool(run.checkpoints))
+    for dataset, group in filled.groupby("dataset", sort=False):
+        fits = group[
+            (group.split == group.split.iloc[0]) & group.run.map(lambda run: bool(run.checkpoints))
         ]
         # The first of a method's cells stands for all of its efforts and seeds.
         first = fits.drop_duplicates("method").set_index("method")
         if len(first):
             log.info("%s: timing single queries of every method in turns", dataset)
             files, job = first.run.map(lambda run: run.checkpoints[0]), first.job.iloc[0]
-            found = time_queries(files.to_dict(), job.data, job.split)
+            latencies = time_queries(files.to_dict(), job.data, job.split)
             rows += [
-                {**first.loc[name, TIMED[:2]], "method": name, **one} for name, one in found.items()
+                {**first.loc[name, TIMED[:2]], "method": name, **latency}
+                for name, latency in latencies.items()
             ]
     return pd.DataFrame(rows, columns=TIMED)
 

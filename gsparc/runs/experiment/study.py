@@ -116,7 +116,7 @@ def plan_rounds(
         data, split: as they are before any condition.
         folder: of the study.
     """
-    learned = dict.fromkeys(each_condition.learned for each_condition in conditions)
+    learned = dict.fromkeys(condition.learned for condition in conditions)
     content, jobs = measurements_hash(data), []
     for turn, (variant, config), condition in product(range(rounds), configs.items(), learned):
         job_config = OmegaConf.merge(config, {"seed": config.seed + turn})
@@ -173,15 +173,15 @@ def average_rounds(
         `query_ms`, `query_p95_ms`: single queries, timed in turns with all other rows' [ms].
         NaN where there is no spread.
     """
-    every, job = ask_moved(fits, conditions), fits.job.iloc[0]
-    every = every.astype(dict.fromkeys(("train_s", "train_cpu_s"), float))
+    moved, job = ask_moved(fits, conditions), fits.job.iloc[0]
+    moved = moved.astype(dict.fromkeys(("train_s", "train_cpu_s"), float))
     # The model of the last round is timed: rounds differ in weights, not in size.
     last = {name: (name, "last") for name in ("effects", "rows", "figure", "model")}
     median = {name: (name, "median") for name in ("train_s", "train_cpu_s")}
     by = ["variant", "what", "amount"]
     rows, averages = (
-        every.groupby(by, sort=False).agg(**last, **median),
-        average(every, by, ["value"]),
+        moved.groupby(by, sort=False).agg(**last, **median),
+        average(moved, by, ["value"]),
     )
     rows = rows.assign(value=averages["mean"].value, spread=averages["std"].value).reset_index()
     order = [list(fits.variant.unique()).index(variant) for variant in rows.variant]
@@ -233,9 +233,7 @@ class DataChanges:
             "keep": self.keep,
         }
         changed = [
-            Condition(key, float(amount))
-            for key, each_amount in amounts.items()
-            for amount in each_amount
+            Condition(key, float(amount)) for key, listed in amounts.items() for amount in listed
         ]
         return changed if self.keep else [Condition(), *changed]
 
@@ -296,11 +294,11 @@ def thin_fold(fold: Fold, keep: float, seed: int) -> Fold:
         keep: a share of the rows up to 1; above, a number of rows.
         seed: of the choice.
     """
-    every = len(fold.learned())
+    total_rows = len(fold.learned())
     # Never more than there are.
-    total = min(round(keep * every if keep <= 1 else keep), every)
+    total = min(round(keep * total_rows if keep <= 1 else keep), total_rows)
     # One validation row at least, where there is one: it decides when to stop.
-    validate = min(max(round(total * len(fold.val) / every), 1), len(fold.val))
+    validate = min(max(round(total * len(fold.val) / total_rows), 1), len(fold.val))
     # 4 keeps this draw apart from others of the same seed.
     rng = np.random.default_rng([seed, 4])
     train, val = (rng.permutation(rows) for rows in (fold.train, fold.val))

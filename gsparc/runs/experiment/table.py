@@ -79,7 +79,7 @@ ROW = [
     "tested",
 ]
 SPREADS = ["score_error_db", "score_std_db"]  # `spread_db` by what it is
-CSV = [name for one in ROW for name in (SPREADS if one == "spread_db" else [one])]
+CSV = [name for column in ROW for name in (SPREADS if column == "spread_db" else [column])]
 
 
 def _scored(own: Row) -> dict[str, Any]:
@@ -178,11 +178,11 @@ def _with_behind(rows: pd.DataFrame) -> pd.DataFrame:
     and its error.
     """
     rows = rows.assign(behind_db=np.nan, behind_error_db=np.nan)
-    for _, here in rows[rows.draws].groupby(PROBLEM):
+    for _, draws in rows[rows.draws].groupby(PROBLEM):
         # A method that failed on hard draws has an easier mean: it is no best.
-        best = here[here.seeds == here.seeds.max()].score_db.idxmax()
-        for row, results in here.results.items():
-            if lead := lead_over_runs(here.results[best], results):
+        best = draws[draws.seeds == draws.seeds.max()].score_db.idxmax()
+        for row, results in draws.results.items():
+            if lead := lead_over_runs(draws.results[best], results):
                 rows.loc[row, ["behind_db", "behind_error_db"]] = lead.ahead_db, lead.error_db
     return rows
 
@@ -193,7 +193,7 @@ def columns_of_csv(rows: pd.DataFrame) -> dict[str, list[Any]]:
     """
     several = rows.draws.astype(bool)
     columns = rows.assign(
-        score_db=[shown(*one) for one in zip(rows.figure, rows.score_db, strict=True)],
+        score_db=[shown(*score) for score in zip(rows.figure, rows.score_db, strict=True)],
         score_error_db=rows.spread_db.where(several),
         score_std_db=rows.spread_db.where(~several),
         draws=rows.seeds.where(several, 1),
@@ -210,10 +210,10 @@ def split_by_problem(rows: pd.DataFrame) -> list[pd.DataFrame]:
     published rows have the usual one.
     """
     blocks = []
-    for _, here in rows.groupby(PROBLEM, sort=False):
-        without = here.effort.isna()
-        for effort in sorted(here.effort[~_published(here)].dropna().unique()) or [1.0]:
-            members = here[without | (here.effort == effort)]
+    for _, problem in rows.groupby(PROBLEM, sort=False):
+        without = problem.effort.isna()
+        for effort in sorted(problem.effort[~_published(problem)].dropna().unique()) or [1.0]:
+            members = problem[without | (problem.effort == effort)]
             blocks.append(members.sort_values("score_db", ascending=False, kind="stable"))
     return blocks
 

@@ -118,10 +118,12 @@ def load_tracer(
     """
     tracer, town, _ = _load(scene, sampling)
     masts = _stated(scene, tracer.surface_height, None if town is None else town.georeference) or []
-    here = [mast for mast in masts if np.linalg.norm(mast.position - transmitter) < SAME_PLACE_M]
-    called = [mast for mast in here if name.endswith(mast.name)]
+    masts_there = [
+        mast for mast in masts if np.linalg.norm(mast.position - transmitter) < SAME_PLACE_M
+    ]
+    called = [mast for mast in masts_there if name.endswith(mast.name)]
     return tracer.with_transmitter(
-        transmitter, next((mast.antenna for mast in called or here), ISOTROPIC)
+        transmitter, next((mast.antenna for mast in called or masts_there), ISOTROPIC)
     )
 
 
@@ -133,7 +135,9 @@ def _shoebox(scene: SceneSettings) -> Survey:
     boxes = [box(f"box{k}", "", *corners) for k, corners in enumerate(stated.boxes)]
     before, after = (
         Room.from_size(
-            size, reflection, occluders=np.array([one.keep_out for one in each]).reshape(-1, 2, 3)
+            size,
+            reflection,
+            occluders=np.array([solid.keep_out for solid in each]).reshape(-1, 2, 3),
         )
         for each in (boxes, move_solids(boxes, read_moves(scene.moved))[0])
     )

@@ -47,7 +47,7 @@ class Move(Checked):
 
 def read_moves(moved: Sequence[Mapping[str, Any]]) -> list[Move]:
     """Return settings as moves; `ValueError` where one cannot be."""
-    return [from_settings(Move, one, "moved") for one in moved]
+    return [from_settings(Move, move, "moved") for move in moved]
 
 
 def move_solids(solids: Sequence[Solid], moves: Sequence[Move]) -> tuple[list[Solid], list[Solid]]:
@@ -67,7 +67,7 @@ def move_solids(solids: Sequence[Solid], moves: Sequence[Move]) -> tuple[list[So
             result.append(box(f"new_{number}", move.material, *np.array(move.box_m, float)))
             changed.append(len(result) - 1)
             continue
-        matches = [k for k, one in enumerate(result) if one.name.startswith(move.name)]
+        matches = [k for k, solid in enumerate(result) if solid.name.startswith(move.name)]
         if not matches:
             names = [solid.name for solid in solids]
             hint = suggest_name(move.name, names) or f"; there are {list_first(names, MOST_NAMED)}"

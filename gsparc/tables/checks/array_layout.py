@@ -41,11 +41,13 @@ def layout_warnings(data: Measurements) -> list[str]:
     declared = _unexplained(few, site.array)
     if declared < UNEXPLAINED:
         return []
-    found = {words: residual for words, residual in _rivals(few) if residual < RIVAL * declared}
-    best = min(found, key=lambda words: found[words], default=None)
+    rivals = {words: residual for words, residual in _rivals(few) if residual < RIVAL * declared}
+    best = min(rivals, key=lambda words: rivals[words], default=None)
     if best is None:
         return []
-    residual = f"{declared:.1%} of these spectra cannot be of the declared array, {found[best]:.2%}"
+    residual = (
+        f"{declared:.1%} of these spectra cannot be of the declared array, {rivals[best]:.2%}"
+    )
     return [f"{residual} with {best}: is it that?"]
 
 
@@ -91,18 +93,18 @@ def carrier_warnings(data: Measurements) -> list[str]:
         }
         ways = [where for by, where in ((1, "before"), (-1, "after")) if _clear(fit[by] - fit[0])]
         shifted += [f"{name} ({where})" for where in ways]
-    found = []
+    faults = []
     if shifted:
         symptom = (
             "spectra are more like those of other carriers at the place before or after theirs"
         )
-        found.append(f"{symptom} at {', '.join(shifted)}: are their rows shifted by one?")
+        faults.append(f"{symptom} at {', '.join(shifted)}: are their rows shifted by one?")
     mirrored = convert_conventions(data, ["clockwise"])
     gain = _along_direct_path(mirrored) - _along_direct_path(data)
     if _clear(np.bincount(data.place, gain) / np.bincount(data.place)):
         symptom = "direct paths are where azimuths that run the other way would have them"
-        found.append(f"{symptom}: is an axis mirrored? dataset.clockwise=true mends azimuths")
-    return found
+        faults.append(f"{symptom}: is an axis mirrored? dataset.clockwise=true mends azimuths")
+    return faults
 
 
 def _clear(gain: np.ndarray) -> bool:

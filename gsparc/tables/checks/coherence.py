@@ -171,7 +171,7 @@ def _unlike(rows: Snapshots, pairs: np.ndarray) -> np.ndarray:
     a, b = (rows.values[pairs[:, side]] for side in (0, 1))
     if a[0].size > 1:
         turned = a * align_factors(a, b, rows.tones, "phase+delay")[:, None]
-        return 1 - np.abs(np.stack([_correlation(one, b)[0] for one in (a, turned)], 1))
+        return 1 - np.abs(np.stack([_correlation(values, b)[0] for values in (a, turned)], 1))
     size = np.abs(np.stack([a, b])).reshape(2, -1)
     difference = (size[0] - size[1]) ** 2 / (size**2).sum(0).clip(1e-300)
     return np.stack([difference, difference], 1)
@@ -193,23 +193,23 @@ def set_unknown_factor(data: Measurements, align: str) -> Measurements:
         return data
     unknown_factor: UnknownFactor = align  # type: ignore[assignment]
     if align == "auto":
-        found = estimate_coherence(data)
-        if found is None or found.unknown_factor == "none":
+        coherence = estimate_coherence(data)
+        if coherence is None or coherence.unknown_factor == "none":
             return data
-        unknown_factor = found.unknown_factor
-        log.warning("%s; they are aligned (dataset.align=none keeps them as they are)", found)
+        unknown_factor = coherence.unknown_factor
+        log.warning("%s; they are aligned (dataset.align=none keeps them as they are)", coherence)
         if (
             spacing := neighbour_distance(data.moving) / (data.site.wavelength or np.inf)
         ) > IN_LINE:
-            what = "neighbours tell levels, not the shape over subcarriers"
-            log.warning("places are %.3g wavelengths apart: %s", spacing, what)
+            reason = "neighbours tell levels, not the shape over subcarriers"
+            log.warning("places are %.3g wavelengths apart: %s", spacing, reason)
     return replace(data, site=replace(data.site, unknown_factor=unknown_factor))
 
 
 def _correlation(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of rows (P, A, K) each with each, (P,) complex, and what both measured (P, 2) of power."""
     both = (a != 0) & (b != 0)
-    size = np.stack([(np.abs(one) ** 2 * both).sum((1, 2)) for one in (a, b)], 1).clip(1e-300)
+    size = np.stack([(np.abs(values) ** 2 * both).sum((1, 2)) for values in (a, b)], 1).clip(1e-300)
     # Roots first: of two rows without power the product of sizes is 0.
     return (a * b.conj()).sum((1, 2)) / np.sqrt(size).prod(1), size
 
@@ -218,7 +218,7 @@ def _neighbours(rows: Snapshots, reach: float, pairs: bool) -> np.ndarray:
     """Rows of one run within `reach` [m]: pairs (P, 2), or triples (P, 3) in line,
     the middle one first.
     """
-    found = [np.zeros((0, 2 if pairs else 3), np.int64)]
+    triples = [np.zeros((0, 2 if pairs else 3), np.int64)]
     for _, run in rows_by(rows.run):
         at = rows.places[run]
         near, index = (
@@ -226,8 +226,8 @@ def _neighbours(rows: Snapshots, reach: float, pairs: bool) -> np.ndarray:
         )
         good = (near <= reach) & (index != np.arange(len(run))[:, None])
         if pairs:
-            one, column = np.nonzero(good & (index > np.arange(len(run))[:, None]))
-            found.append(run[np.c_[one, index[one, column]]])
+            row, column = np.nonzero(good & (index > np.arange(len(run))[:, None]))
+            triples.append(run[np.c_[row, index[row, column]]])
             continue
         good &= near > 0
         step = (at[index] - at[:, None]) / np.maximum(near, 1e-12)[..., None]
@@ -237,6 +237,8 @@ def _neighbours(rows: Snapshots, reach: float, pairs: bool) -> np.ndarray:
         opposite = good & ((step * towards).sum(-1) < STRAIGHT) & (length > EVEN * near)
         middle = np.flatnonzero(good.any(1) & opposite.any(1))
         third = opposite.argmax(1)
-        found.append(run[np.c_[middle, index[middle, first[middle]], index[middle, third[middle]]]])
-    every = np.concatenate(found)
-    return every[evenly_spaced(len(every), MOST)]
+        triples.append(
+            run[np.c_[middle, index[middle, first[middle]], index[middle, third[middle]]]]
+        )
+    triples_of_all = np.concatenate(triples)
+    return triples_of_all[evenly_spaced(len(triples_of_all), MOST)]

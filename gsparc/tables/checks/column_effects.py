@@ -102,14 +102,14 @@ def find_effects(
         row: (n,) of a table, of each link.
         columns: by their heads, a text for each row of the table; empty: no value.
     """
-    rng, found = np.random.default_rng(0), list[Effect]()
+    rng, effects_so_far = np.random.default_rng(0), list[Effect]()
     dense = _dense_rows(links.place, rng)
     links, row = links.take(dense), row[dense]
     texts = {head: pd.factorize(words[row])[0] for head, words in columns.items()}
     values = {head: _numbers(words[row]) for head, words in columns.items()}
-    while len(links) >= LEAST_ROWS and len(found) < MOST_EFFECTS:
+    while len(links) >= LEAST_ROWS and len(effects_so_far) < MOST_EFFECTS:
         plain, pairs = _fit(links, links.station), (_near_pairs(links), _far_pairs(links, rng))
-        rest = [head for head in columns if head not in {one.head for one in found}]
+        rest = [head for head in columns if head not in {effect.head for effect in effects_so_far}]
         candidates = [
             _effect(links, plain, pairs, head, texts[head], values[head]) for head in rest
         ]
@@ -122,7 +122,7 @@ def find_effects(
         # Of columns that tell the same apart the first of the fewest values.
         alike = (effect for effect in effects if effect.contrast <= ALIKE * effects[0].contrast)
         best = min(alike, key=lambda one: texts[one.head].max())
-        found.append(best)
+        effects_so_far.append(best)
         value = values[best.head]
         if best.kind == "number" and value is not None:
             links = replace(links, level=links.level - best.size * value)
@@ -130,7 +130,7 @@ def find_effects(
             links = replace(links, level=links.level - _devices(links, texts[best.head]).regression)
         else:
             links = replace(links, station=_pairwise(links.station, texts[best.head]))
-    return found
+    return effects_so_far
 
 
 def run_warnings(data: Measurements) -> list[str]:
@@ -190,7 +190,9 @@ def _fit(
 
 
 def _devices(links: LevelsAtPlaces, code: np.ndarray) -> LevelField:
-    return _fit(links, links.station, [(code == one).astype(float) for one in np.unique(code)[1:]])
+    return _fit(
+        links, links.station, [(code == device).astype(float) for device in np.unique(code)[1:]]
+    )
 
 
 def _effect(
@@ -250,8 +252,8 @@ def _contrast(
     residual = level - slope * code if slope else level
     # Stations of few rows are looked at together, about their own means.
     few = np.bincount(which)[which] < LEAST_ROWS / 3
-    for one in np.unique(part := np.where(few, -1, which)):
-        mask = part == one
+    for group in np.unique(part := np.where(few, -1, which)):
+        mask = part == group
         whole, within = (_centred(value[mask], which[mask]) for value in (level, residual))
         within = within if slope else _centred(within, code[mask])
         if (

@@ -58,11 +58,11 @@ def mark_constants(data: Measurements, notes: list[str]) -> Measurements:
     which = [f"antenna {number}" for number in np.flatnonzero(antennas)]
     which += [f"tone {number}" for number in np.flatnonzero(tones)]
     which += [f"antenna {i} tone {k}" for i, k in np.argwhere(common & ~antennas[:, None] & ~tones)]
-    what = (
+    inputs = (
         f"{name_row_ranges(which, count=LEAST)} (of {shape[0]} x {shape[1]}, from 0) are constant"
     )
     fault = (
-        f"{what} over all rows: guards, nulls or a dead input? left out of learning and of "
+        f"{inputs} over all rows: guards, nulls or a dead input? left out of learning and of "
         "all figures"
     )
     measured = np.broadcast_to(~common, data.target.shape)

@@ -132,10 +132,10 @@ def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[s
                 facts.is_image
                 or np.ptp(placed.moving, axis=0).max() > LIGHT / placed.site.tones().mean()
             ):
-                one = _score(placed, labels)
-                delayed = one.fit > ONE_DELAY and (one.rows - declared.rows).mean() > CLEAR
-                if one.fit > FIT[facts.kind] and (delayed or name != "delays_removed"):
-                    rivals[name] = one
+                score = _score(placed, labels)
+                delayed = score.fit > ONE_DELAY and (score.rows - declared.rows).mean() > CLEAR
+                if score.fit > FIT[facts.kind] and (delayed or name != "delays_removed"):
+                    rivals[name] = score
     best = max(rivals.values(), key=lambda one: one.log_likelihood, default=declared)
     if (
         _of_most_groups(best.rows - declared.rows, data) + (best.phases - declared.phases) / 2
@@ -147,7 +147,11 @@ def _rivals(data: Measurements, few: Measurements, labels: np.ndarray) -> list[s
 
 
 def _tried(data: Measurements) -> list[str]:
-    return [n for n, one in CONVENTIONS.items() if one.tried and one.trait in traits(data)]
+    return [
+        n
+        for n, convention in CONVENTIONS.items()
+        if convention.tried and convention.trait in traits(data)
+    ]
 
 
 def _mending(how: str, rivals: Mapping[str, float]) -> list[str]:

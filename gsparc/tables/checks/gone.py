@@ -68,13 +68,13 @@ def find_gone(level: np.ndarray, place: np.ndarray, reach: float) -> dict[int, i
         place: (M, 2) [m].
         reach: of lists that count as near [m].
     """
-    listed, weakest, found = np.isfinite(level), np.nanmin(level, axis=1), dict[int, int]()
+    listed, weakest, losses = np.isfinite(level), np.nanmin(level, axis=1), dict[int, int]()
     square = number_squares(place, reach)
     way = np.r_[0, np.cumsum(np.linalg.norm(np.diff(place, axis=0), axis=1))]
     some = evenly_spaced(len(place), max(min(SAMPLE, MOST // len(place)), 1))
     gap = np.where(np.abs(way[some, None] - way) > 2 * reach, cdist(place[some], place), np.inf)
     other = gap.argmin(1)
-    some, other = (one[gap.min(1) < reach] for one in (some, other))
+    some, other = (numbers[gap.min(1) < reach] for numbers in (some, other))
     for station in np.flatnonzero(listed.sum(0) >= LEAST).tolist():
         held, first = listed[:, station], len(level) - int(listed[::-1, station].argmax())
         # Most stations end where a drive leaves them: no tree is built of these.
@@ -89,5 +89,5 @@ def find_gone(level: np.ndarray, place: np.ndarray, reach: float) -> dict[int, i
         if min(len(late), early.sum()) >= LEAST:
             share = min(float(held[some[early]].mean()), SURE)
             if (1 - share) ** len(np.unique(square[late])) < CHANCE:
-                found[station] = first
-    return found
+                losses[station] = first
+    return losses

@@ -71,7 +71,7 @@ def detect_level_steps(
         mean.append(np.log10(np.maximum(distance, np.ptp(places, axis=0).max() / 300)))
     some = evenly_spaced(len(level), LIKELIHOOD_BLOCKS)
     # Medians of rows hold less noise than rows do.
-    of_some = places[some], level[some], np.zeros(len(some)), [one[some] for one in mean]
+    of_some = places[some], level[some], np.zeros(len(some)), [column[some] for column in mean]
     field = fit_level_field(*of_some, nuggets=NUGGETS[:-1])
     precision, regressors = field.precision(places), np.column_stack([np.ones(len(level)), *mean])
     steps = [

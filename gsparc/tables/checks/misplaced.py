@@ -34,26 +34,26 @@ def misplaced_warnings(levels: LinkLevels) -> list[str]:
     )
     site, finite = site.reshape(-1)[levels.station], np.isfinite(where).all(axis=1)
     heard = dict[int, np.ndarray]()
-    for one in np.flatnonzero(finite)[:SITES].tolist():
-        rows = np.flatnonzero((site == one) & np.isfinite(levels.level_db))
+    for number in np.flatnonzero(finite)[:SITES].tolist():
+        rows = np.flatnonzero((site == number) & np.isfinite(levels.level_db))
         rows = rows[np.argsort(-levels.level_db[rows], kind="stable")]
         rows = rows[np.sort(np.unique(levels.position[rows], axis=0, return_index=True)[1])]
-        heard |= {one: rows} if len(rows) >= LEAST else {}
+        heard |= {number: rows} if len(rows) >= LEAST else {}
     strong = [levels.position[rows[: len(rows) // STRONG]].mean(axis=0) for rows in heard.values()]
     shift = np.median(strong - where[[*heard]], axis=0) * [1, 1, 0] if heard else np.zeros(3)
     shifts = shift * np.array(SHARES)[:, None]
     gains, shifted = np.full((len(where),) * 2, -np.inf), np.zeros(len(SHARES))
     names, kilometres = [levels.names[t] for t in first], list[str]()
-    for one, rows in heard.items():
+    for number, rows in heard.items():
         some = np.random.default_rng(0).permutation(rows)[:MOST]
         places = np.vstack(
-            [where[one], where[one] * [1e3, 1e3, 1], where[one] + shifts, where[finite]]
+            [where[number], where[number] * [1e3, 1e3, 1], where[number] + shifts, where[finite]]
         )
         gain = _gains(levels.position[some], levels.level_db[some], places)
-        kilometres += [names[one]] * bool(gain[0] > LIKELY)
+        kilometres += [names[number]] * bool(gain[0] > LIKELY)
         shifted += np.maximum(gain[1 : 1 + len(SHARES)], -LIKELY)
         # Each that is tried may fit by chance.
-        gains[one, finite] = gain[1 + len(SHARES) :] - math.log(len(where))
+        gains[number, finite] = gain[1 + len(SHARES) :] - math.log(len(where))
     gains[np.diag_indices(len(where))] = 0
     who = list_first(kilometres)
     finding = (

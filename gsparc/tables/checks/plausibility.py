@@ -230,11 +230,11 @@ def find_marks(values: np.ndarray) -> list[float]:
             counts[[0, -1]] >= REPEATS
         )
         beyond = different[-1] >= 0 or steps[-1] > max(1.5 * APART_DB, 0.7 * spans[1])
-        found = different[[0, -1]][enough & [True, beyond] | [piled, False]].tolist()
-        if not found:
+        new_marks = different[[0, -1]][enough & [True, beyond] | [piled, False]].tolist()
+        if not new_marks:
             return marks
-        marks += found
-        rest = rest[~np.isin(rest, found)]
+        marks += new_marks
+        rest = rest[~np.isin(rest, new_marks)]
 
 
 def still_warnings(levels: LinkLevels) -> list[str]:
@@ -324,7 +324,7 @@ def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) ->
     names, rows, warnings = levels.names, levels.rows, []
     for t in dict.fromkeys(t for t, _ in steps):
         who = f"station {names[t]}" if len(names) > 1 else "the level"
-        station_steps = [step for each_step, step in steps if each_step == t]
+        station_steps = [step for station, step in steps if station == t]
         change = " and ".join(
             f"{'rises' if step.change_db > 0 else 'falls'} by {abs(step.change_db):.0f} dB between "
             f"{rows[step.last]} and {rows[step.first]}"

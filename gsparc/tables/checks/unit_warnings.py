@@ -163,9 +163,9 @@ def _compare_reaches(still: np.ndarray, moving: np.ndarray) -> list[str]:
     lie where the others do in thousandths.
     """
     still, hints = np.unique(still[np.isfinite(still).all(axis=1)], axis=0), []
-    for one, other, who in ((still, moving, "stations"), (moving, still, "rows")):
-        if len(still) >= LEAST and (small := _are_thousandths(one, other, NEAR)).any():
-            reach, wide = (float(np.ptp(some[:, small], axis=0).max()) for some in (one, other))
+    for places, other, who in ((still, moving, "stations"), (moving, still, "rows")):
+        if len(still) >= LEAST and (small := _are_thousandths(places, other, NEAR)).any():
+            reach, wide = (float(np.ptp(some[:, small], axis=0).max()) for some in (places, other))
             axes = " and ".join(np.array(["x", "y"])[small])
             hints += [
                 f"{axes} of {who} reach over {reach:.3g} m, the others over {wide:.4g}: in "

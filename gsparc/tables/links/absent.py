@@ -73,13 +73,13 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
     # What is known not to be heard, of marks or a stated sensitivity, needs no guess.
     limit_known = floor is not None or np.isneginf(levels).any() or bool(find_marks(levels[heard]))
     no_floor = strongest or limit_known or absent == "silent" or count < LEAST_LISTED
-    found = None if no_floor else lists.below_floor()
-    if not strongest and found is None:
+    bound = None if no_floor else lists.below_floor()
+    if not strongest and bound is None:
         return 0
     listed = "the strongest alone" if lists.length == 1 else f"the {lists.length} strongest"
     missing = f"lists of {listed} of {count} stations"
-    if found is not None:
-        (floor, may), lists = found, replace(lists, length=0)
+    if bound is not None:
+        (floor, may), lists = bound, replace(lists, length=0)
         missing = "levels are missing beside weak ones alone"
         how = (
             f"not heard, below each station's weakest ({np.nanmin(floor):.4g} to "
@@ -114,12 +114,14 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
             Severe(f"{missing} with dataset.absent={absent}: {does}; leave absent out")
         )
         return 0
-    most, every = UNLISTED_EACH * len(heard), int(may.sum())
+    most, all_below = UNLISTED_EACH * len(heard), int(may.sum())
     of_list, station, below = lists.bound_unlisted(floor, most, may)
     _repeat(check, np.r_[heard, heard[lists.first[of_list]]], station)
     check.raw.arrays["sensitivity_db"] = np.r_[levels[heard], below]
-    used = "all" if len(below) == every else f"{len(below)} (mostly near where they are listed) of"
-    used = f"{used} {every} unlisted levels are used beside {len(heard)} listed ones"
+    used = (
+        "all" if len(below) == all_below else f"{len(below)} (mostly near where they are listed) of"
+    )
+    used = f"{used} {all_below} unlisted levels are used beside {len(heard)} listed ones"
     check.notes += [f"{missing}: {how}", f"{used} (dataset.absent=unknown uses none)"]
     return len(below) * strongest
 

@@ -106,8 +106,8 @@ def _without_table(check: Checker, measured: str, part: Selection) -> Links | No
             still, other = (rx, tx) if links.static_end == "rx" else (tx, rx)
             arrays.setdefault("station", np.zeros(rows, np.int64))
             arrays["place"] = number_places(other)
-            one = links.stations or Stations(still[:1].astype(np.float64), (links.static_end,))
-            links = replace(links, stations=split_by_carrier(check, one, measured in POWERS))
+            stations = links.stations or Stations(still[:1].astype(np.float64), (links.static_end,))
+            links = replace(links, stations=split_by_carrier(check, stations, measured in POWERS))
             links = links if len(links.stations or ()) > 1 else replace(links, stations=None)
     if links.stations is None and moving.ndim == 2 and len(moving) == rows:
         place = number_places(moving)

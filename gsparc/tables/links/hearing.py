@@ -27,8 +27,8 @@ FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less 
 def _are_levels(value: Any) -> bool:
     listed = np.atleast_1d(np.array(value, object)).ravel().tolist()
     return all(
-        isinstance(one, int | float) and not isinstance(one, bool) and one < np.inf
-        for one in listed
+        isinstance(level, int | float) and not isinstance(level, bool) and level < np.inf
+        for level in listed
     )
 
 
@@ -110,15 +110,12 @@ def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) 
         none = " or without any power" if measured == "spectrum" else ""
         below = np.ones(1) if floor is None or not censored.any() else floor[censored]
         below = to_decibels(below) if measured == "rssi" else below
-        limits = f"{below.min():.4g}" + f" to {below.max():.4g}" * bool(np.ptp(below))
-        what = (
-            "not listed" + " or not heard" * bool(censored.sum() > unlisted)
-            if unlisted
-            else "not heard"
-        )
-        unheard = f"powers were {what}: below {limits} dB"
-        for flags, what in ((~keep, f"values are missing{none}"), (censored, unheard)):
-            check.notes += [f"{flags.sum()} of {len(keep)} {what}"] if flags.any() else []
+        limits = f"{below.min():.4g}" + (f" to {below.max():.4g}" if np.ptp(below) else "")
+        reasons = ["not listed"] if unlisted else []
+        reasons += ["not heard"] if not unlisted or censored.sum() > unlisted else []
+        unheard = f"powers were {' or '.join(reasons)}: below {limits} dB"
+        for flags, note in ((~keep, f"values are missing{none}"), (censored, unheard)):
+            check.notes += [f"{flags.sum()} of {len(keep)} {note}"] if flags.any() else []
         arrays, side = take_rows(arrays, np.flatnonzero(keep), len(keep)), side[keep]
         check.raw = replace(check.raw, arrays=arrays)
     if not side.any():
@@ -194,9 +191,9 @@ def forget_unknown(check: Checker, moving: str) -> None:
     for mark in marks:
         beside: list[bool] = []
         marked = (values == mark) & np.isfinite(place).all(1)
-        for one in np.unique(station[marked]):
+        for marked_station in np.unique(station[marked]):
             heard_rows, marked_rows = (
-                np.flatnonzero(rows & (station == one)) for rows in (heard, marked)
+                np.flatnonzero(rows & (station == marked_station)) for rows in (heard, marked)
             )
             if len(heard_rows) < BESIDE:
                 continue

@@ -40,7 +40,7 @@ def _without_fix(check: Checker, measured: str) -> None:
     degrees = "latitude" in arrays
     for name in ("latitude",) if degrees else check.present("rx_position", "tx_position"):
         pair = (
-            [arrays[one] for one in (name, "longitude") if one in arrays]
+            [arrays[key] for key in (name, "longitude") if key in arrays]
             if degrees
             else [arrays[name]]
         )

@@ -62,9 +62,9 @@ def read_station_table(check: Checker, may_miss: bool = False) -> Stations | Non
         return None
     count = len(places)
     places[no_place] = np.nan
-    names, label = (check.raw.arrays.get(f"station_{each_name}") for each_name in ("name", "label"))
-    for what, texts in (("station_name", names), ("station_label", label)):
-        if texts is not None and not check.has_shape(what, texts, (count,)):
+    names, label = (check.raw.arrays.get(f"station_{field}") for field in ("name", "label"))
+    for field, texts in (("station_name", names), ("station_label", label)):
+        if texts is not None and not check.has_shape(field, texts, (count,)):
             return None
     called = tuple(map(str, range(count) if names is None else names))
     for name in sorted({name for name in called if called.count(name) > 1}):
@@ -112,10 +112,10 @@ def _of_one(
         bands.append((bands[-1] if bands else 0) + int(value > ONE_CARRIER * start))
     band = np.array(bands)[which.reshape(-1)]
     pairs = np.unique(np.stack([station, band, which.reshape(-1)], 1), axis=0)[:, :2]
-    one, count = np.unique(pairs, axis=0, return_counts=True)
+    carriers, count = np.unique(pairs, axis=0, return_counts=True)
     if count.max() == 1:
         return carrier
-    most = names[one[count.argmax(), 0]]
+    most = names[carriers[count.argmax(), 0]]
     note = f"station {most} at {count.max()} carriers within {100 * (ONE_CARRIER - 1):.0f} % is one"
     check.notes.append(
         f"{note}, and the like; dataset.columns.station=STATION+CARRIER tells them apart"
@@ -145,6 +145,6 @@ def split_by_carrier(check: Checker, stations: Stations, hopping: bool) -> Stati
         return stations
     several = np.bincount(first)[first] > 1  # a station of one carrier keeps its name
     called = zip(first, carrier, several, strict=True)
-    names = [stations.name[i] + f" at {c / 1e6:g} MHz" * bool(more) for i, c, more in called]
+    names = [stations.name[i] + (f" at {c / 1e6:g} MHz" if more else "") for i, c, more in called]
     arrays["station"] = which.reshape(-1).astype(np.int64)
     return replace(stations.subset(first, names), carrier_hz=carrier)

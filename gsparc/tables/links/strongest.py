@@ -218,8 +218,8 @@ class StrongestLists(Stored):
         near = cKDTree(self.place[has_fix]).query(places, range(1, min(NEAREST, len(listed)) + 1))[
             1
         ]
-        for one in near.T:  # together they would take much memory
-            result |= listed[one]
+        for square in near.T:  # together they would take much memory
+            result |= listed[square]
         return result
 
     def bound_unlisted(self, floor: np.ndarray, most: int, may: np.ndarray) -> Silent:

@@ -61,9 +61,11 @@ def write_scenario(folder: Path, predictor: Predictor, place: np.ndarray) -> tup
         "inter": np.where(direct, 0.0, 1.0),
         "inter_pos": meets[:, :, None],
     }
-    for name, one in (("aoa", towards), ("aod", leaves)):
-        arrays[f"{name}_az"] = np.degrees(np.arctan2(one[..., 1], one[..., 0]))
-        arrays[f"{name}_el"] = np.degrees(np.arccos(one[..., 2].clip(-1, 1)))  # from the zenith
+    for name, direction in (("aoa", towards), ("aod", leaves)):
+        arrays[f"{name}_az"] = np.degrees(np.arctan2(direction[..., 1], direction[..., 0]))
+        arrays[f"{name}_el"] = np.degrees(
+            np.arccos(direction[..., 2].clip(-1, 1))
+        )  # from the zenith
     for value in arrays.values():
         value[silent] = np.nan
     for name, value in (arrays | {"rx_pos": place, "tx_pos": still[None]}).items():

@@ -89,10 +89,12 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
     ]
     squared, power = np.concatenate(parts, axis=1)
     # The worst may be near the station, the mean is over random places alone.
-    found = np.array([squared[:count].mean(), squared.max()])
-    shares = found / max(power[:count].mean(), 1e-300)
-    found = shares if site.target.is_complex else np.sqrt(found) if site.target.is_level else found
-    error, worst = np.maximum(found, 1e-12).tolist()
+    errors = np.array([squared[:count].mean(), squared.max()])
+    shares = errors / max(power[:count].mean(), 1e-300)
+    errors = (
+        shares if site.target.is_complex else np.sqrt(errors) if site.target.is_level else errors
+    )
+    error, worst = np.maximum(errors, 1e-12).tolist()
     figure = f"{FIGURES[site.kind]} {error:.2g} at {count} random places, {worst:.2g} at the worst"
     if site.target.is_level:
         away, _ = _squares(form.predictor, predictor, far_places(site, 256, seed + 4))
@@ -109,13 +111,13 @@ def _squares(form: Predictor, model: Predictor, places: np.ndarray) -> np.ndarra
     """Mean square of errors, and of the model's answers, of each local place (2, n),
     see `FIGURES`.
     """
-    answers, whole = (ask_model(one, places).reshape(len(places), -1) for one in (form, model))
+    answers, whole = (ask_model(asked, places).reshape(len(places), -1) for asked in (form, model))
     if model.site.target.is_level:
         # A power of 0 has no decibels; 1e-30 is far below any receiver's noise.
         whole = np.maximum(whole, 1e-30)
         answers, whole = to_decibels(np.maximum(answers / whole, SILENT)), np.zeros_like(whole)
     squared, power = (
-        np.square(np.abs(one).astype(np.float64)).mean(1) for one in (answers - whole, whole)
+        np.square(np.abs(levels).astype(np.float64)).mean(1) for levels in (answers - whole, whole)
     )
     return np.stack([squared, power])
 
@@ -200,9 +202,9 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
 def _sources_of(method: Method) -> ImageSourceGP:
     """The sources of largest weight in a model of channels."""
     parts = method.weighted_members() if isinstance(method, ClosedForm) else ()
-    for _, each_part in sorted(parts, key=lambda part: -part[0]):
-        if isinstance(each_part, ImageSourceGP):
-            return each_part
+    for _, member in sorted(parts, key=lambda part: -part[0]):
+        if isinstance(member, ImageSourceGP):
+            return member
     fault = (
         "channels that are no sum of image sources have no compiled form "
         "(model=image_source_gp has)"

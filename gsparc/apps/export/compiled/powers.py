@@ -30,7 +30,9 @@ def compile_powers(process: PowerProcess, scale: float) -> Form | None:
     if process.others:
         weights, alone = zip(*process.members, strict=True)
         files = [
-            pack_form(form, np.zeros(3)) for one in alone if (form := compile_powers(one, scale))
+            pack_form(form, np.zeros(3))
+            for member in alone
+            if (form := compile_powers(member, scale))
         ]
         named = {f"member{i}": np.frombuffer(file, np.int64) for i, file in enumerate(files)}
         # As many as `kMost` of ops/csrc/field/mixture.h.
@@ -40,7 +42,7 @@ def compile_powers(process: PowerProcess, scale: float) -> Form | None:
     if (signed := kernel.compiled_lengths) is None or trend.more:
         return None
     assert isinstance(posterior, (Exact, Nearest))
-    every = isinstance(posterior, Exact)
+    exact = isinstance(posterior, Exact)
     nearest = posterior._vecchia if isinstance(posterior, Exact) else posterior
     columns = posterior._trend_columns
     if isinstance(posterior, Exact):
@@ -72,7 +74,7 @@ def compile_powers(process: PowerProcess, scale: float) -> Form | None:
     beside[:, :count] = places[order].T
     arrays = {
         "places": places[order],
-        "columns": beside if every else np.zeros(0),
+        "columns": beside if exact else np.zeros(0),
         # JITTER as the process itself adds it before its Cholesky factor.
         "extra": noise.numpy()[order] + JITTER,
         "values": values.double().numpy()[order],
@@ -90,9 +92,9 @@ def compile_powers(process: PowerProcess, scale: float) -> Form | None:
         sets[:, 1].sum(),
         len(sets),
         columns.shape[1],
-        every,
+        exact,
         nearest is None,
-        every,
+        exact,
         law is not None,
         len(signed),
         shares[0],

@@ -112,15 +112,15 @@ def _still(
     """Draw what stands still of a station in place of the nodes `before`; its nodes,
     and their colours.
     """
-    one = view.station(name)
-    scene = one.scene
+    station = view.station(name)
+    scene = station.scene
     nodes = draw_scene(api, scene, before)
     legends = list(scene.legends.values())
     if view.grid is not None:
         plane = view.plane(name, view.grid)
-        legend = one.power or Legend.over(f"predicted power [{view.unit}]", plane.level_db)
+        legend = station.power or Legend.over(f"predicted power [{view.unit}]", plane.level_db)
         legends.append(legend)
-        level = plane_sheet("plane", view.grid, plane.level_db, legend, one.dot / 2)
+        level = plane_sheet("plane", view.grid, plane.level_db, legend, station.dot / 2)
         nodes["plane"] = level.draw(api, scene.frame)
     if len(view.viewed.stations) > 1:
         legends = [replace(legend, label=f"{name}: {legend.label}") for legend in legends]

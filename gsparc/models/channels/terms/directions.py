@@ -83,7 +83,9 @@ class Directions(ChannelTerm):
 
     def end_covariances(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterable[Tensor]:
         """Return covariances of ends whose correlations are computed once, see `ChannelTerm`."""
-        powers = self.direction_powers([one.slot for one in a]).to(torch.complex128)
+        powers = self.direction_powers([places_of_slot.slot for places_of_slot in a]).to(
+            torch.complex128
+        )
         wavenumber, other, parts = a[0].slot.wavenumber, b[0].places, []
         for part in a[0].places.split(max(ENTRIES // (len(other) * len(self.angles)), 1)):
             each = torch.tensordot(
@@ -104,7 +106,9 @@ class Directions(ChannelTerm):
         def correlation_matrices() -> list[Tensor]:
             bound = matern32(distances(places, places), self.frame.envelope)
             ones = self.angles.split(1)
-            return [self.correlations(one, wavenumber, places, places)[0] * bound for one in ones]
+            return [
+                self.correlations(angle, wavenumber, places, places)[0] * bound for angle in ones
+            ]
 
         return basis.compress_once(
             (self.concentration, self.angles.numpy().tobytes()), correlation_matrices

@@ -37,7 +37,9 @@ class Spherical(ChannelTerm):
         both = zip(
             sources, torch.linalg.vector_norm(sources - self.frame.middle, dim=-1), strict=True
         )
-        return torch.stack([spherical_wave(at.places, one, wavenumber, away) for one, away in both])
+        return torch.stack(
+            [spherical_wave(at.places, source, wavenumber, away) for source, away in both]
+        )
 
     @property
     def split_powers(self) -> tuple[Tensor, Tensor]:
@@ -63,4 +65,6 @@ class Spherical(ChannelTerm):
         waves, away, frame = self.waves(at), distances(at.places, at.places), self.frame
         each = [wave[:, None] * wave.conj() for wave in waves]
         gains = [squared_exponential(away, length) for length in (frame.reach, frame.gain)]
-        return torch.stack([basis.compress(one * gain) for gain in gains for one in each])
+        return torch.stack(
+            [basis.compress(covariance * gain) for gain in gains for covariance in each]
+        )

@@ -138,9 +138,9 @@ def share_past_boxes(paths: Legs, boxes: Tensor) -> Tensor:
     for start, per_metre, low, high in zip(
         paths.start.unbind(-1), inverse.unbind(-1), *corners, strict=True
     ):
-        one, other = (low - start) * per_metre, (high - start) * per_metre
-        enter = torch.maximum(enter, torch.minimum(one, other))
-        leave = torch.minimum(leave, torch.maximum(one, other))
+        low_face, high_face = (low - start) * per_metre, (high - start) * per_metre
+        enter = torch.maximum(enter, torch.minimum(low_face, high_face))
+        leave = torch.minimum(leave, torch.maximum(low_face, high_face))
     chord = ((leave - enter) * length).amax(-1)  # negative for legs that miss
     passed = torch.sigmoid((MARGIN - chord) / SOFT)
     return torch.where(paths.valid, passed, 1.0)

@@ -49,14 +49,14 @@ def find_patch(unexplained: UnexplainedRows, plane: int) -> tuple[Tensor, float]
     mine = [k for k, sequence in enumerate(unexplained.scene.sequences) if plane in sequence]
     few, waves = unexplained.paths.select_sequences(mine), unexplained.waves[:, mine]
     along = plane_tangents(unexplained.scene.planes[plane])
-    met, here = few.end @ along.T, few.plane == plane
+    met, reflected = few.end @ along.T, few.plane == plane
     ends = unexplained.room @ along.T
     low, high = ends.amin(0), ends.amax(0)
 
     def gain_of_patches(patches: Tensor) -> Tensor:
         return unexplained.scorer.gains_of_shares(
             patches,
-            lambda part: torch.where(here, share_inside_patches(met, part), 1.0).prod(-1),
+            lambda part: torch.where(reflected, share_inside_patches(met, part), 1.0).prod(-1),
             waves,
         )
 

@@ -101,16 +101,16 @@ class Unfolding:
     def paths(self, places: Tensor) -> Legs:
         """Return the paths from places (n, 3) [m]."""
         shape = (*self.present.shape[:2], len(places))
-        here, valid = places.to(self.chain.dtype).expand(*shape, 3), self.present.expand(shape)
-        points = [here]
+        point, valid = places.to(self.chain.dtype).expand(*shape, 3), self.present.expand(shape)
+        points = [point]
         steps = list(zip(self.normal, self.offset, self.height, self.chain[1:], strict=True))
         for normal, offset, height, image in reversed(steps):
-            above = (here * normal).sum(-1) - offset
+            above = (point * normal).sum(-1) - offset
             share = above / (above - height + PARALLEL)
             valid = valid & ((share - 0.5).abs() < 0.5 + EDGE)
-            here = torch.lerp(here, image, share.clamp(0, 1)[..., None])
-            points.append(here)
-        points.append(self.chain[0].expand_as(here))
+            point = torch.lerp(point, image, share.clamp(0, 1)[..., None])
+            points.append(point)
+        points.append(self.chain[0].expand_as(point))
         chosen = valid.int().argmax(1)  # the first valid variant, else the first
         plane = _select_variants(self.plane.expand(*shape, -1), chosen)
         return Legs(_select_variants(torch.stack(points, -2), chosen), plane, valid.any(1))

@@ -94,9 +94,9 @@ class Mirrors:
         """
         sides = _side_lengths(self.clutter.patches)
         size: dict[int, float] = {}
-        for plane, (one, other) in zip(self.clutter.plane, sides.tolist(), strict=True):
-            if min(one, other) >= smallest:
-                size[plane] = size.get(plane, 0.0) + one * other
+        for plane, (width, height) in zip(self.clutter.plane, sides.tolist(), strict=True):
+            if min(width, height) >= smallest:
+                size[plane] = size.get(plane, 0.0) + width * height
         return sorted(size, key=lambda plane: -size[plane])
 
     def paths(self, sequences: Sequence[Reflections], transmitter: Tensor, places: Tensor) -> Legs:
@@ -158,8 +158,8 @@ class Mirrors:
         used = {index for sequence in sequences for index in sequence}
         numbers = []
         for number, plane in enumerate(clutter.plane):
-            one = Clutter(clutter.boxes[:0], clutter.patches[number : number + 1], (plane,))
-            shadow = 1 - visible_share(paths, one, self.planes)
+            patch = Clutter(clutter.boxes[:0], clutter.patches[number : number + 1], (plane,))
+            shadow = 1 - visible_share(paths, patch, self.planes)
             if plane in used or float(shadow.max()) > HIDES:
                 numbers.append(number)
         planes = tuple(clutter.plane[i] for i in numbers)
@@ -183,10 +183,10 @@ class Mirrors:
         """Whether (W, n) every leg of a sequence ends on a rectangle of its plane, as 0 and 1."""
         inside = paths.plane < 0
         for patch, plane in zip(self.clutter.patches, self.clutter.plane, strict=True):
-            here = paths.plane == plane
-            if bool(here.any()):
-                met = paths.end[here] @ plane_tangents(self.planes[plane]).T
-                inside[here] |= ((met >= patch[:2]) & (met <= patch[2:])).all(1)
+            reflected = paths.plane == plane
+            if bool(reflected.any()):
+                met = paths.end[reflected] @ plane_tangents(self.planes[plane]).T
+                inside[reflected] |= ((met >= patch[:2]) & (met <= patch[2:])).all(1)
         return (inside.all(-1) & paths.valid).float()
 
     def _mean_visible_shares(self, sequences: list[Reflections], *ends: Tensor) -> Tensor:

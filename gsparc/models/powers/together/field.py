@@ -108,11 +108,11 @@ class JointPowerField(ClosedForm):
             names = data.site.every_station.shown
             evidence, prior, remarks = learn_network(used, network, names, self.seed)
             for maps in self.maps:
-                known, own, said = learn_network(
+                known, own, remarks_with_map = learn_network(
                     used, maps.put_under(network, self.places), names, self.seed
                 )
                 if used_maps := known > evidence:
-                    prior, remarks = own, said
+                    prior, remarks = own, remarks_with_map
                 # Second: a table shows the first few.
                 remarks.insert(1, describe_use(used_maps, len(maps.maps)))
                 remarks += map(Caution, maps.explain_misfits(measured, names))
@@ -144,9 +144,9 @@ class JointPowerField(ClosedForm):
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ClosedForm`; silent rows say that powers are below a level."""
-        every = rows_of_stations(data, rows, self.places)
-        every = every if self.network is None else relabel_by_site(every, self.network)
-        used = every.thin_rows(rows_per_station(len(every.stations)), self.seed)
+        own_rows = rows_of_stations(data, rows, self.places)
+        own_rows = own_rows if self.network is None else relabel_by_site(own_rows, self.network)
+        used = own_rows.thin_rows(rows_per_station(len(own_rows.stations)), self.seed)
         self.posterior, self._reach = self.own.condition(used, self.heard, self.seed), None
         elsewhere = self.posterior
         if self.network is None:  # sites share nothing that is learned here
@@ -197,14 +197,14 @@ class JointPowerField(ClosedForm):
         groups, count = moving.shape[:2]
         mean, noise = torch.zeros(groups, count).double(), torch.zeros(count).double()
         covariance = torch.zeros(groups, count, count).double()
-        for one in number.unique().tolist():
-            at = (number == one).nonzero()[:, 0]
+        for station in number.unique().tolist():
+            at = (number == station).nonzero()[:, 0]
             of, inflation = (
-                (posterior, 1.0) if one in posterior.processes else (elsewhere, self.inflation)
+                (posterior, 1.0) if station in posterior.processes else (elsewhere, self.inflation)
             )
-            mean[:, at], block = of.predict_joint(places[:, at], one)
+            mean[:, at], block = of.predict_joint(places[:, at], station)
             covariance[:, at[:, None], at] = inflation * block
-            kernel = self.own.prior(one).kernel
+            kernel = self.own.prior(station).kernel
             noise[at] = inflation * kernel.amplitude * kernel.noise
         return JointLevels(mean, covariance, noise)
 
@@ -245,8 +245,8 @@ class JointPowerField(ClosedForm):
             state["processes"] = {
                 str(n): process.state() for n, process in self.posterior.processes.items()
             }
-            for name, one in (("posterior", self.posterior), ("elsewhere", self.elsewhere)):
-                state[name] = {"lower": one.factor.lower, "mean": one.mean}
+            for name, shared in (("posterior", self.posterior), ("elsewhere", self.elsewhere)):
+                state[name] = {"lower": shared.factor.lower, "mean": shared.mean}
         return state
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
@@ -318,12 +318,14 @@ class JointPowerField(ClosedForm):
         if query.station is not None:
             still = torch.where(number[:, None] >= 0, table[number.clamp_min(0)], still)
             return torch.cat([moving, still], 1), number
-        here, there = (stations_at(table, one) for one in (still, moving))
-        turned = (here < 0) & (there >= 0)  # asked the other way round
+        station_of_still, station_of_moving = (
+            stations_at(table, place) for place in (still, moving)
+        )
+        turned = (station_of_still < 0) & (station_of_moving >= 0)  # asked the other way round
         swapped = torch.where(
             turned[:, None], torch.cat([still, moving], 1), torch.cat([moving, still], 1)
         )
-        return swapped, torch.where(turned, there, here)
+        return swapped, torch.where(turned, station_of_moving, station_of_still)
 
     def _process_places(self, places: Tensor, number: Tensor) -> tuple[Tensor, Tensor]:
         """Places (B, 6), of a network (B, 7), and stations (B,) as processes have them."""

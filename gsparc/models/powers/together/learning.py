@@ -205,7 +205,7 @@ def learn_shared_terms(
     (_, errors, *_), (_, others, _, station) = best, plain
     gain, unsure = mean_and_error(others**2 - errors**2, station)
     terms, _, ratio, _ = best if gain > ERRORS * unsure else plain
-    before, after = (math.sqrt(float((one**2).mean())) for one in (others, errors))
+    before, after = (math.sqrt(float((residuals**2).mean())) for residuals in (others, errors))
     remark = (
         f"stations left out, after one constant each: rmse {before:.3g} dB without shared terms, "
         f"{after:.3g} dB with them (gain {gain:.2g} +- {unsure:.2g} dB^2)"

@@ -120,11 +120,11 @@ def check_azimuths(data: Measurements, seed: int = 0) -> list[str]:
     """Return what `learn_network` says of azimuths; nothing where `data` are of no network."""
     if not data.site.target.is_level or data.station is None or len(data) < LEAST_TESTED:
         return []
-    every = np.arange(len(data))
-    places, _ = places_and_notes(data, every)
+    numbers = np.arange(len(data))
+    places, _ = places_and_notes(data, numbers)
     if (network := find_sectors(data, places)) is None or (network.table[:, 0] == NO_AZIMUTH).all():
         return []
-    rows = relabel_by_site(rows_of_stations(data, every, places), network)
+    rows = relabel_by_site(rows_of_stations(data, numbers, places), network)
     return _fit_azimuths(rows, network, data.site.every_station.shown, seed)[-1]
 
 
@@ -309,12 +309,12 @@ def _note_untested(
 
 def _note_turned(given: Tensor, found: Tensor, names: tuple[str, ...]) -> list[str]:
     """A note that names all azimuths (T,) [deg] that were turned, also by less in several steps."""
-    said = [
+    turned = [
         f"{names[t]} (listed {given[t]:.0f}, fitted {found[t]:.0f} degrees)"
         for t in torch.nonzero(found != given)[:, 0].tolist()
     ]
-    every = f"azimuths are contradicted by levels; the fitted ones are used: {', '.join(said)}"
-    return [Caution(every)] if said else []
+    text = f"azimuths are contradicted by levels; the fitted ones are used: {', '.join(turned)}"
+    return [Caution(text)] if turned else []
 
 
 def _fit_by_evidence(

@@ -149,8 +149,8 @@ class SharedTerms(Columns):
 
     def set_inducing(self, rows: StationRows, limit: int, seed: int) -> SharedTerms:
         """Return the same with g known at so many places of rows, drawn evenly."""
-        every = np.unique(first_end(rows.places), axis=0)
-        return replace(self, inducing=torch.from_numpy(every[draw_rows(len(every), limit, seed)]))
+        ends = np.unique(first_end(rows.places), axis=0)
+        return replace(self, inducing=torch.from_numpy(ends[draw_rows(len(ends), limit, seed)]))
 
     def columns(self, places: Tensor) -> Tensor:
         """Return (n, P) [units] at places of both ends (n, 6) [m], or of sectors (n, 7)."""
