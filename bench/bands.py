@@ -1,20 +1,18 @@
 """Places and carriers that nobody measured: rooms at ten carriers, ours beside plain methods.
 
-python bench/bands.py FOLDER SEED          # rooms of a seed; docs/results/bands.csv, half an hour
-of one core python bench/bands.py FOLDER SEED box      # rooms whose names begin so;
-a file that is there is added to
+python bench/bands.py FOLDER SEED              # rooms of a seed: half an hour of one core
+python bench/bands.py FOLDER SEED box draws=3  # rooms whose names begin so; settings of
+                                               # `gsparc compare`, which does the rest
 
 Three rooms of Sionna (`make sionna`): the meshes of `../shared/data/wideband`, the conference room,
 cabinets in a box; three shoeboxes of known mirrors; the last of either is turned. Fifty places .9 m
-apart, half of them in sight of the gateway; array and spectrum of XFreq-GS. Held out: ten places
-(three draws), half of the carriers there, every third carrier in its turn. `true_paths`:
-the paths that there are, without phases.
+apart, half of them in sight of the gateway; array and spectrum of XFreq-GS. Held out: a fifth of
+the places, and each carrier in its turn.
 """
 
 from __future__ import annotations
 
 import sys
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -22,18 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
-import torch
+from beside_plain import compare_with_plain
 from PIL import Image
 
-from gsparc.data.schema import LIGHT, Measurements
-from gsparc.data.splits import Fold
-from gsparc.datasets.load import load
+from gsparc.data.schema import LIGHT
 from gsparc.datasets.rfid import planar_array
-from gsparc.field.losses import ssim
-from gsparc.models.carriers.plain import DirectBeam
-from gsparc.models.per_station import wrap_per_station
-from gsparc.models.registry import method_class
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.llvm import prepare_llvm
 from gsparc.simulate.raytracer import RayTracer, Sampling
@@ -41,16 +32,13 @@ from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.solid import Solid, box
 from gsparc.simulate.scenes.transmitters import Antenna
 from gsparc.simulate.shoebox import Room, mirror_images, visible_images
-from gsparc.training.context import FitContext
 
 SCENE = Path(__file__).resolve().parents[2] / "shared" / "data" / "wideband" / "scene" / "scene.xml"
-OUT = Path(__file__).resolve().parents[1] / "docs" / "results" / "bands.csv"
 GHZ = (1, 2.4, 5, 10, 24.25, 37, 47, 60, 77, 94)
 ELEMENTS = planar_array(spacing_m=0.5)[:, [2, 0, 1]]  # [wavelengths]
 EFFECTS = Effects(diffuse=False, edge_diffraction=False, polarisation=False)
-COUNT, APART_M, TURN, STRONGEST = 50, 0.9, 0.4, 60  # of places; of the world [rad]; paths
+COUNT, APART_M, TURN = 50, 0.9, 0.4  # of places; of the world [rad]
 CORNERS = {"home": [[-6, -3, 0], [6, 3, 3]], "hall": [[0, 0, 0], [14, 10, 4]]}  # [m]
-METHODS = ("gsparc", "mean", "nearest", "idw", "gp", "other_carriers", "direct_beam")
 # Of places (n, 3), a gateway (3,), a carrier [Hz] and most bounces: gains (n, P) without the
 # carrier's phase, metres (n, P), directions at the gateway (n, P, 3).
 Paths = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -120,7 +108,7 @@ def traced(
 def make_room(
     folder: Path, rng: np.random.Generator, corners: np.ndarray, trace: Trace, turn: float
 ) -> None:
-    """Write a room in the layout that `dataset=rfid` reads, and its strongest paths."""
+    """Write a room in the layout that `dataset=rfid` reads."""
     low, high = corners
     along = map(np.arange, low[:2] + rng.uniform(0.2, 0.7, 2), high[:2] - 0.2, [APART_M] * 2)
     every = np.stack(np.meshgrid(*along), -1).reshape(-1, 2)
@@ -140,7 +128,7 @@ def make_room(
         [np.sin(zenith) * np.cos(azimuth), -np.sin(zenith) * np.sin(azimuth), np.cos(zenith)]
     )
     steering = np.exp(-2j * np.pi * np.einsum("kij,mk->mij", looks, ELEMENTS))
-    images, powers, directions = [], [], []
+    images, arrives = [], np.full(len(places), True)
     for carrier in np.array(GHZ) * 1e9:
         gains, metres, direction = trace(places, gateway, carrier, 3)
         waves, turned = (
@@ -149,13 +137,8 @@ def make_room(
         )
         vectors = np.einsum("np,npm->nm", waves, np.exp(2j * np.pi * turned @ ELEMENTS.T))
         images.append(np.abs(np.einsum("nm,mij->nij", vectors, steering)))
-        order = np.argsort(-np.abs(gains), 1)[:, :STRONGEST]
-        powers.append(np.take_along_axis(np.abs(gains) ** 2, order, 1))
-        directions.append(np.take_along_axis(turned, order[..., None], 1))
-    heard = np.all([power.any(1) for power in powers], 0)
-    image, power, direction = (
-        np.concatenate([one[heard] for one in all]) for all in (images, powers, directions)
-    )
+        arrives &= gains.any(1)
+    image = np.concatenate([rows[arrives] for rows in images])
     (folder / "spectrum").mkdir(parents=True)
     for number, one in enumerate(
         np.round(255 * image / image.max((1, 2), keepdims=True)).astype(np.uint8), 1
@@ -163,97 +146,26 @@ def make_room(
         Image.fromarray(one).save(folder / "spectrum" / f"{number:05d}.png")
     pose = f"gateway1: {{position: {(gateway @ world).tolist()}, orientation: [0, 0, 0, 1]}}\n"
     (folder / "gateway_info.yml").write_text("dataset_name: bands\n" + pose)
-    np.savetxt(folder / "freq.txt", np.repeat(GHZ, heard.sum()), "%g")
-    rows = np.tile(places[heard] @ world, (len(GHZ), 1))
+    np.savetxt(folder / "freq.txt", np.repeat(GHZ, arrives.sum()), "%g")
+    rows = np.tile(places[arrives] @ world, (len(GHZ), 1))
     np.savetxt(folder / "tx_pos.csv", rows, "%.6f", ",", header="x,y,z", comments="")
-    np.savez(folder / "paths.npz", direction=direction, power=power)
-
-
-def folds(data: Measurements, seed: int) -> Iterator[tuple[str, Fold]]:
-    """Yield what is held out."""
-    place, none = (
-        np.unique(data.tx, axis=0, return_inverse=True)[1].reshape(-1),
-        np.zeros(0, np.int64),
-    )
-
-    def hold_out(rows: np.ndarray) -> Fold:
-        return Fold(np.flatnonzero(~rows), none, np.flatnonzero(rows))
-
-    for draw in range(3):
-        out = np.isin(place, np.random.default_rng([seed, draw]).permutation(place.max() + 1)[:10])
-        yield "places", hold_out(out)
-        yield "half", hold_out(out & (data.station % 2 == 1))
-    for carrier in range(0, len(GHZ), 3):
-        yield "carriers", hold_out(data.station == carrier)
-
-
-def judge(name: str, data: Measurements, fold: Fold) -> dict[str, float | str]:
-    """Return figures of a method."""
-    method, batch = wrap_per_station(method_class(name)(), data), data.batch(fold.test)
-    start = time.process_time()
-    method.fit(data, fold, FitContext(Path()))
-    fitted = time.process_time()
-    mean, one, query_start = (
-        method.predict(batch).mean,
-        data.batch(fold.test[:1]),
-        time.process_time(),
-    )
-    for _ in range(10):
-        method.predict(one)
-    query_ms = (time.process_time() - query_start) / 10 * 1e3
-    return {
-        "method": name,
-        **score(mean, batch.target),
-        "fit_cpu_s": fitted - start,
-        "query_cpu_ms": query_ms,
-    }
-
-
-def ceiling(truth: Path, data: Measurements, fold: Fold) -> dict[str, float | str]:
-    """Return figures of the true paths without their phases."""
-    beam, batch = DirectBeam(), data.batch(fold.test)
-    beam.fit(data, fold, FitContext(Path()))
-    with np.load(truth) as paths:
-        arrays = (torch.from_numpy(paths[name][fold.test]) for name in ("direction", "power"))
-        images = beam.expect_paths(*arrays)
-    return {"method": "true_paths", **score(beam.answer_images(images, batch), batch.target)}
-
-
-def score(images: torch.Tensor, target: torch.Tensor) -> dict[str, float]:
-    """Return the means over rows."""
-    squared = (images - target).square().flatten(1).mean(1)
-    alike = torch.cat([ssim(*pair) for pair in zip(images.split(1), target.split(1), strict=True)])
-    return {"ssim_gauss": float(alike.mean()), "psnr_db": float(-10 * squared.log10().mean())}
 
 
 def main() -> None:
-    """Make rooms, fit, write a row a room, what is held out and method,
-    and print the means over rooms.
-    """
-    folder, seed, *names = sys.argv[1:]
-    torch.set_num_threads(1)
-    rows = []
+    """Make rooms, and compare on them."""
+    folder, seed, *words = sys.argv[1:]
+    datasets, wanted = {}, tuple(word for word in words if "=" not in word) or ""
     for number, (name, corners, trace) in enumerate(rooms(int(seed))):
-        if not name.startswith(tuple(names or [""])):
-            continue
         root = Path(folder) / f"{name}_{seed}"
+        if not name.startswith(wanted):
+            continue
         if not root.exists():
             rng = np.random.default_rng([int(seed), number, 1])
             make_room(root, rng, corners, trace, TURN * (number % 3 == 2))
-        data = load({"name": "rfid", "root": str(root)})
-        for held_out, fold in folds(data, int(seed)):
-            judged = [judge(one, data, fold) for one in METHODS]
-            judged += [ceiling(root / "paths.npz", data, fold)] if held_out == "places" else []
-            rows += [{"room": root.name, "held_out": held_out, **one} for one in judged]
-    by = ["room", "held_out", "method"]
-    draws = pd.DataFrame(rows).groupby(by, sort=False)
-    mean = draws.mean()
-    mean.insert(1, "ssim_error", draws["ssim_gauss"].sem())  # over draws, or carriers
-    mean = mean.round(4)
-    before = [pd.read_csv(OUT).set_index(by)] if OUT.exists() else []
-    every = pd.concat([*before, mean])
-    every[~every.index.duplicated(keep="last")].to_csv(OUT)
-    sys.stdout.write(f"{mean.groupby(by[1:], sort=False).mean().to_string()}\n")
+        datasets[root.name] = {"dataset": "rfid", "root": str(root)}
+    splits = {"places": {"choose": ["split=random", "split.redraw=true"]}}
+    splits |= {"carriers": {"choose": ["split=carriers"], "draws": 0}}
+    compare_with_plain(Path(folder), datasets, splits, words)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 """Ours beside every plain method on 76 small cases: is it ever behind?
 
-python bench/cases.py FOLDER           # its files and cells; docs/results/cases.csv: half an hour
-of one core python bench/cases.py FOLDER draw.     # cases whose names begin so;
-`reuse=true` and others: as of compare
+python bench/cases.py FOLDER                   # FOLDER/cases.csv: half an hour of one core
+python bench/cases.py FOLDER draw. draws=4     # cases whose names begin so, four draws of each
+python bench/cases.py FOLDER reuse=true        # and any other setting of `gsparc compare`
 
-Cells are those of `gsparc compare`: an interrupted run goes on. Cases of `../shared/data`, 56, are
-of others; those of `draw`, twenty, are drawn by seed from what stands here. Each is cut at random
-and in squares; ratios are of root mean squared errors, to the best plain method that serves a case.
+`gsparc compare` does it: an interrupted run goes on, its own tables are beside. Cases of
+`../shared/data`, 56, are of others; those of `draw`, twenty, are drawn by seed from what stands
+here. Each is cut at random and in squares.
 """
 
 from __future__ import annotations
@@ -15,23 +15,19 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-import hydra
 import numpy as np
-import pandas as pd
 import torch
-from omegaconf import OmegaConf
+from beside_plain import PROBLEM, compare_with_plain
 from town import shadowed
 
-from gsparc.commands.train import train_job
-from gsparc.models.registry import plain_methods
 from gsparc.physics.waves import point_wave
-from gsparc.runs.experiment.cells import plan_jobs
-from gsparc.runs.experiment.runner import run_jobs
-from gsparc.runs.experiment.table import average_cells
 
 MEASURED = Path(__file__).resolve().parents[2] / "shared" / "data"
 ROWS = 900  # of a case, of more
-COLUMNS = ["case", "split", "gsparc", "best plain", "its error", "ratio", "processor s"]
+COLUMNS = {
+    **{"dataset": "case", "split": "split", "error": "gsparc", "method_plain": "best plain"},
+    **{"error_plain": "its error", "ratio": "ratio", "train_cpu_s": "processor s"},
+}
 Arrays = dict[str, np.ndarray | float]
 Case = tuple[str, float, Arrays]  # name, side of squares [m], measurements under the schema's names
 
@@ -199,62 +195,30 @@ def thinned(arrays: Arrays) -> Arrays:
 
 
 def main() -> None:
-    """Write files, fill cells, write the table, and say how far behind ours is."""
-    folder, *words = sys.argv[1:]
-    data = Path(folder) / "data"
-    data.mkdir(parents=True, exist_ok=True)
-    with hydra.initialize_config_module("gsparc.conf", version_base="1.3"):
-        chosen = hydra.compose("compare", overrides=[word for word in words if "=" in word])
-        config = OmegaConf.to_container(chosen, resolve=False)
-        room = {"dataset": "newrf", "file": str(MEASURED / "newrf-conference.npz")}
-        config["datasets"] = {"rfid": {"root": str(MEASURED / "rfid-s23-160")}, "conference": room}
-        squares = {0.2: ["rfid"], 1.0: ["conference"]}
-        for name, side, arrays in (*measured(), *drawn()):
-            file = data / f"{name}.npz"
-            np.savez(file, **thinned(arrays))
-            config["datasets"][name] = {"dataset": "own", "file": str(file)}
-            squares.setdefault(side, []).append(name)
-        config["splits"] = {"random": {"choose": ["split=random", "split.redraw=true"], "draws": 1}}
-        for side, names in squares.items():
-            cut = {
-                "choose": ["split=blocks", f"split.side_m={side}"],
-                "draws": 1,
-                "datasets": names,
-            }
-            config["splits"][f"squares_{side:g}m"] = cut
-        wanted = {*plain_methods(), "gsparc"}
-        config["methods"] = {
-            name: method for name, method in config["methods"].items() if name in wanted
-        }
-        config["only"] = [f"{name}*" for name in words if "=" not in name]
-        filled = run_jobs(plan_jobs(config, Path(folder) / "cells"), train_job, True, None)
-    rows = average_cells(filled)
-    write_table(rows, Path(__file__).resolve().parents[1] / "docs" / "results" / "cases.csv")
-
-
-def write_table(rows: pd.DataFrame, file: Path) -> None:
-    """Write ours beside the best plain method, a row a case,
-    and print the mean and the largest ratio.
-    """
-    cases = []
-    for (dataset, split), those in rows.groupby(["dataset", "split"], sort=False):
-        # A score is of squared errors [dB] but for powers, whose root mean squared error it is.
-        one = those.set_index("method")
-        error = (-one.score_db).where(one.figure.str.startswith("rmse"), 10 ** (-one.score_db / 20))
-        best = error.drop("gsparc").idxmin()
-        ratio = error["gsparc"] / error[best]
-        cases.append(
-            (dataset, split, error["gsparc"], best, error[best], ratio, one.train_cpu_s["gsparc"])
-        )
-    table = pd.DataFrame(cases, columns=COLUMNS)
+    """Write files, compare, and leave ours beside the best plain method, a row a case."""
+    folder, words = Path(sys.argv[1]), sys.argv[2:]
+    (folder / "data").mkdir(parents=True, exist_ok=True)
+    room = {"dataset": "newrf", "file": str(MEASURED / "newrf-conference.npz")}
+    datasets = {"rfid": {"root": str(MEASURED / "rfid-s23-160")}, "conference": room}
+    splits = {"random": {"choose": ["split=random", "split.redraw=true"]}}
+    sides = {"rfid": 0.2, "conference": 1.0}
+    for name, side, arrays in (*measured(), *drawn()):
+        file, sides[name] = folder / "data" / f"{name}.npz", side
+        np.savez(file, **thinned(arrays))
+        datasets[name] = {"dataset": "own", "file": str(file)}
+    for side in dict.fromkeys(sides.values()):
+        names = [name for name in sides if sides[name] == side]
+        cut = {"choose": ["split=blocks", f"split.side_m={side}"], "datasets": names}
+        splits[f"squares_{side:g}m"] = cut
+    rows = compare_with_plain(folder, datasets, splits, words)
+    ours = rows.method == "gsparc"
+    best = rows[~ours & (rows.ratio == 1)].drop_duplicates(PROBLEM)
+    table = rows[ours].merge(best, on=PROBLEM, suffixes=("", "_plain"))
+    table = table.rename(columns=COLUMNS)[[*COLUMNS.values()]]
+    file = folder / "cases.csv"
     table.to_csv(file, index=False, lineterminator="\n", float_format="%.4g")
-    for at_random, those in table.groupby(table.split == "random"):
-        worst = those.loc[those.ratio.idxmax()]
-        text = (
-            f"{len(those)} cases, ratio {those.ratio.mean():.3f}, {worst.ratio:.3f} at most "
-            f"({worst.case})"
-        )
-        sys.stdout.write(f"{'random' if at_random else 'squares'}: {text}\n")
+    ratios = table.groupby(table.split == "random").ratio.agg(["size", "mean", "max"])
+    sys.stdout.write(f"{ratios.rename({True: 'random', False: 'squares'}).to_string()}\n")
 
 
 if __name__ == "__main__":

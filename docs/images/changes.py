@@ -5,7 +5,6 @@ python docs/images/changes.py
 """
 
 import logging
-import sys
 import tempfile
 from pathlib import Path
 
@@ -14,13 +13,31 @@ import numpy as np
 
 import gsparc
 
-ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "bench"))
-
-from changes import draw, field, planned, screened  # noqa: E402
-
 OUT = Path(__file__).parent / "changes.png"
 POST, SIDE, TOWN = [9.0, 9.0, 2.6], 20.0, 600.0
+
+
+def field(places, seed, length):
+    """Levels (n,) of a smooth random field with deviation 4 dB."""
+    rng = np.random.default_rng(seed)
+    waves, phase = rng.normal(size=(60, 2)) * 1.4 / length, rng.uniform(0, 2 * np.pi, 60)
+    return 4 * np.sqrt(2 / 60) * np.cos(places[:, :2] @ waves.T + phase).sum(1)
+
+
+def draw(count, seed, side):
+    """Places (count, 3) on a floor."""
+    return np.c_[np.random.default_rng(seed).uniform(0, side, (count, 2)), np.full(count, 1.5)]
+
+
+def screened(places, stands=True):
+    """Levels (n,) of a room; if it `stands`, a screen of 12 dB is before a disc of 4 m."""
+    disc = np.linalg.norm(places[:, :2] - 5, axis=1) < 4
+    return -60 + field(places, 1, 4.0) - 12 * (stands & disc)
+
+
+def planned(places, number=1):
+    """What a planning tool knows of a town [dBm]."""
+    return -40 - 30 * np.log10(np.hypot(*places[:, :2].T) + 10) + 2 * field(places, number, 60.0)
 
 
 def grid(low, high, count=61):
@@ -44,7 +61,7 @@ def room():
         found = model.update(rx=near[:count], rssi=told[:count])
         alarm = found.alarms[0] if found.alarms else None
         said = "" if alarm is None else f"; alarm: {alarm.kind}, {alarm.change_db:.0f} dB"
-        place = None if alarm is None else np.add(alarm.place, model.site.origin[:2])
+        place = None if alarm is None else alarm.place
         yield f"after {count} rows{said}", model.rssi(rx=asked)[:, 0], near[:count], place
         model.undo()
 

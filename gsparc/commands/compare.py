@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +39,21 @@ log = logging.getLogger(__name__)
 
 
 def task(config: DictConfig) -> pd.DataFrame:
-    """Fill the cells that are asked for and not there yet, then time all methods and report."""
+    """Compare as conf/compare.yaml says, see `compare`."""
     run_dir, settings = begin_run(config)
+    return compare(settings, run_dir)
+
+
+def compare(settings: Mapping[str, Any], run_dir: Path) -> pd.DataFrame:
+    """Fill the cells that are asked for and not there yet, then time all methods and report.
+
+    Args:
+        settings: those of conf/compare.yaml.
+        run_dir: where tables and pictures are written.
+
+    Returns:
+        The rows of `average_cells`.
+    """
     for form in settings["figures"]:  # now: the pictures come after hours of training
         PRINTED.check("figures", form)
     published = read_published(settings["beside"]) if settings["beside"] else None

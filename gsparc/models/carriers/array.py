@@ -150,12 +150,6 @@ class OneArray(Method):
         """Return mean images (n, pixels) of the paths to places (n, 3),
         every `stride`-th row and column.
         """
-        return self.expect_paths(paths.ways(places)[0], paths.powers(places))
-
-    def expect_paths(self, directions: Tensor, powers: Tensor) -> Tensor:
-        """Return mean images (n, pixels) of waves from (n, K, 3), receiver frame,
-        of powers (n, K).
-        """
         if self._spectra is None:
             (array, wavelength), grid = self.array(), self.fitted_site.grid
             assert grid is not None
@@ -166,4 +160,4 @@ class OneArray(Method):
             turns = torch.from_numpy(2 * np.pi / wavelength * array).float()
             how = self.fitted_site.normalisation
             self._spectra = ExpectedSpectra(renderer, turns, how, self.exponent)
-        return self._spectra(directions, powers)
+        return self._spectra(paths.ways(places)[0], paths.powers(places))

@@ -15,6 +15,7 @@ from gsparc.evaluation.metric_formats import (
     OF_KIND,
     WITH_SILENT,
     heading_of,
+    is_root,
     lower_is_better,
     score_heading,
 )
@@ -59,6 +60,8 @@ ROW = [
     "value_error",
     "behind_db",
     "behind_error_db",
+    "error",
+    "ratio",
     *BESIDE,
     "second_figure",
     "second_value",
@@ -117,7 +120,9 @@ def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd
         deviation over `seeds`, of `draws` of the split the standard error of the mean.
         `figure`, `value`: the figure behind the score; `value_error`: its standard error over
         draws. `behind_db`: how much the best over draws has more, and its standard error, see
-        `lead_over_runs`. `psnr_db_median` and the like: medians over test rows.
+        `lead_over_runs`. `error`: root mean squared error, of powers [dB], of channels as a share
+        of their root mean square, of spectra of full scale; `ratio`: in units of that of the best
+        plain method. `psnr_db_median` and the like: medians over test rows.
         `coverage`: share of measured powers within the predicted 90 % interval; `outage`: Brier
         score of predicted outages; `after_constant`: RMSE of powers after a constant of each
         station [dB]; `chi2`: of `reduced_chi_squared`.
@@ -165,7 +170,7 @@ def average_cells(filled: pd.DataFrame, timed: pd.DataFrame | None = None) -> pd
     rows[["commit", "date"]] = latest[["commit", "date"]].last()
     rows["tested"] = groups["tested"].agg(lambda tested: " ".join(sorted(set(tested))))
     rows["label"] = groups["label"].agg(lambda labels: Counter(labels).most_common(1)[0][0])
-    rows = _with_behind(rows.reset_index())
+    rows = _with_ratio(_with_behind(rows.reset_index()))
     timed = pd.DataFrame(columns=TIMED) if timed is None else timed
     rows = rows.merge(timed, "left").astype(dict.fromkeys(TIMED[3:], float))
     rows["order"] = rows.groupby(PROBLEM, sort=False).ngroup()
@@ -185,6 +190,18 @@ def _with_behind(rows: pd.DataFrame) -> pd.DataFrame:
             if lead := lead_over_runs(draws.results[best], results):
                 rows.loc[row, ["behind_db", "behind_error_db"]] = lead.ahead_db, lead.error_db
     return rows
+
+
+def _with_ratio(rows: pd.DataFrame) -> pd.DataFrame:
+    """Add root mean squared errors, also in units of the problem's best plain method's."""
+    # A score is of squared errors [dB] but for powers, whose root mean squared error it is.
+    decibels = rows.figure.map(is_root)
+    rows = rows.assign(error=(-rows.score_db).where(decibels, 10 ** (-rows.score_db / 20)))
+    plain = rows[rows.method.isin(plain_methods())]
+    # One that failed on hard draws has an easier mean.
+    plain = plain[plain.seeds == plain.groupby(PROBLEM).seeds.transform("max")]
+    least = rows[PROBLEM].join(plain.groupby(PROBLEM).error.min(), on=PROBLEM).error
+    return rows.assign(ratio=rows.error / least)
 
 
 def columns_of_csv(rows: pd.DataFrame) -> dict[str, list[Any]]:
