@@ -7,6 +7,7 @@ import http.client
 import json
 import logging
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -324,8 +325,8 @@ def test_the_log_stays_open_while_there_are_files(powers, tmp_path):
 
 
 @contextlib.contextmanager
-def commanded(folder, predictor, *settings):
-    """The command in a process of its own, and its port."""
+def commanded(folder, predictor, *settings, files=None):
+    """The command in a process of its own that may open so many files, and its port."""
     checkpoint.save(folder / "model.ckpt", predictor.method)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -339,8 +340,9 @@ def commanded(folder, predictor, *settings):
         f"port={port}",
         *settings,
     ]
+    allow = files and partial(resource.setrlimit, resource.RLIMIT_NOFILE, (files, files))
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    served = subprocess.Popen(line, cwd=folder, env=environment)
+    served = subprocess.Popen(line, cwd=folder, env=environment, preexec_fn=allow)
     try:
         until = time.monotonic() + 60
         while time.monotonic() < until and served.poll() is None:
@@ -372,6 +374,20 @@ def test_the_command_serves_until_it_is_told_to_stop(powers, tmp_path):
         served.send_signal(signal.SIGTERM)  # while the request waits for others
         assert answer.result()[0] == 200
         assert served.wait(20) in (0, -signal.SIGTERM)
+
+
+@pytest.mark.slow
+def test_half_sent_requests_took_all_files(powers, tmp_path):
+    """And the process ended: it answers again when they are gone."""
+    with commanded(tmp_path, powers, files=90) as (served, port):
+        assert asked(port, [[1, 2, 1]])[0] == 200
+        with contextlib.ExitStack() as clients:
+            for _ in range(120):
+                client = clients.enter_context(socket.create_connection(("127.0.0.1", port)))
+                client.sendall(b"POST /predict HTTP/1.1\r\n")
+            time.sleep(2)
+            assert served.poll() is None
+        assert asked(port, [[1, 2, 1]])[0] == 200
 
 
 def test_a_second_request_hid_in_a_body_of_two_ends(served):
