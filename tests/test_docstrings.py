@@ -20,8 +20,8 @@ POWERS = (
 )
 ROOT = Path(__file__).parents[1]
 DESCRIBED = ast.Module, ast.ClassDef, ast.FunctionDef
-# Of Python, of torch.func, and of a user's table
-OTHERS = {"yield", "vjp", "jacrev", "jacfwd", "tx_x_mm"}
+# Of Python, and of a user's table
+OTHERS = {"yield", "tx_x_mm"}
 PACKAGES = {"gsparc": "gsparc", "ops": "gsparc.ops", "callbacks": "gsparc.callbacks"}  # by folder
 # They ask for Sionna's solver, or for a cloud of a trained field.
 ELSEWHERE = ("gsparc.apps.view.ply",)

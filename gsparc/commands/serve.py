@@ -5,7 +5,6 @@ from __future__ import annotations
 import gc
 import ipaddress
 import os
-import resource
 from contextlib import suppress
 from dataclasses import fields
 from functools import partial
@@ -19,8 +18,6 @@ from gsparc.evaluation.console import open_console
 from gsparc.models import checkpoint
 from gsparc.prediction.operating_point import load
 from gsparc.runs.settings import RunSettings
-
-OTHERS = 64  # files that are open beside connections: the log, libraries
 
 
 def is_loopback(host: str) -> bool:
@@ -43,14 +40,10 @@ def task(config: DictConfig) -> None:
         )
     if find_spec("fastapi") is None or find_spec("uvicorn") is None:
         raise DataError("gsparc serve needs the extra `serve`: pip install 'gsparc[serve]'")
-    from gsparc.apps.export.serving import LimitedServer, Limits, build_application
+    from gsparc.apps.export.serving import Limits, build_application, make_server
     from gsparc.apps.export.told_file import ToldFile
 
     limits = Limits(**{field.name: config[field.name] for field in fields(Limits)})
-    needed, allowed = 2 * limits.connections + OTHERS, resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    if 0 <= allowed < needed:
-        files = f"{needed} open files may be needed, {allowed} are allowed"
-        raise SettingError(f"connections={limits.connections}: {files}; say ulimit -n {needed}")
     stored, as_stored = checkpoint.read(config.ckpt), partial(load, unit=config.unit)
     predictor = as_stored(stored).select_station(config.station)
     site, powers = predictor.site, predictor.site.target.is_level
@@ -68,4 +61,4 @@ def task(config: DictConfig) -> None:
     )
     gc.freeze()  # going through all that was loaded held up answers by half a second
     with suppress(KeyboardInterrupt):  # the server has ended by then
-        LimitedServer(app, limits, host=config.host, port=config.port).run()
+        make_server(app, limits, host=config.host, port=config.port).run()

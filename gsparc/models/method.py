@@ -273,8 +273,8 @@ class Method(MethodFactory):
     def gradient_problem(self) -> str | None:
         """Return why predictions have no gradients by position; None where they have.
 
-        Then autograd in either mode and `torch.func` follow `predict` at float64 positions of what
-        moves, for mean, variance and confidence, in double precision.
+        Then autograd, and `torch.func.jvp` where errors of places are estimated, follow `predict`
+        at float64 positions of what moves, for mean, variance and confidence, in double precision.
         What float32 positions get is not changed by it.
         """
         return self.no_gradient

@@ -1,4 +1,4 @@
-"""Predictions that autograd and `torch.func` follow by the position of what moves."""
+"""Predictions that autograd follows, in reverse mode, by the position of what moves."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from torch import Tensor
 from gsparc.data.schema import End
 from gsparc.models.method import Method, Prediction, suitable_threads
 from gsparc.ops import Pose
-from gsparc.ops.transforms import carries_tangent, has_vmap_axis, transform_is_active
+from gsparc.ops.transforms import needs_reference
 from gsparc.prediction.query import Queries
 
 
@@ -26,7 +26,7 @@ class FollowedPrediction(NamedTuple):
 
 
 def predict_with_gradients(
-    method: Method, queries: Queries, tx: Any, rx: Any, prepared: list[Method]
+    method: Method, queries: Queries, tx: Any, rx: Any
 ) -> FollowedPrediction:
     """Return a prediction with gradients by position.
 
@@ -34,10 +34,10 @@ def predict_with_gradients(
         method: that answers.
         queries: of its site.
         tx, rx: as a `Predictor` is asked, what moves as tensors.
-        prepared: methods whose caches were filled outside of transforms; `method` is added.
 
     Raises:
-        ValueError: the method has no gradients, or positions that nothing follows.
+        ValueError: the method has no gradients, or the positions are no tensors or those of a
+            transform.
     """
     problem, site = method.gradient_problem(), queries.site
     if problem is not None:
@@ -53,13 +53,12 @@ def predict_with_gradients(
             raise ValueError(
                 f"grad=True: {end}= must be a torch tensor, got {type(value).__name__}"
             )
-    if has_vmap_axis(*ends.values()):
+    if needs_reference(*ends.values(), *fixed):
         raise ValueError(
-            "grad=True: torch.vmap is not followed; give all positions at once, (B, 3)"
+            "grad=True: torch.func, torch.vmap and forward mode are not followed; "
+            "take torch.autograd.grad of all positions at once, (B, 3)"
         )
-    if any(
-        isinstance(one, Tensor) and (one.requires_grad or carries_tangent(one)) for one in fixed
-    ):
+    if any(isinstance(value, Tensor) and value.requires_grad for value in fixed):
         raise ValueError(f"grad=True: gradients are by the position of {' and '.join(ends)} alone")
     query, single, _ = queries.query(tx, rx, torch.float64)
     origin = torch.from_numpy(np.asarray(site.origin, np.float64))
@@ -68,11 +67,6 @@ def predict_with_gradients(
         end: (value.cpu().double() - origin).expand(len(query), 3) for end, value in ends.items()
     }
     with suitable_threads(method, len(query)):
-        # What it keeps must not be a transform's
-        if transform_is_active() and method not in prepared:
-            prepared.append(method)
-            with torch._C._DisableFuncTorch(), torch.no_grad():
-                method.predict(query)
         moments = method.predict(query.with_ends(local))
     dtype = torch.float32
     for value in ends.values():

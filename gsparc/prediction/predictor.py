@@ -47,9 +47,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
     or `linear` where nobody said what decibels refer to.
 
     With `grad=True` predictions are differentiable by the position of what moves, which is then a
-    tensor: autograd in reverse and forward mode and `torch.func` (`grad`, `jacrev`, `jacfwd`,
-    `jvp`, `vjp`) follow them. All is computed in float64 and answered in the precision of the
-    positions; `ValueError` where the model has no gradients.
+    tensor: autograd follows them in reverse mode. All is computed in float64 and answered in the
+    precision of the positions; `ValueError` where the model has no gradients, under `torch.func`
+    and in forward mode.
     Which rows are nearest and what a clamp cuts off have none.
 
     >>> at = torch.tensor([2.0, 1.0, 1.5], dtype=torch.float64, requires_grad=True)
@@ -97,7 +97,6 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         self._unit = unit
         self.unit = self._answer_unit(None).name  # "1" of channels and spectra
         self._device = MEAN_DEVICE
-        self._prepared: list[Method] = []  # whose caches were filled outside of transforms
         # Of the whole model, and which of its stations is asked:
         # later rows are of it in every view.
         self._model_site, self._own_station = site, None
@@ -513,9 +512,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         """Moments in a unit that autograd follows, and whether one position was given;
         see the class.
         """
-        moments, dtype, single = predict_with_gradients(
-            method, self.queries, tx, rx, self._prepared
-        )
+        moments, dtype, single = predict_with_gradients(method, self.queries, tx, rx)
         result, is_own = (
             self._in_unit(moments, wanted),
             (self.kind or self.trusted.kind) in (None, "learned"),

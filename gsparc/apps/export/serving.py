@@ -5,12 +5,9 @@ from __future__ import annotations
 import asyncio
 import hmac
 import json
-import socket
 from collections.abc import AsyncIterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from dataclasses import asdict, dataclass
-from functools import partial
 from threading import Lock
 from typing import Annotated, Any, NamedTuple
 from urllib.parse import quote
@@ -18,16 +15,15 @@ from urllib.parse import quote
 import numpy as np
 import uvicorn
 from fastapi import FastAPI, HTTPException, Request, Response
-from fastapi.responses import JSONResponse, StreamingResponse
+from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 from pydantic_core import to_json
 from starlette.requests import ClientDisconnect
 from starlette.types import ASGIApp, Receive, Scope, Send
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from gsparc.apps.export.told_file import ToldFile
 from gsparc.base.files import is_out_of_space, list_causes, refuse_repeated
-from gsparc.base.limits import POSITIVE, Checked, SettingError, number, setting, whole
+from gsparc.base.limits import Checked, SettingError, number, setting, whole
 from gsparc.models.checkpoint import CheckpointError
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import read_places
@@ -36,10 +32,9 @@ from gsparc.prediction.updating import ToldBefore
 RAW = "application/octet-stream"
 # Bytes of a place, raw and at most as JSON, and of what is around places
 PLACE, BYTES, MORE = 12, 64, 8192
-PIECE = 8192  # numbers that are written at once: a millisecond, in which nobody else is answered
-QUEUE = 2048  # connections that wait in the kernel
-# That a connection without a request stays, that requests have when the server stops
+# That an answered connection stays, that requests have when the server stops
 KEEP_S, STOP_S = 5, 10
+FILE_S = 5.0  # that an update waits for another process that writes the file
 
 
 @dataclass(frozen=True)
@@ -48,15 +43,13 @@ class Limits(Checked):
 
     Attributes:
         most, numbers: places and numbers of an answer.
-        connections: open at once; of more, one that waits long or asks for much is ended.
-        request_s: from the first byte of a request to the last of its answer [s].
+        connections: open at once; requests of more are refused (503).
         delay_ms: that a request waits for others, to be computed with them.
     """
 
     most: int = setting(1024, whole(1))
     numbers: int = setting(131_072, whole(1))
     connections: int = setting(64, whole(1))
-    request_s: float = setting(10.0, POSITIVE)
     delay_ms: float = setting(2.0, number(0, 1000))
 
 
@@ -78,74 +71,24 @@ class RowsBody(PlacesBody):
     key: Annotated[str | None, Field(min_length=1, max_length=100)] = None
 
 
-class Connection(H11Protocol):
-    """A client's connection, which ends when a request takes too long, whatever of it is slow."""
-
-    def __init__(self, limits: Limits, **given: Any) -> None:
-        super().__init__(**given)
-        self.limits = limits
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """See the base class; where there are too many, another one is ended."""
-        super().connection_made(transport)
-        # Counted from the start, not from the last byte: a byte a second keeps no connection open.
-        self.end = self.loop.call_later(self.limits.request_s, transport.abort)
-        if len(self.connections) <= self.limits.connections:
-            return
-        others = [
-            connection
-            for connection in self.connections
-            if isinstance(connection, Connection) and connection is not self
-        ]
-        works = [each_other for each_other in others if each_other.works()]
-        # Half the room is for those whose request is not read yet.
-        if 2 * len(works) > self.limits.connections:
-            other = max(works, key=lambda one: int(one.cycle.scope.get("places", 0)))  # type: ignore[call-overload]
-        else:
-            other = min((one for one in others if not one.works()), key=lambda one: one.end.when())
-        self.connections.discard(other)
-        other.transport.abort()
-
-    def works(self) -> bool:
-        """Return whether the answer to a whole request is computed,
-        or written to a client that reads.
-        """
-        cycle = self.cycle
-        return bool(cycle) and not (
-            cycle.more_body or cycle.response_complete or self.flow.write_paused
+def make_server(app: ASGIApp, limits: Limits, **listen: Any) -> uvicorn.Server:
+    """Return a server within limits that logs no request: the log is the command's, and open."""
+    return uvicorn.Server(
+        uvicorn.Config(
+            app,
+            http="h11",
+            ws="none",
+            log_config=None,
+            log_level="error",
+            access_log=False,
+            # uvicorn counts the connection that asks, and refuses at the limit itself
+            limit_concurrency=limits.connections + 1,
+            timeout_keep_alive=KEEP_S,
+            timeout_graceful_shutdown=STOP_S,
+            h11_max_incomplete_event_size=MORE,
+            **listen,
         )
-
-    def on_response_complete(self) -> None:
-        """See the base class; the next request has its own time."""
-        self.end.cancel()
-        self.end = self.loop.call_later(self.limits.request_s + KEEP_S, self.transport.abort)
-        super().on_response_complete()
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """See the base class."""
-        self.end.cancel()
-        super().connection_lost(exc)
-
-
-class LimitedServer(uvicorn.Server):
-    """uvicorn within limits: of requests nothing is logged, and the log is the command's,
-    which is open.
-    """
-
-    def __init__(self, app: ASGIApp, limits: Limits, **listen: Any) -> None:
-        listen |= {"ws": "none", "log_config": None, "log_level": "error", "access_log": False}
-        listen |= {"timeout_keep_alive": KEEP_S, "timeout_graceful_shutdown": STOP_S}
-        # Until the first of them is read, thrice as many may come
-        at_once = max(1, limits.connections // 8)
-        listen |= {"http": partial(Connection, limits), "backlog": at_once}
-        super().__init__(uvicorn.Config(app, **listen))
-
-    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """See the base class; the kernel lets more wait than are taken at once."""
-        await super().startup(sockets)
-        for listener in self.servers[0].sockets:
-            with socket.fromfd(listener.fileno(), listener.family, listener.type) as same:
-                same.listen(QUEUE)
+    )
 
 
 class WaitingRequest(NamedTuple):
@@ -156,7 +99,7 @@ class WaitingRequest(NamedTuple):
     size: int
     body: bytes
     raw: bool
-    answer: asyncio.Future[np.ndarray]
+    answer: asyncio.Future[np.ndarray | Exception]
 
 
 class Batcher:
@@ -186,10 +129,13 @@ class Batcher:
             WaitingRequest(size, body, raw, asyncio.get_running_loop().create_future())
         )
         self.some.set()
-        return await self.waiting[-1].answer
+        answer = await self.waiting[-1].answer
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
 
     async def run(self) -> None:
-        """Until cancelled; a request whose client left is dropped."""
+        """Answer until cancelled."""
         while True:
             await self.some.wait()
             # A first request waits 2 ms by default: those
@@ -197,24 +143,20 @@ class Batcher:
             await asyncio.sleep(self.delay_s)
             batch = self._next()
             # In a thread: while the model computes others can connect and be refused.
-            for one, found in zip(
-                batch, await asyncio.to_thread(self._answers, batch), strict=True
-            ):
-                if not one.answer.done():
-                    failed = isinstance(found, Exception)
-                    (one.answer.set_exception if failed else one.answer.set_result)(found)  # type: ignore[arg-type]
+            answers = await asyncio.to_thread(self._answers, batch)
+            for request, answer in zip(batch, answers, strict=True):
+                if not request.answer.done():  # cancelled when the server stops
+                    request.answer.set_result(answer)
 
     def _next(self) -> list[WaitingRequest]:
         """The request that waits longest, and the smallest others:
         few places do not wait for many.
         """
-        waiting = [one for one in self.waiting if not one.answer.done()]
-        batch, capacity = waiting[:1], self.most
         # By size: a request for a thousand places would otherwise delay many for one.
-        for one in sorted(waiting[1:], key=lambda one: one.size):
-            capacity -= one.size
-            batch += [one] if capacity >= 0 else []
-        self.waiting = [one for one in waiting if one not in batch]
+        others = sorted(self.waiting[1:], key=lambda request: request.size)
+        count = int(np.searchsorted(np.cumsum([each.size for each in others]), self.most, "right"))
+        batch = [self.waiting[0], *others[:count]]
+        self.waiting = [request for request in self.waiting if request not in batch]
         if not self.waiting:
             self.some.clear()
         return batch
@@ -232,9 +174,11 @@ class Batcher:
             parts = np.split(values.astype("<f4"), np.cumsum([len(place) for place in places])[:-1])
             return [part.copy() for part in parts[1:]]  # a view would keep the others' answers
         except Exception as error:
+            if len(batch) == 1:
+                return [error]
             # One faulty request must not spoil a batch: each is asked again alone,
             # to find whose fault it is.
-            return [error] if len(batch) == 1 else [self._answers([one])[0] for one in batch]
+            return [self._answers([request])[0] for request in batch]
 
 
 def build_application(
@@ -270,11 +214,9 @@ def build_application(
         )
     # Both limits hold: of places, and of numbers in the answer.
     most = min(limits.most, limits.numbers // each)
-    # One thread writes for all: text of numbers holds the interpreter's lock anyhow.
-    routes, writer = {"/predict": site.kind, "/std": "std"}, ThreadPoolExecutor(1)
     batchers = {
-        r: Batcher(predictor, route, limits.delay_ms / 1e3, most, lock)
-        for r, route in routes.items()
+        route: Batcher(predictor, method, limits.delay_ms / 1e3, most, lock)
+        for route, method in (("/predict", site.kind), ("/std", "std"))
     }
 
     @asynccontextmanager
@@ -283,7 +225,6 @@ def build_application(
         yield
         for task in work:
             task.cancel()
-        writer.shutdown(wait=False, cancel_futures=True)
 
     # Scripts from elsewhere
     app = FastAPI(title="gsparc", lifespan=life, docs_url=None, redoc_url=None)
@@ -298,12 +239,6 @@ def build_application(
             **stations,
         }
         return {"status": "ok", "kind": site.kind, **model}
-
-    async def stream_blocks(values: np.ndarray, raw: bool) -> AsyncIterator[bytes]:
-        rows, loop = max(1, PIECE // each), asyncio.get_running_loop()
-        for first in range(0, len(values), rows):
-            part = values, raw, predictor.unit, first, first + rows
-            yield await loop.run_in_executor(writer, _written, *part)
 
     async def read_body(request: Request, raw: bool, lists: int = 1) -> tuple[bytes, int]:
         body, count = bytearray(), 0
@@ -329,7 +264,7 @@ def build_application(
         where: dict[str, Any] = site.name_moving(rows.places)
         assert told is not None
         more = {"rssi": rows.levels, "key": rows.key}
-        found = told.tell(predictor, lock, limits.request_s / 2, **where, **more)
+        found = told.tell(predictor, lock, FILE_S, **where, **more)
         return {
             "rows": found.rows.tolist(),
             "skipped": found.skipped,
@@ -370,27 +305,19 @@ def build_application(
             raise HTTPException(422, f"Content-Type twice: {', '.join(sorted(kinds))}; say one")
         raw = kinds == {RAW}
         body, count = await read_body(request, raw)
-        request.scope["places"] = count = max(count, 1)
-        work = asyncio.ensure_future(batchers[request.url.path].ask(count, body, raw))
-        # After a body nothing but the client's leaving
-        gone = asyncio.ensure_future(request.receive())
-        await asyncio.wait((work, gone), return_when=asyncio.FIRST_COMPLETED)
-        gone.cancel()
-        if not work.done():
-            work.cancel()
-            raise HTTPException(400, "the client left")
         try:
-            values = work.result()
+            values = await batchers[request.url.path].ask(max(count, 1), body, raw)
         except Exception as error:
             raise HTTPException(
                 422 if isinstance(error, ValueError) else 500, str(error)
             ) from error
-        kind = RAW if raw else "application/json"
         about = {"x-shape": ",".join(map(str, values.shape)), "x-unit": quote(predictor.unit)}
-        if values.size <= PIECE:
-            whole = _written(values, raw, predictor.unit, 0, len(values))
-            return Response(whole, headers=about, media_type=kind)
-        return StreamingResponse(stream_blocks(values, raw), headers=about, media_type=kind)
+        if raw:
+            return Response(values.tobytes(), headers=about, media_type=RAW)
+        answer = {"shape": values.shape, "unit": predictor.unit, "values": values.tolist()}
+        # JSON has no word for the level of silence.
+        text = to_json(answer, inf_nan_mode="null")
+        return Response(text, headers=about, media_type="application/json")
 
     return _guarded(app, None if token is None else f"Bearer {token}".encode())
 
@@ -438,18 +365,3 @@ def _read(end: str, asked: WaitingRequest) -> np.ndarray:
         )
         raise ValueError(f"expected {wanted}, finite metres, and nothing else") from None
     return read_places(end, places)
-
-
-def _written(values: np.ndarray, raw: bool, unit: str, first: int, past: int) -> bytes:
-    """Answers [first, past) of (n, ...), with what is before the first and after the last."""
-    part = values[first:past]
-    if raw:
-        return part.tobytes()
-    about = to_json({"shape": values.shape, "unit": unit})[:-1]
-    head = b"," if first else about + b',"values":['
-    # JSON has no word for the level of silence.
-    return (
-        head
-        + to_json(part.tolist(), inf_nan_mode="null")[1:-1]
-        + (b"" if past < len(values) else b"]}")
-    )

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, field
-from typing import Any, ClassVar, Literal, get_args
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 
-from gsparc.base.limits import Checked, choice, setting, whole
+from gsparc.base.limits import Checked, setting, whole
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
@@ -39,7 +39,11 @@ from gsparc.simulate.scenes.settings import from_config
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.stopwatch import Stopwatch
 
-Start = Literal["generic", "scene"]
+# Diffuse scattering has parameters of its own, which nothing here learns; interactions of a path
+EFFECTS = Effects(
+    diffraction=True, edge_diffraction=False, diffuse=False, polarisation=False, depth=5
+)
+SAMPLING = Sampling(100_000, 400)
 
 
 @dataclass(eq=False, kw_only=True)
@@ -48,11 +52,7 @@ class CalibratedRayTracer(Checked, Method):
 
     Args:
         scene: see `known_scene`; None: the one that a simulated file names.
-        start: materials to begin with: one `generic` for all surfaces, or the `scene`'s own.
         steps: most evaluations of likelihood and gradient; 0 learns the gain alone.
-        depth: most interactions of a path.
-        diffraction: at wedges.
-        samples, batch: of the solver, see `Sampling`.
     """
 
     name = "calibrated_raytracer"
@@ -60,20 +60,13 @@ class CalibratedRayTracer(Checked, Method):
     kinds: ClassVar[tuple[Kind, ...]] = ("rssi", "csi")
     is_yardstick: ClassVar[bool] = True  # type: ignore[misc]
     scene: str | None = None
-    start: Start = setting("generic", choice(*get_args(Start)))
     steps: int = setting(40, whole(0))
-    depth: int = 5
-    diffraction: bool = True
-    samples: int = setting(100_000, whole(1))
-    batch: int = setting(400, whole(1))
     learned: RoomCalibration | None = field(default=None, init=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self._scene_json, self._silent_db, self._factor = "", 0.0, 1.0 + 0.0j
         self._tracer: RayTracer | None = None
-        # A depth that no tracer takes is refused here, before anything is loaded.
-        self._effects()
 
     def why_not(self, data: Measurements) -> str | None:
         """Return why it cannot serve these measurements; None where it may."""
@@ -110,12 +103,11 @@ class CalibratedRayTracer(Checked, Method):
         # Measurements are local, the tracer's scene is in world coordinates.
         places, measured = data.moving[rows] + data.site.origin, _measured_decibels(data, rows)
         tracer = self._loaded_tracer()
-        materials = used_materials(tracer)
-        start = materials if self.start == "scene" else dict.fromkeys(materials, GENERIC)
+        start = dict.fromkeys(used_materials(tracer), GENERIC)
         # Before the replay, whose first powers are those under the start's materials.
         apply_materials(tracer, start)
         # Paths are traced once: materials change what they carry, not where they run.
-        replay = Replay(tracer, places, self._effects())
+        replay = Replay(tracer, places, EFFECTS)
         traced = replay.received_powers()
         reached = traced > 0
         # Gain and scale of the residuals are learned at least: two unknowns.
@@ -176,17 +168,7 @@ class CalibratedRayTracer(Checked, Method):
 
     def _trace(self, places: np.ndarray) -> TracedPaths:
         """Paths to places (B, 3) [m], local."""
-        return self._loaded_tracer().trace(places + self.fitted_site.origin, self._effects())
-
-    def _effects(self) -> Effects:
-        # Diffuse scattering has parameters of its own, which nothing here learns.
-        return Effects(
-            diffraction=self.diffraction,
-            edge_diffraction=False,
-            diffuse=False,
-            polarisation=False,
-            depth=self.depth,
-        )
+        return self._loaded_tracer().trace(places + self.fitted_site.origin, EFFECTS)
 
     def _loaded_tracer(self) -> RayTracer:
         """The scene under what was learned, loaded when it is first asked."""
@@ -194,9 +176,7 @@ class CalibratedRayTracer(Checked, Method):
             assert self.site is not None and self.site.static_position is not None
             scene = from_config(json.loads(self._scene_json))
             place = self.site.static_position + self.site.origin
-            self._tracer = load_tracer(
-                scene, Sampling(self.samples, self.batch), place, self.site.name
-            )
+            self._tracer = load_tracer(scene, SAMPLING, place, self.site.name)
             if self.learned is not None:
                 apply_materials(self._tracer, self.learned.materials)
         return self._tracer

@@ -24,6 +24,9 @@ from gsparc.models.peers.trained import KnownSite, Network, TrainedPeer, percept
 from gsparc.models.uplink.interface import UplinkMethod, root_mean_power
 from gsparc.training.context import FitContext, FitReport
 
+HIDDEN, CODE = 256, 32  # units of each hidden layer, numbers of the code
+DIVERGENCE = 1e-4  # weight of the code's divergence in the loss
+
 
 class Coder(Network):
     """Complex (B, L) -> complex (B, K) through a Gaussian code, the same of all antennas."""
@@ -32,12 +35,9 @@ class Coder(Network):
         super().__init__(scene)
         assert scene.site.uplink_hz is not None
         self.antennas = torch.from_numpy(np.asarray(scene.site.antennas))
-        self.weight, self.code = settings.divergence, settings.code
         # Of every number of the code a mean and the logarithm of its variance.
-        self.encoder = perceptron(
-            2 * len(scene.site.uplink_hz), 2 * self.code, settings.hidden, 2, nn.GELU
-        )
-        self.decoder = perceptron(self.code, 2 * scene.shape[1], settings.hidden, 2, nn.GELU)
+        self.encoder = perceptron(2 * len(scene.site.uplink_hz), 2 * CODE, HIDDEN, 2, nn.GELU)
+        self.decoder = perceptron(CODE, 2 * scene.shape[1], HIDDEN, 2, nn.GELU)
 
     def downlink_and_divergence(
         self, uplink: Tensor, noise: Tensor | None = None
@@ -77,29 +77,21 @@ class Coder(Network):
         # Snapshots have arbitrary phase: rotating both ends augments the data.
         angle = 2 * math.pi * torch.rand(len(uplink), 1, generator=generator)
         turn = torch.polar(torch.ones_like(angle), angle)
-        noise = torch.randn(len(uplink), self.code, generator=generator)
+        noise = torch.randn(len(uplink), CODE, generator=generator)
         guess, divergence = self.downlink_and_divergence(uplink.flatten(0, 1)[pick] * turn, noise)
         missed = guess - (batch.target / scale).flatten(0, 1)[pick] * turn
-        return missed.abs().square().mean() + self.weight * divergence.mean()
+        return missed.abs().square().mean() + DIVERGENCE * divergence.mean()
 
 
 @dataclass(eq=False, kw_only=True)
 class Fire(UplinkMethod, TrainedPeer):
-    """One network for all antennas, each snapshot at unit uplink power.
-
-    Args:
-        hidden: units of each hidden layer.
-        code: numbers of the code.
-        divergence: weight of the code's divergence.
-        others: see `TrainedPeer`.
+    """One network for all antennas, each snapshot at unit uplink power;
+    settings as of `TrainedPeer`.
     """
 
     usual_steps: ClassVar[dict[Kind, int]] = {"csi": 4_800}
     makes = Coder
     name: str = "fire"
-    hidden: int = 256
-    code: int = 32
-    divergence: float = 1e-4
     batch_size: int = 256
     rate: float = 1e-3
 
