@@ -50,9 +50,8 @@ class Pictures(Checked, L.Callback):
             return
         # The same rows at every step, so that pictures can be compared.
         rows = candidates[evenly_spaced(len(candidates), self.count)]
-        ledger = next(
-            (callback for callback in trainer.callbacks if isinstance(callback, CostLedger)), None
-        )  # type: ignore[attr-defined]
+        callbacks = trainer.callbacks  # type: ignore[attr-defined]
+        ledger = next((part for part in callbacks if isinstance(part, CostLedger)), None)
         with nullcontext() if ledger is None else ledger.paused(), torch.no_grad():
             batch = data.measurements.batch(rows).to(module.device)
             predicted = module.mean(batch)

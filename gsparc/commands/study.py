@@ -6,6 +6,7 @@ Leaves `study.csv`, a row a variant and condition (`study.ROW`), `study.png` and
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import pandas as pd
@@ -43,10 +44,8 @@ def configs_of(config: DictConfig) -> dict[str, DictConfig]:
         for name, overrides in to_dict(config.variants).items()
     }
     models |= {name: OmegaConf.create(config_node(method_class(name))) for name in config.baselines}
-    return {
-        name: OmegaConf.merge(whole, {"model": None}, {"model": model})
-        for name, model in models.items()
-    }  # type: ignore[misc]
+    merged = partial(OmegaConf.merge, whole, {"model": None})
+    return {name: merged({"model": model}) for name, model in models.items()}  # type: ignore[misc]
 
 
 def task(config: DictConfig) -> pd.DataFrame:

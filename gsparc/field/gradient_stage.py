@@ -290,9 +290,8 @@ def interruptible(trainer: L.Trainer, batches: DataModule) -> Iterator[None]:
         KeyboardInterrupt: stopped by the user; the message names the checkpoint to go on from.
         RuntimeError: one of several processes was lost.
     """
-    stop = next(
-        callback for callback in trainer.callbacks if isinstance(callback, StopBetweenSteps)
-    )  # type: ignore[attr-defined]
+    callbacks = trainer.callbacks  # type: ignore[attr-defined]
+    stop = next(callback for callback in callbacks if isinstance(callback, StopBetweenSteps))
     try:
         with stop.handling_interrupts():
             yield

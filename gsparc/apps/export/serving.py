@@ -137,9 +137,8 @@ class LimitedServer(uvicorn.Server):
         listen |= {"timeout_keep_alive": KEEP_S, "timeout_graceful_shutdown": STOP_S}
         # Until the first of them is read, thrice as many may come
         at_once = max(1, limits.connections // 8)
-        super().__init__(
-            uvicorn.Config(app, http=partial(Connection, limits), backlog=at_once, **listen)
-        )  # type: ignore[arg-type]
+        listen |= {"http": partial(Connection, limits), "backlog": at_once}
+        super().__init__(uvicorn.Config(app, **listen))
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """See the base class; the kernel lets more wait than are taken at once."""

@@ -124,11 +124,8 @@ def plan_rounds(
         change = partial(condition.change_training, seed=job_config.seed)
         name = Round(condition.what, condition.amount, variant, turn)
         unchanged = condition.what == "none"
-        jobs.append(
-            Job(
-                name, job_config, place, data, split, content, learned=None if unchanged else change
-            )
-        )  # type: ignore[arg-type]
+        changed = None if unchanged else change
+        jobs.append(Job(name, job_config, place, data, split, content, changed))  # type: ignore[arg-type]
     return jobs
 
 
