@@ -117,8 +117,8 @@ def composite(
     """Blend features front to back over a plan made from the same Gaussians;
     differentiable in every tensor.
 
-    Under `torch.func` (`jvp`, `jacrev`, `hessian`) and in forward mode plain PyTorch computes it,
-    slowly. `features` is (N, C) or (B, N, C), real.
+    Under `torch.func` and in forward mode plain PyTorch computes it, slowly.
+    `features` is (N, C) or (B, N, C), real.
     With one pose the weights are formed once for all B C channels.
 
     Raises:

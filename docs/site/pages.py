@@ -17,7 +17,7 @@ ROOT = Path(__file__).parents[2]
 EXECUTED = ROOT / "build" / "executed"
 TABLE = re.compile(r"^<!-- table: (\S+\.csv) -->$", re.MULTILINE)  # its path from the root
 SETTINGS = "<!-- settings -->"
-SORT = ROOT / "gsparc" / "evaluation" / "report" / "sort.js"  # tables are sorted as in reports
+SORT = ROOT / "gsparc" / "pictures" / "report" / "sort.js"  # tables are sorted as in reports
 TAKEN = ("ARCHITECTURE.md", "CONTRIBUTING.md", "CHANGELOG.md")
 
 

@@ -44,6 +44,7 @@ OF_DATA = (  # paths that stand for what was read from them, or is written there
 )
 # Settings that are never paths: a folder may be called as a method is
 WORDS = (".name", "._target_")
+WRITERS = ("callbacks.", "trainer.")  # folders that these name are written to
 WHOLE = "gsparc.datasets.own.Own"  # reads no file but those that its settings name
 LEFT = (  # by a training: of another one, all of it would be read beside this one's
     *("summary.json", "split.json", "per_sample.csv", "by_station.csv", "render_ms.csv"),
@@ -254,7 +255,11 @@ def _joined(files: Iterable[Path], root: Path) -> str:
 
 def _hashes(settings: Mapping[str, Any]) -> dict[str, str]:
     """Of those settings that name a file or folder, alone or in a list."""
-    hashes = {name: _named(value) for name, value in settings.items() if not name.endswith(WORDS)}
+    hashes = {
+        name: _named(value)
+        for name, value in settings.items()
+        if not name.endswith(WORDS) and not (name.startswith(WRITERS) and os.path.isdir(str(value)))
+    }
     return {name: content for name, content in hashes.items() if content}
 
 

@@ -149,7 +149,7 @@ def test_a_node_of_ray_is_lost_half_way(tmp_path, nodes, elsewhere):
 
 INTERRUPTED = """
 import sys, time
-from gsparc.data import executor
+from gsparc.base import executor
 if __name__ == "__main__":
     executor.use_engine(executor.Engine(sys.argv[1], 2))
     list(executor.run_each(abs, [1, 2]))

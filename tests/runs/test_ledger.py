@@ -320,3 +320,11 @@ def test_a_run_that_went_on_said_that_it_began_anew(tmp_path, caplog):
     run_once(tmp_path, state(settings={"effort": 1}), ends(tmp_path))
     run_once(tmp_path, state(settings={"effort": 3}), ends(tmp_path), again=True, resumes=True)
     assert not any("runs again" in message for message in caplog.messages)
+
+
+def test_a_folder_that_a_callback_writes_to_made_a_killed_job_begin_anew(tmp_path):
+    """It is no input: what the first try had written there counted as a change."""
+    config = OmegaConf.create({"callbacks": {"kill": {"folder": str(tmp_path)}}})
+    before = FitInputs.from_config(config)
+    (tmp_path / "steps").write_text("1")
+    assert FitInputs.from_config(config) == before and not before.files
