@@ -46,9 +46,10 @@ STEPS = torch.cat([UNITS, -UNITS, 0 * UNITS[:1]])  # of parameters, the last wit
 
 
 def sector_table(beams: np.ndarray) -> Tensor:
-    """Return a table (T, 5) float64 as of `Sectors` of what is known of beams (T, 5), NaN where
-    nothing is; powers are less their mean.
+    """Return a table (T, 5) float64 as of `Sectors` of what is known of beams (T, 5 or more), NaN
+    where nothing is; powers are less their mean.
     """
+    beams = beams[:, : len(USUAL)]
     known, given = np.isfinite(beams), torch.from_numpy(np.nan_to_num(beams))
     azimuth, tilt, width, height, power = torch.where(torch.from_numpy(known), given, USUAL).T
     aimed, tilted = torch.from_numpy(known[:, :2]).T
@@ -210,7 +211,10 @@ class Beam(Columns):
 
     def loss(self, places: Tensor) -> Tensor:
         """Return what the listed pattern takes off (n,) [dB] at places (n, 3) [m]."""
-        still, sector = self.still.to(places).expand(len(places), 3), places.new_zeros(len(places), 1)
+        still, sector = (
+            self.still.to(places).expand(len(places), 3),
+            places.new_zeros(len(places), 1),
+        )
         ends = torch.cat([places, still, sector], 1)
         return Sectors(0.0, table=self.table).pattern_loss(ends) - self.middle
 
