@@ -39,7 +39,6 @@ from gsparc.models.image_sources.rows import (
 )
 from gsparc.models.image_sources.scene import JITTER, SourceScene
 from gsparc.models.image_sources.search import Found, SearchSettings
-from gsparc.models.member_weights import weights_of_fits
 from gsparc.models.method import Method
 from gsparc.models.reduced import MeanOnly, Settings
 from gsparc.physics.mirror_planes import hesse_form, image_rotations
@@ -169,7 +168,9 @@ class ImageSourceGP(SourcesInFrame):
     def _set_members(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
         """Say what these members say, with their weights (M,) float32 of sum 1."""
         self._set_posteriors(rows, [member.scene for member in members])
-        self.weights = weights_of_fits(torch.tensor([member.left_out for member in members]))
+        self.weights = ensemble.weights_of_fits(
+            torch.tensor([member.left_out for member in members])
+        )
         return self
 
     def _describe_search(self, members: list[Member]) -> list[str]:

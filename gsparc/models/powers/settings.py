@@ -19,7 +19,6 @@ from torch import Tensor
 from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import fit_site_law
 from gsparc.models.baselines.kriging import fit_variogram
-from gsparc.models.member_weights import best_weights
 from gsparc.models.powers.groups import SIDES, number_squares
 from gsparc.models.powers.own_terms import (
     UserTerm,
@@ -28,6 +27,7 @@ from gsparc.models.powers.own_terms import (
     subtract_means,
 )
 from gsparc.models.powers.prior_map import PriorMap
+from gsparc.models.stack import best_weights
 from gsparc.processes.censored import ConditionalGaussian
 from gsparc.processes.fit_kernel import LOOKS, fit_kernel_by_evidence, fit_kernel_by_left_out
 from gsparc.processes.kernel import (
