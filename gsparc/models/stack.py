@@ -19,7 +19,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from gsparc.physics.decibels import TINY_POWER
-from gsparc.processes.uncertainty import mean_and_error
+from gsparc.processes.uncertainty import mean_and_error, standard_error
 
 # What a mean over rows is taken of: squared errors, as of an NMSE or of decibels, or their
 # logarithms, as of a PSNR, in which rows count by ratios.
@@ -29,6 +29,7 @@ LEAST_HELD = 4  # rows, for weights to mean anything
 UNUSED, LEAST_SHARE = 0.1, 0.05  # weights below are 0: of members, and of any products
 SPREAD = 0.25  # of weights about equal ones, before rows are seen
 PARTS = 5  # of the units; weights are learned on all but one, and tried on that
+MOST = 100.0  # times the errors, that the prior weighs where nothing tells
 ROUNDS = 12  # of weighing rows by their errors: logarithms move no further
 LEAST_ERROR = 1e-9  # of a row: its logarithm stays finite
 
@@ -73,11 +74,11 @@ def weigh(
         mixed = np.empty(len(losses))
         for part in range(min(PARTS, units)):
             tested = number % PARTS == part
-            learned = _convex_weights(products[~tested], members, units, loss)
+            learned = _convex_weights(products[~tested], members, unit[~tested], loss)
             mixed[tested] = _losses(mixture_errors(learned, products[tested]), loss)
         gain, error = mean_and_error(reached - mixed, unit)
         if gain > sure * error:
-            weights, reached = _convex_weights(products, members, units, loss), mixed
+            weights, reached = _convex_weights(products, members, unit, loss), mixed
     return weights
 
 
@@ -86,18 +87,22 @@ def _losses(errors: np.ndarray, loss: Loss) -> np.ndarray:
 
 
 def _convex_weights(
-    products: np.ndarray, members: np.ndarray, units: int, loss: Loss
+    products: np.ndarray, members: np.ndarray, unit: np.ndarray, loss: Loss
 ) -> np.ndarray:
-    """Weights (K,) of the least mean loss and a prior of equal ones for so many units; 0 of others.
+    """Weights (K,) of the least mean loss of some members, with a prior of equal ones; else 0.
 
     A mean of logarithms falls with that of errors over what they were: a row counts by 1 / error.
+    How far units differ in the slope of the loss tells how sure its least value is.
     """
     used = np.flatnonzero(members)
     some, weights = products[:, used[:, None], used], np.full(len(used), 1 / len(used))
-    for _ in range(ROUNDS if loss == "log" else 1):
+    for _ in range(ROUNDS):
         size = mixture_errors(weights, some) + LEAST_ERROR if loss == "log" else np.ones(len(some))
-        gram = (some / size[:, None, None]).mean(0)
-        prior = gram.diagonal().min() / (2 * SPREAD**2 * units)
+        gram, slopes = (some / size[:, None, None]).mean(0), (some @ weights) / size[:, None]
+        slopes = slopes - slopes.mean(1, keepdims=True)  # weights sum to one
+        unsure = sum(standard_error(slope, unit) ** 2 for slope in slopes.T)
+        curve = (gram - gram.mean(0)).trace()
+        prior = min(unsure / max(2 * SPREAD**2 * curve, TINY_POWER), MOST * gram.trace())
         weights = best_weights(gram + prior * np.eye(len(used)), UNUSED)
     return np.bincount(used, weights, len(members))
 
