@@ -59,7 +59,12 @@ class Race:
         return Race(rows, missed, mean_square(missed) / max(mean_square(target), 1e-30), note)
 
     def check_candidate(
-        self, name: str, rows: np.ndarray, missed: Tensor, before: Sequence[float] = (0.0,)
+        self,
+        name: str,
+        rows: np.ndarray,
+        missed: Tensor,
+        before: Sequence[float] = (0.0,),
+        finished: bool = False,
     ) -> float:
         """Return the mean squared error of another candidate, where both left rows out.
 
@@ -67,6 +72,7 @@ class Race:
             name: of it, for the learning curve.
             rows: (m,) rows, which it missed by `missed` (m, ...).
             before: what was returned at earlier looks; empty at the first.
+            finished: whether it learns no more: then it need not have stalled.
 
         Raises:
             FellBehind: it is `STALLED` while `FAR` behind, or weighing it gains less than
@@ -76,7 +82,7 @@ class Race:
         self.note(name, now)
         _, own, theirs = np.intersect1d(self.rows, rows, return_indices=True)
         best, candidate = (each.detach().flatten(1) for each in (self.missed[own], missed[theirs]))
-        if now <= STALLED * (before[-1] if before else math.inf):
+        if not finished and now <= STALLED * (before[-1] if before else math.inf):
             return now
         difference, whole = best - candidate, max(float(best.abs().square().sum()), 1e-30)
         gains = (best * difference.conj()).real.double().sum(1) / whole

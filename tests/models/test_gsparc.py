@@ -22,6 +22,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint, fitting, loading
 from gsparc.models.gsparc import Gsparc
+from gsparc.models.image_sources import ensemble
 from gsparc.models.method import Method
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.methods import Powers
@@ -218,7 +219,7 @@ def test_channels_are_a_mean_of_fields_that_is_stored_whole(monkeypatch, tmp_pat
     equal = lambda gram, *unused, **named: np.full(gram.shape[1], 1 / gram.shape[1])  # noqa: E731
     monkeypatch.setattr(fit_candidates, "weigh", equal)
     monkeypatch.setattr(race, "LEAST_GAIN", -math.inf)
-    monkeypatch.setattr(fit_candidates, "CONVERGED_ERROR", 0.0)
+    monkeypatch.setattr(ensemble, "CONVERGED_ERROR", 0.0)
     few = ("init.searches=2", "init.search_rows=64", "init.max_sources=8")
     fitted = fit("channels", *few, effort=1.0)
     field = fitted.method

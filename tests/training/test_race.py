@@ -51,6 +51,14 @@ def test_a_search_that_had_settled_went_on_for_what_no_mean_gained():
         race().check_candidate("settled", ROWS, missed, [9.0, 6.0, 1.8, 1.8, 1.8])
 
 
+def test_a_search_that_had_ended_went_on_for_what_no_mean_gained():
+    """Looked at once, when all its sources were found, it was never held against the best."""
+    missed = OWN[0] + 1.5 * OWN[1]
+    assert race().check_candidate("first", ROWS, missed, []) > 1
+    with pytest.raises(FellBehind, match=r"gains -?\d+% ±"):
+        race().check_candidate("ended", ROWS, missed, [], finished=True)
+
+
 def test_only_rows_that_both_left_out_are_compared():
     rows = np.r_[ROWS[30:][::-1], 100 + ROWS]
     with pytest.raises(FellBehind):

@@ -30,7 +30,8 @@ QUADRATURE = 0.4  # initial `SourceScene.quadrature`
 CONVERGED_ERROR = 0.004
 ROUNDS_SHARE = 0.9  # of a search's effort, after which no round adds sources
 SHARPNESS = 4  # weight of a fit = error^-4: 1.5 times the error weighs a fifth
-Look = Callable[[Rows, SourceScene], None]  # of a search, with phases
+# Of a search, with phases, and whether all its sources are found.
+Look = Callable[[Rows, SourceScene, bool], None]
 COMPACT_M = 0.5  # [m], extent of a static array up to which clutter occludes its antennas alike
 
 
@@ -98,7 +99,7 @@ def run_searches(
 
         def look_then_has_ended() -> bool:
             if look is not None and number == 0:
-                look(rows, estimate_phases(rows, search.scene, QUADRATURE, noise_floor))
+                look(rows, estimate_phases(rows, search.scene, QUADRATURE, noise_floor), False)
             return ended()
 
         search = Search(rows, transmitter, settings, number, look_then_has_ended, start)
@@ -107,7 +108,7 @@ def run_searches(
             rows, learn_visibility(rows, scene, KernelVisibility()), POLISHING_STEPS
         )
         if look is not None and number == 0:
-            look(rows, scene)
+            look(rows, scene, True)
         error = left_out_nmse(rows, scene)
         hidden = scene.quadrature == 1 or reached_noise_floor([error], noise_floor, 1)
         if settings.clutter and not hidden and occludes_antennas_alike(rows):

@@ -228,6 +228,7 @@ class ImageSourceGP(SourcesInFrame):
         errors: list[float],
         rows: Rows,
         scene: SourceScene,
+        finished: bool,
     ) -> None:
         """Look at a search's scene by a batch of rows `group` (n,) that it left out;
         `FellBehind` ends it.
@@ -236,9 +237,8 @@ class ImageSourceGP(SourcesInFrame):
         mean = copy.copy(self)._set_members(rows, [Member(scene, 1.0)]).predict(batch).mean
         # Predictions are in stored units, the batch's targets already times the factors.
         missed = mean - batch.target / self.factors[:, None]
-        errors.append(
-            race.check_candidate(f"{len(scene.sequences)} sources", group, missed, errors)
-        )
+        text = f"{len(scene.sequences)} sources"
+        errors.append(race.check_candidate(text, group, missed, errors, finished))
 
     def _draw(
         self, data: Measurements, rows: np.ndarray, limit: int | None = None, number: int = 0

@@ -16,7 +16,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.image_sources.ensemble import CONVERGED_ERROR
+from gsparc.models.image_sources.ensemble import reached_noise_floor
 from gsparc.models.method import factors_to_measured
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.stack import LEAST_HELD, error_products, to_real_entries, weigh
@@ -63,6 +63,10 @@ def fit_candidates(
     several = cut is not None
     rows = fold.train if several else np.sort(fold.learned())
     groups = () if cut is None else _training_groups(cut, fold.train)
+    noise = 0.0
+    if data.noise_variance is not None:
+        energy = mean_square(data.batch(rows).target)
+        noise = float(np.mean(data.noise_variance[rows])) / max(energy, TINY_POWER)
     # Searches come last: they race against the best before them, and end where they fall behind.
     fields: dict[str, ClosedForm] = {}
     reports: dict[str, FitReport] = {}
@@ -72,7 +76,7 @@ def fit_candidates(
         context.log_curve(watch.seconds, what, error)
 
     for name in sorted(parts, key=OPEN_ENDED.__contains__):
-        if name in SEARCHES and (why := _why_not_searched(race)):
+        if name in SEARCHES and (why := _why_not_searched(race, noise)):
             log.info("init=%s is left out: %s", name, why)
             continue
         began = watch.seconds
@@ -179,9 +183,11 @@ def weigh_candidates(
     return {name: float(weight) for name, weight in zip(members, weights, strict=True) if weight}
 
 
-def _why_not_searched(race: Race | None) -> str | None:
-    """Why no search is begun: another solution is as near as searches come; else None."""
-    if race is None or race.error > CONVERGED_ERROR:
+def _why_not_searched(race: Race | None, noise: float) -> str | None:
+    """Why no search is begun: another solution is as near as searches, or the `noise` of rows
+    (of their energy), let any come; else None.
+    """
+    if race is None or not reached_noise_floor([race.error], noise, 1):
         return None
     return f"another solution has an NMSE of {race.error:.4f} on held-out rows"
 
