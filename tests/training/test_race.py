@@ -53,7 +53,7 @@ def test_a_search_that_had_settled_went_on_for_what_no_mean_gained():
 
 def test_a_search_that_had_ended_went_on_for_what_no_mean_gained():
     """Looked at once, when all its sources were found, it was never held against the best."""
-    missed = OWN[0] + 1.5 * OWN[1]
+    missed = 1.5 * OWN[0] + OWN[1]
     assert race().check_candidate("first", ROWS, missed, []) > 1
     with pytest.raises(FellBehind, match=r"gains -?\d+% ±"):
         race().check_candidate("ended", ROWS, missed, [], finished=True)
