@@ -26,7 +26,8 @@ from gsparc.processes.uncertainty import mean_and_error, standard_error
 Loss = Literal["square", "log"]
 
 LEAST_HELD = 4  # rows, for weights to mean anything
-UNUSED, LEAST_SHARE = 0.1, 0.05  # weights below are 0: of members, and of any products
+UNUSED = 0.1  # weights below are 0
+ROWS = 30.0  # that a belief before any row counts as
 SPREAD = 0.25  # of weights about equal ones, before rows are seen
 PARTS = 5  # of the units; weights are learned on all but one, and tried on that
 MOST = 100.0  # times the errors, that the prior weighs where nothing tells
@@ -103,12 +104,34 @@ def _convex_weights(
         unsure = sum(standard_error(slope, unit) ** 2 for slope in slopes.T)
         curve = (gram - gram.mean(0)).trace()
         prior = min(unsure / max(2 * SPREAD**2 * curve, TINY_POWER), MOST * gram.trace())
-        weights = best_weights(gram + prior * np.eye(len(used)), UNUSED)
+        weights = best_weights(gram + prior * np.eye(len(used)))
     return np.bincount(used, weights, len(members))
 
 
-def best_weights(gram: np.ndarray, least: float = LEAST_SHARE) -> np.ndarray:
-    """Return weights (K,) of the smallest w^T `gram` w, of sum one, none below `least` but 0.
+def shrunk_weights(errors: np.ndarray, belief: np.ndarray) -> np.ndarray:
+    """Return weights (K,) of sum one: of the least squared error of rows left out, shrunk towards
+    what is believed before any row; none below `UNUSED` but 0.
+
+    >>> few, many = np.ones((2, 2)) * [1.0, 2.0], np.ones((2000, 2)) * [1.0, 2.0]
+    >>> shrunk_weights(few, np.ones(2)).round(1), shrunk_weights(many, np.ones(2)).round(1)
+    (array([0.5, 0.5]), array([1., 0.]))
+
+    Args:
+        errors: (n, K) of members.
+        belief: (K,) weights before any row, of any sum; 0: left out.
+    """
+    used = np.flatnonzero(belief)
+    some, start = errors[:, used], belief[used] / belief[used].sum()
+    least = (some**2).sum(0).min() / max(len(some), 1)
+    gram = some.T @ some / max(least, np.finfo(float).tiny)
+    away = np.eye(len(used)) - start[:, None]  # w - start, of w of sum one
+    weights = np.bincount(used, best_weights(gram + ROWS * away.T @ away), len(belief))
+    kept = belief * (weights > 0)  # what is dropped was believed in by nobody
+    return weights if (kept == belief).all() else shrunk_weights(errors, kept)
+
+
+def best_weights(gram: np.ndarray) -> np.ndarray:
+    """Return weights (K,) of the smallest w^T `gram` w, of sum one, none below `UNUSED` but 0.
 
     Scaled to any sum s, the smallest s^2 w^T G w + (s - 1)^2 belongs to the same w: plain
     non-negative least squares.
@@ -121,7 +144,7 @@ def best_weights(gram: np.ndarray, least: float = LEAST_SHARE) -> np.ndarray:
             * vectors.T
         )
         shares = nnls(np.vstack([root, np.ones(len(used))]), np.append(np.zeros(len(used)), 1.0))[0]
-        large = shares >= least * shares.sum()
+        large = shares >= UNUSED * shares.sum()
         if large.all():
             return np.bincount(used, shares / shares.sum(), len(gram))
         used = used[large]
