@@ -76,8 +76,9 @@ def fit_candidates(
         context.log_curve(watch.seconds, what, error)
 
     for name in sorted(parts, key=OPEN_ENDED.__contains__):
-        if name in SEARCHES and (why := _why_not_searched(race, noise)):
-            log.info("init=%s is left out: %s", name, why)
+        if name in SEARCHES and race and reached_noise_floor([race.error], noise, 1):
+            text = "init=%s is left out: another solution has an NMSE of %.4f on held-out rows"
+            log.info(text, name, race.error)
             continue
         began = watch.seconds
         try:
@@ -181,15 +182,6 @@ def weigh_candidates(
         text = "%d held-out rows: %s has an NMSE of %.3f, weight %.2f"
         log.info(text, len(rows), name, error / power, weight)
     return {name: float(weight) for name, weight in zip(members, weights, strict=True) if weight}
-
-
-def _why_not_searched(race: Race | None, noise: float) -> str | None:
-    """Why no search is begun: another solution is as near as searches, or the `noise` of rows
-    (of their energy), let any come; else None.
-    """
-    if race is None or not reached_noise_floor([race.error], noise, 1):
-        return None
-    return f"another solution has an NMSE of {race.error:.4f} on held-out rows"
 
 
 def _training_groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:
