@@ -42,7 +42,7 @@ class RunSettings(Checked):
         effort: that all counts of a fit are multiplied by.
         rounds_s: seconds after which timing starts no round.
         stations: `auto`, `each` or `together`.
-        rounds, queries, draws: trainings of a study, timings of its rows, trials of a promise.
+        rounds, draws: timings of each model, trials of a promise.
     """
 
     seed: int = setting(0, whole(0, 2**32 - 1))
@@ -53,7 +53,6 @@ class RunSettings(Checked):
     rounds_s: float = setting(1.0, POSITIVE)
     stations: str = setting("auto", choice("auto", "each", "together"))
     rounds: int = setting(1, whole(1))
-    queries: int = setting(1, whole(1))
     draws: int = setting(1, whole(1))
 
     @classmethod

@@ -182,7 +182,6 @@ def fit_folds(
     split: Split,
     contexts: Sequence[FitContext],
     *,
-    learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None,
     keep: Callable[[int, Measurements, Fold, Method, FitReport], None] | None = None,
 ) -> FoldFits:
     """Fit an unfitted method on every fold.
@@ -191,7 +190,6 @@ def fit_folds(
         factory: an unfitted method, or what chooses one.
         data, split: learned from `train` and `val` of each fold.
         contexts: of each fold's fit.
-        learned: what is learned from instead, such as displaced or fewer measurements.
         keep: called after each fit with the fold's number, what it learned from, the method and its
             report.
 
@@ -204,16 +202,9 @@ def fit_folds(
     if uses_other_processes() and len(split.folds) > 1:
         contexts = [replace(context, loggers=(), datamodule=None) for context in contexts]
 
-    def of_fold(number: int) -> tuple[Measurements, Fold]:
-        fold = split.folds[number]
-        return (data, fold) if learned is None else learned(data, fold)
-
     def fitted(number: int) -> tuple[Method, FitReport]:
-        there, rows = of_fold(number)
-        # Stations are counted in the data that are learned from, which `learned` may have changed.
-        return fitting.fit_or_resume(
-            wrap_per_station(factory, there), there, rows, contexts[number]
-        )
+        whole = wrap_per_station(factory, data)
+        return fitting.fit_or_resume(whole, data, split.folds[number], contexts[number])
 
     by_fold: dict[int, tuple[Method, FitReport]] = {}
     try:
@@ -221,7 +212,7 @@ def fit_folds(
         for number, fit in run_each(fitted, range(len(split.folds)), "folds"):
             by_fold[number] = fit
             if keep is not None:
-                keep(number, *of_fold(number), *fit)
+                keep(number, data, split.folds[number], *fit)
     except KeyboardInterrupt as stopped:
         if len(contexts) == 1:
             raise
