@@ -66,7 +66,7 @@ def read_inputs(config: DictConfig, known: Measurements | None = None) -> RunInp
     # Once: each fold, and each station, fits a copy of it
     method = build(fill_defaults(config.model))
     RunSettings.from_config(config)
-    errors = from_settings(Disturbance, to_dict(config.get("disturb") or {}), "disturb")
+    errors = from_settings(Disturbance, to_dict(config.disturb), "disturb")
     tracking.refuse_missing_loggers(config)
     module = _data(config, known)
     split = split_for(to_dict(config.split), module.measurements)
