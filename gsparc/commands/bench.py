@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from itertools import product
-from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 
-from gsparc.base.limits import check_arguments, choice
+from gsparc.base.limits import choice
 from gsparc.evaluation.table import Column, Table
 from gsparc.ops.backends import backend_named
-from gsparc.prediction.bench import Call, kernel_cases, loss_case, training_step_case
+from gsparc.prediction.bench import Call as Timed
+from gsparc.prediction.bench import kernel_cases, loss_case, training_step_case
 from gsparc.prediction.timing import ClockSettings, time_interleaved
-from gsparc.runs.output import finish_run, run_directory
+from gsparc.runs.output import Call, Result, command
 
 COLUMNS = (
     Column("kernel", ""),
@@ -26,11 +25,11 @@ COLUMNS = (
 REFERENCE = ClockSettings(rounds=3, least=1, warmup=0, rounds_s=0.5)
 
 
-def task(config: DictConfig) -> dict[str, Any]:
-    """Time all kernels; return the facts of `summary.json`, the table is also `bench.csv`."""
+@command(device=choice("cpu", "cuda"))
+def task(call: Call) -> Result:
+    """Time all kernels; the table is also `bench.csv`."""
+    config, device = call.config, call.config.device
     clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, rounds_s=config.rounds_s)
-    check_arguments(config, device=choice("cpu", "cuda"))
-    device = config.device
     backend_named(device)  # where there is no such device, its reason comes first
     cases = [
         case
@@ -52,10 +51,10 @@ def task(config: DictConfig) -> dict[str, Any]:
         facts[f"bench/{name}/{size}/seconds"] = seconds
     note = "medians of warm calls; -: the dense tensors of plain PyTorch would be too large"
     sheet = Table("", COLUMNS, rows, note)
-    (run_directory() / "bench.csv").write_text(sheet.csv(), encoding="utf-8")
-    return finish_run(run_directory(), facts, sheet)
+    (call.folder / "bench.csv").write_text(sheet.csv(), encoding="utf-8")
+    return Result(facts, [sheet])
 
 
-def median_s(call: Call, clock: ClockSettings) -> float:
+def median_s(call: Timed, clock: ClockSettings) -> float:
     """Return the median seconds of a call."""
     return float(np.median(time_interleaved({0: lambda turn: call()}, clock)[0])) / 1e3

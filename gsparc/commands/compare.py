@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from omegaconf import DictConfig
 
 from gsparc.base.files import platform_cache
 from gsparc.commands.train import train_job
@@ -32,16 +31,16 @@ from gsparc.runs.experiment.table import (
     table_of,
     title_of,
 )
-from gsparc.runs.output import begin_run, show_result
+from gsparc.runs.output import Call, command, show_result
 from gsparc.runs.run_lock import locked
 
 log = logging.getLogger(__name__)
 
 
-def task(config: DictConfig) -> pd.DataFrame:
+@command()
+def task(call: Call) -> pd.DataFrame:
     """Compare as conf/compare.yaml says, see `compare`."""
-    run_dir, settings = begin_run(config)
-    return compare(settings, run_dir)
+    return compare(call.given, call.folder)
 
 
 def compare(settings: Mapping[str, Any], run_dir: Path) -> pd.DataFrame:

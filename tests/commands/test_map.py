@@ -218,7 +218,7 @@ def test_an_interrupt_leaves_no_half_written_file(model, tmp_path, monkeypatch):
         os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr(
-        "gsparc.commands.map.read_or_gather", lambda *_: Timer(0.3, interrupt).start()
+        "gsparc.commands.map.read_or_gather", lambda *_, **__: Timer(0.3, interrupt).start()
     )
     answer = run("map", f"ckpt={model}", "step_m=0.03", folder=tmp_path)
     assert answer.status == 130 and began, answer

@@ -153,13 +153,13 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
     return Promise(HeldOutLevels.join(parts), places, data.stations_of(learned.rows), side)
 
 
-def read_or_gather(path: str, settings: Mapping[str, Any]) -> Promise | None:
+def read_or_gather(path: str, settings: Mapping[str, Any], renew: bool = False) -> Promise | None:
     """Return the evidence stored with a model, or gathered from its training data and then stored.
 
     Args:
         path: the model's file.
-        settings: `promised`, without which there is none; `promise`, `dataset` and `renew` of
-            conf/map.yaml.
+        settings: `promised`, without which there is none; `promise`, `dataset` of conf/map.yaml.
+        renew: whether what is stored is gathered anew.
 
     Raises:
         DataError: the training data are gone, or are others.
@@ -169,7 +169,7 @@ def read_or_gather(path: str, settings: Mapping[str, Any]) -> Promise | None:
     if not settings["promised"]:
         return None
     stored = checkpoint.read(path)
-    promise = None if settings.get("renew") else read_promise(stored.extra)
+    promise = None if renew else read_promise(stored.extra)
     # Blocks of another size are other evidence.
     if promise is not None and how.block_m in (None, promise.block_m):
         return promise
