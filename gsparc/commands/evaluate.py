@@ -16,7 +16,7 @@ from gsparc.pictures.confidence_pictures import PICTURES, draw_confidences
 from gsparc.pictures.plots import draw_sweep
 from gsparc.prediction.hearing import read_hearing
 from gsparc.runs.evaluate import Evaluation, evaluate
-from gsparc.runs.open_runs import open_files
+from gsparc.runs.open_runs import open_run
 from gsparc.runs.output import Call, Result, command, tables_of
 
 
@@ -34,14 +34,14 @@ def evaluate_files(
     from the rows that the models learned from.
 
     Args:
-        paths, dataset, split: see `open_files`.
+        paths, dataset, split: see `open_run` and `OpenRun.read`.
         eval_on: `train`, `val` or `test`.
         baselines: shown beside it; None: all plain methods that serve the data.
 
     Raises:
-        ValueError: as `open_files`.
+        ValueError: as these.
     """
-    run = open_files(paths, dataset, split, others_whole=True)
+    run = open_run(paths, dataset or {}).read(split, others_whole=True)
     other, without = run.data.site.sha256 != run.stored[0].site.sha256, None
     # Without the rows that the models learned from, baselines would have learned from others.
     if other and run.trained is None and (baselines is None or len(baselines)):

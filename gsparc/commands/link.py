@@ -16,7 +16,7 @@ from gsparc.apps.link.run import LinkStudy
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import write_summary
 from gsparc.evaluation.table import Column, Table
-from gsparc.runs.open_runs import open_files
+from gsparc.runs.open_runs import open_run
 from gsparc.runs.output import Call, Result, command
 
 log = logging.getLogger(__name__)
@@ -51,7 +51,7 @@ def task(call: Call) -> Result:
     run_dir, settings = call.folder, call.given
     # Bits, noise and channels of PUSCH are drawn from torch's global generator.
     torch.manual_seed(settings["seed"])
-    run = open_files([settings["ckpt"]], settings["dataset"], settings["split"])
+    run = open_run(settings["ckpt"], settings["dataset"]).read(settings["split"])
     # Seconds of the experiments alone: reading the data is not theirs.
     started = time.perf_counter()
     study = LinkStudy(run, settings)

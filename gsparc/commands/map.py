@@ -15,9 +15,9 @@ from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.pictures import Layer, draw_layer, file_name, list_layers
 from gsparc.apps.maps.promise import PromiseSettings, map_notes, read_or_gather
 from gsparc.base.errors import DataError
-from gsparc.evaluation.summary import write_samples
-from gsparc.prediction.operating_point import load
+from gsparc.base.files import write_samples
 from gsparc.prediction.timing import peak_memory
+from gsparc.runs.open_runs import open_run
 from gsparc.runs.output import Call, Result, command, warn_of_held_out
 
 SUFFIXES = (".png", ".pdf", ".svg")  # of pictures
@@ -62,7 +62,8 @@ def _pictures(call: Call, field: FieldMap) -> list[str]:
 def task(call: Call) -> Result:
     """Map, draw and write."""
     run_dir, config, floor = call.folder, call.config, read_plan_settings(call.given)
-    predictor = load(call.given["ckpt"])
+    run = open_run(config.ckpt, call.given["dataset"])
+    predictor = run.predictor
     warn_of_held_out(predictor)
     how = PromiseSettings(**call.given["promise"])
     query = {
@@ -86,7 +87,7 @@ def task(call: Call) -> Result:
     wanted = _pictures(call, first)
     # Refused before evidence is gathered, which takes minutes.
     tiff = check_geotiff(config.geotiff)
-    promise = read_or_gather(config.ckpt, call.given, renew=config.renew)
+    promise = read_or_gather(run, call.given, renew=config.renew)
     field = add_changes(predict_map(predictor, promise=promise, **query), predictor)
     coverage = None if promise is None else cross_validate(promise.evidence, how.share)
     ends = None if promise is None else covered_between(field, predictor, promise)

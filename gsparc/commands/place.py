@@ -10,7 +10,7 @@ from gsparc.apps.maps.promise import read_or_gather, reopen_training
 from gsparc.evaluation.summary import coordinates
 from gsparc.models import checkpoint
 from gsparc.models.per_station import UNHEARD
-from gsparc.prediction.operating_point import load
+from gsparc.runs.open_runs import open_run
 from gsparc.runs.output import Call, Result, command, warn_of_held_out
 
 
@@ -20,7 +20,8 @@ def task(call: Call) -> Result:
     config, path = call.config, call.given["ckpt"]
     if str(UNHEARD) not in checkpoint.read(path).state.get("per_station", {str(UNHEARD): None}):
         raise placing.unheard_stations_error(path)  # before the copies of all stations are restored
-    predictor = load(call.given["ckpt"])
+    run = open_run(path, call.given["dataset"])
+    predictor = run.predictor
     warn_of_held_out(predictor)
     where = {
         "area": call.given["area"],
@@ -31,12 +32,10 @@ def task(call: Call) -> Result:
         "antenna": placing.NewAntenna(**call.given["antenna"]),
     }
     placing.lay_candidates(predictor, **where)  # refuses before anything is fitted
-    promise, error = read_or_gather(path, call.given), placing.NewStationError()
+    promise, error = read_or_gather(run, call.given), placing.NewStationError()
     # Stations left out one by one tell how far the level of a new one is off.
     if config.left_out:
-        error = placing.new_station_error(
-            reopen_training(path, call.given["dataset"]), int(config.left_out)
-        )
+        error = placing.new_station_error(reopen_training(run), int(config.left_out))
     level, unit = float(config.threshold_db), predictor.site.level_unit
     placement = placing.place_station(
         predictor, threshold_db=level, promise=promise, error=error, **where

@@ -12,7 +12,7 @@ from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import read_or_gather
 from gsparc.commands.map import stations_of
 from gsparc.evaluation.summary import coordinates
-from gsparc.prediction.operating_point import load
+from gsparc.runs.open_runs import open_run
 from gsparc.runs.output import Call, Result, command, warn_of_held_out
 
 
@@ -25,10 +25,11 @@ def task(call: Call) -> Result:
         read_plan_settings(call.given),
     )
     # Before anything is measured there is no model, and places are spread over the area.
-    predictor = None if config.ckpt is None else load(call.given["ckpt"])
+    run = None if config.ckpt is None else open_run(config.ckpt, call.given["dataset"])
+    predictor = None if run is None else run.predictor
     if predictor is not None:
         warn_of_held_out(predictor)
-    promise = None if predictor is None else read_or_gather(config.ckpt, call.given)
+    promise = None if run is None else read_or_gather(run, call.given)
     plan = plan_measurements(
         predictor,
         config.count,

@@ -5,7 +5,7 @@ as a table.
 from __future__ import annotations
 
 from gsparc.apps.maps.promise import read_promise
-from gsparc.evaluation.answers import predict_file
+from gsparc.prediction.answers import predict_file
 from gsparc.prediction.operating_point import load
 from gsparc.runs.output import Call, Result, command
 

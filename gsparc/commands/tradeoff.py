@@ -22,7 +22,7 @@ from gsparc.prediction import operating_point
 from gsparc.prediction.timing import BLOCKS, peak_memory
 from gsparc.runs.experiment import tradeoff
 from gsparc.runs.ledger import FitInputs, measurements_hash, run_once
-from gsparc.runs.open_runs import Opened, open_files
+from gsparc.runs.open_runs import Opened, open_run
 from gsparc.runs.output import Result, in_multirun, run_directory
 from gsparc.runs.run_lock import locked
 from gsparc.runs.settings import to_dict
@@ -34,7 +34,7 @@ log = logging.getLogger(__name__)
 def task(config: DictConfig) -> dict[str, Any]:
     """Sweep a checkpoint; return the facts of `summary.json`. A job of a multirun is done once."""
     run_dir = run_directory()
-    run = open_files([config.ckpt], to_dict(config.dataset), to_dict(config.split))
+    run = open_run(config.ckpt, to_dict(config.dataset)).read(to_dict(config.split))
     state = FitInputs.from_config(config, measurements_hash(run.data), run.split.sha256)
     # The front is stored in the file itself, which changes it
     trained = run.stored[0].extra.get("run_id")

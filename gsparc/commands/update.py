@@ -4,8 +4,6 @@ and what changed.
 
 from __future__ import annotations
 
-import csv
-import io
 import logging
 from collections.abc import Mapping
 from typing import Any
@@ -13,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from gsparc.base.errors import DataError
-from gsparc.base.files import write_whole
 from gsparc.base.limits import or_null, switch, whole
 from gsparc.evaluation.summary import coordinates
 from gsparc.evaluation.table import Column, Table
@@ -52,13 +49,8 @@ def task(call: Call) -> Result:
         seconds, out = watch.seconds, config.out or config.ckpt
         file.store(versions_extra(predictor.versions))
     table = alarm_rows(predictor)
-    text = io.StringIO()
-    writer = csv.DictWriter(
-        text, dict.fromkeys([*COLUMNS, *(table or [{}])[0]]), lineterminator="\n"
-    )
-    writer.writeheader()
-    writer.writerows(table)
-    write_whole(call.folder / "changes.csv", text.getvalue())
+    heads = dict.fromkeys([*COLUMNS, *(table or [{}])[0]])
+    columns = {name: [row[name] for row in table] for name in heads}
     facts = {
         "ckpt": str(config.ckpt),
         "out": str(out),
@@ -73,7 +65,8 @@ def task(call: Call) -> Result:
     message = f"back by {config.undo}: {len(predictor.rows)} rows kept" if config.undo else message
     message += f", {seconds:.2g} s"
     before = f"update: {message}; model in {out}; summary "
-    return Result(facts, [changes_table(table)] if table else [], before=before)
+    tables = [changes_table(table)] if table else []
+    return Result(facts, tables, (), before, {"changes.csv": columns})
 
 
 def _add_rows(

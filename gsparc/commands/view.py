@@ -17,7 +17,6 @@ from gsparc.base.files import write_whole
 from gsparc.base.limits import whole
 from gsparc.prediction.query import read_place
 from gsparc.prediction.timing import peak_memory
-from gsparc.runs.open_runs import check_dataset
 from gsparc.runs.output import Call, Result, command
 
 log = logging.getLogger(__name__)
@@ -60,8 +59,6 @@ def view_of(settings: dict[str, Any]) -> SiteView:
     `DataError` for a file or place that cannot be.
     """
     plan = read_plan_settings(settings)
-    # What else is wrong with data is a note alone
-    check_dataset(settings["ckpt"], settings["dataset"])
     viewed = open_model(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
     at, other = (
         None if settings[k] is None else read_place(k, settings[k]) for k in ("at", "other_end")

@@ -14,7 +14,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import RenderableType
 
-from gsparc.base.files import SUMMARY
+from gsparc.base.files import SUMMARY, write_samples
 from gsparc.base.limits import Limit, check_arguments
 from gsparc.data.splits import Split
 from gsparc.evaluation.by_station import worst_stations
@@ -23,7 +23,6 @@ from gsparc.evaluation.summary import (
     provenance,
     remarks,
     results_table,
-    write_samples,
     write_summary,
 )
 from gsparc.evaluation.table import Table

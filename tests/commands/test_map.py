@@ -136,7 +136,7 @@ def test_a_plan_for_some_stations_spoke_of_all(model, tmp_path):
 
 def test_a_model_that_cannot_place_was_restored_before_it_said_so(model, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "gsparc.commands.place.load", lambda path: pytest.fail("all stations are restored")
+        "gsparc.commands.place.open_run", lambda *_: pytest.fail("all stations are restored")
     )
     answer = run("place", f"ckpt={model}", folder=tmp_path)
     assert_refused(answer, "train with stations=together", tmp_path)

@@ -18,7 +18,7 @@ from gsparc.evaluation.results import read_run
 from gsparc.models import checkpoint
 from gsparc.runs import run_lock
 from gsparc.runs.ledger import LEFT, set_earlier_aside
-from gsparc.runs.open_runs import open_files
+from gsparc.runs.open_runs import open_run
 from gsparc.runs.run_lock import LOCK, RunLock, hold_folder, locked, release_folders
 
 HOLDS = "import sys, time; from gsparc.runs.run_lock import hold_folder; from pathlib import Path; "
@@ -131,7 +131,7 @@ def test_a_failed_run_left_its_split_beside_the_summary_of_the_one_before(tmp_pa
         mixed.write_bytes((tmp_path / "run" / name).read_bytes())
         refused("its summary, samples and split are of two runs", read_run, tmp_path / "other")
     models = [tmp_path / folder / checkpoint.MODEL for folder in ("run", "other")]
-    refused("of different runs; give the folds of one", open_files, models)
+    refused("of different runs; give the folds of one", open_run, models, {})
 
 
 def test_a_command_that_is_refused_leaves_no_summary_of_the_one_before(tmp_path):

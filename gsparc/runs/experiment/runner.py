@@ -21,20 +21,19 @@ from omegaconf import DictConfig
 
 from gsparc.base.errors import list_first
 from gsparc.base.executor import run_each
-from gsparc.base.files import is_out_of_space
+from gsparc.base.files import is_out_of_space, write_samples
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.evaluation.console import error_in_one_line
 from gsparc.evaluation.metric_formats import number_format
 from gsparc.evaluation.results import as_frame, frame_of_runs, own_rows, read_run, read_summary
 from gsparc.evaluation.scores import rows_to_score
-from gsparc.evaluation.summary import write_samples
 from gsparc.models import loading
 from gsparc.models.method import Method
 from gsparc.prediction import timing
 from gsparc.prediction.timing import SPEED, Call, ClockSettings, time_beside_copy
 from gsparc.runs.ledger import RECORD, REFUSED, FitInputs, edited, read_finished, run_once
-from gsparc.runs.open_runs import open_files
+from gsparc.runs.open_runs import open_run
 
 log = logging.getLogger(__name__)
 
@@ -272,7 +271,7 @@ def time_again(rows: pd.DataFrame, *, rounds: int = 40, rounds_s: float = 60.0) 
     runs, calls, threads = list(own_rows(rows).run), dict[int, Call](), dict[int, int]()
     for number, run in enumerate(runs):
         try:
-            opened = open_files(run.checkpoints[:1])
+            opened = open_run(run.checkpoints[:1], {}).read()
             # A folder used twice may hold the model of one run beside the summary of the other.
             if opened.stored[0].extra.get("run_id") != run.facts.get("run_id"):
                 raise ValueError("its checkpoint is of another run than its summary")
