@@ -1,8 +1,6 @@
-"""Settings of a process of powers: its mean law, lengths and noise, from rows heard and silent.
+"""The likeliest process of powers: its mean law, lengths and noise, from rows heard and silent.
 
-Left-out likelihood is of rows with neighbours. What a setting is worth in a gap it does not tell:
-there a mixture of processes, by the errors at squares of floor left out, is safer than the
-likeliest of them (stacking: D. H. Wolpert, Neural Networks 5 (1992)).
+One process without what is known of numbers before any row: what `model=gp` maps powers by.
 """
 
 from __future__ import annotations
@@ -18,16 +16,6 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import fit_site_law
-from gsparc.models.baselines.kriging import fit_variogram
-from gsparc.models.member_weights import best_weights
-from gsparc.models.powers.groups import SIDES, number_squares
-from gsparc.models.powers.own_terms import (
-    UserTerm,
-    add_terms_to_trend,
-    set_term_unit,
-    subtract_means,
-)
-from gsparc.models.powers.prior_map import PriorMap
 from gsparc.processes.censored import ConditionalGaussian
 from gsparc.processes.fit_kernel import LOOKS, fit_kernel_by_evidence, fit_kernel_by_left_out
 from gsparc.processes.kernel import (
@@ -58,24 +46,18 @@ MEANS: tuple[MeanName, ...] = get_args(MeanName)
 
 CHOSEN_ON = Effort.chosen_on
 COMPARED_ON = 500  # of them, constant and distance law; with little effort
-MIXED_ON = 300  # the same of processes that are averaged: an error of one weighs less
 WEIGHED_ON = 400  # the same where some rows were silent: each look factors several
 SILENT, LEAST_SILENT = 0.5, 30  # of these, for each row that was heard, and at least
-MAP_COST = 3.0  # nats that rows must say for a map that was there before
-MAP_PAYS = 0.05  # of the squared errors at rows left out that a map must take off
 LAW_NEEDS = 8  # rows that were heard, for a distance law
 LAW_ODDS = 3.0  # logarithm of the prior odds of a law over a constant about a known place: 20 to 1
 LEAST_FALL = 1.0  # exponent of a law that these odds speak for: below it, rows show no distance law
-TWO_LENGTHS_NEED, MIXED_FROM = 100, 20  # rows that were heard
-LEAST_SILL = 1e-2  # of the nugget: below it levels are all alike to kriging
+TWO_LENGTHS_NEED = 100  # rows that were heard
 SHARES = (0.02, 0.1, 0.4)  # starting lengths, of the median distance
 SPLITS = ((0.3, 1.5), (0.15, 4.0))  # starting pairs of lengths, of the one length that fits best
 # Further pairs, of the median distance: the best one length may be short
 WIDE = ((0.03, 0.3), (0.03, 1.5))
-SPANS = (SIDES, SIDES // 2)  # squares along the longer side that are left out
 REFINED = 8  # looks at all rows after such at few
 EVIDENCE_LOOKS = 30
-AMONG_ROWS = 4.0  # weight of errors among rows, of those at squares
 
 
 def process_and_notes(
@@ -119,136 +101,15 @@ class KernelCandidate:
 
     @property
     def prior(self) -> Prior:
-        """Both; deviations that terms have in decibels are relative to the kernel's."""
-        return Prior(self.kernel, set_term_unit(self.trend, math.sqrt(self.kernel.amplitude)))
+        """Both."""
+        return Prior(self.kernel, self.trend)
 
     @property
     def description(self) -> str:
         """One line of the settings."""
         law = self.trend.law
         mean = "a constant" if law is None else f"a distance law of exponent {law.exponent:.3g}"
-        return f"{self.kernel.description}, mean: {mean}{' and a share of the map' * self.has_map}"
-
-    @property
-    def has_map(self) -> bool:
-        """Whether the mean has a share of a map from before."""
-        return any(
-            isinstance(term, UserTerm) and isinstance(term.term, PriorMap)
-            for term in self.trend.more
-        )
-
-
-def candidate_priors(
-    rows: PowerRows, site: Site, seed: int, max_rows: int, terms: tuple[UserTerm, ...] = ()
-) -> list[KernelCandidate]:
-    """Return the likeliest settings of each mean law, the best first, kriging's, and one for gaps.
-
-    That for gaps is of kriging's shape; its length and noise suit squares left out as they do rows.
-    Of few or very many rows the best law alone. Each law has further `terms`,
-    and stands there without a map, too.
-    """
-    sure = tuple(term for term in terms if not isinstance(term.term, PriorMap))
-    trends = [
-        MeanLaw(add_terms_to_trend(rest, trend, some), cost + MAP_COST * (some is not sure), notes)
-        for some in ((sure, terms) if len(sure) < len(terms) else (terms,))
-        for rest in (subtract_means(rows, some),)
-        for trend, cost, notes in _candidate_laws(rest, site, "auto")
-    ]
-    if not MIXED_FROM <= (~rows.silent).sum() <= len(rows.places) <= MOST_ROWS:
-        return [choose_candidate(rows, trends, seed, max_rows)]
-    if rows.silent.any():
-        candidates = [choose_candidate(rows, [trend], seed, max_rows, MIXED_ON) for trend in trends]
-        return sorted(candidates, key=lambda one: -one.score)
-    candidates = [choose_candidate(rows, trends, seed, max_rows, MIXED_ON)]
-    # Other laws have a kernel like it: a short walk from there, not one from anywhere.
-    others = [
-        replace(candidates[0], **other._asdict())
-        for other in trends
-        if other.trend is not candidates[0].trend
-    ]
-    candidates += [_refine_kernel(rows, other, seed, max_rows) for other in others]
-    # One row of a place: levels that repeat there to the digit would speak for no noise.
-    once = np.sort(np.unique(rows.places, axis=0, return_index=True)[1])
-    few = rows.subset(once).draw_subset(MIXED_ON, seed)
-    squares = [list(rows_of_groups(number_squares(few.places, sides))) for sides in SPANS]
-    gaps = [
-        _fit_one_length(few, candidate.trend, 0.0, candidate.notes, ExponentialShadowing, squares)
-        for candidate in candidates
-    ]
-    return [*candidates, *_kriged(rows, trends[0]), max(gaps, key=lambda one: one.score)]
-
-
-def _kriged(rows: PowerRows, mean: MeanLaw) -> list[KernelCandidate]:
-    """The settings of a variogram, which ordinary kriging has; none of many rows,
-    or without a sill.
-    """
-    if len(rows.places) > CHOSEN_ON:  # there a third of the seconds, for nothing
-        return []
-    variogram = fit_variogram(rows.places, rows.decibels[:, None])
-    if not variogram.sill > LEAST_SILL * variogram.nugget:
-        return []
-    noise = max(variogram.nugget / variogram.sill, NOISE_SPAN[0])
-    kernel = Kernel.from_length(variogram.range, noise, variogram.sill, ExponentialShadowing)
-    return [KernelCandidate(-math.inf, mean.trend, kernel, 0.0, mean.notes)]
-
-
-def mix_candidates(
-    rows: PowerRows, candidates: list[KernelCandidate], seed: int, max_rows: int
-) -> tuple[tuple[tuple[float, Prior], ...], tuple[str, ...]]:
-    """Return candidates with their shares in a mean, the largest first,
-    and what must be said of them.
-
-    Shares have the least squared error at rows left out one by one and at squares of floor left
-    out, both relative to the best candidate's.
-    A prior on equal shares would lose among rows (by 1 % on dense streets).
-    """
-    if len(candidates) == 1:
-        return ((1.0, candidates[0].prior),), (candidates[0].description, *candidates[0].notes)
-    part = rows.draw_subset(max_rows, seed)
-    posteriors = [
-        condition_on_powers(part, candidate.prior, seed)[0].posterior for candidate in candidates
-    ]
-    # Of all rows: drawn ones are farther apart than those that will answer.
-    values = rows.measured_rows.means_at_places()
-    near = [
-        condition_on_nearest(candidate.prior, values, seed, cover=FEW).left_out().mean
-        for candidate in candidates
-    ]
-    gram = AMONG_ROWS * _relative_gram([(values.values - mean)[:, 0].numpy() for mean in near])
-    for sides in SPANS:
-        gram += _relative_gram(
-            [_errors_without_squares(posterior, sides) for posterior in posteriors]
-        ) / len(SPANS)
-    share = best_weights(gram)
-    bare = np.flatnonzero([not candidate.has_map for candidate in candidates])
-    if 0 < len(bare) < len(candidates):
-        alone = np.zeros_like(share)
-        alone[bare] = best_weights(gram[np.ix_(bare, bare)])
-        # Both were chosen on these rows: what a map gains by chance is no gain elsewhere.
-        if share @ gram @ share > (1 - MAP_PAYS) * (alone @ gram @ alone):
-            share = alone
-    mixture = [
-        (float(share[k]), candidates[k]) for k in np.argsort(-share, kind="stable") if share[k]
-    ]
-    texts = [f"{weight:.0%} of {candidate.description}" for weight, candidate in mixture]
-    notes = dict.fromkeys(note for _, candidate in mixture for note in candidate.notes)
-    return tuple((weight, candidate.prior) for weight, candidate in mixture), (*texts, *notes)
-
-
-def _relative_gram(errors: list[np.ndarray]) -> np.ndarray:
-    """Mean products (K, K) of errors (n,) of K candidates, relative to the square of the best."""
-    gram = np.stack(errors) @ np.stack(errors).T
-    return gram / max(gram.diagonal().min(), np.finfo(float).tiny)
-
-
-def _errors_without_squares(posterior: Posterior, sides: int) -> np.ndarray:
-    """Errors (n,) [dB] of rows that were heard,
-    each predicted without those of its square of floor.
-    """
-    assert isinstance(posterior, Exact)
-    group = rows_of_groups(number_squares(posterior.rows.numpy(), sides))
-    residual, _ = left_out_residuals(posterior.factor.inverse, posterior.weights, group)
-    return residual[posterior.extra == 0, 0].numpy()
+        return f"{self.kernel.description}, mean: {mean}"
 
 
 def choose_candidate(
@@ -332,16 +193,14 @@ def _fit_one_length(
     trend: Trend,
     cost: float,
     notes: tuple[str, ...],
-    shape: type[Shadowing | ExponentialShadowing] = Shadowing,
-    squares: Sequence[Sequence[Tensor]] = (),
 ) -> KernelCandidate:
     view = rows.view(trend)
     scale = median_distance(view.apart)
     if len(view.values) < 3 or not view.values.any() or not view.apart.any():
         amplitude = max(float(view.values.square().mean()), 1e-12)
         return KernelCandidate(0.0, trend, Kernel.from_length(scale, 1e-2, amplitude), cost, notes)
-    starts = [Kernel.from_length(scale * share, 0.1, 1.0, shape) for share in SHARES]
-    value, kernel = fit_kernel_by_left_out(starts, [view], partitions=squares)
+    starts = [Kernel.from_length(scale * share, 0.1) for share in SHARES]
+    value, kernel = fit_kernel_by_left_out(starts, [view])
     return KernelCandidate(-value - cost, trend, kernel, cost, notes)
 
 
@@ -370,12 +229,8 @@ def _end_starts(scale: float, kernel: Kernel) -> list[Kernel]:
     """Shadows of the path and of each end, or gains of each place,
     where one was found for both together.
     """
-    starts = []
-    for length in (kernel.length, SHARES[0] * scale):
-        ends = (EndShadowing(length), EndShadowing(length, other=True))
-        signals = [replace(end, share=1 / 3) for end in (Shadowing(kernel.lengths[-1]), *ends)]
-        starts.append(replace(kernel, terms=(*signals, kernel.terms[-1])))
-    return starts
+    lengths = (kernel.length, SHARES[0] * scale)
+    return [Kernel.of_ends(kernel.lengths[-1], length, kernel.noise) for length in lengths]
 
 
 def _select_doubtful(rows: PowerRows, base: KernelCandidate) -> PowerRows:
