@@ -1,4 +1,5 @@
 """Weights of members by rows left out."""
+
 from __future__ import annotations
 
 import numpy as np

@@ -210,7 +210,10 @@ class Beam(Columns):
 
     def loss(self, places: Tensor) -> Tensor:
         """Return what the listed pattern takes off (n,) [dB] at places (n, 3) [m]."""
-        still, sector = self.still.to(places).expand(len(places), 3), places.new_zeros(len(places), 1)
+        still, sector = (
+            self.still.to(places).expand(len(places), 3),
+            places.new_zeros(len(places), 1),
+        )
         ends = torch.cat([places, still, sector], 1)
         return Sectors(0.0, table=self.table).pattern_loss(ends) - self.middle
 

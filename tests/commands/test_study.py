@@ -64,6 +64,8 @@ def test_errors_cost_an_interpolator_and_not_the_mean(tmp_path):
         facts, _ = train(config, tmp_path / key, in_full=False)
         names = ("test", "baseline/gp", "baseline/mean")
         rmse[key] = [facts[f"{name}/rmse_db"] for name in names]
+        rows = facts["split/train"] + facts["split/val"]
+        assert rows == (13 if key == "keep=0.2" else 64)  # that a model learned from
     assert all(own == beside for own, beside, _ in rmse.values())
     clean, *disturbed = rmse.values()
     assert all(own > clean[0] + 0.3 for own, _, _ in disturbed)

@@ -59,6 +59,7 @@ class FoldFits:
         train_cpu_s: processor seconds of each fit, of all threads [s]: a busy machine does not
             inflate them.
         notes: what the first fold's fit said.
+        learned: rows of all folds that were learned from, by their subset.
         cost: of all fits together.
     """
 
@@ -66,6 +67,7 @@ class FoldFits:
     train_s: tuple[float, ...]
     train_cpu_s: tuple[float, ...]
     notes: tuple[str, ...]
+    learned: dict[str, int]
     cost: Cost = NO_COST
 
     def facts(self) -> dict[str, Any]:
@@ -75,6 +77,7 @@ class FoldFits:
         facts = {
             "time/train_cpu_s": fmean(self.train_cpu_s),
             "model/learned": "\n".join(notes) or None,
+            **{f"split/{subset}": count for subset, count in self.learned.items()},
         }
         facts["model/refused"] = (
             "\n".join(note for note in self.notes if isinstance(note, Severe)) or None
@@ -228,5 +231,6 @@ def fit_folds(
         tuple(report.seconds for report in reports),
         tuple(report.cpu_s for report in reports),
         reports[0].notes,
+        {name: sum(len(getattr(f, name)) for f in split.folds) for name in ("train", "val")},
         sum((report.cost for report in reports), NO_COST),
     )
