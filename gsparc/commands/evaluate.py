@@ -11,7 +11,6 @@ from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
 from gsparc.evaluation.results import Run, frame_of_runs
 from gsparc.evaluation.summary import remarks
-from gsparc.models import checkpoint
 from gsparc.pictures.confidence_pictures import PICTURES, draw_confidences
 from gsparc.pictures.plots import draw_sweep
 from gsparc.prediction.hearing import read_hearing
@@ -60,7 +59,11 @@ def evaluate_files(
         learned=run.trained if other else None,
         hearing=hearing,
     )
-    evaluation.facts.update({"split/foreign": run.doubt, "split/without_baselines": without})
+    # All folds of a run share its configuration, and so its seed.
+    seed = run.stored[0].configuration.get("seed")
+    evaluation.facts.update(
+        {"split/foreign": run.doubt, "split/without_baselines": without, "seed": seed}
+    )
     return evaluation, run.data, run.split
 
 
@@ -70,9 +73,7 @@ def task(call: Call) -> Result:
     given, run_dir, paths = call.given, call.folder, call.paths
     how = {"eval_on": given["eval_on"], "baselines": given["baselines"]}
     evaluation, data, split = evaluate_files(paths, given["dataset"], given["split"], **how)
-    # All folds of a run share its configuration, and so its seed.
-    seed = checkpoint.read(paths[0]).configuration.get("seed")
-    facts = {**evaluation.facts, "seed": seed, "ckpt": ", ".join(paths)}
+    facts = {**evaluation.facts, "ckpt": ", ".join(paths)}
     evaluation.write(run_dir)
     rows, eval_on = frame_of_runs([Run(run_dir, facts)]), given["eval_on"]
     if evaluation.columns:

@@ -17,7 +17,7 @@ from gsparc.base.executor import run_all
 from gsparc.base.files import write_archive, write_samples
 from gsparc.data.schema import End, Site
 from gsparc.data.target import Target
-from gsparc.data.units import PowerUnit, power_in_decibels
+from gsparc.data.units import LINEAR, PowerUnit, power_in_decibels
 from gsparc.models.device_offsets import find_device
 from gsparc.models.method import MEAN_DEVICE, Prediction
 from gsparc.prediction.hearing import read_hearing
@@ -82,7 +82,7 @@ def in_blocks(rows: np.ndarray) -> list[np.ndarray]:
 
 def ask(
     models: Predictor | Sequence[tuple[Predictor, np.ndarray]],
-    ends: Mapping[End, np.ndarray],
+    ends: Mapping[Any, np.ndarray],
     *,
     linear: bool = False,
     what: str = "",
@@ -96,7 +96,7 @@ def ask(
     Args:
         models: who is asked, each with the numbers (m,) of its places; one alone: all of them.
         ends: by end, (n, 3) places, or (3,) of one that stands still [m].
-        linear: powers as such, see `Predictor.predict_linear`.
+        linear: powers as such, whose levels are in `site.level_unit`.
         what, threads: see `run_each`.
 
     Raises:
@@ -109,7 +109,8 @@ def ask(
     def predicted(block: tuple[Predictor, np.ndarray]) -> Prediction:
         model, rows = block
         where: Any = {end: at if at.ndim == 1 else at[rows] for end, at in ends.items()}
-        return model.predict_linear(**where) if linear else model.predict(**where)
+        unit = LINEAR if linear and model.site.target.is_level else None
+        return model.predict(**where, unit=unit)
 
     parts = run_all(predicted, blocks, what, threads=threads)
     order = np.argsort(np.concatenate([rows for _, rows in blocks]), kind="stable")
