@@ -11,8 +11,6 @@ from __future__ import annotations
 import csv
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +47,9 @@ def stations() -> Iterator[Station]:
     rows["x"], rows["y"] = east, (rows.latitude - cells.lat.iloc[0]) * METRES
     for (cell, device), part in rows.groupby(["PCI", "device"]):
         place = on_floor(part[["x", "y"]].to_numpy())
-        yield Station("campus", f"{cell} {device}", place, part.rsrp.to_numpy(), np.array([0, 0, 20.0]))
+        yield Station(
+            "campus", f"{cell} {device}", place, part.rsrp.to_numpy(), np.array([0, 0, 20.0])
+        )
     city = np.load(MEASURED / "real/powder-rss-462mhz.npz", allow_pickle=False)
     for number, place in enumerate(city["station_position"]):
         moving, level = on_floor(city["mobile_position"]), city["rssi_db"][:, number]
@@ -68,7 +68,9 @@ def stations() -> Iterator[Station]:
         npz = np.load(MEASURED / f"locate/{name}.npz", allow_pickle=False)
         heard = np.argsort(-np.isfinite(npz["rss_dbm"]).sum(0))[: EACH // 2]
         for number in heard:
-            yield Station("building", f"{name} {number}", npz["position"], npz["rss_dbm"][:, number], None)
+            yield Station(
+                "building", f"{name} {number}", npz["position"], npz["rss_dbm"][:, number], None
+            )
     garage = np.load(MEASURED / "change/garage-rounds.npz", allow_pickle=False)
     first = garage["round"] == 1
     for number in range(0, garage["rss_dbm"].shape[1], 3):

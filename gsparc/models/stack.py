@@ -26,10 +26,12 @@ def shrunk_weights(errors: np.ndarray, belief: np.ndarray) -> np.ndarray:
     while True:
         start = belief[used] / belief[used].sum()
         some = errors[:, used]
-        gram = some.T @ some / max((some**2).mean(0).min(), np.finfo(float).tiny)
+        least = (some**2).sum(0).min() / max(len(some), 1)
+        gram = some.T @ some / max(least, np.finfo(float).tiny)
         # min w^T G w + ROWS |w - start|^2 over w of sum one, which a large weight holds.
-        root = np.linalg.cholesky(gram + ROWS * np.eye(len(used))).T
-        goal = np.linalg.solve(root.T, ROWS * start)
+        values, vectors = np.linalg.eigh(gram + ROWS * np.eye(len(used)))
+        root = np.sqrt(values)[:, None] * vectors.T
+        goal = ROWS * (vectors.T @ start) / np.sqrt(values)
         held = np.sqrt(HELD * gram.trace() + HELD * ROWS)
         shares = nnls(np.vstack([root, np.full(len(used), held)]), np.append(goal, held))[0]
         large = shares >= UNUSED * shares.sum()

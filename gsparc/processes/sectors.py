@@ -46,9 +46,10 @@ STEPS = torch.cat([UNITS, -UNITS, 0 * UNITS[:1]])  # of parameters, the last wit
 
 
 def sector_table(beams: np.ndarray) -> Tensor:
-    """Return a table (T, 5) float64 as of `Sectors` of what is known of beams (T, 5), NaN where
-    nothing is; powers are less their mean.
+    """Return a table (T, 5) float64 as of `Sectors` of what is known of beams (T, 5 or more), NaN
+    where nothing is; powers are less their mean.
     """
+    beams = beams[:, : len(USUAL)]
     known, given = np.isfinite(beams), torch.from_numpy(np.nan_to_num(beams))
     azimuth, tilt, width, height, power = torch.where(torch.from_numpy(known), given, USUAL).T
     aimed, tilted = torch.from_numpy(known[:, :2]).T

@@ -5,39 +5,28 @@ One process without what is known of numbers before any row: what `model=gp` map
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.models.baselines.distance_law import fit_site_law
-from gsparc.processes.censored import ConditionalGaussian
 from gsparc.processes.fit_kernel import LOOKS, fit_kernel_by_evidence, fit_kernel_by_left_out
 from gsparc.processes.kernel import (
-    NOISE_SPAN,
-    EndShadowing,
-    ExponentialShadowing,
     Kernel,
-    Shadowing,
     median_distance,
 )
-from gsparc.processes.left_out import left_out_residuals, rows_of_groups
-from gsparc.processes.nearest import FEW, choose_kernel_by_nearest, condition_on_nearest
+from gsparc.processes.nearest import choose_kernel_by_nearest
 from gsparc.processes.places import has_both_ends
-from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import (
-    MOST_ROWS,
     PowerProcess,
     PowerRows,
     condition_on_powers,
+    rows_in_doubt,
     trend_about_rows,
 )
-from gsparc.processes.prior import Posterior, Prior
+from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend
 from gsparc.training.effort import Effort
 
@@ -47,7 +36,6 @@ MEANS: tuple[MeanName, ...] = get_args(MeanName)
 CHOSEN_ON = Effort.chosen_on
 COMPARED_ON = 500  # of them, constant and distance law; with little effort
 WEIGHED_ON = 400  # the same where some rows were silent: each look factors several
-SILENT, LEAST_SILENT = 0.5, 30  # of these, for each row that was heard, and at least
 LAW_NEEDS = 8  # rows that were heard, for a distance law
 LAW_ODDS = 3.0  # logarithm of the prior odds of a law over a constant about a known place: 20 to 1
 LEAST_FALL = 1.0  # exponent of a law that these odds speak for: below it, rows show no distance law
@@ -151,7 +139,7 @@ def _choose_on_part(
     candidates = [_fit_one_length(few, *law) for law in trends]
     scores = [candidate.score for candidate in candidates]
     if both:
-        weighed = _select_doubtful(weighed, candidates[-1])
+        weighed = rows_in_doubt(weighed, candidates[-1].prior)
         scores = [_fit_by_evidence(weighed, candidate, REFINED).score for candidate in candidates]
     best = candidates[int(np.argmax(scores))]
     if len(few.places) >= TWO_LENGTHS_NEED:
@@ -231,21 +219,6 @@ def _end_starts(scale: float, kernel: Kernel) -> list[Kernel]:
     """
     lengths = (kernel.length, SHARES[0] * scale)
     return [Kernel.of_ends(kernel.lengths[-1], length, kernel.noise) for length in lengths]
-
-
-def _select_doubtful(rows: PowerRows, base: KernelCandidate) -> PowerRows:
-    """Rows that were heard, and half as many silent ones: those that these leave most in doubt."""
-    view = rows.view(base.trend, base.kernel)
-    gram, values = base.kernel.amplitude * view.gram(base.kernel), view.values
-    silent, most = (
-        torch.from_numpy(rows.silent),
-        max(round(SILENT * (~rows.silent).sum()), LEAST_SILENT),
-    )
-    gaussian = ConditionalGaussian.from_gram(gram, values[:, 0], silent)
-    doubt = torch.from_numpy(rows.side)[silent] * gaussian.z_score(values[silent, 0])
-    used = ~rows.silent
-    used[np.flatnonzero(rows.silent)[doubt.argsort()[:most]]] = True
-    return rows.subset(np.flatnonzero(used))
 
 
 def _fit_by_evidence(rows: PowerRows, base: KernelCandidate, limit: int) -> KernelCandidate:

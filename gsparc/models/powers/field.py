@@ -42,6 +42,7 @@ from gsparc.training.context import FitContext, FitReport
 from gsparc.training.effort import Effort
 from gsparc.training.stopwatch import Stopwatch
 
+WALL_DB = 10.0  # deviation of the loss in a wall before any row
 LEFT_OUT = "model.prior: the map is left out: rows left out are predicted as well without it"
 
 
@@ -107,8 +108,9 @@ class PowerField(ClosedForm):
         )
         walls, remarks = (), list[str]()
         if self.walls is not None:
-            walls = (walls_in_frame(self.walls, site.origin, site.static_position),)
-            remarks.append(f"losses in {len(walls[0].sizes)} known walls and floors")
+            known = walls_in_frame(self.walls, site.origin, site.static_position)
+            walls = (replace(known, loss_db=WALL_DB),)
+            remarks.append(f"losses in {len(known.sizes)} known walls and floors")
         members = learn_members(seen, site, self.seed, chosen_on, terms, walls)
         self.priors, notes = weigh_members(seen, members, self.seed, chosen_on)
         # A level that silent rows are below is no power that waves could be fitted to.

@@ -2,8 +2,8 @@
 
 A member has a mean, a distance law or none, and a shape, rough or smoother. Its numbers have the
 largest evidence with what stations elsewhere teach (`known_numbers.py`); level and exponent are
-integrated out. Shares have the least squared error at rows left out, shrunk towards what is believed
-before any row: with few rows a mean of members is safer than the best of them.
+integrated out. Shares have the least squared error at rows left out, shrunk towards what is
+believed before any row: with few rows a mean of members is safer than the best of them.
 """
 
 from __future__ import annotations
@@ -21,15 +21,14 @@ from gsparc.models.powers.known_numbers import known_numbers
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, subtract_means
 from gsparc.models.powers.prior_map import PriorMap
 from gsparc.models.stack import shrunk_weights
-from gsparc.processes.censored import ConditionalGaussian
 from gsparc.processes.fit_kernel import LOOKS, NumberPrior, fit_kernel_by_evidence
 from gsparc.processes.kernel import ExponentialShadowing, Kernel, Shadowing
 from gsparc.processes.nearest import Nearest, choose_kernel_by_nearest
 from gsparc.processes.places import has_both_ends
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import PowerProcess, PowerRows, condition_on_powers
+from gsparc.processes.powers import PowerProcess, PowerRows, condition_on_powers, rows_in_doubt
 from gsparc.processes.prior import Prior
-from gsparc.processes.sectors import USUAL, Beam, sector_table
+from gsparc.processes.sectors import Beam, sector_table
 from gsparc.processes.term import Columns
 from gsparc.processes.trend import TINY_M, Law, Trend
 
@@ -38,9 +37,8 @@ LEVEL_DB = 20.0  # deviation of a level before any row
 LAW, SOUGHT, NONE = 3.0, 1.0, 1.0
 SHAPES = (ExponentialShadowing, 3.0), (Shadowing, 1.0)
 PLACE_NEEDS = 8  # rows that were heard, for a place that is sought
-LEARNED_ON = 500  # rows: numbers, and shares; of more the member of the largest share is alone
-NEAREST_FROM = 1_000  # rows, from which on numbers follow from nearest ones
-SILENT, LEAST_SILENT = 0.5, 30  # of these, for each row that was heard, and at least
+LEARNED_ON = 500  # rows: numbers, and shares
+NEAREST_FROM = 1_000  # rows, from which on shape and numbers follow from the nearest ones
 WALKED = 15  # looks of a member that begins where the first ended, of one that hears of silence
 MAP_PAYS = 0.05  # of the squared errors at rows left out that a map must take off
 
@@ -114,17 +112,16 @@ def learn_members(
         path, noise = shapes[0][0].length, shapes[0][0].noise
         ends = replace(Kernel.of_ends(path, path, noise), amplitude=shapes[0][0].amplitude)
         shapes = [shapes[0], (ends, SHAPES[0][1])]
-    members = [
-        Member(add_terms_to_trend(rest, trend, some), belief * weight, kernel, notes)
-        for some in dict.fromkeys((terms, sure))
-        for rest in (subtract_means(rows, some),)
-        for trend, belief, notes in means(rest, site, walls)
-        for kernel, weight in shapes
-    ]
+    members = []
+    for some in (terms, sure) if len(sure) < len(terms) else (terms,):
+        rest = subtract_means(rows, some)
+        for mean, belief, notes in means(rest, site, walls):
+            trend = add_terms_to_trend(rest, mean, some)
+            members += [Member(trend, belief * weight, kernel, notes) for kernel, weight in shapes]
     members = [learn_numbers(few, member, known, extent, LOOKS) for member in members]
     if rows.silent.any() and not rows.silent.all():
         part = rows.draw_subset(most, seed)
-        doubtful = select_doubtful(part, members[0].prior)
+        doubtful = rows_in_doubt(part, members[0].prior)
         members = [learn_numbers(doubtful, member, known, extent, WALKED) for member in members]
     return members
 
@@ -174,7 +171,7 @@ def means(rows: PowerRows, site: Site, walls: tuple[Columns, ...]) -> list[MeanL
     decades = law.decades(places)
     law = replace(law, level=level + 10 * exponent * float(decades.mean()))
     slope = 1 / (10 * unsure)
-    beams = site.every_station.beams[:, : len(USUAL)]
+    beams = site.every_station.beams
     if at is not None and not notes and np.isfinite(beams[0, 0]):
         beam = Beam(sector_table(beams[:1]), torch.tensor(at, dtype=torch.float64))
         walls = (*walls, replace(beam, middle=float(beam.loss(places).mean())))
@@ -202,21 +199,6 @@ def learn_numbers(
     return replace(member, kernel=kernel)
 
 
-def select_doubtful(rows: PowerRows, prior: Prior) -> PowerRows:
-    """Return rows that were heard, and half as many silent ones: those that these leave most in
-    doubt.
-    """
-    view = rows.view(prior.known_trend, prior.kernel)
-    gram, values = prior.kernel.amplitude * view.gram(prior.kernel), view.values[:, 0]
-    silent = torch.from_numpy(rows.silent)
-    most = max(round(SILENT * int((~rows.silent).sum())), LEAST_SILENT)
-    gaussian = ConditionalGaussian.from_gram(gram, values, silent)
-    doubt = torch.from_numpy(rows.side)[silent] * gaussian.z_score(values[silent])
-    used = ~rows.silent
-    used[np.flatnonzero(rows.silent)[doubt.argsort()[:most]]] = True
-    return rows.subset(np.flatnonzero(used))
-
-
 def weigh_members(
     rows: PowerRows, members: list[Member], seed: int, most: int = LEARNED_ON
 ) -> tuple[tuple[tuple[float, Prior], ...], tuple[str, ...]]:
@@ -237,23 +219,36 @@ def weigh_members(
         # Both were chosen on these rows: what a map gains by chance is no gain elsewhere.
         if ((errors @ shares) ** 2).mean() > (1 - MAP_PAYS) * ((errors @ alone) ** 2).mean():
             shares = alone
-    order = [k for k in np.argsort(-shares, kind="stable") if shares[k]]
-    if len(rows.places) > most:
-        member = members[order[0]]
-        if len(rows.places) > NEAREST_FROM and member.kernel.is_isotropic:
+    weighed = [(float(shares[k]), members[k]) for k in np.flatnonzero(shares)]
+    if len(rows.places) > NEAREST_FROM and not rows.silent.any():
+        weighed = _by_nearest(rows, weighed, seed)
+    weighed = sorted(weighed, key=lambda pair: -pair[0])
+    texts = [f"{share:.0%} of {member.description}" for share, member in weighed]
+    notes = dict.fromkeys(note for _, member in weighed for note in member.notes)
+    if len(weighed) == 1:
+        texts = [weighed[0][1].description]
+    return tuple((share, member.prior) for share, member in weighed), (*texts, *notes)
+
+
+def _by_nearest(
+    rows: PowerRows, weighed: list[tuple[float, Member]], seed: int
+) -> list[tuple[float, Member]]:
+    """A member for each mean, with a shape and numbers that rows say of others near them."""
+    result = []
+    for trend in {id(member.trend): member.trend for _, member in weighed}.values():
+        alike = [(share, member) for share, member in weighed if member.trend is trend]
+        member = max(alike, key=lambda pair: pair[0])[1]
+        if member.kernel.is_isotropic:
             kernel, how = choose_kernel_by_nearest(member.prior, rows.means_at_places(), seed)
             member = replace(member, kernel=kernel, notes=(*member.notes, f"then {how}"))
-        return ((1.0, member.prior),), (member.description, *member.notes)
-    if len(order) == 1:
-        member = members[order[0]]
-        return ((1.0, member.prior),), (member.description, *member.notes)
-    texts = [f"{shares[k]:.0%} of {members[k].description}" for k in order]
-    notes = dict.fromkeys(note for k in order for note in members[k].notes)
-    return tuple((float(shares[k]), members[k].prior) for k in order), (*texts, *notes)
+        result.append((sum(share for share, _ in alike), member))
+    return result
 
 
 def _left_out_errors(rows: PowerRows, prior: Prior, seed: int) -> np.ndarray:
     """Errors (n,) [dB] of rows that were heard, each predicted from all others."""
     posterior = condition_on_powers(rows, prior, seed)[0].posterior
     assert isinstance(posterior, Exact)
+    if rows.silent.all():
+        return np.zeros(0)
     return posterior.left_out_residuals().residual[posterior.extra == 0, 0].numpy()

@@ -194,9 +194,6 @@ class Mirrors:
         return visible_share(self.paths(sequences, *ends[:2]), self.clutter, self.planes).mean(1)
 
 
-WALL_DB = 10.0  # deviation of a wall's loss before any row
-
-
 def walls_in_frame(walls: SceneWalls, origin: np.ndarray, static_end: np.ndarray | None) -> Walls:
     """Return walls and boxes of a file for paths to the end that stands (3,) local [m]; None:
     both move.
@@ -208,7 +205,7 @@ def walls_in_frame(walls: SceneWalls, origin: np.ndarray, static_end: np.ndarray
     axes = torch.cat([normal[None], plane_tangents(planes).double()]).movedim(0, 1)
     corners = torch.cat([offset, patches.chunk(2, 1)[0]], 1)
     end = torch.from_numpy(np.zeros(0) if static_end is None else static_end).double()
-    return Walls(axes, corners, _side_lengths(patches), end, WALL_DB)
+    return Walls(axes, corners, _side_lengths(patches), end)
 
 
 def _side_lengths(patches: Tensor) -> Tensor:
