@@ -18,7 +18,7 @@ from gsparc.base.errors import DataError
 from gsparc.base.files import write_samples
 from gsparc.prediction.timing import peak_memory
 from gsparc.runs.open_runs import open_run
-from gsparc.runs.output import Call, Result, command, warn_of_held_out
+from gsparc.runs.output import Call, Result, command
 
 SUFFIXES = (".png", ".pdf", ".svg")  # of pictures
 
@@ -64,7 +64,6 @@ def task(call: Call) -> Result:
     run_dir, config, floor = call.folder, call.config, read_plan_settings(call.given)
     run = open_run(config.ckpt, call.given["dataset"])
     predictor = run.predictor
-    warn_of_held_out(predictor)
     how = PromiseSettings(**call.given["promise"])
     query = {
         "area": call.given["area"],

@@ -11,7 +11,7 @@ from gsparc.evaluation.summary import coordinates
 from gsparc.models import checkpoint
 from gsparc.models.per_station import UNHEARD
 from gsparc.runs.open_runs import open_run
-from gsparc.runs.output import Call, Result, command, warn_of_held_out
+from gsparc.runs.output import Call, Result, command
 
 
 @command()
@@ -22,7 +22,6 @@ def task(call: Call) -> Result:
         raise placing.unheard_stations_error(path)  # before the copies of all stations are restored
     run = open_run(path, call.given["dataset"])
     predictor = run.predictor
-    warn_of_held_out(predictor)
     where = {
         "area": call.given["area"],
         "height_m": config.height_m,

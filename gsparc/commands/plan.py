@@ -13,7 +13,7 @@ from gsparc.apps.maps.promise import read_or_gather
 from gsparc.commands.map import stations_of
 from gsparc.evaluation.summary import coordinates
 from gsparc.runs.open_runs import open_run
-from gsparc.runs.output import Call, Result, command, warn_of_held_out
+from gsparc.runs.output import Call, Result, command
 
 
 @command()
@@ -27,8 +27,6 @@ def task(call: Call) -> Result:
     # Before anything is measured there is no model, and places are spread over the area.
     run = None if config.ckpt is None else open_run(config.ckpt, call.given["dataset"])
     predictor = None if run is None else run.predictor
-    if predictor is not None:
-        warn_of_held_out(predictor)
     promise = None if run is None else read_or_gather(run, call.given)
     plan = plan_measurements(
         predictor,

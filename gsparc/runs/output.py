@@ -26,7 +26,6 @@ from gsparc.evaluation.summary import (
     write_summary,
 )
 from gsparc.evaluation.table import Table
-from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import machine_facts
 from gsparc.runs.settings import RunSettings, to_dict
 
@@ -115,19 +114,6 @@ def command(**limits: Limit) -> Callable[[Callable[[Call], Any]], Callable[..., 
         return task
 
     return decorate
-
-
-def warn_of_held_out(predictor: Predictor) -> None:
-    """Warn of rows that were held out for a test:
-    to a map they are places where nobody measured.
-    """
-    if count := predictor.extra.get("tested"):
-        log.warning(
-            "%d rows of its file were held out for the test and count as not measured here: "
-            "train the final "
-            "model with split=none",
-            count,
-        )
 
 
 def in_multirun() -> bool:

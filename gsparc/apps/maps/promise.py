@@ -158,6 +158,9 @@ def read_or_gather(
 ) -> Promise | None:
     """Return the evidence stored with a model, or gathered from its training data and then stored.
 
+    Rows that were held out for a test are warned of: to a map they are places where nobody
+    measured.
+
     Args:
         run: the model.
         settings: `promised`, without which there is none; `promise` of conf/map.yaml.
@@ -167,6 +170,12 @@ def read_or_gather(
         DataError: the training data are gone, or are others.
     """
     how = PromiseSettings(**settings["promise"])
+    if count := run.stored[0].extra.get("tested"):
+        log.warning(
+            "%d rows of its file were held out for the test and count as not measured here: "
+            "train the final model with split=none",
+            count,
+        )
     if not settings["promised"]:
         return None
     promise = None if renew else read_promise(run.stored[0].extra)
