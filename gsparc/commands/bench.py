@@ -9,10 +9,9 @@ import numpy as np
 from gsparc.base.limits import choice
 from gsparc.evaluation.table import Column, Table
 from gsparc.ops.backends import backend_named
-from gsparc.prediction.bench import Call as Timed
-from gsparc.prediction.bench import kernel_cases, loss_case, training_step_case
+from gsparc.prediction.bench import Call, kernel_cases, loss_case, training_step_case
 from gsparc.prediction.timing import ClockSettings, time_interleaved
-from gsparc.runs.output import Call, Result, command
+from gsparc.runs.output import CommandCall, Result, command
 
 COLUMNS = (
     Column("kernel", ""),
@@ -26,7 +25,7 @@ REFERENCE = ClockSettings(rounds=3, least=1, warmup=0, rounds_s=0.5)
 
 
 @command(device=choice("cpu", "cuda"))
-def task(call: Call) -> Result:
+def task(call: CommandCall) -> Result:
     """Time all kernels; the table is also `bench.csv`."""
     config, device = call.config, call.config.device
     clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, rounds_s=config.rounds_s)
@@ -55,6 +54,6 @@ def task(call: Call) -> Result:
     return Result(facts, [sheet])
 
 
-def median_s(call: Timed, clock: ClockSettings) -> float:
+def median_s(call: Call, clock: ClockSettings) -> float:
     """Return the median seconds of a call."""
     return float(np.median(time_interleaved({0: lambda turn: call()}, clock)[0])) / 1e3

@@ -16,13 +16,13 @@ from gsparc.prediction.confidence import Guarantee
 from gsparc.prediction.left_out import Evidence
 from gsparc.prediction.risk import SHARES, calibration_facts, explain_too_few, run_trials
 from gsparc.runs.open_runs import Unseen
-from gsparc.runs.output import Call, Result, command
+from gsparc.runs.output import CommandCall, Result, command
 
 log = logging.getLogger(__name__)
 
 
 @command()
-def task(call: Call) -> Result:
+def task(call: CommandCall) -> Result:
     """Gather, resample, write."""
     config, given = call.config, call.given
     opened = [Unseen.open(path, given["dataset"], given["split"]) for path in call.paths]

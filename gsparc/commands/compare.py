@@ -31,14 +31,14 @@ from gsparc.runs.experiment.table import (
     table_of,
     title_of,
 )
-from gsparc.runs.output import Call, command, show_result
+from gsparc.runs.output import CommandCall, command, show_result
 from gsparc.runs.run_lock import locked
 
 log = logging.getLogger(__name__)
 
 
 @command()
-def task(call: Call) -> pd.DataFrame:
+def task(call: CommandCall) -> pd.DataFrame:
     """Compare as conf/compare.yaml says, see `compare`."""
     return compare(call.given, call.folder)
 

@@ -16,7 +16,7 @@ from gsparc.pictures.plots import draw_sweep
 from gsparc.prediction.hearing import read_hearing
 from gsparc.runs.evaluate import Evaluation, evaluate
 from gsparc.runs.open_runs import open_run
-from gsparc.runs.output import Call, Result, command, tables_of
+from gsparc.runs.output import CommandCall, Result, command, tables_of
 
 
 def evaluate_files(
@@ -68,7 +68,7 @@ def evaluate_files(
 
 
 @command()
-def task(call: Call) -> Result:
+def task(call: CommandCall) -> Result:
     """Test checkpoints."""
     given, run_dir, paths = call.given, call.folder, call.paths
     how = {"eval_on": given["eval_on"], "baselines": given["baselines"]}

@@ -21,7 +21,7 @@ from gsparc.base.limits import POSITIVE, SettingError, choice, or_null, whole
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.placing import fill_heights, to_world
 from gsparc.prediction.predictor import Predictor
-from gsparc.runs.output import Call, Result, command
+from gsparc.runs.output import CommandCall, Result, command
 from gsparc.tables.query_places import read_query_places, read_times
 
 SOURCES = Path(gsparc.ops.__file__).parent / "csrc"
@@ -33,7 +33,7 @@ Facts = tuple[dict[str, Any], list[str]]
 
 
 @command(**LIMITS)
-def task(call: Call) -> Result:
+def task(call: CommandCall) -> Result:
     """Export, and say what is lost."""
     given, path = call.given, Path(call.given["ckpt"])
     out = Path(given["out"] or path.with_name(f"{path.stem}-{given['to']}"))

@@ -17,7 +17,7 @@ from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import write_summary
 from gsparc.evaluation.table import Column, Table
 from gsparc.runs.open_runs import open_run
-from gsparc.runs.output import Call, Result, command
+from gsparc.runs.output import CommandCall, Result, command
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +43,7 @@ BEAMS = (
 
 
 @command()
-def task(call: Call) -> Result:
+def task(call: CommandCall) -> Result:
     """Run all three experiments on one checkpoint."""
     # Before anything is read: rates and PUSCH are Sionna's.
     if find_spec("sionna") is None:

@@ -15,7 +15,7 @@ from gsparc.base.limits import (
     switch,
     whole,
 )
-from gsparc.runs.output import Call, Result, command
+from gsparc.runs.output import CommandCall, Result, command
 
 LIMITS = {
     "prior": choice("box", "trained"),
@@ -30,7 +30,7 @@ LIMITS = {
 
 
 @command(**LIMITS)
-def task(call: Call) -> Result:
+def task(call: CommandCall) -> Result:
     """Locate rows, as conf/locate.yaml says."""
     config = call.config
     for name in config.against:

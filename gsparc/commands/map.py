@@ -18,7 +18,7 @@ from gsparc.base.errors import DataError
 from gsparc.base.files import write_samples
 from gsparc.prediction.timing import peak_memory
 from gsparc.runs.open_runs import open_run
-from gsparc.runs.output import Call, Result, command
+from gsparc.runs.output import CommandCall, Result, command
 
 SUFFIXES = (".png", ".pdf", ".svg")  # of pictures
 
@@ -42,7 +42,7 @@ def _layers(field: FieldMap) -> list[Layer]:
     return [*list_layers(field), *change_layers(field)]
 
 
-def _pictures(call: Call, field: FieldMap) -> list[str]:
+def _pictures(call: CommandCall, field: FieldMap) -> list[str]:
     """Patterns of the files that layers are drawn to.
 
     Raises:
@@ -59,7 +59,7 @@ def _pictures(call: Call, field: FieldMap) -> list[str]:
 
 
 @command()
-def task(call: Call) -> Result:
+def task(call: CommandCall) -> Result:
     """Map, draw and write."""
     run_dir, config, floor = call.folder, call.config, read_plan_settings(call.given)
     run = open_run(config.ckpt, call.given["dataset"])

@@ -11,11 +11,11 @@ from gsparc.evaluation.summary import coordinates
 from gsparc.models import checkpoint
 from gsparc.models.per_station import UNHEARD
 from gsparc.runs.open_runs import open_run
-from gsparc.runs.output import Call, Result, command
+from gsparc.runs.output import CommandCall, Result, command
 
 
 @command()
-def task(call: Call) -> Result:
+def task(call: CommandCall) -> Result:
     """Try candidates, draw and write."""
     config, path = call.config, call.given["ckpt"]
     if str(UNHEARD) not in checkpoint.read(path).state.get("per_station", {str(UNHEARD): None}):

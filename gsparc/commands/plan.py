@@ -13,11 +13,11 @@ from gsparc.apps.maps.promise import read_or_gather
 from gsparc.commands.map import stations_of
 from gsparc.evaluation.summary import coordinates
 from gsparc.runs.open_runs import open_run
-from gsparc.runs.output import Call, Result, command
+from gsparc.runs.output import CommandCall, Result, command
 
 
 @command()
-def task(call: Call) -> Result:
+def task(call: CommandCall) -> Result:
     """Choose, draw and write."""
     config, stations, floor = (
         call.config,

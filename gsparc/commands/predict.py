@@ -7,11 +7,11 @@ from __future__ import annotations
 from gsparc.apps.maps.promise import read_promise
 from gsparc.prediction.answers import predict_file
 from gsparc.prediction.operating_point import load
-from gsparc.runs.output import Call, Result, command
+from gsparc.runs.output import CommandCall, Result, command
 
 
 @command()
-def task(call: Call) -> Result:
+def task(call: CommandCall) -> Result:
     """Predict at places of a table."""
     predictor = load(
         call.given["ckpt"], confidence=call.given["confidence"], unit=call.given["unit"]

@@ -13,11 +13,11 @@ from gsparc.evaluation.results import PROBLEM, frame, own_rows, read_columns, re
 from gsparc.pictures.drawing import PRINTED
 from gsparc.pictures.report.page import write_report
 from gsparc.runs.experiment.runner import time_again
-from gsparc.runs.output import Call, Result, command
+from gsparc.runs.output import CommandCall, Result, command
 
 
 @command()
-def task(call: Call) -> Result:
+def task(call: CommandCall) -> Result:
     """Write one page about runs."""
     config = call.config
     if OmegaConf.is_missing(config, "runs"):

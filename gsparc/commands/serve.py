@@ -15,7 +15,7 @@ from gsparc.base.limits import SettingError, whole
 from gsparc.evaluation.console import open_console
 from gsparc.models import checkpoint
 from gsparc.prediction.operating_point import load
-from gsparc.runs.output import Call, command
+from gsparc.runs.output import CommandCall, command
 
 
 def is_loopback(host: str) -> bool:
@@ -27,7 +27,7 @@ def is_loopback(host: str) -> bool:
 
 
 @command(port=whole(0, 65535))
-def task(call: Call) -> None:
+def task(call: CommandCall) -> None:
     """Serve until Ctrl-C or SIGTERM; requests under way are answered."""
     config = call.config
     token = config.token or os.environ.get("GSPARC_TOKEN")

@@ -13,7 +13,7 @@ from gsparc.base.instantiate import from_settings
 from gsparc.evaluation.console import open_console
 from gsparc.pictures import simulated
 from gsparc.prediction.timing import machine_facts
-from gsparc.runs.output import Call, Result, command
+from gsparc.runs.output import CommandCall, Result, command
 from gsparc.runs.run_lock import locked
 from gsparc.runs.settings import to_dict
 from gsparc.simulate.auto import AutoSettings
@@ -58,7 +58,7 @@ def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
 
 
 @command()
-def task(call: Call) -> Result | None:
+def task(call: CommandCall) -> Result | None:
     """Simulate, then table, summary and a floor plan; `scene=help` lists scenes."""
     config = call.config
     if config.scene.name == "help":

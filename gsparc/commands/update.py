@@ -20,7 +20,7 @@ from gsparc.prediction.operating_point import load
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.updating import LIMITS, ToldBefore, versions_extra
 from gsparc.runs.open_runs import read_like_stored
-from gsparc.runs.output import Call, Result, command
+from gsparc.runs.output import CommandCall, Result, command
 from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
@@ -31,7 +31,7 @@ COLUMNS = ("station", "kind", "since", "at", "change_db", "x", "y")
 
 
 @command(**LIMITS, **OWN_LIMITS)
-def task(call: Call) -> Result:
+def task(call: CommandCall) -> Result:
     """Condition a model on a file's rows, or go back."""
     config = call.config
     if (config.data is None) == (config.undo == 0):

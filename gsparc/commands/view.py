@@ -17,7 +17,7 @@ from gsparc.base.files import write_whole
 from gsparc.base.limits import whole
 from gsparc.prediction.query import read_place
 from gsparc.prediction.timing import peak_memory
-from gsparc.runs.output import Call, Result, command
+from gsparc.runs.output import CommandCall, Result, command
 
 log = logging.getLogger(__name__)
 
@@ -25,7 +25,7 @@ SAVED = (".html", ".ply")
 
 
 @command(port=whole(0, 65535))
-def task(call: Call) -> Result:
+def task(call: CommandCall) -> Result:
     """Serve until Ctrl-C, or write what `save` names."""
     config, save = call.config, None if call.config.save is None else Path(call.config.save)
     check(save)  # before model and data are read, which takes seconds

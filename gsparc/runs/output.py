@@ -29,7 +29,7 @@ from gsparc.evaluation.table import Table
 from gsparc.prediction.timing import machine_facts
 from gsparc.runs.settings import RunSettings, to_dict
 
-log = logging.getLogger(__name__)
+Task = Callable[..., Any]  # of a configuration, and of a folder other than Hydra's
 
 
 def run_directory() -> Path:
@@ -38,7 +38,7 @@ def run_directory() -> Path:
 
 
 @dataclass(frozen=True)
-class Call:
+class CommandCall:
     """What a command is called with.
 
     Attributes:
@@ -91,9 +91,10 @@ class Result:
         return whole
 
 
-def command(**limits: Limit) -> Callable[[Callable[[Call], Any]], Callable[..., Any]]:
-    """Make a function of a `Call` the task of a command: settings are checked before it, and its
-    `Result` is shown after it; returns the facts.
+def command(**limits: Limit) -> Callable[[Callable[[CommandCall], Any]], Task]:
+    """Make a function of a `CommandCall` the task of a command.
+
+    Settings are checked before it, its `Result` is shown after it; the task returns the facts.
 
     Args:
         **limits: of settings of its own.
@@ -102,12 +103,12 @@ def command(**limits: Limit) -> Callable[[Callable[[Call], Any]], Callable[..., 
         ValueError: a setting that cannot be.
     """
 
-    def decorate(work: Callable[[Call], Any]) -> Callable[..., Any]:
+    def decorate(work: Callable[[CommandCall], Any]) -> Task:
         @wraps(work)
         def task(config: DictConfig, folder: Path | None = None) -> Any:
             RunSettings.from_config(config)
             check_arguments(config, **limits)
-            call = Call(config, folder or run_directory())
+            call = CommandCall(config, folder or run_directory())
             result = work(call)
             return result.show(call.folder) if isinstance(result, Result) else result
 
