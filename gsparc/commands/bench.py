@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from itertools import product
+from typing import Any
 
 import numpy as np
+from omegaconf import DictConfig
 
-from gsparc.base.limits import choice
+from gsparc.base.limits import check_arguments, choice
 from gsparc.evaluation.table import Column, Table
 from gsparc.ops.backends import backend_named
 from gsparc.prediction.bench import Call, kernel_cases, loss_case, training_step_case
 from gsparc.prediction.timing import ClockSettings, time_interleaved
-from gsparc.runs.output import CommandCall, Result, command
+from gsparc.runs.output import Result, run_directory
 
 COLUMNS = (
     Column("kernel", ""),
@@ -24,11 +26,11 @@ COLUMNS = (
 REFERENCE = ClockSettings(rounds=3, least=1, warmup=0, rounds_s=0.5)
 
 
-@command(device=choice("cpu", "cuda"))
-def task(call: CommandCall) -> Result:
-    """Time all kernels; the table is also `bench.csv`."""
-    config, device = call.config, call.config.device
+def task(config: DictConfig) -> dict[str, Any]:
+    """Time all kernels, BLAS with its own threads; the table is also `bench.csv`."""
     clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, rounds_s=config.rounds_s)
+    check_arguments(config, device=choice("cpu", "cuda"))
+    device = config.device
     backend_named(device)  # where there is no such device, its reason comes first
     cases = [
         case
@@ -50,8 +52,8 @@ def task(call: CommandCall) -> Result:
         facts[f"bench/{name}/{size}/seconds"] = seconds
     note = "medians of warm calls; -: the dense tensors of plain PyTorch would be too large"
     sheet = Table("", COLUMNS, rows, note)
-    (call.folder / "bench.csv").write_text(sheet.csv(), encoding="utf-8")
-    return Result(facts, [sheet])
+    (run_directory() / "bench.csv").write_text(sheet.csv(), encoding="utf-8")
+    return Result(facts, [sheet]).show(run_directory())
 
 
 def median_s(call: Call, clock: ClockSettings) -> float:

@@ -44,7 +44,7 @@ def test_kernels_compute_what_their_references_do(projection):
 
 @pytest.mark.slow
 def test_the_table_has_a_ratio_where_there_is_a_reference(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("gsparc.runs.output.run_directory", lambda: tmp_path)
+    monkeypatch.setattr(bench, "run_directory", lambda: tmp_path)
     monkeypatch.setattr(
         bench,
         "training_step_case",
@@ -61,12 +61,12 @@ def test_the_table_has_a_ratio_where_there_is_a_reference(tmp_path, monkeypatch,
     assert (tmp_path / "bench.csv").read_text().count("\n") == 8
 
 
-def test_a_device_that_is_not_here_says_why(tmp_path):
+def test_a_device_that_is_not_here_says_why():
     reason = cuda_library.missing_device()
     if reason is None:
         pytest.skip("there is a GPU here")
     with pytest.raises(BackendUnavailable, match=re.escape(reason)):
-        bench.task(compose("counts=[20]", "device=cuda", config="bench"), tmp_path)
+        bench.task(compose("counts=[20]", "device=cuda", config="bench"))
 
 
 def test_another_device_is_no_traceback():
