@@ -106,7 +106,7 @@ class PowerField(ClosedForm):
             UserTerm.from_site(t, site).centre(torch.from_numpy(seen.places))
             for t in self.own_terms
         )
-        walls, remarks = (), list[str]()
+        walls, remarks = tuple[Columns, ...](), list[str]()
         if self.walls is not None:
             known = walls_in_frame(self.walls, site.origin, site.static_position)
             walls = (replace(known, loss_db=WALL_DB),)

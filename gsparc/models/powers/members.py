@@ -163,7 +163,7 @@ def means(rows: PowerRows, site: Site, walls: tuple[Columns, ...]) -> list[MeanL
             return [none]
         still, belief = locate_still_end(rows), SOUGHT
         notes = (f"the {ENDS[site.still_end]}'s place {say_estimated(still + site.origin)}",)
-    at = None if still is None else tuple(map(float, still))
+    at = None if still is None else (float(still[0]), float(still[1]), float(still[2]))
     (exponent, unsure), places = known_numbers().exponent, torch.from_numpy(rows.places)
     law = Law(0.0, exponent, TINY_M, 1.0, at)
     nearest = float(law.distance(places).min())
