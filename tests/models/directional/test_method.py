@@ -22,7 +22,7 @@ from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.mixture.candidates import CANDIDATES
 from gsparc.models.mixture.methods import ImageSources
 from gsparc.models.terms import EffectSettings
-from gsparc.runs.experiment.study import add_direction_errors
+from gsparc.runs.experiment.disturb import add_direction_errors
 from gsparc.training.context import FitContext
 
 
