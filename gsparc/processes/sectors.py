@@ -194,8 +194,8 @@ class Beam(Columns):
     """What the pattern of one sector takes off: about the listed one, more or less of it.
 
     >>> north = Beam(torch.tensor([[0.0, 0.0, 70.0, 10.0, 0.0]]), torch.zeros(3))
-    >>> north.mean(torch.tensor([[0.0, 1, 0], [0, -1, 0]]))  # ahead of it, and behind
-    tensor([ 0., -20.])
+    >>> north.loss(torch.tensor([[0.0, 1, 0], [0, -1, 0]])).float()  # ahead of it, and behind
+    tensor([ 0., 25.])
 
     Attributes:
         table: (1, 5) of it, see `Sectors`.
