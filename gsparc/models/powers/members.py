@@ -44,7 +44,7 @@ ASKED = 200  # places, whose error is foreseen
 MAP_PAYS = 0.05  # of the squared errors at rows left out that a map must take off
 
 
-class MeanLaw(NamedTuple):
+class LevelMean(NamedTuple):
     """A trend, its weight before any row, and what must be said of it."""
 
     trend: Trend
@@ -53,7 +53,7 @@ class MeanLaw(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Member:
+class PowerMember:
     """A process before any row.
 
     Attributes:
@@ -94,7 +94,7 @@ def learn_members(
     most: int = LEARNED_ON,
     terms: tuple[UserTerm, ...] = (),
     walls: tuple[Columns, ...] = (),
-) -> list[Member]:
+) -> list[PowerMember]:
     """Return members with the numbers that rows say, the most believed first.
 
     Args:
@@ -118,7 +118,9 @@ def learn_members(
         rest = subtract_means(rows, some)
         for mean, belief, notes in means(rest, site, walls):
             trend = add_terms_to_trend(rest, mean, some)
-            members += [Member(trend, belief * weight, kernel, notes) for kernel, weight in shapes]
+            members += [
+                PowerMember(trend, belief * weight, kernel, notes) for kernel, weight in shapes
+            ]
     members = [learn_numbers(few, member, known, extent, LOOKS) for member in members]
     if rows.silent.any() and not rows.silent.all():
         part = rows.draw_subset(most, seed)
@@ -145,7 +147,7 @@ def exponent_of(process: PowerProcess) -> float:
     return trend.law.exponent - float(slope) / (10 * trend.spread * trend.unit)
 
 
-def means(rows: PowerRows, site: Site, walls: tuple[Columns, ...]) -> list[MeanLaw]:
+def means(rows: PowerRows, site: Site, walls: tuple[Columns, ...]) -> list[LevelMean]:
     """Return what levels may be about, the law first.
 
     Args:
@@ -154,7 +156,7 @@ def means(rows: PowerRows, site: Site, walls: tuple[Columns, ...]) -> list[MeanL
         walls: further columns.
     """
     level = float(rows.heard_rows.decibels.mean())
-    none = MeanLaw(Trend(level, more=walls, level_db=LEVEL_DB), NONE)
+    none = LevelMean(Trend(level, more=walls, level_db=LEVEL_DB), NONE)
     still, notes, belief = site.static_position, tuple[str, ...](), LAW
     if has_both_ends(rows.places):
         still = None
@@ -177,12 +179,12 @@ def means(rows: PowerRows, site: Site, walls: tuple[Columns, ...]) -> list[MeanL
         beam = Beam(sector_table(beams[:1]), torch.tensor(at, dtype=torch.float64))
         walls = (*walls, replace(beam, middle=float(beam.loss(places).mean())))
     trend = Trend(0.0, law, float(decades.mean()), slope, walls, LEVEL_DB)
-    return [MeanLaw(trend, belief, notes), none]
+    return [LevelMean(trend, belief, notes), none]
 
 
 def learn_numbers(
-    rows: PowerRows, member: Member, known: NumberPrior, extent: float, looks: int
-) -> Member:
+    rows: PowerRows, member: PowerMember, known: NumberPrior, extent: float, looks: int
+) -> PowerMember:
     """Return the member with numbers of the largest evidence, beginning at its own.
 
     Args:
@@ -223,7 +225,7 @@ def foresee_errors(rows: PowerRows, site: Site, further: int, seed: int = 0) -> 
 
 
 def weigh_members(
-    rows: PowerRows, members: list[Member], seed: int, most: int = LEARNED_ON
+    rows: PowerRows, members: list[PowerMember], seed: int, most: int = LEARNED_ON
 ) -> tuple[tuple[tuple[float, Prior], ...], tuple[str, ...]]:
     """Return priors with their shares, the largest first, and what must be said of them.
 
@@ -254,8 +256,8 @@ def weigh_members(
 
 
 def _by_nearest(
-    rows: PowerRows, weighed: list[tuple[float, Member]], seed: int
-) -> list[tuple[float, Member]]:
+    rows: PowerRows, weighed: list[tuple[float, PowerMember]], seed: int
+) -> list[tuple[float, PowerMember]]:
     """A member for each mean, with a shape and numbers that rows say of others near them."""
     result = []
     for trend in {id(member.trend): member.trend for _, member in weighed}.values():
