@@ -1,4 +1,4 @@
-"""What few rows can tell of levels, before a training: the error that they leave, and more would."""
+"""What few rows can tell of levels before a training: the error they leave, and what more bring."""
 
 from __future__ import annotations
 
