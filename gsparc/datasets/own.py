@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gsparc.base.errors import DataError
+from gsparc.base.errors import DataError, Question
 from gsparc.base.instantiate import from_settings
 from gsparc.base.limits import finite_array, or_null, switch
 from gsparc.data.selection import Selection, take_selection
@@ -31,6 +31,7 @@ def read_own(
     path: str | Path,
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
+    guess: bool = False,
     **settings: Any,
 ) -> Raw:
     """Read a file of docs/reference/schema.md, or a table under the schema's names.
@@ -39,13 +40,14 @@ def read_own(
         path: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
         columns: of a table, by quantity, where the guess from their heads will not do.
         stations_file: of a table, a second one that lists the stations.
+        guess: whether the likeliest reading of what is open is taken.
         **settings: see `apply_settings`.
 
     Raises:
         DataError: bad input, or a file of another campaign.
         SettingError: see `apply_settings`.
     """
-    raw = apply_settings(read_file_or_table(path, columns, stations_file), **settings)
+    raw = apply_settings(read_file_or_table(path, columns, stations_file, guess), **settings)
     campaign = dataset_by_arrays(raw)
     if campaign is not None:
         raise DataError(
@@ -145,7 +147,7 @@ def read_any(path: str | Path, **settings: Any) -> Reading:
     """
     path = Path(path)
     part = from_settings(Selection, take_selection(settings), "dataset")
-    table = {name: settings.pop(name, None) for name in ("columns", "stations_file")}
+    table = {name: settings.pop(name, None) for name in ("columns", "stations_file", "guess")}
     # Releases before anything else: their folders may hold tables that look like one's own.
     release = dataset_by_path(path)
     if release is not None:
@@ -165,13 +167,18 @@ def read_any(path: str | Path, **settings: Any) -> Reading:
         if (campaign := dataset_by_arrays(raw)) is not None:
             raw, note = campaign.reader(path), f"this is a file of dataset={campaign.choice}"
     raw = replace(raw, notes=(*filter(None, [note]), *raw.notes))
-    return interpret(apply_settings(raw, **settings), path, part)
+    questions = [note for note in raw.notes if isinstance(note, Question)]
+    try:
+        return interpret(apply_settings(raw, **settings), path, part)
+    except DataError as error:
+        raise DataError([*questions, *error.problems], path) from None
 
 
 def read_file_or_table(
     path: str | Path,
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
+    guess: bool | None = False,
 ) -> Raw:
     """Read the arrays of a file of the schema, or of a table;
     notes say how its columns were understood.
@@ -188,4 +195,4 @@ def read_file_or_table(
         return read_raw(path)
     from gsparc.tables.read import parse_table  # here, as pandas takes half a second to import
 
-    return parse_table(path, columns or {}, stations_file)
+    return parse_table(path, columns or {}, stations_file, guess=bool(guess))

@@ -7,7 +7,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ import pandas as pd
 
 from gsparc.base.errors import Problems
 from gsparc.tables.heads import PERCENT, SHEET, UNITS, Unit
+from gsparc.tables.roles import Role
 
 NOT_HEARD = re.compile(SHEET["not_heard"])
 REPEATS = 3
@@ -43,6 +44,7 @@ class Sheet:
         marks: texts that stand for "not heard" among levels that were read, and how often each
             does.
         notes: how it was understood, for the user, one line each.
+        asked: takes roles that are open; None: they are refused.
     """
 
     source: str
@@ -52,6 +54,7 @@ class Sheet:
     problems: Problems = field(default_factory=lambda: Problems(""))
     marks: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
+    asked: list[Role] | None = None
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -72,6 +75,22 @@ class Sheet:
     def refuse(self, what: str, head: str | None = None) -> Any:
         """Note what is wrong with the table, or with a column; returns None."""
         return self.problems.add(self.source if head is None else self.describe_column(head), what)
+
+    def ask(self, role: Role) -> Any:
+        """Note a role that is open; returns None."""
+        role = replace(role, why=f"{self.source}: {role.why}")
+        return (
+            self.problems.append(role.question()) if self.asked is None else self.asked.append(role)
+        )
+
+    def is_open(self) -> bool:
+        """Tell whether anything is wrong, or open, so that nothing further can be said."""
+        return bool(self.problems or self.asked)
+
+    def first_cell(self, head: str) -> str:
+        """Return the first value of a column, and where it stands, for messages."""
+        rows = np.flatnonzero(self.words(head) != "")
+        return f"{self.words(head)[rows[0]]} in {self.rows[rows[0]]}" if len(rows) else "empty"
 
     def refuse_rows(self, head: str | None, rows: np.ndarray, what: str) -> Any:
         """Note `what` for rows (n,) of a column; returns None."""

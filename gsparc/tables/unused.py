@@ -12,7 +12,8 @@ from gsparc.tables.checks.column_effects import (
     find_effects,
     find_filled,
 )
-from gsparc.tables.columns import Chosen, say_column, used_heads
+from gsparc.tables.columns import Chosen, used_heads
+from gsparc.tables.roles import say_column
 from gsparc.tables.sheet import Sheet
 
 

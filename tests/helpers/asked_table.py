@@ -37,7 +37,7 @@ def files(folder: Path) -> Iterator[tuple[str, Path, dict]]:
 def outcome(path: Path, settings: dict) -> tuple[str, str]:
     """`read`, `asked` or `refused`, and the first question or problem."""
     try:
-        notes = read_any(path, **settings).notes
+        notes = read_any(path, **settings, guess=True).notes
     except DataError as error:
         return "refused", error.problems[0].replace(f"{path.parent}/", "")
     questions = [note for note in notes if type(note).__name__ == "Question"]
