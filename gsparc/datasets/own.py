@@ -11,6 +11,7 @@ from typing import Any
 from gsparc.base.errors import DataError, Question
 from gsparc.base.instantiate import from_settings
 from gsparc.base.limits import finite_array, or_null, switch
+from gsparc.data.schema import Measurements
 from gsparc.data.selection import Selection, take_selection
 from gsparc.datasets.ble import BLE
 from gsparc.datasets.campaign import Campaign
@@ -74,8 +75,9 @@ def apply_settings(
         not_heard: levels that mean that nothing was heard; None: those that stand apart from all
             others.
         absent: `silent`: a station without a level at a place where others have one was not heard
-            there; `auto`: one that a list of the strongest leaves out is below its weakest, levels
-            that are missing beside weak ones alone are below their station's; `unknown`: neither.
+            there; `weaker`: one that a list of the strongest leaves out is below its weakest, levels
+            that are missing beside weak ones alone are below their station's; `auto`: the same, but
+            the last is asked where no row names the pair; `unknown`: neither.
         saturation_db: level [dB] from which on powers are at least that; `auto`: the highest where
             it repeats; `none`: there is none.
         tx_position: of a transmitter that stood still, where the file does not say it [m].
@@ -108,6 +110,22 @@ class Own(Campaign):
     choice, reader = "own", staticmethod(read_own)
     # Arguments of `apply_settings` but its data and its conventions, which are listed by name.
     switches = tuple(inspect.signature(apply_settings).parameters)[1:-1] + tuple(CONVENTIONS)
+
+    def raw(self) -> Raw:
+        """Read the file; answers to its questions are kept."""
+        raw = super().raw()
+        self.said = raw.said
+        return raw
+
+    def load(self) -> Measurements:
+        """Read, and stop where readings differ that nothing decides,
+        unless training was answered.
+        """
+        data = super().load()
+        questions = [note for note in self.notes if isinstance(note, Question)]
+        if questions and not (self.settings.get("guess") or self.told):
+            raise DataError(questions, self.file)
+        return data
 
 
 CAMPAIGNS: tuple[type[Campaign], ...] = (Techtile, Powder, BLE, NeWRF, TechtilePower, WSR, WifiCsi)

@@ -88,6 +88,9 @@ def _data(config: DictConfig, known: Measurements | None) -> DataModule:
     if known is not None:
         module.measurements = known
     module.measurements  # noqa: B018 (read now, so that errors show the path that was typed)
+    # As they were answered: other files are read so, too
+    for quantity, column in module.said.items():
+        OmegaConf.update(config, f"dataset.columns.{quantity}", column, force_add=True)
     for key in ("root", "file"):  # absolute, so that a checkpoint finds its data from any folder
         location = None if OmegaConf.is_missing(config.dataset, key) else config.dataset.get(key)
         if location:

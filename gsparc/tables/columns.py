@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 import math
 import re
 from collections.abc import Container, Iterable, Mapping, Sequence
@@ -28,6 +27,7 @@ from gsparc.tables.heads import (
 )
 from gsparc.tables.roles import NONE, Answer, Role, Sure, say_column
 from gsparc.tables.sheet import Sheet
+from gsparc.tables.slots import ranked_names
 from gsparc.tables.times import find_times
 
 MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in heads.LEVELS), CHANNELS, POLAR)
@@ -193,6 +193,8 @@ def choose_columns(
         if doubted or (len(candidates) > 1 and not several and not exact):
             _ask_which(sheet, role, candidates)
             continue
+        if several and role in heads.LEVELS and _ask_ranks(sheet, role, candidates):
+            continue
         chosen[role] = tuple(candidates) if several else tuple((exact or candidates)[:1])
         if not exact or several:
             sheet.notes.append(_note(chosen[role]))
@@ -255,7 +257,7 @@ def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Colu
 
 MAC = re.compile(r"(?i)(?<![0-9a-f])(?:[0-9a-f]{2}[:-]){5}[0-9a-f]{2}(?![0-9a-f])")
 # With a number behind the word: `AP1` is a station's levels, `ap` a column of their names.
-NAMED = re.compile(rf"(?i)^[\W_]*({_STATIONS}|beam|ssb)[\W_]*[a-z]?\d+[\W_]*$")
+NAMED = re.compile(rf"(?i)^[\W_]*({_STATIONS}|beam|ssb|mac)[\W_]*[a-z]?\d+[\W_]*$")
 
 
 def _wide_survey(sheet: Sheet, chosen: Chosen) -> None:
@@ -298,6 +300,26 @@ def name_block(sheet: Sheet, names: Sequence[str]) -> object:
     if len(names) > 2 and sheet.heads[first : first + len(names)] == tuple(names):
         return f"{names[0]}...{names[-1]}"
     return [*names] if len(names) > 1 else names[0]
+
+
+def _ask_ranks(sheet: Sheet, role: str, columns: Sequence[Column]) -> bool:
+    """Ask whether numbers of levels are ranks, where columns beside them hold names; whether so."""
+    found = [(re.findall(r"\d+", column.label), column.head or "") for column in columns]
+    if sheet.asked is None or any(len(numbers) != 1 for numbers, _ in found):
+        return False
+    numbered = {numbers[0]: head for numbers, head in found}
+    if (names := ranked_names(sheet, numbered)) is None:
+        return False
+    levels = _pattern([*columns])
+    why = f"columns {names!r} hold names beside the levels of {levels!r}: are these the stations, "
+    why += "or the numbers"
+    block = name_block(sheet, [*numbered.values()])
+    readings = (
+        Answer({"station": names, role: levels}, "lists of the strongest"),
+        Answer({role: block}, "a station each"),
+    )
+    sheet.ask(Role(tuple(numbered.values()), role, "seen", readings=readings, why=why))
+    return True
 
 
 def _means(sheet: Sheet, way: object) -> str:
@@ -373,12 +395,8 @@ def _named_columns(sheet: Sheet, role: str, text: str) -> tuple[Column, ...]:
         begin, end = sheet.heads.index(first), sheet.heads.index(last)
         listed = sheet.heads[begin : end + 1]
         return tuple(Column(role, _label(head), _unit(head, role), head=head) for head in listed)
-    # A pattern has one star: what it stands for in a head is the name of the station or tone.
+    labels = {h: unit_of(l)[0].strip() for h, l in heads.match_pattern(text, sheet.heads).items()}
     before, _, after = text.partition("*")
-    named = [head for head in sheet.heads if fnmatch.fnmatchcase(head, text)] * (
-        text.count("*") == 1
-    )
-    labels = {h: unit_of(h[len(before) : len(h) - len(after)])[0].strip() for h in named}
     # `MAC1` is a name, `RSSI_1` a level of the station 1.
     whole = role in heads.LEVELS and not LISTS["level"] & {*words_of(before + " " + after)}
     labels = {h: h if whole and label.isdigit() else label for h, label in labels.items()}

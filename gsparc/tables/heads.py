@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any
@@ -101,6 +102,19 @@ def station_in_head(text: str) -> str:
     if head.role in LEVELS:
         return head.label
     return re.sub(rf"(?i)^[\W_]*(?:{'|'.join(STATION_WORDS)})[\W_]+", "", unit_of(text)[0]).strip()
+
+
+def match_pattern(pattern: str, names: Iterable[str]) -> dict[str, str]:
+    """Return what the one `*` of a pattern stands for, by the heads that it names.
+
+    >>> match_pattern("RSSI_*", ["x", "RSSI_a", "RSSI_b"])
+    {'RSSI_a': 'a', 'RSSI_b': 'b'}
+    """
+    before, star, after = pattern.partition("*")
+    fits = [name for name in names if name.startswith(before) and name.endswith(after)]
+    one = star and "*" not in after
+    long = len(before) + len(after)
+    return {n: n[len(before) : len(n) - len(after)] for n in fits if one and len(n) > long}
 
 
 def unit_suits(role: str, unit: Unit) -> bool:

@@ -84,7 +84,8 @@ def _build(
     sheet: Sheet, columns: Said, listed: StationList | None, stations: Collection[str]
 ) -> Raw | None:
     """The arrays; None where something is wrong, or open."""
-    sheet = unfold_tones(unfold_slots(sheet, {str(value) for value in columns.values()}))
+    sheet, columns = unfold_slots(sheet, columns)
+    sheet = unfold_tones(sheet)
     # The list of stations comes before the columns:
     # heads that hold its names are levels of stations.
     labelled: dict[str, str] = {}
