@@ -46,6 +46,7 @@ def check(
     from gsparc.datasets.own import read_any
     from gsparc.models.powers.together.network import check_azimuths
     from gsparc.tables.checks.array_layout import carrier_warnings, layout_warnings
+    from gsparc.tables.columns_file import write_columns
 
     try:
         # Read on with the likeliest of what is open, so that all that is open is said.
@@ -63,6 +64,8 @@ def check(
     warnings = outlier_warnings(reading.data) + doubtful
     warnings += layout_warnings(reading.data) + carrier_warnings(reading.data) + implausible
     topics = describe(reading.data)
+    if reading.raw is not None and reading.raw.roles:
+        topics += [("columns", write_columns(path, reading.raw.roles, reading.raw.heads))]
     topics += [("note", note) for note in notes if not isinstance(note, Caution)]
     if any(" row " in warning for warning in warnings):
         topics += [("rows", "are counted from 0, as by split.leave_out and dataset.level_steps")]

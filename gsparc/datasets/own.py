@@ -33,6 +33,7 @@ def read_own(
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
     guess: bool = False,
+    columns_file: str | Path | None = None,
     **settings: Any,
 ) -> Raw:
     """Read a file of docs/reference/schema.md, or a table under the schema's names.
@@ -42,13 +43,15 @@ def read_own(
         columns: of a table, by quantity, where the guess from their heads will not do.
         stations_file: of a table, a second one that lists the stations.
         guess: whether the likeliest reading of what is open is taken.
+        columns_file: of a table, that says what its columns are.
         **settings: see `apply_settings`.
 
     Raises:
         DataError: bad input, or a file of another campaign.
         SettingError: see `apply_settings`.
     """
-    raw = apply_settings(read_file_or_table(path, columns, stations_file, guess), **settings)
+    table = columns, stations_file, guess, columns_file
+    raw = apply_settings(read_file_or_table(path, *table), **settings)
     campaign = dataset_by_arrays(raw)
     if campaign is not None:
         raise DataError(
@@ -128,6 +131,7 @@ class Own(Campaign):
         return data
 
 
+TABLE = ("columns", "stations_file", "guess", "columns_file")  # settings of tables
 CAMPAIGNS: tuple[type[Campaign], ...] = (Techtile, Powder, BLE, NeWRF, TechtilePower, WSR, WifiCsi)
 
 
@@ -165,7 +169,7 @@ def read_any(path: str | Path, **settings: Any) -> Reading:
     """
     path = Path(path)
     part = from_settings(Selection, take_selection(settings), "dataset")
-    table = {name: settings.pop(name, None) for name in ("columns", "stations_file", "guess")}
+    table = {name: settings.pop(name, None) for name in TABLE}
     # Releases before anything else: their folders may hold tables that look like one's own.
     release = dataset_by_path(path)
     if release is not None:
@@ -187,7 +191,7 @@ def read_any(path: str | Path, **settings: Any) -> Reading:
     raw = replace(raw, notes=(*filter(None, [note]), *raw.notes))
     questions = [note for note in raw.notes if isinstance(note, Question)]
     try:
-        return interpret(apply_settings(raw, **settings), path, part)
+        return replace(interpret(apply_settings(raw, **settings), path, part), raw=raw)
     except DataError as error:
         raise DataError([*questions, *error.problems], path) from None
 
@@ -197,6 +201,7 @@ def read_file_or_table(
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
     guess: bool | None = False,
+    columns_file: str | Path | None = None,
 ) -> Raw:
     """Read the arrays of a file of the schema, or of a table;
     notes say how its columns were understood.
@@ -206,11 +211,10 @@ def read_file_or_table(
     """
     if not is_table(path):
         named = any(value is not None for value in (columns or {}).values())
-        for name in [
-            name for name, entry in (("columns", named), ("stations_file", stations_file)) if entry
-        ]:
+        given = zip(TABLE, (named, stations_file, False, columns_file), strict=True)
+        for name in [name for name, entry in given if entry]:
             raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
         return read_raw(path)
     from gsparc.tables.read import parse_table  # here, as pandas takes half a second to import
 
-    return parse_table(path, columns or {}, stations_file, guess=bool(guess))
+    return parse_table(path, columns or {}, stations_file, (), bool(guess), columns_file)

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,7 @@ from gsparc.tables.heads import (
     unit_suits,
     words_of,
 )
-from gsparc.tables.roles import NONE, Answer, Role, Sure, say_column
+from gsparc.tables.roles import NONE, Answer, Role, Said, Sure, say_column, say_quantity
 from gsparc.tables.sheet import Sheet
 from gsparc.tables.slots import ranked_names
 from gsparc.tables.times import find_times
@@ -45,6 +46,7 @@ STATION = re.compile(
 )
 MOST_LOOKED_AT = 10_000  # rows, for columns that may be levels
 BY_ROW = "#"  # in place of a head: the number of the row; before heads: of what they hold together
+MOST_SHOWN = 3  # values of a column
 REPEATED = 4  # rows for each name of a column that may hold stations
 
 
@@ -111,6 +113,26 @@ class Column(Head):
 
 
 Chosen = dict[str, tuple[Column, ...]]
+
+
+def list_roles(sheet: Sheet, chosen: Chosen, said: Said) -> list[Role]:
+    """Return what all columns are taken for, in the order of quantities; like ones as one."""
+    roles = []
+    for quantity, columns in chosen.items():
+        names = [column.head for column in columns if column.head]
+        text = said.get(quantity, said.get(say_quantity(quantity)))
+        if text is None and names:
+            text = "+".join(names) if columns[0].label == JOINED else name_block(sheet, names)
+        unit = columns[0].unit.name if columns[0].unit else columns[0].schema_unit
+        unit = unit if KINDS[quantity] in SCHEMA else ""
+        role = Role(tuple(names), quantity, columns[0].sure, unit, column=text)
+        roles.append(replace(role, values=sheet.first_words(names, MOST_SHOWN)))
+    rest = [head for head in sheet.heads if head not in used_heads(chosen)]
+    for _, group in groupby(rest, lambda head: re.sub(r"\d+", "*", head)):
+        names = [*group]
+        role = Role(tuple(names), "", "usual", column=name_block(sheet, names))
+        roles.append(replace(role, values=sheet.first_words(names, MOST_SHOWN)))
+    return roles
 
 
 def used_heads(chosen: Chosen) -> set[str | None]:
@@ -204,7 +226,11 @@ def choose_columns(
     _one_unit(sheet, chosen)
     if only is None and not sheet.asked:
         _wide_survey(sheet, chosen)
-    if only is None and "time_s" not in chosen and any(role in chosen for role in heads.MANY):
+    if (
+        only is None
+        and "time_s" not in {*chosen, *settled}
+        and any(role in chosen for role in heads.MANY)
+    ):
         timed = tuple(Column("time_s", head=head) for head in find_times(sheet, used_heads(chosen)))
         chosen |= {"time_s": timed} if timed else {}
     used = used_heads(chosen)
@@ -358,7 +384,7 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
         return (Column(role, text.removeprefix(BY_ROW)),)
     if isinstance(value, Sequence) and not isinstance(value, str):  # of stations each
         listed = [column for text in value for column in _by_setting(sheet, key, text)]
-        return tuple(replace(c, label=_label(c.head or "")) for c in listed)
+        return tuple(replace(c, label=_label(c.head or "", role)) for c in listed)
     head = _head(sheet, text)
     if head is not None:
         return (Column(role, unit=_unit(head, role), head=head),)
@@ -394,7 +420,7 @@ def _named_columns(sheet: Sheet, role: str, text: str) -> tuple[Column, ...]:
     if dots and {first, last} <= {*sheet.heads}:
         begin, end = sheet.heads.index(first), sheet.heads.index(last)
         listed = sheet.heads[begin : end + 1]
-        return tuple(Column(role, _label(head), _unit(head, role), head=head) for head in listed)
+        return tuple(Column(role, _label(h, role), _unit(h, role), head=h) for h in listed)
     labels = {h: unit_of(l)[0].strip() for h, l in heads.match_pattern(text, sheet.heads).items()}
     before, _, after = text.partition("*")
     # `MAC1` is a name, `RSSI_1` a level of the station 1.
@@ -403,8 +429,9 @@ def _named_columns(sheet: Sheet, role: str, text: str) -> tuple[Column, ...]:
     return tuple(Column(role, label, _unit(h, role), head=h) for h, label in labels.items())
 
 
-def _label(head: str) -> str:
-    return heads.station_in_head(head) or head
+def _label(head: str, role: str) -> str:
+    station = role in heads.LEVELS
+    return heads.station_in_head(head) or head if station else heads.parse_head(head).label
 
 
 def _sum_of_columns(sheet: Sheet, role: str, text: str) -> Column | None:

@@ -68,6 +68,8 @@ class Raw:
         explain: what there is to say of the measurements that these became, and (S,) the row of
             each, from 0.
         said: of a table, its columns by quantity, as `dataset.columns` and answers say.
+        roles: of a table's columns (`gsparc.tables.roles`).
+        heads: of a table.
     """
 
     arrays: dict[str, np.ndarray]
@@ -76,6 +78,8 @@ class Raw:
     notes: tuple[str, ...] = ()
     explain: Callable[[Any, np.ndarray], list[str]] = lambda data, file_row: []
     said: Mapping[str, object] = field(default_factory=dict)
+    roles: tuple[Any, ...] = ()
+    heads: tuple[str, ...] = ()
 
 
 def read_raw(path: str | Path) -> Raw:

@@ -23,10 +23,12 @@ from gsparc.tables.columns import (
     Chosen,
     Column,
     choose_columns,
+    list_roles,
     name_block,
     name_columns,
     used_heads,
 )
+from gsparc.tables.columns_file import beside, is_edited, read_columns
 from gsparc.tables.links.stations import PER_STATION
 from gsparc.tables.opening import read_sheet
 from gsparc.tables.own_checks import LOWEST_HZ, MOST_DB
@@ -45,6 +47,7 @@ def parse_table(
     stations_file: str | Path | None = None,
     stations: Collection[str] = (),
     guess: bool = False,
+    columns_file: str | Path | None = None,
 ) -> Raw:
     """Read the arrays of a table; notes say what was guessed.
 
@@ -55,6 +58,8 @@ def parse_table(
         stations_file: a second table: name, x, y, z or latitude, longitude, height of each station.
         stations: names in place of such a list: where heads hold them, no others are levels.
         guess: whether the likeliest reading of what is open is taken, and noted.
+        columns_file: that says what columns are (`columns_file`); None: the one beside the table,
+            if somebody edited it.
 
     Raises:
         DataError: all questions and problems, with row and column.
@@ -73,17 +78,27 @@ def parse_table(
         raw = _build(fresh, said, listed, stations)
         return raw, asked, tuple(fresh.problems)
 
-    settled = settle(build, {key: value for key, value in columns.items() if value is not None})
-    questions = [role.question() for role in settled.asked]
+    said: dict[str, object] = {}
+    about = beside(path) if columns_file is None else Path(columns_file)
+    if columns_file is not None or (about.exists() and is_edited(about)):
+        said |= read_columns(about, sheet.heads)
+        sheet.notes.append(f"columns are what {about} says")
+    given = {key: value for key, value in columns.items() if value is not None}
+    said |= {heads.OTHER_NAMES.get(key, key): value for key, value in given.items()}
+    settled = settle(build, said)
+    questions, raw = [role.question() for role in settled.asked], settled.raw
     if questions and not guess:
         raise DataError(questions, path)
-    return replace(settled.raw, notes=(*questions, *settled.raw.notes), said=settled.said)
+    roles = (*settled.asked, *raw.roles)
+    notes = (*questions, *raw.notes)
+    return replace(raw, notes=notes, said=settled.said, roles=roles, heads=sheet.heads)
 
 
 def _build(
     sheet: Sheet, columns: Said, listed: StationList | None, stations: Collection[str]
 ) -> Raw | None:
     """The arrays; None where something is wrong, or open."""
+    given = columns
     sheet, columns = unfold_slots(sheet, columns)
     sheet = unfold_tones(sheet)
     # The list of stations comes before the columns:
@@ -115,7 +130,8 @@ def _build(
     ):
         about["unit"] = power.unit.name
     explain = partial(say_effects, sheet, chosen)
-    return Raw(arrays, about, notes=tuple(sheet.notes), explain=explain)
+    roles = tuple(list_roles(sheet, chosen, given))
+    return Raw(arrays, about, notes=tuple(sheet.notes), explain=explain, roles=roles)
 
 
 def _name_levels(sheet: Sheet, stations: Collection[str]) -> tuple[Sheet, dict[str, str]]:
@@ -402,7 +418,8 @@ class Builder:
             # The end without a name is whichever the named one is not; unsaid, it is the receiver.
             moving = "tx" if named == ["rx_"] else "rx"
             station = self.chosen.get("station") or self.chosen.get("station_x") or ()
-            if not named and station and station[0].word in heads.LISTS["hearing"]:
+            words = {*heads.words_of(station[0].head or "")} if station else set()
+            if not named and words & heads.LISTS["hearing"]:
                 moving = "tx"
             if not named:
                 other = "tx" if moving == "rx" else "rx"
@@ -649,7 +666,7 @@ class Builder:
         # GHz are below 100.
         if (
             column.unit is None
-            and column.word
+            and column.head
             and np.nanmin(values) >= 100
             and np.nanmax(values) < LOWEST_HZ
         ):

@@ -46,6 +46,8 @@ class Role:
         unit: of the values as they are written.
         readings: that fit, the likeliest first; none where it is decided.
         why: what is open, for a question.
+        column: the columns, as `dataset.columns` takes them.
+        values: the first ones, as they are written.
     """
 
     heads: tuple[str, ...]
@@ -54,10 +56,17 @@ class Role:
     unit: str = ""
     readings: tuple[Answer, ...] = ()
     why: str = ""
+    column: object = ""
+    values: tuple[str, ...] = ()
 
     def question(self) -> Question:
         """Return one line: what is open, and the settings that answer it."""
         return Question(f"{self.why}? say {', or '.join(map(str, self.readings))}")
+
+
+def say_quantity(role: str) -> str:
+    """Return what settings call a quantity."""
+    return role.replace("latitude", "lat").replace("longitude", "lon")
 
 
 def say_column(role: str, text: object) -> str:
@@ -68,7 +77,7 @@ def say_column(role: str, text: object) -> str:
     >>> print(say_column("rssi_db", ["A", "B"]))
     'dataset.columns.rssi_db=["A","B"]'
     """
-    name = role.replace("latitude", "lat").replace("longitude", "lon")
+    name = say_quantity(role)
     if isinstance(text, list | tuple):
         listed = ",".join(f'"{head}"' for head in text)
         return f"'dataset.columns.{name}=[{listed}]'"

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -86,6 +86,10 @@ class Sheet:
     def is_open(self) -> bool:
         """Tell whether anything is wrong, or open, so that nothing further can be said."""
         return bool(self.problems or self.asked)
+
+    def first_words(self, heads: Sequence[str], count: int) -> tuple[str, ...]:
+        """Return the first cells of the first of columns."""
+        return tuple(self.words(heads[0])[:count].tolist()) if heads else ()
 
     def first_cell(self, head: str) -> str:
         """Return the first value of a column, and where it stands, for messages."""
