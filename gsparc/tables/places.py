@@ -15,8 +15,8 @@ from gsparc.tables.columns import BY_ROW, Chosen, choose_columns, rename_for_sta
 from gsparc.tables.heads import AXES, ENDS, LISTS, OTHER_NAMES, TOGETHER, parse_head, words_of
 from gsparc.tables.links.stations import PER_STATION, SECTOR
 from gsparc.tables.opening import read_sheet
-from gsparc.tables.sectors import TILTS, number_sites, read_sectors, sector_quantity
 from gsparc.tables.roles import say_column
+from gsparc.tables.sectors import TILTS, number_sites, read_sectors, sector_quantity
 from gsparc.tables.sheet import Sheet
 
 UNKNOWN_HEIGHT = 0.0

@@ -17,6 +17,7 @@ from gsparc.base.errors import Caution, DataError, Problems, list_first, suggest
 from gsparc.data.schema import ENDS, OTHER
 from gsparc.data.units import UNITS, WATTS
 from gsparc.tables import heads, places
+from gsparc.tables.advice import advise
 from gsparc.tables.amplitudes import join_polar
 from gsparc.tables.columns import (
     JOINED,
@@ -38,7 +39,6 @@ from gsparc.tables.roles import Answer, Role, Said, say_column, settle
 from gsparc.tables.sheet import MEASURED, Sheet
 from gsparc.tables.slots import unfold_slots, unfold_tones
 from gsparc.tables.times import read_times
-from gsparc.tables.unused import say_effects
 
 
 def parse_table(
@@ -98,7 +98,7 @@ def _build(
     sheet: Sheet, columns: Said, listed: StationList | None, stations: Collection[str]
 ) -> Raw | None:
     """The arrays; None where something is wrong, or open."""
-    given = columns
+    given, whole = columns, sheet
     sheet, columns = unfold_slots(sheet, columns)
     sheet = unfold_tones(sheet)
     # The list of stations comes before the columns:
@@ -129,7 +129,12 @@ def _build(
         and not power.unit.times
     ):
         about["unit"] = power.unit.name
-    explain = partial(say_effects, sheet, chosen)
+
+    def reads(said: Said) -> Raw | None:
+        again = replace(whole, problems=Problems(sheet.source), notes=[], asked=[])
+        return _build(again, {**given, **said}, listed, stations)
+
+    explain = partial(advise, sheet, chosen, reads)
     roles = tuple(list_roles(sheet, chosen, given))
     return Raw(arrays, about, notes=tuple(sheet.notes), explain=explain, roles=roles)
 

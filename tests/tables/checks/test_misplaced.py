@@ -8,7 +8,7 @@ import pytest
 from level_fields import fields, flight
 from networks import network
 
-from gsparc.tables.checks.column_effects import run_warnings
+from gsparc.tables.advice import run_warnings
 from gsparc.tables.checks.link_levels import LinkLevels, link_levels
 from gsparc.tables.checks.misplaced import misplaced_warnings
 from gsparc.tables.own import from_arrays
