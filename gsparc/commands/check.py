@@ -39,6 +39,8 @@ def check(
         draw: PNG file for a map; None draws none.
     """
     # Here: they bring torch, which --help does not need.
+    import numpy as np
+
     from gsparc.data.outliers import outlier_warnings
     from gsparc.datasets.campaign import find_implausible
     from gsparc.datasets.describe import describe
@@ -58,7 +60,10 @@ def check(
             _line(console, line)
         return False
     implausible, levels, steps = find_implausible(reading.data, reading.file_row, most=math.inf)
-    notes = [*reading.notes, *check_azimuths(reading.data)]
+    stations, heights = reading.data.site.every_station, reading.data.moving[:, 2::3]
+    # Where no azimuth is given there is none to contradict
+    aimed = np.isfinite(stations.sector[:, 0]).any() if stations.sector is not None else False
+    notes = [*reading.notes, *(check_azimuths(reading.data) if aimed else ())]
     questions = [note for note in notes if isinstance(note, Question)]
     doubtful = [note for note in notes if isinstance(note, Caution) and note not in questions]
     warnings = outlier_warnings(reading.data) + doubtful
@@ -69,7 +74,6 @@ def check(
     topics += [("note", note) for note in notes if not isinstance(note, Caution)]
     if any(" row " in warning for warning in warnings):
         topics += [("rows", "are counted from 0, as by split.leave_out and dataset.level_steps")]
-    stations, heights = reading.data.site.every_station, reading.data.moving[:, 2::3]
     if (abs(stations.beams[:, 1]) > 0).any():
         # Of beams that point down nothing is known where both ends are at one height.
         warnings += [] if stations.position[:, 2].any() or heights.any() else [TILTED]
