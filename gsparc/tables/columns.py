@@ -226,6 +226,7 @@ def choose_columns(
     _one_unit(sheet, chosen)
     if only is None and not sheet.asked:
         _wide_survey(sheet, chosen)
+        _ask_phase(sheet, chosen)
     if (
         only is None
         and "time_s" not in {*chosen, *settled}
@@ -346,6 +347,24 @@ def _ask_ranks(sheet: Sheet, role: str, columns: Sequence[Column]) -> bool:
     )
     sheet.ask(Role(tuple(numbered.values()), role, "seen", readings=readings, why=why))
     return True
+
+
+def _ask_phase(sheet: Sheet, chosen: Chosen) -> None:
+    """Ask whether a level beside a phase is the amplitude of a channel."""
+    levels = chosen.get("rssi_db", ())
+    rest = [head for head in sheet.heads if head not in used_heads(chosen)]
+    phases = [head for head in rest if words_of(unit_of(head)[0]) == ["phase"]]
+    if sheet.asked is None or len(levels) != 1 or levels[0].sure == "said" or len(phases) != 1:
+        return
+    level, phase = levels[0].head or "", phases[0]
+    why = (
+        f"{name_columns([level, phase])} are level and phase: of a channel, or is the phase unused"
+    )
+    readings = (
+        Answer({"rssi_db": level}, "levels"),
+        Answer({"csi_amp": level, "csi_phase": phase}, "channels"),
+    )
+    sheet.ask(Role((level, phase), "rssi_db", "seen", readings=readings, why=why))
 
 
 def _means(sheet: Sheet, way: object) -> str:
@@ -484,7 +503,8 @@ def _unit(head: str, role: str) -> Unit | None:
         and unit_suits(role, UNITS[words[-1]])
     ):
         return UNITS[words[-1]]
-    return unit
+    # A level that is the amplitude of a channel
+    return UNITS["db"] if unit is None and role == "csi_amp" and LISTS["level"] & {*words} else unit
 
 
 def _settled(role: str, chosen: Chosen) -> bool:

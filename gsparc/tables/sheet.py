@@ -26,6 +26,7 @@ SEXAGESIMAL = re.compile(
     re.IGNORECASE,
 )
 
+MOVED = re.compile(r"[-+]?\d+(?:\.\d+){2,}")  # several points
 INVISIBLE = "[\u200b-\u200d\u2060\ufeff]"  # spaces of no width, which names are pasted with
 # 379.0 is 379: a name that a join of tables turned into a number
 WHOLE = re.compile(r"^(\d+)\.0+$")
@@ -170,6 +171,12 @@ class Sheet:
             understood = [i for i in np.flatnonzero(bad) if read[cells[i]] is not None]
             values[understood] = [read[cells[i]] for i in understood]
             bad[understood] = False
+        moved = [i for i in np.flatnonzero(bad) if MOVED.fullmatch(str(column.iloc[i]).strip())]
+        if moved:
+            first = f"{column.iloc[moved[0]]!r} in {self.rows[moved[0]]}"
+            fault = f"{len(moved)} of {len(column)} cells hold several points, like {first}: a "
+            fault += "spreadsheet took them for marks of thousands; export the column anew, as text"
+            return self.refuse(fault, head)
         if bad.any():
             cells = column.astype(str).to_numpy(dtype=object)[bad]
             texts = (repr(cell if len(cell) <= 40 else cell[:37] + "...") for cell in cells)

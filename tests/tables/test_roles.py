@@ -125,3 +125,81 @@ def test_one_answer_takes_all_columns_of_a_block(write, way):
         Own(write(content)).load()
     data = read_any(write(content), columns={"rssi_db": way}).data
     assert len(data) == 3 * ROWS and data.site.stations.name == ("A", "B", "C")
+
+
+PHASES = table("x,y,RSSI,phase", *PLACES.T, LEVELS[:, 0], np.linspace(0, 6, ROWS))
+
+
+def test_a_level_beside_a_phase_is_asked(write):
+    with pytest.raises(DataError, match=r"rssi_db=RSSI .*csi_amp=RSSI dataset.columns.csi_phase"):
+        Own(write(PHASES)).load()
+    polar = {"csi_amp": "RSSI", "csi_phase": "phase"}
+    csi = parse_table(write(PHASES), polar).arrays["csi"]
+    np.testing.assert_allclose(20 * np.log10(abs(csi)), LEVELS[:, 0])
+
+
+GRID = 47.4 + PLACES / 1e4
+
+
+@pytest.mark.parametrize(
+    "heads, says",
+    [
+        ("grid_lat,grid_lon", "dataset.columns.lat=grid_lat dataset.columns.lon=grid_lon"),
+        ("ECoord,NCoord", "dataset.columns.x=ECoord dataset.columns.y=NCoord"),
+    ],
+)
+def test_heads_that_hold_a_coordinate_are_proposed(write, refused, heads, says):
+    refused(says, parse_table, write(table(f"{heads},rssi", *GRID.T, LEVELS[:, 0])))
+
+
+def test_exchanged_degrees_of_a_few_rows_are_named_and_left_out(write):
+    exchanged = np.arange(ROWS) % 60 == 7
+    places = np.where(exchanged[:, None], GRID[:, ::-1] - [41, 0], GRID - [0, 41])
+    found = said(write(table("lat,lon,rssi", *places.T, LEVELS[:, 0])))
+    assert "line 9, line 69, line 129, line 189: latitude and longitude are exchanged" in found
+    assert "these 4 of 240 rows are left out" in found
+
+
+def test_points_that_a_spreadsheet_moved_are_one_sentence(write, refused):
+    moved = [f"4.652.{row}.391" if row % 3 else f"{row}.5" for row in range(100, 100 + ROWS)]
+    error = refused(
+        "160 of 240 cells hold several points, like '4.652.100.391' in line 2: a spreadsheet",
+        parse_table,
+        write(table("x,y,rssi", moved, PLACES[:, 1], LEVELS[:, 0])),
+    )
+    assert len(error.problems) == 1
+
+
+def test_halves_of_the_earth_in_one_cell(write):
+    cells = [f"{51 + y / 1e3:.5f} N {x / 1e3:.5f} W" for x, y in PLACES]
+    arrays = parse_table(write(table("where,rssi", cells, LEVELS[:, 0]))).arrays
+    np.testing.assert_allclose(arrays["longitude"], -PLACES[:, 0] / 1e3, atol=1e-5)
+
+
+def test_pairs_that_no_row_names_were_taken_for_silence(tmp_path):
+    """Somebody chose which to measure; a table of a column a station listened to all."""
+    heard = LEVELS > np.quantile(LEVELS, 0.4)
+    rows = [
+        f"{x},{y},{name},{level}"
+        for (x, y), row, keep in zip(PLACES, LEVELS, heard, strict=True)
+        for name, level, kept in zip("abc", row, keep, strict=True)
+        if kept
+    ]
+    path = tmp_path / "pairs.csv"
+    path.write_text("\n".join(["x,y,anchor,rssi", *rows]))
+    with pytest.raises(DataError, match="not heard, or not measured.*absent=weaker.*unknown"):
+        Own(path).load()
+    assert Own(path, absent="unknown").load().censored is None
+    assert (Own(path, absent="weaker").load().censored > 0).any()
+    wide = np.where(heard, LEVELS.astype(int).astype(str), "")
+    path.write_text(table("x,y,AP1,AP2,AP3", *PLACES.T, *wide.T))
+    assert (Own(path).load().censored > 0).any()
+
+
+@pytest.mark.parametrize(
+    "start, says",
+    [(b"\xd4\xc3\xb2\xa1", "pcap"), (b"\x89PNG\r\n", "a picture"), (b"\xff\xd8\xff", "a picture")],
+)
+def test_logs_and_pictures_are_named_by_their_first_bytes(tmp_path, refused, start, says):
+    (tmp_path / "log.csv").write_bytes(start + bytes(range(200)))
+    refused(f"not a table of text but .*{says}", parse_table, tmp_path / "log.csv")
