@@ -217,6 +217,9 @@ def choose_columns(
             continue
         if several and role in heads.LEVELS and _ask_ranks(sheet, role, candidates):
             continue
+        if several and any(map(_is_rank, candidates)):
+            _ask_which(sheet, role, candidates)
+            continue
         chosen[role] = tuple(candidates) if several else tuple((exact or candidates)[:1])
         if not exact or several:
             sheet.notes.append(_note(chosen[role]))
@@ -296,6 +299,7 @@ def _wide_survey(sheet: Sheet, chosen: Chosen) -> None:
     used = used_heads(chosen)
     rest = [head for head in sheet.heads if head not in used]
     named = [head for head in rest if MAC.search(head) or NAMED.match(head)]
+    named = [head for head in named if _holds_numbers(sheet, head)]
     if named and "station" not in chosen and not measured:
         columns = (Column("rssi_db", head, head=head, word="station") for head in named)
         chosen["rssi_db"] = tuple(columns)
@@ -370,6 +374,12 @@ def _ask_phase(sheet: Sheet, chosen: Chosen) -> None:
 def _means(sheet: Sheet, way: object) -> str:
     single = isinstance(way, str) and way in sheet.heads
     return sheet.first_cell(str(way)) if single else "a station each"
+
+
+def _holds_numbers(sheet: Sheet, head: str) -> bool:
+    """Whether a column holds any number, or nothing: names of stations are no levels."""
+    values = sheet.frame[head].dropna()
+    return bool(pd.to_numeric(values, errors="coerce").notna().any() or (values == "").all())
 
 
 BY_VALUE = (-140.0, -20.0)  # dBm, of columns that no head says to be levels
@@ -587,12 +597,18 @@ def _one_unit(sheet: Sheet, chosen: Chosen) -> None:
 MOST_READINGS = 4  # of one question
 
 
+def _is_rank(column: Column) -> bool:
+    """Whether what is left of a level's head says which of a list it is, and no station's name."""
+    return bool({*words_of(column.label)} & LISTS["ranks"])
+
+
 def _ask_which(sheet: Sheet, role: str, columns: list[Column]) -> None:
     """Ask which of columns is a quantity, or of levels whether they are of a station each."""
     names = [column.head or "" for column in columns]
     ways: list[Any] = names[:MOST_READINGS]
     if role in heads.LEVELS and len(columns) > 1 and all(column.label for column in columns):
-        ways = [name_block(sheet, names), *ways[:-1]]
+        block, ranks = name_block(sheet, names), any(map(_is_rank, columns))
+        ways = [*names[: MOST_READINGS - 1], block] if ranks else [block, *ways][:MOST_READINGS]
     ways += [NONE] if KINDS[role] == "length" else []
     why = f"{_names(columns)} could each be {role}: which is it"
     if len(columns) == 1:

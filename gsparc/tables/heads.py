@@ -148,7 +148,9 @@ def words_of(text: str) -> list[str]:
     text = re.sub(r"(?i)(?<![a-z])([eg])node[ _-]?b", r"\1nb", text)  # eNodeB is one word
     text = re.sub(r"(?i)physical[ _]*(?:layer[ _]*)?cell[ _]*id(?:entity)?", "pci", text)
     phrase = re.sub(r"(?<=[a-z0-9])(?=[A-Z])(?!Bm?\b|BW\b|Hz|W\b)", " ", text)
-    phrase = re.sub(r"(rssi|rsrp|rss|power)(?=\d)", r"\1 ", phrase, flags=re.IGNORECASE)
+    phrase = re.sub(
+        r"(rssi|rsrp|rss|power|level|signal|rscp|dbm)(?=\d)", r"\1 ", phrase, flags=re.IGNORECASE
+    )
     return [word for word in re.split(r"[^0-9a-zµμ°]+", phrase.lower()) if word]
 
 

@@ -69,7 +69,8 @@ def ranked_names(sheet: Sheet, numbered: Mapping[str, str]) -> str | None:
         ranks = [{*sheet.words(members[number]).tolist()} - {""} for number in numbered]
         names = set[str]().union(*ranks)
         again = len(names) < sum(map(len, ranks)) and 2 * len(names) < len(sheet) * len(ranks)
-        if again and not any(re.fullmatch(r"[-+]?\d*\.?\d*", name) for name in names):
+        numbers = any(re.fullmatch(r"[-+]?\d*\.?\d*", name) for name in names)
+        if again and (not numbers or {*_words(pattern)} & LISTS["station"]):
             return pattern
     return None
 

@@ -203,3 +203,16 @@ def test_pairs_that_no_row_names_were_taken_for_silence(tmp_path):
 def test_logs_and_pictures_are_named_by_their_first_bytes(tmp_path, refused, start, says):
     (tmp_path / "log.csv").write_bytes(start + bytes(range(200)))
     refused(f"not a table of text but .*{says}", parse_table, tmp_path / "log.csv")
+
+
+def test_heads_that_say_which_of_a_list_were_stations(write):
+    path = write(table("x,y,rsrp_serving,rsrp_best_neighbour,rsrp_gap", *PLACES.T, *LEVELS.T))
+    with pytest.raises(DataError, match=r"rssi_db=rsrp_serving \(.*=rsrp_best_neighbour"):
+        Own(path).load()
+
+
+def test_names_in_numbered_columns_were_levels(write):
+    names = [f"02:00:00:00:00:{ord(name):x}" for name in RANKS[0]]
+    columns = (names, RANKS[1], names, RANKS[3])
+    data = read_any(write(table("x,y,bssid1,level1,bssid2,level2", *PLACES.T, *columns))).data
+    assert {*data.site.stations.name} == {*names}
