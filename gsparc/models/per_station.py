@@ -95,7 +95,8 @@ def station_site(site: Site, number: int) -> Site:
     return replace(
         site,
         name=f"{site.name}{OF_STATION}{stations.shown[number]}",
-        stations=None,
+        # Which way it looks is a fact of its own
+        stations=None if stations.sector is None else stations.subset(np.array([number])),
         array=array,
         carrier_hz=None if np.isnan(hertz) else hertz,
         static_position=place if np.isfinite(place).all() else None,

@@ -44,6 +44,7 @@ JUDGED = 1_000  # rows, of small stations all: one mad answer in 300 is then see
 WILD = 2  # times what the mean misses any row by: all that was measured spans no more
 WORK, FEWEST = 1e8, 60  # multiplications that solve for them, and rows where these do not suffice
 LEAST = 4  # rows: fewer tell nothing
+SURE = 2.0  # standard errors: one was a good fit's at a sixth of stations of five rows
 MEAN = "the plain mean"
 
 
@@ -134,7 +135,7 @@ def _refuse_members(
         while group:
             error = missed([*kept, *group])
             gain, unsure = mean_and_error(error - least, np.arange(len(rows)))
-            if gain <= unsure and error.max() <= most:
+            if gain <= SURE * unsure and error.max() <= most:
                 kept, least = [*kept, *group], error
                 simpler = " and ".join(member.name for _, member in kept)
                 break

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -72,8 +73,9 @@ def mixture_moments(parts: Sequence[tuple[float, Tensor, Tensor]]) -> MeanVarian
     if len(parts) == 1:
         return MeanVariance(*parts[0][1:])
     mean = torch.stack([share * mean_of_part for share, mean_of_part, _ in parts]).sum(0)
+    entries = math.prod(mean.shape[1:])
     deviations = (
-        (part - mean).abs().square().reshape(len(mean), -1).mean(1) for _, part, _ in parts
+        (part - mean).abs().square().reshape(len(mean), entries).mean(1) for _, part, _ in parts
     )
     spread = [
         share * (variance + off)

@@ -7,7 +7,7 @@ With exact slopes: autograd brings them from the covariance to lengths, shares a
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,6 @@ from torch import Tensor
 
 from gsparc.processes.censored import PseudoValues, log_evidence
 from gsparc.processes.factor import BLAS, Factor
-from gsparc.processes.left_out import left_out_residuals
 
 TINY = np.finfo(float).tiny
 # Amplitude below which values are all alike, and tell of nothing: its inverse has a square
@@ -154,28 +153,3 @@ class ProfiledDensity(torch.autograd.Function):
     def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
         """Return the slope by the covariance."""
         return slopes[0] * ctx.saved_tensors[0], None
-
-
-def density_without_groups(
-    gram: Tensor, values: Tensor, partitions: Sequence[Iterable[Tensor]]
-) -> tuple[Tensor, Tensor]:
-    """Return the negative density of rows without their groups and without themselves,
-    half and half.
-
-    It is relative to the best amplitude [nats per row], which follows.
-
-    Args:
-        gram: (n, n) with noise, relative to the amplitude.
-        values: (n, 1) less the mean.
-        partitions: each of groups of rows that are left out together.
-    """
-    inverse = Factor.from_gram(gram, "raise").inverse
-    parts = (groups for partition in partitions for groups in (None, partition))
-    errors = [left_out_residuals(inverse, inverse @ values, groups) for groups in parts]
-    variance = torch.cat([error.variance for error in errors])
-    amplitude = (
-        (torch.cat([error.residual for error in errors])[:, 0].square() / variance)
-        .mean()
-        .clamp_min(FLAT)
-    )
-    return 0.5 * (amplitude.log() + variance.log().mean()), amplitude.detach()

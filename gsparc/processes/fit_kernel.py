@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import combinations
 from typing import NamedTuple
@@ -19,12 +19,11 @@ from gsparc.processes.density import (
     TINY,
     NegativeLogEvidence,
     ProfiledDensity,
-    density_without_groups,
     left_out_density,
 )
 from gsparc.processes.factor import NotDefiniteError
 from gsparc.processes.few_rows import covering_rows
-from gsparc.processes.kernel import SHARES, Kernel, distances
+from gsparc.processes.kernel import SHARES, Kernel, Stationary, distances
 
 LOOKS = 40  # of a walk: most evaluations
 # Gain of a step that is the last [nats of all rows]. Over rows a gain of g has a standard error of
@@ -59,9 +58,9 @@ class KernelRows(NamedTuple):
     values: Tensor
     side: Tensor | None = None
 
-    def gram(self, kernel: Kernel) -> Tensor:
+    def gram(self, kernel: Kernel, unit: Tensor | float = 1.0) -> Tensor:
         """Return the covariance (n, n) with noise, of amplitude 1,
-        differentiable in the kernel's numbers.
+        differentiable in the kernel's numbers; columns are divided by `unit`.
 
         >>> one = torch.zeros(1, 1, dtype=torch.float64)
         >>> KernelRows(one, None, one).gram(Kernel.from_length(length=2.0, noise=0.5))
@@ -69,7 +68,7 @@ class KernelRows(NamedTuple):
         """
         total = kernel.correlations_of(self.apart)
         if self.columns is not None:
-            total = total + self.columns @ self.columns.T
+            total = total + (self.columns @ self.columns.T) / unit**2
         return total + kernel.noise * torch.eye(len(total), dtype=total.dtype)
 
 
@@ -160,13 +159,10 @@ def fit_kernel_by_left_out(
     looks: int = LOOKS,
     entries: int = 1,
     bounded: bool = True,
-    partitions: Sequence[Iterable[Tensor]] = (),
     alike: float = 0.0,
 ) -> tuple[float, Kernel]:
-    """Find the least negative density of rows left out [nats per output], and its kernel.
-
-    They are left out one by one, and by `partitions` of the rows of one process
-    where there are any.
+    """Find the least negative density of rows left out one by one [nats per output],
+    and its kernel.
 
     Args:
         starts: of terms of one kind.
@@ -175,13 +171,10 @@ def fit_kernel_by_left_out(
         bounds: of the parameters; none: those of the first process.
         looks: most evaluations.
         entries, bounded, alike: see `left_out_density`.
-        partitions: groups of rows, each left out together.
     """
     sizes = torch.tensor([len(view.values) for view in views], dtype=torch.float64)
 
     def objective(kernel: Kernel) -> tuple[Tensor, Tensor]:
-        if partitions:
-            return density_without_groups(views[0].gram(kernel), views[0].values, partitions)
         parts = [(view.gram(kernel), view.values) for view in views]
         value, amplitude = left_out_density(parts, entries, bounded, alike)
         return value / sizes.sum(), ((sizes * amplitude.log()).sum() / sizes.sum()).exp()
@@ -194,8 +187,45 @@ def fit_kernel_by_left_out(
     return value * count, kernel
 
 
+@dataclass(frozen=True)
+class NumberPrior:
+    """What is known of a process's numbers before any row: each is log-normal, its middle first.
+
+    Attributes:
+        length: of that of rows' extent.
+        deviation, noise: of values [dB].
+    """
+
+    length: tuple[float, float]
+    deviation: tuple[float, float]
+    noise: tuple[float, float]
+
+    def start(self, extent: float, term: type[Stationary]) -> Kernel:
+        """Return the kernel of the middle numbers, of rows of an extent [m]."""
+        deviation, noise = self.deviation[0], self.noise[0]
+        return Kernel.from_length(
+            self.length[0] * extent, (noise / deviation) ** 2, deviation**2, term
+        )
+
+    def cost(self, kernel: Tensor, amplitude: Tensor, lengths: int, extent: float) -> Tensor:
+        """Return how much numbers are against it [nats], of `Kernel.parameters` (p,)
+        and the logarithm of an amplitude ().
+        """
+        sizes = kernel[:lengths] - math.log(extent), 0.5 * amplitude, 0.5 * (amplitude + kernel[-1])
+        known = self.length, self.deviation, self.noise
+        parts = (
+            ((size - math.log(middle)) / spread).square().sum()
+            for size, (middle, spread) in zip(sizes, known, strict=True)
+        )
+        return 0.5 * sum(parts, amplitude.new_zeros(()))
+
+
 def fit_kernel_by_evidence(
-    start: Kernel, views: Sequence[KernelRows], looks: int
+    start: Kernel,
+    views: Sequence[KernelRows],
+    looks: int,
+    known: NumberPrior | None = None,
+    extent: float = 1.0,
 ) -> tuple[float, Kernel]:
     """Find the kernel of largest evidence, levels among the values; without looks `start` as it is.
 
@@ -203,6 +233,9 @@ def fit_kernel_by_evidence(
         start: where the search begins.
         views: rows of independent processes of one prior, such as those of several stations.
         looks: at all of them.
+        known: of the numbers; columns of views then are in the values' unit,
+            else in deviations of the process.
+        extent: of the rows, which lengths are known by [m].
 
     Returns:
         The least negative evidence [nats per row], and its kernel.
@@ -214,9 +247,12 @@ def fit_kernel_by_evidence(
     last, count = [list[PseudoValues]() for _ in views], sum(map(len, sides))
 
     def negative_log_evidence(at: Tensor) -> Tensor:
-        kernel, total = start.with_values(at[:-1]), at.new_zeros(())
+        kernel, total, unit = start.with_values(at[:-1]), at.new_zeros(()), at.new_ones(())
+        if known is not None:
+            unit = (0.5 * at[-1]).exp()
+            total = known.cost(at[:-1], at[-1], len(start.signals), extent)
         for view, side, before in zip(views, sides, last, strict=True):
-            gram = at[-1].exp() * view.gram(kernel)
+            gram = at[-1].exp() * view.gram(kernel, unit)
             total = total + NegativeLogEvidence.apply(gram, view.values[:, 0], side, before)  # type: ignore[no-untyped-call]
         return total / count
 

@@ -278,6 +278,12 @@ class Kernel(Stored):
         """Return a kernel of several `Shadowing` and of noise."""
         return cls((*map(Shadowing, lengths, shares), WhiteNoise(noise)), amplitude)
 
+    @classmethod
+    def of_ends(cls, path: float, end: float, noise: float) -> Self:
+        """Return a kernel of a path's shadows and of those of each end alone, of lengths [m]."""
+        terms = Shadowing(path), EndShadowing(end), EndShadowing(end, other=True)
+        return cls((*(replace(term, share=1 / 3) for term in terms), WhiteNoise(noise)))
+
     @property
     def signals(self) -> tuple[Stationary, ...]:
         """Terms of distance without the noise."""

@@ -27,6 +27,7 @@ from gsparc.processes.trend import Law, Trend
 # Whose covariance is factored as one: of more, each place is predicted from the nearest
 MOST_ROWS = 6_000
 LEAST_SILENT, MOST_SILENT = 200, 3_000  # silent ones of them: no more than were heard, but for few
+DOUBTED, LEAST_DOUBTED = 0.5, 30  # silent rows in doubt, for each that was heard, and at least
 BOUNDS = {1: "where nothing was heard are below", -1: "in saturation are above"}
 REACH = 0.25  # diagonals of the known places, by which a law's confidence falls to 1/e
 
@@ -223,6 +224,21 @@ class PowerProcess(Stored):
         extra = nearest.noise[few] - prior.kernel.noise
         values = nearest.rest[few] + prior.mean(places)
         return replace(self, posterior=Exact.from_values(prior, places, values, extra), others=())
+
+
+def rows_in_doubt(rows: PowerRows, prior: Prior) -> PowerRows:
+    """Return rows that were heard, and half as many silent ones: those that these leave most in
+    doubt.
+    """
+    view = rows.view(prior.known_trend, prior.kernel)
+    gram, values = prior.kernel.amplitude * view.gram(prior.kernel), view.values[:, 0]
+    silent = torch.from_numpy(rows.silent)
+    most = max(round(DOUBTED * int((~rows.silent).sum())), LEAST_DOUBTED)
+    gaussian = ConditionalGaussian.from_gram(gram, values, silent)
+    doubt = torch.from_numpy(rows.side)[silent] * gaussian.z_score(values[silent])
+    used = ~rows.silent
+    used[np.flatnonzero(rows.silent)[doubt.argsort()[:most]]] = True
+    return rows.subset(np.flatnonzero(used))
 
 
 def condition_on_powers(

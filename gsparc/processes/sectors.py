@@ -15,12 +15,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Self
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from gsparc.processes.kernel import ExponentialShadowing, distances, to_number
 from gsparc.processes.places import Places, first_end, horizontal, other_end
-from gsparc.processes.term import Term
+from gsparc.processes.term import Columns, Term
 from gsparc.processes.trend import Trend
 
 ELEVATION_FLOOR_DB = 20.0
@@ -36,9 +37,25 @@ SHARE_SPAN = (1e-2, 1e3)  # bounds of a part's variance [dB^2]
 NONE = torch.zeros(0, dtype=torch.float64)
 NO_AZIMUTH = -1.0
 ROUND = torch.tensor([[NO_AZIMUTH, 0.0, 65.0, 10.0, 0.0]])  # without a pattern, of mean power
+USUAL = ROUND[0].clamp_min(0.0).double()  # of a sector where it is not known
+ROUND_DEG, NO_PATTERN = 360.0, 1e9  # width [deg] of a beam in height whose tilt nobody gave
+BEAM = (0.8, 0.4)  # mean and deviation of the share of its pattern that a sector's levels show
 STEP = 0.5  # of a spread, for slopes of the mean
 UNITS = STEP * torch.cat([SHARED_SPREAD, OWN_SPREAD[:4]]).diag()
 STEPS = torch.cat([UNITS, -UNITS, 0 * UNITS[:1]])  # of parameters, the last without any
+
+
+def sector_table(beams: np.ndarray) -> Tensor:
+    """Return a table (T, 5) float64 as of `Sectors` of what is known of beams (T, 5 or more), NaN
+    where nothing is; powers are less their mean.
+    """
+    beams = beams[:, : len(USUAL)]
+    known, given = np.isfinite(beams), torch.from_numpy(np.nan_to_num(beams))
+    azimuth, tilt, width, height, power = torch.where(torch.from_numpy(known), given, USUAL).T
+    aimed, tilted = torch.from_numpy(known[:, :2]).T
+    azimuth = torch.where(aimed, azimuth % ROUND_DEG, NO_AZIMUTH)
+    height = torch.where(tilted, height, NO_PATTERN)
+    return torch.stack([azimuth, tilt, width, height, power - power.mean()], 1)
 
 
 def sector_of(places: Places) -> Places:
@@ -170,6 +187,44 @@ class Sectors(Trend):
         return mean + self.known_mean(places), torch.cat(
             [blocks, self.shared_columns(places, slopes) @ self.doubt], 1
         ) / self.unit
+
+
+@dataclass(frozen=True)
+class Beam(Columns):
+    """What the pattern of one sector takes off: about the listed one, more or less of it.
+
+    >>> north = Beam(torch.tensor([[0.0, 0.0, 70.0, 10.0, 0.0]]), torch.zeros(3))
+    >>> north.mean(torch.tensor([[0.0, 1, 0], [0, -1, 0]]))  # ahead of it, and behind
+    tensor([ 0., -20.])
+
+    Attributes:
+        table: (1, 5) of it, see `Sectors`.
+        still: (3,) the end that stands [m].
+        middle: mean loss of the rows, less which it is nearly independent of the level [dB].
+        unit: deviation of the process [dB], which columns are relative to.
+    """
+
+    table: Tensor
+    still: Tensor
+    middle: float = 0.0
+    unit: float = 1.0
+
+    def loss(self, places: Tensor) -> Tensor:
+        """Return what the listed pattern takes off (n,) [dB] at places (n, 3) [m]."""
+        still, sector = (
+            self.still.to(places).expand(len(places), 3),
+            places.new_zeros(len(places), 1),
+        )
+        ends = torch.cat([places, still, sector], 1)
+        return Sectors(0.0, table=self.table).pattern_loss(ends) - self.middle
+
+    def columns(self, places: Tensor) -> Tensor:
+        """See `Columns`."""
+        return -BEAM[1] / self.unit * self.loss(places)[:, None]
+
+    def mean(self, places: Tensor) -> Tensor:
+        """See `Columns`."""
+        return -BEAM[0] * self.loss(places)
 
 
 @dataclass(frozen=True)

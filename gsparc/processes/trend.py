@@ -6,7 +6,7 @@ final report, 1999, section 4.7.2): one loss for each wall, another for each flo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -83,12 +83,16 @@ class Walls(Columns):
         corners: (Q, 3) lowest coordinates along these [m].
         sizes: (Q, 2) along the tangents [m].
         still: (3,) the end that stands [m]; (0,) where both move.
+        loss_db: deviation of a wall's loss before any row [dB].
+        unit: deviation of the process [dB], which columns are relative to.
     """
 
     axes: Tensor
     corners: Tensor
     sizes: Tensor
     still: Tensor
+    loss_db: float = 1.0  # of the process's deviation in older files
+    unit: float = 1.0
 
     def columns(self, places: Tensor) -> Tensor:
         """Count walls and floors (n, 2) on paths to places (n, 3), or between both ends (n, 6)
@@ -106,7 +110,8 @@ class Walls(Columns):
         inside = ((met[..., 1:] >= 0) & (met[..., 1:] <= self.sizes)).all(-1)
         hit = (inside & (start[..., 0] * end[..., 0] < 0)).to(places)
         level = self.axes[:, 0, 2].abs() > LEVEL
-        return torch.stack([hit[:, ~level].sum(1), hit[:, level].sum(1)], 1)
+        counts = torch.stack([hit[:, ~level].sum(1), hit[:, level].sum(1)], 1)
+        return counts * (self.loss_db / self.unit)
 
 
 @dataclass(frozen=True)
@@ -119,9 +124,12 @@ class Trend(Columns):
     Attributes:
         level: the mean where there is no law [dB].
         law: the distance law, or None.
-        middle, spread: mean and deviation of the rows' decades of distance: over one deviation
-            its uncertain slope changes powers as much as the process does.
+        middle, spread: of the rows' decades of distance their mean, and the number of decades over
+            which the uncertain slope changes powers by one unit.
         more: further terms with uncertain weights, such as losses in known walls.
+        level_db: deviation of the level before any row [dB].
+        unit: deviation of the process [dB], which columns are relative to; of both 1 in trends
+            whose deviations are the process's own.
     """
 
     level: float
@@ -129,6 +137,8 @@ class Trend(Columns):
     middle: float = 0.0
     spread: float = 1.0
     more: tuple[Columns, ...] = ()
+    level_db: float = 1.0
+    unit: float = 1.0
 
     @classmethod
     def from_law(cls, law: Law, places: Tensor) -> Trend:
@@ -139,6 +149,14 @@ class Trend(Columns):
         return cls(
             0.0, law, float(decades.mean()), max(float(decades.std(correction=0)), LEAST_SPREAD)
         )
+
+    def in_unit(self, deviation: float) -> Trend:
+        """Return the same of a process of this deviation [dB]."""
+        more = tuple(
+            replace(term, unit=deviation) if hasattr(term, "unit") else term  # type: ignore[type-var]
+            for term in self.more
+        )
+        return replace(self, unit=deviation, more=more)
 
     def mean(self, places: Tensor) -> Tensor:
         """Return powers (n,) [dB] at places (n, 3) or (n, 6) [m]."""
@@ -157,8 +175,9 @@ class Trend(Columns):
         """Return what is uncertain of the mean (n, Q): constant, slope,
         and what `more` terms have.
         """
-        parts = [torch.ones_like(places[:, :1])]
+        parts = [torch.full_like(places[:, :1], self.level_db / self.unit)]
         if self.law is not None:
             # Centred, so that slope and level are nearly independent.
-            parts.append((self.law.decades(places)[:, None] - self.middle) / self.spread)
+            decades = self.law.decades(places)[:, None] - self.middle
+            parts.append(decades / (self.spread * self.unit))
         return torch.cat([*parts, *(term.columns(places) for term in self.more)], 1)

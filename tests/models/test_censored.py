@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models.powers.settings import process_and_notes
+from gsparc.models.baselines.likeliest import process_and_notes
 from gsparc.models.registry import build
 from gsparc.models.target_rows import heard_rows
 from gsparc.processes.powers import PowerRows

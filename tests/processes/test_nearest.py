@@ -17,7 +17,7 @@ from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, PowerRows, condition_on_powers
 from gsparc.processes.prior import Prior
 from gsparc.processes.trend import Trend
-from tests.models.powers.test_settings import error_db, fit, town
+from tests.models.baselines.test_likeliest import error_db, fit, town
 
 KERNEL = Kernel.from_lengths((60.0, 300.0), (0.3, 0.7), 0.05, 30.0)
 

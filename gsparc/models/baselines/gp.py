@@ -19,9 +19,9 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.target import Target
 from gsparc.models.baselines.interpolation import Differentiable
+from gsparc.models.baselines.likeliest import CHOSEN_ON, MEANS, MeanName, process_and_notes
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Method, Prediction
-from gsparc.models.powers.settings import CHOSEN_ON, MEANS, MeanName, process_and_notes
 from gsparc.models.reduced import Interpolated, MeanOnly, Settings
 from gsparc.models.target_rows import power_rows, training_targets
 from gsparc.physics.separable import Separable, separate_axes

@@ -61,10 +61,6 @@ class LearnsTogether(MethodFactory):
             return "together", "carriers at one place have the same paths"
         if data.site.target.is_complex:
             return "together", "channels at all stations share waves and the frame of places"
-        if find_sectors(data) is not None:
-            return "together", (
-                "sectors of a network share a law, a pattern and the shadowing of their sites"
-            )
         if not np.isin(data.stations_of(fold.test), data.stations_of(fold.train)).any() and len(
             fold.test
         ):
@@ -75,4 +71,8 @@ class LearnsTogether(MethodFactory):
         rows = heard_rows(data, fold.learned())
         if len(rows) > ONE_FACTOR:
             return "each", f"{len(rows)} rows are more than one factor holds ({ONE_FACTOR})"
+        if find_sectors(data) is not None:
+            return "together", (
+                "sectors of a network share a law, a pattern and the shadowing of their sites"
+            )
         return "together", "powers at all stations share a law of distance"

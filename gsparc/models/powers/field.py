@@ -21,30 +21,18 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.data.walls import SceneWalls
-from gsparc.models.baselines.distance_law import fit_site_law
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.known.images import walls_in_frame
 from gsparc.models.method import Prediction
 from gsparc.models.powers.fringes import Fringes, fit_fringes, resolves_wavelength
-from gsparc.models.powers.own_terms import (
-    UserTerm,
-    add_terms_to_trend,
-    describe_weights,
-    subtract_means,
-)
+from gsparc.models.powers.members import learn_members, weigh_members
+from gsparc.models.powers.own_terms import UserTerm, describe_weights
 from gsparc.models.powers.prior_map import PriorMap
-from gsparc.models.powers.settings import (
-    LAW_NEEDS,
-    MeanLaw,
-    candidate_priors,
-    choose_candidate,
-    mix_candidates,
-)
 from gsparc.models.target_rows import linear_moments, power_rows
 from gsparc.physics.decibels import from_decibels
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.posterior import Exact, approximation_label
-from gsparc.processes.powers import PowerProcess, PowerRows, condition_on_powers, trend_about_rows
+from gsparc.processes.powers import PowerProcess, PowerRows, condition_on_powers
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import QUERIES
 from gsparc.processes.stored import from_plain, to_plain
@@ -54,6 +42,7 @@ from gsparc.training.context import FitContext, FitReport
 from gsparc.training.effort import Effort
 from gsparc.training.stopwatch import Stopwatch
 
+WALL_DB = 10.0  # deviation of the loss in a wall before any row
 LEFT_OUT = "model.prior: the map is left out: rows left out are predicted as well without it"
 
 
@@ -111,31 +100,23 @@ class PowerField(ClosedForm):
         self, data: Measurements, rows: np.ndarray, effort: Effort
     ) -> tuple[str, ...]:
         """Set the priors and waves; what must be said of them."""
-        seen, site, chosen_on = power_rows(data, rows), data.site, effort.chosen_on
+        seen, site, chosen_on = power_rows(data, rows), data.site, effort.chosen_on // 2
         # Checked once: a query has no time for it, nor has `torch.func`.
         terms = tuple(
             UserTerm.from_site(t, site).centre(torch.from_numpy(seen.places))
             for t in self.own_terms
         )
+        walls, remarks = (), list[str]()
         if self.walls is not None:
-            walls = walls_in_frame(self.walls, site.origin, site.static_position)
-            # A law goes through so few rows exactly, and leaves next to no variance.
-            has_law = int((~seen.silent).sum()) >= LAW_NEEDS
-            rest = subtract_means(seen, terms)
-            law, notes = fit_site_law(rest, site) if has_law else (None, ())
-            trend = add_terms_to_trend(
-                rest, replace(trend_about_rows(rest, law), more=(walls,)), terms
-            )
-            best = choose_candidate(seen, [MeanLaw(trend, 0.0, ())], self.seed, chosen_on)
-            self.priors = ((1.0, best.prior),)
-            about = "a distance law" if has_law else f"a constant, with fewer than {LAW_NEEDS} rows"
-            note = f"losses in {len(walls.sizes)} known walls and floors, mean: {about}"
-            return (note, *notes, *best.notes)
-        candidates, remarks = candidate_priors(seen, site, self.seed, chosen_on, terms), list[str]()
-        self.priors = ((1.0, candidates[0].prior),)
+            known = walls_in_frame(self.walls, site.origin, site.static_position)
+            walls = (replace(known, loss_db=WALL_DB),)
+            remarks.append(f"losses in {len(known.sizes)} known walls and floors")
+        members = learn_members(seen, site, self.seed, chosen_on, terms, walls)
+        self.priors, notes = weigh_members(seen, members, self.seed, chosen_on)
         # A level that silent rows are below is no power that waves could be fitted to.
         if (
             self.waves
+            and not walls
             and not seen.silent.any()
             and resolves_wavelength(seen.places, site.wavelength)
         ):
@@ -145,22 +126,15 @@ class PowerField(ClosedForm):
             self.fringes, note = fit_fringes(
                 seen.subset(order),
                 rows[order],
-                candidates[0].prior,
+                self.priors[0][1],
                 site.wavelength,
                 self.seed,
                 effort.fringes,
             )
             remarks.append(note)
             if self.fringes is not None:  # their share was learned beside this process
-                return (candidates[0].description, *candidates[0].notes, note)
-        self.priors, notes = mix_candidates(seen, candidates, self.seed, chosen_on)
-        own = tuple(term for term in terms if not isinstance(term.term, PriorMap))
-        if len(own) < len(terms) and not self._used_maps():
-            # Kernels were sought beside the map's: a map that is left out leaves what there is
-            # without it.
-            candidates = candidate_priors(seen, site, self.seed, chosen_on, own)
-            self.priors, notes = mix_candidates(seen, candidates, self.seed, chosen_on)
-        return (*notes, *remarks)
+                self.priors = ((1.0, self.priors[0][1]),)
+        return (*remarks, *notes)
 
     def _used_maps(self) -> list[PriorMap]:
         """Maps from before that the mean has a share of."""

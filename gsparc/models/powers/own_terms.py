@@ -92,6 +92,8 @@ class UserTerm(Columns):
         still: (3,) the end that stands, local [m]; None where unknown, or where both move.
         middle: (Q,) mean columns of the rows, less which they are nearly independent of the level.
         unit: deviation of the process [dB], which columns are relative to.
+        spread_db: deviation of a weight that the term says nothing of [dB of a column's unit];
+            0: that of the process.
     """
 
     term: Columns
@@ -99,6 +101,7 @@ class UserTerm(Columns):
     still: Tensor | None
     middle: Tensor | float = 0.0
     unit: float = 1.0
+    spread_db: float = 0.0
 
     @classmethod
     def from_site(cls, term: Columns, site: Site) -> Self:
@@ -110,7 +113,7 @@ class UserTerm(Columns):
     @property
     def weight_prior(self) -> tuple[float, float]:
         """Mean [dB] and deviation [units] of each weight, of a column's unit."""
-        mean, deviation = self.term.prior_db or (0.0, self.unit)
+        mean, deviation = self.term.prior_db or (0.0, self.spread_db or self.unit)
         return mean, deviation / self.unit
 
     def columns(self, places: Tensor) -> Tensor:
@@ -169,21 +172,13 @@ def subtract_means(rows: PowerRows, terms: Sequence[UserTerm]) -> PowerRows:
 
 
 def add_terms_to_trend(rows: PowerRows, trend: Trend, terms: tuple[UserTerm, ...]) -> Trend:
-    """Return a trend of rows less the terms' means, with the terms,
-    in units of what it leaves of rows.
+    """Return a trend of rows less the terms' means, with the terms;
+    what these say nothing of spreads as rows do about the trend.
     """
     heard = rows.heard_rows
     residual = heard.decibels - trend.mean(torch.from_numpy(heard.places)).numpy()
-    unit = float(residual.std()) or 1.0
-    return set_term_unit(replace(trend, more=(*trend.more, *terms)), unit)
-
-
-def set_term_unit(trend: Trend, deviation: float) -> Trend:
-    """Return a trend whose users' terms are relative to a process of this deviation [dB]."""
-    terms = (
-        replace(term, unit=deviation) if isinstance(term, UserTerm) else term for term in trend.more
-    )
-    return replace(trend, more=tuple(terms)) if trend.more else trend
+    spread = float(residual.std()) or 1.0
+    return replace(trend, more=(*trend.more, *(replace(term, spread_db=spread) for term in terms)))
 
 
 class LearnedWeights(str):

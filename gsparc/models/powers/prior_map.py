@@ -3,7 +3,7 @@ or last year's model.
 
 Levels are a share of the map's, which is about 1 before any row, a constant, and a process of what
 the map lacks. Laws without the map stand beside it, and the likelihood of rows left out says which
-is right (`candidate_priors` in `settings.py`).
+is right (`members.py`).
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@
 extern "C" {
 #endif
 
-#define GSPARC_FIELD_VERSION 2
+#define GSPARC_FIELD_VERSION 3
 #define GSPARC_FARTHEST_M 1e7              /* from the origin of the world: no place in metres lies beyond, as in Python */
 #define GSPARC_MOST_BYTES (INT64_C(1) << 28) /* of an answer and its scratch memory: files of more are refused, as damaged */
 

@@ -61,7 +61,7 @@ struct PowersForm final : Form {
     int rows, near, sets, terms;
     bool all, whole, bounded, law;  // means of all rows; variances by all; these at most the prior's; a distance law
     Correlation<double> kernel;
-    double noise, amplitude, heard, reach, level, exponent, floor, middle, spread, scale;
+    double noise, amplitude, heard, reach, level, exponent, floor, middle, spread, scale, doubted;  // the last: the level's column
     const double *places, *columns, *extra;   // (n, D), (D, padded) [m], (n,) noise
     const double *values, *slopes;            // (n,) by which weights or correlations count, (n, Q) terms of the rows
     const double *weighed, *unsure;           // (Q,), (Q, Q): weights of the law's terms, and their covariance
@@ -89,7 +89,7 @@ struct PowersForm final : Form {
         all = in.flag(), whole = in.flag(), bounded = in.flag(), law = in.flag();
         kernel.smooth = 0, kernel.smooth_length = 1, kernel.parts = in.size(2);
         for (int i = 0; i < 2; ++i) in.values(kernel.shares[i], kernel.lengths[i]);
-        in.values(noise, amplitude, heard, reach, level, exponent, floor, middle, spread, scale);
+        in.values(noise, amplitude, heard, reach, level, exponent, floor, middle, spread, scale, doubted);
         const int64_t n = rows, axes = facts.axes;
         if (!rows || !axes || sets > kMostSets || terms > kMostTerms || terms < 1 || (near && !sets)) refuse("a process of no rows");
         constexpr int widest = 8;
@@ -120,7 +120,7 @@ struct PowersForm final : Form {
     }
 
     int answer(const float* place, float* values_out, float* variance, float* unknown, Scratch scratch) const override {
-        double at[6] = {}, terms_here[kMostTerms] = {1};
+        double at[6] = {}, terms_here[kMostTerms] = {doubted};
         for (int axis = 0; axis < facts.axes; ++axis) at[axis] = double(place[axis]);
         double mean = level;
         if (law) {

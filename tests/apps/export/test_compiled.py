@@ -150,7 +150,7 @@ def test_a_form_says_what_it_is_and_its_file_is_checked(tmp_path):
     )
     blob = pack_form(found.form, predictor.site.origin, found.error)
     magic, version, checksum, size, _ = HEAD.unpack(blob[: HEAD.size])
-    assert (magic, version, size) == (b"GSPARC\r\n", 2, len(blob))
+    assert (magic, version, size) == (b"GSPARC\r\n", 3, len(blob))
     assert checksum == zlib.crc32(blob[CHECKED:])
 
 

@@ -1,6 +1,4 @@
-"""The mean of processes of powers, by squares of floor left out: its shares, variance,
-state and slopes.
-"""
+"""The mean of processes of powers: its shares, variance and state."""
 
 from dataclasses import replace
 
@@ -13,13 +11,8 @@ from releases import real
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.baselines.kriging import fit_variogram
-from gsparc.models.powers import settings
 from gsparc.models.powers.field import PowerField
-from gsparc.models.target_rows import power_rows
 from gsparc.processes import powers
-from gsparc.processes.kernel import ExponentialShadowing
-from gsparc.processes.powers import condition_on_powers
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
@@ -132,34 +125,3 @@ def test_a_mixture_is_stored_whole(monkeypatch, nearest):
         told, found = (one.predict(batch) for one in (field, again))
         assert torch.allclose(told.mean, found.mean, rtol=1e-6)
         assert torch.allclose(told.variance, found.variance, rtol=1e-5)
-
-
-def test_few_rows_have_one_process():
-    assert len(fitted_to(PowerField(), walks(), np.arange(settings.MIXED_FROM - 1))[0].priors) == 1
-
-
-@pytest.mark.parametrize("rows", [30, 150])
-def test_kriging_was_no_member(rows):
-    data = walks()
-    known = power_rows(data, np.arange(rows))
-    found = fit_variogram(known.places, known.decibels[:, None])
-    kernels = [one.kernel for one in settings.candidate_priors(known, data.site, 0, 300)]
-    (own,) = (one for one in kernels if one.length == found.range)
-    assert isinstance(own.terms[0], ExponentialShadowing) and own.amplitude == found.sill
-    assert own.noise == pytest.approx(found.nugget / found.sill, abs=1e-6)
-
-
-def test_gaps_were_predicted_by_lengths_of_rows_with_neighbours():
-    """Levels of a leaky cable that start anew every 300 m: a distance law was ahead in gaps."""
-    rng = np.random.default_rng(0)
-    along = np.sort(rng.uniform(0, 1500, 300))
-    decibels = -55 - 0.035 * (along % 300) + rng.normal(0, 2, 5)[(along // 300).astype(int)]
-    decibels += 2 * np.sin(2 * np.pi * along / 7) + 1.5 * rng.standard_normal(300)
-    places = np.pad(along[:, None], ((0, 0), (0, 2)))
-    arrays = {"rx_position": places, "tx_position": np.zeros(3), "rssi_db": decibels}
-    data = from_arrays(arrays, {"name": "tunnel"})
-    rows = power_rows(data, np.arange(300))
-    likeliest, *_, gaps = settings.candidate_priors(rows, data.site, 0, 300)
-    posteriors = [condition_on_powers(rows, one.prior, 0)[0].posterior for one in (likeliest, gaps)]
-    likely, wide = (np.mean(settings._errors_without_squares(one, 10) ** 2) for one in posteriors)
-    assert wide < 0.95 * likely, (wide, likely)

@@ -13,7 +13,7 @@ import numpy as np
 from gsparc.prediction.predictor import Predictor
 
 # \r\n as in PNG: a transfer as text would change it, which is then found out. 64: a cache line.
-MAGIC, VERSION, LINE = b"GSPARC\r\n", 2, 64
+MAGIC, VERSION, LINE = b"GSPARC\r\n", 3, 64
 TYPES = {np.dtype(t): i for i, t in enumerate((np.float32, np.float64, np.int32, np.int64))}
 HEAD, SECTION = struct.Struct("<8sIIqq"), struct.Struct("<24sIIqq")
 CHECKED = 16  # bytes before those that the checksum is of

@@ -107,8 +107,9 @@ def compile_powers(process: PowerProcess, scale: float) -> Form | None:
         process._trend_reach,
         *about,
         trend.middle,
-        trend.spread,
+        trend.spread * trend.unit,
         scale,
+        trend.level_db / trend.unit,
     ]
     return Form(4, [float(number) for number in numbers], arrays)
 

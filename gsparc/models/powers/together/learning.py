@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from gsparc.models.baselines.distance_law import fit_law
-from gsparc.models.powers.settings import EVIDENCE_LOOKS
+from gsparc.models.baselines.likeliest import EVIDENCE_LOOKS
 from gsparc.models.powers.together.terms import SharedTerms, StationRows
 from gsparc.processes.density import left_out_density
 from gsparc.processes.fit_kernel import fit_kernel_by_evidence, fit_kernel_by_left_out

@@ -32,27 +32,27 @@ from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import (
     NO_AZIMUTH,
     OWN_SPREAD,
-    ROUND,
+    ROUND_DEG,
     SHARED,
     SHARED_SPREAD,
+    USUAL,
     Sectors,
     SectorShadowing,
     sector_of,
+    sector_table,
 )
 from gsparc.processes.trend import LEAST_SPREAD
 from gsparc.tables.checks.plausibility import find_noise
 
 SAME_SITE_M = 5.0  # stations closer than this are of one site
 SAME_NAME_M = 100.0  # the same of those whose names differ in their last part alone
-USUAL = ROUND[0].clamp_min(0.0).double().numpy()  # of `Stations.sector` where it is not known
-NO_PATTERN = 1e9  # width [deg] of a beam in height whose tilt nobody gave
 ONE_BAND = 1.1  # ratio of carriers of one band
 GAIN_DB = 4.0  # deviation of a sector's level, before it is learned
 LOOSE = 1.5  # deviation of logarithms of kernels' numbers from usual
 # Usual noise and deviations by bearing, of the variance; usual lengths, of that between places
 LITTLE = 0.1
 BOUND = 5.0  # deviations of what sectors share, beyond which it is not looked for
-CONTRADICTED_DEG, ROUND_DEG = 30.0, 360.0
+CONTRADICTED_DEG = 30.0
 LEAST_TESTED = 20  # rows of a file, whose azimuths are asked
 # At .1 nats a row 6 of 16 azimuths that were 60 degrees off passed;
 # at .03 too many right ones do not.
@@ -85,13 +85,8 @@ def find_sectors(data: Measurements, places: np.ndarray | None = None) -> Sector
         order = np.argsort(stations.carrier_hz)
         steps = np.diff(stations.carrier_hz[order], prepend=stations.carrier_hz[order[:1]])
         band[order] = np.cumsum(steps > (ONE_BAND - 1) * stations.carrier_hz[order])
-    sector = sector[:, : len(USUAL)]
-    table = np.where(known := np.isfinite(sector), sector, USUAL)
-    (azimuth, _, _, height, power), (aimed, tilted, *_) = table.T, known.T
-    height[~tilted], power[:] = NO_PATTERN, power - power.mean()
-    azimuth[:] = np.where(aimed, azimuth % ROUND_DEG, NO_AZIMUTH)
     which = torch.from_numpy(np.stack([site, band]))
-    return Sectors(0.0, table=torch.from_numpy(table), site=which[0], band=which[1])
+    return Sectors(0.0, table=sector_table(sector), site=which[0], band=which[1])
 
 
 def number_sites(stations: Stations, places: np.ndarray) -> np.ndarray:

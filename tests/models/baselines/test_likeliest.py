@@ -12,18 +12,10 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.kriging import Kriging
-from gsparc.models.powers.settings import (
-    LEAST_SILENT,
-    KernelCandidate,
-    _select_doubtful,
-    process_and_notes,
-)
+from gsparc.models.baselines.likeliest import process_and_notes
 from gsparc.models.reduced import with_reduction
 from gsparc.models.target_rows import power_rows
 from gsparc.ops import Pose
-from gsparc.processes.kernel import Kernel
-from gsparc.processes.powers import PowerRows
-from gsparc.processes.trend import Trend
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 from tests.models.powers.test_mixture import station
@@ -53,20 +45,6 @@ def fit(method, data: Measurements, known: int):
 def error_db(method, batch) -> float:
     found = method.predict(batch).mean
     return float((10 * torch.log10(found / batch.target)).square().mean().sqrt())
-
-
-def test_of_silent_rows_those_in_doubt_are_weighed():
-    """All were, at each look of a search: 5.1 times the seconds of the rows that were heard."""
-    heard, silent = np.linspace(0, 400, 40), np.linspace(0, 2000, 101)
-    side = np.repeat([0, 1], [40, 101]).astype(np.int8)
-    places = np.pad(np.r_[heard, silent][:, None], ((0, 0), (0, 2)))
-    rows = PowerRows(places, np.where(side, -70.0, -60.0), side)
-    few = _select_doubtful(
-        rows, KernelCandidate(0.0, Trend(-60.0), Kernel.from_length(100.0, 0.1, 16.0), 0.0)
-    )
-    assert (few.side == 0).sum() == 40 and few.silent.sum() == LEAST_SILENT
-    # Beside strong ones a silent row contradicts what is known; 2 km away it says little.
-    assert (few.places[few.silent, 0] <= 400).sum() == (silent <= 400).sum()
 
 
 def test_few_rows_do_not_choose_a_process_that_varies_far_more_than_they_do():

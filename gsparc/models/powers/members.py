@@ -1,0 +1,254 @@
+"""Processes of powers that one station's rows are predicted by, and their shares.
+
+A member has a mean, a distance law or none, and a shape, rough or smoother. Its numbers have the
+largest evidence with what stations elsewhere teach (`known_numbers.py`); level and exponent are
+integrated out. Shares have the least squared error at rows left out, shrunk towards what is
+believed before any row: with few rows a mean of members is safer than the best of them.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from gsparc.data.schema import ENDS, Site
+from gsparc.models.baselines.distance_law import UNSEEN, locate_still_end, say_estimated
+from gsparc.models.powers.known_numbers import known_numbers
+from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, subtract_means
+from gsparc.models.powers.prior_map import PriorMap
+from gsparc.models.stack import shrunk_weights
+from gsparc.processes.fit_kernel import LOOKS, NumberPrior, fit_kernel_by_evidence
+from gsparc.processes.kernel import ExponentialShadowing, Kernel, Shadowing
+from gsparc.processes.nearest import Nearest, choose_kernel_by_nearest
+from gsparc.processes.places import has_both_ends
+from gsparc.processes.posterior import Exact
+from gsparc.processes.powers import PowerProcess, PowerRows, condition_on_powers, rows_in_doubt
+from gsparc.processes.prior import Prior
+from gsparc.processes.sectors import Beam, sector_table
+from gsparc.processes.term import Columns
+from gsparc.processes.trend import TINY_M, Law, Trend
+
+LEVEL_DB = 20.0  # deviation of a level before any row
+# Before any row: of a law about a known place, about one that is sought, of no law; of shapes
+LAW, SOUGHT, NONE = 3.0, 1.0, 1.0
+SHAPES = (ExponentialShadowing, 3.0), (Shadowing, 1.0)
+PLACE_NEEDS = 8  # rows that were heard, for a place that is sought
+LEARNED_ON = 500  # rows: numbers, and shares
+NEAREST_FROM = 1_000  # rows, from which on shape and numbers follow from the nearest ones
+WALKED = 15  # looks of a member that begins where the first ended, of one that hears of silence
+MAP_PAYS = 0.05  # of the squared errors at rows left out that a map must take off
+
+
+class MeanLaw(NamedTuple):
+    """A trend, its weight before any row, and what must be said of it."""
+
+    trend: Trend
+    belief: float
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Member:
+    """A process before any row.
+
+    Attributes:
+        trend: of which deviations are in decibels.
+        belief: its weight before any row.
+        kernel: of the largest evidence.
+        notes: what must be said of it.
+    """
+
+    trend: Trend
+    belief: float
+    kernel: Kernel
+    notes: tuple[str, ...] = ()
+
+    @property
+    def prior(self) -> Prior:
+        """Both; the trend is relative to the kernel's deviation."""
+        return Prior(self.kernel, self.trend.in_unit(math.sqrt(self.kernel.amplitude)))
+
+    @property
+    def description(self) -> str:
+        """One line of the settings."""
+        mean = "a constant" if self.trend.law is None else "a distance law"
+        share = " and a share of the map" if self.has_map else ""
+        return f"{self.kernel.description}, mean: {mean}{share}"
+
+    @property
+    def has_map(self) -> bool:
+        """Whether the mean has a share of a map from before."""
+        own = (term.term for term in self.trend.more if isinstance(term, UserTerm))
+        return any(isinstance(term, PriorMap) for term in own)
+
+
+def learn_members(
+    rows: PowerRows,
+    site: Site,
+    seed: int,
+    most: int = LEARNED_ON,
+    terms: tuple[UserTerm, ...] = (),
+    walls: tuple[Columns, ...] = (),
+) -> list[Member]:
+    """Return members with the numbers that rows say, the most believed first.
+
+    Args:
+        rows: at least one.
+        site: where the still end is.
+        seed: of rows that are drawn where there are too many.
+        most: rows that numbers are learned on.
+        terms: of a user; maps from before among them stand in some members alone.
+        walls: columns of losses, in the mean of all.
+    """
+    sure = tuple(term for term in terms if not isinstance(term.term, PriorMap))
+    extent = extent_of(rows)
+    few, known = rows.heard_rows.draw_subset(most, seed), known_numbers().numbers
+    shapes = [(known.start(extent, term), weight) for term, weight in SHAPES]
+    if has_both_ends(rows.places):
+        path, noise = shapes[0][0].length, shapes[0][0].noise
+        ends = replace(Kernel.of_ends(path, path, noise), amplitude=shapes[0][0].amplitude)
+        shapes = [shapes[0], (ends, SHAPES[0][1])]
+    members = []
+    for some in (terms, sure) if len(sure) < len(terms) else (terms,):
+        rest = subtract_means(rows, some)
+        for mean, belief, notes in means(rest, site, walls):
+            trend = add_terms_to_trend(rest, mean, some)
+            members += [Member(trend, belief * weight, kernel, notes) for kernel, weight in shapes]
+    members = [learn_numbers(few, member, known, extent, LOOKS) for member in members]
+    if rows.silent.any() and not rows.silent.all():
+        part = rows.draw_subset(most, seed)
+        doubtful = rows_in_doubt(part, members[0].prior)
+        members = [learn_numbers(doubtful, member, known, extent, WALKED) for member in members]
+    return members
+
+
+def extent_of(rows: PowerRows) -> float:
+    """Return the diagonal of the rows' box [m]; of one place 1."""
+    return float(np.linalg.norm(np.ptp(rows.places, axis=0))) or 1.0
+
+
+def exponent_of(process: PowerProcess) -> float:
+    """Return the exponent that rows say; 0 without a law."""
+    trend, posterior = process.trend, process.posterior
+    if trend.law is None:
+        return 0.0
+    if isinstance(posterior, Exact):
+        slope = posterior._trend_columns[:, 1] @ posterior.weights[:, 0]
+    else:
+        assert isinstance(posterior, Nearest)
+        slope = posterior.terms[1, 0]
+    return trend.law.exponent - float(slope) / (10 * trend.spread * trend.unit)
+
+
+def means(rows: PowerRows, site: Site, walls: tuple[Columns, ...]) -> list[MeanLaw]:
+    """Return what levels may be about, the law first.
+
+    Args:
+        rows: at least one.
+        site: where the still end is; a place that nobody gave is sought from `PLACE_NEEDS` rows on.
+        walls: further columns.
+    """
+    level = float(rows.heard_rows.decibels.mean())
+    none = MeanLaw(Trend(level, more=walls, level_db=LEVEL_DB), NONE)
+    still, notes, belief = site.static_position, tuple[str, ...](), LAW
+    if has_both_ends(rows.places):
+        still = None
+    elif still is None or not np.isfinite(still).all():
+        if (~rows.silent).sum() < PLACE_NEEDS:
+            return [none]
+        still, belief = locate_still_end(rows), SOUGHT
+        notes = (f"the {ENDS[site.still_end]}'s place {say_estimated(still + site.origin)}",)
+    at = None if still is None else tuple(map(float, still))
+    (exponent, unsure), places = known_numbers().exponent, torch.from_numpy(rows.places)
+    law = Law(0.0, exponent, TINY_M, 1.0, at)
+    nearest = float(law.distance(places).min())
+    # A place that was sought is itself as unsure as its nearest row is far.
+    law = replace(law, floor=max(nearest if notes else nearest / UNSEEN, TINY_M))
+    decades = law.decades(places)
+    law = replace(law, level=level + 10 * exponent * float(decades.mean()))
+    slope = 1 / (10 * unsure)
+    beams = site.every_station.beams
+    if at is not None and not notes and np.isfinite(beams[0, 0]):
+        beam = Beam(sector_table(beams[:1]), torch.tensor(at, dtype=torch.float64))
+        walls = (*walls, replace(beam, middle=float(beam.loss(places).mean())))
+    trend = Trend(0.0, law, float(decades.mean()), slope, walls, LEVEL_DB)
+    return [MeanLaw(trend, belief, notes), none]
+
+
+def learn_numbers(
+    rows: PowerRows, member: Member, known: NumberPrior, extent: float, looks: int
+) -> Member:
+    """Return the member with numbers of the largest evidence, beginning at its own.
+
+    Args:
+        rows: at least one.
+        member: to begin with.
+        known: of numbers before any row.
+        extent: of all rows [m].
+        looks: most evaluations.
+    """
+    view = rows.view(member.trend, member.kernel)
+    side = None if rows.silent.all() else view.side
+    _, kernel = fit_kernel_by_evidence(
+        member.kernel, [view._replace(side=side)], looks, known, extent
+    )
+    return replace(member, kernel=kernel)
+
+
+def weigh_members(
+    rows: PowerRows, members: list[Member], seed: int, most: int = LEARNED_ON
+) -> tuple[tuple[tuple[float, Prior], ...], tuple[str, ...]]:
+    """Return priors with their shares, the largest first, and what must be said of them.
+
+    Args:
+        rows: at least one.
+        members: of these rows.
+        seed: of rows that are drawn where there are too many.
+        most: rows that shares are learned on.
+    """
+    part, belief = rows.draw_subset(most, seed), np.array([m.belief for m in members])
+    errors = np.stack([_left_out_errors(part, member.prior, seed) for member in members], 1)
+    shares = shrunk_weights(errors, belief)
+    bare = np.array([not member.has_map for member in members])
+    if bare.any() and not bare.all():
+        alone = shrunk_weights(errors, belief * bare)
+        # Both were chosen on these rows: what a map gains by chance is no gain elsewhere.
+        if ((errors @ shares) ** 2).mean() > (1 - MAP_PAYS) * ((errors @ alone) ** 2).mean():
+            shares = alone
+    weighed = [(float(shares[k]), members[k]) for k in np.flatnonzero(shares)]
+    if len(rows.places) > NEAREST_FROM and not rows.silent.any():
+        weighed = _by_nearest(rows, weighed, seed)
+    weighed = sorted(weighed, key=lambda pair: -pair[0])
+    texts = [f"{share:.0%} of {member.description}" for share, member in weighed]
+    notes = dict.fromkeys(note for _, member in weighed for note in member.notes)
+    if len(weighed) == 1:
+        texts = [weighed[0][1].description]
+    return tuple((share, member.prior) for share, member in weighed), (*texts, *notes)
+
+
+def _by_nearest(
+    rows: PowerRows, weighed: list[tuple[float, Member]], seed: int
+) -> list[tuple[float, Member]]:
+    """A member for each mean, with a shape and numbers that rows say of others near them."""
+    result = []
+    for trend in {id(member.trend): member.trend for _, member in weighed}.values():
+        alike = [(share, member) for share, member in weighed if member.trend is trend]
+        member = max(alike, key=lambda pair: pair[0])[1]
+        if member.kernel.is_isotropic:
+            kernel, how = choose_kernel_by_nearest(member.prior, rows.means_at_places(), seed)
+            member = replace(member, kernel=kernel, notes=(*member.notes, f"then {how}"))
+        result.append((sum(share for share, _ in alike), member))
+    return result
+
+
+def _left_out_errors(rows: PowerRows, prior: Prior, seed: int) -> np.ndarray:
+    """Errors (n,) [dB] of rows that were heard, each predicted from all others."""
+    posterior = condition_on_powers(rows, prior, seed)[0].posterior
+    assert isinstance(posterior, Exact)
+    if rows.silent.all():
+        return np.zeros(0)
+    return posterior.left_out_residuals().residual[posterior.extra == 0, 0].numpy()
