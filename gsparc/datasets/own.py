@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +27,8 @@ from gsparc.tables import is_table
 from gsparc.tables.conventions import CONVENTIONS
 from gsparc.tables.own import Reading, interpret
 from gsparc.tables.raw import Raw, read_raw
+
+log = logging.getLogger(__name__)
 
 
 def read_own(
@@ -78,9 +81,9 @@ def apply_settings(
         not_heard: levels that mean that nothing was heard; None: those that stand apart from all
             others.
         absent: `silent`: a station without a level at a place where others have one was not heard
-            there; `weaker`: one that a list of the strongest leaves out is below its weakest, levels
-            that are missing beside weak ones alone are below their station's; `auto`: the same, but
-            the last is asked where no row names the pair; `unknown`: neither.
+            there; `weaker`: one that a list of the strongest leaves out is below its weakest,
+            levels that are missing beside weak ones alone are below their station's; `auto`: the
+            same, but the last is asked where no row names the pair; `unknown`: neither.
         saturation_db: level [dB] from which on powers are at least that; `auto`: the highest where
             it repeats; `none`: there is none.
         tx_position: of a transmitter that stood still, where the file does not say it [m].
@@ -118,6 +121,8 @@ class Own(Campaign):
         """Read the file; answers to its questions are kept."""
         raw = super().raw()
         self.said = raw.said
+        for role in [role for role in raw.roles if role.readings]:
+            log.warning("dataset.guess=true takes %s", role.readings[0])
         return raw
 
     def load(self) -> Measurements:
@@ -127,7 +132,7 @@ class Own(Campaign):
         data = super().load()
         questions = [note for note in self.notes if isinstance(note, Question)]
         if questions and not (self.settings.get("guess") or self.told):
-            raise DataError(questions, self.file)
+            raise DataError([f"{self.file}: {question}" for question in questions], self.file)
         return data
 
 
@@ -193,7 +198,8 @@ def read_any(path: str | Path, **settings: Any) -> Reading:
     try:
         return replace(interpret(apply_settings(raw, **settings), path, part), raw=raw)
     except DataError as error:
-        raise DataError([*questions, *error.problems], path) from None
+        asked = [f"{path}: {question}" for question in questions]
+        raise DataError([*asked, *error.problems], path) from None
 
 
 def read_file_or_table(

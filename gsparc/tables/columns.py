@@ -312,15 +312,15 @@ def _wide_survey(sheet: Sheet, chosen: Chosen) -> None:
         span = float(numbers.min(axis=None)), min(float(numbers.max(axis=None)), -1e-9)
     if not (alike := _like_levels(sheet, rest, span)):
         return None
-    said = name_columns(alike)
+    names, holds = name_columns(alike), "hold" if len(alike) > 1 else "holds"
     if measured:
         whole = [head for head in sheet.heads if head in {*alike, *(c.head for c in levels)}]
         how = say_column("rssi_db", name_block(sheet, whole))
-        said += f" hold{'s' * (len(alike) == 1)} values like these levels and are not used: "
-        return sheet.notes.append(Caution(f"{said}of stations, too? {how}"))
+        finding = f"{names} {holds} values like these levels and are not used: of stations, too?"
+        return sheet.notes.append(Caution(f"{finding} {how}"))
     several = len(alike) > 1 and "station" not in chosen
     ways = [name_block(sheet, alike)] * several + alike[: MOST_READINGS - several]
-    why = f"{said} hold{'s' * (len(alike) == 1)} values like levels, no head says so: which are"
+    why = f"{names} {holds} values like levels, no head says so: which are"
     readings = tuple(Answer({"rssi_db": way}, _means(sheet, way)) for way in ways)
     return sheet.ask(Role(tuple(alike), "rssi_db", "seen", readings=readings, why=why))
 
@@ -335,10 +335,10 @@ def name_block(sheet: Sheet, names: Sequence[str]) -> object:
 
 def _ask_ranks(sheet: Sheet, role: str, columns: Sequence[Column]) -> bool:
     """Ask whether numbers of levels are ranks, where columns beside them hold names; whether so."""
-    found = [(re.findall(r"\d+", column.label), column.head or "") for column in columns]
-    if sheet.asked is None or any(len(numbers) != 1 for numbers, _ in found):
+    parts = [(re.findall(r"\d+", column.label), column.head or "") for column in columns]
+    if sheet.asked is None or any(len(numbers) != 1 for numbers, _ in parts):
         return False
-    numbered = {numbers[0]: head for numbers, head in found}
+    numbered = {numbers[0]: head for numbers, head in parts}
     if (names := ranked_names(sheet, numbered)) is None:
         return False
     levels = _pattern([*columns])
@@ -450,7 +450,8 @@ def _named_columns(sheet: Sheet, role: str, text: str) -> tuple[Column, ...]:
         begin, end = sheet.heads.index(first), sheet.heads.index(last)
         listed = sheet.heads[begin : end + 1]
         return tuple(Column(role, _label(h, role), _unit(h, role), head=h) for h in listed)
-    labels = {h: unit_of(l)[0].strip() for h, l in heads.match_pattern(text, sheet.heads).items()}
+    matches = heads.match_pattern(text, sheet.heads)
+    labels = {head: unit_of(part)[0].strip() for head, part in matches.items()}
     before, _, after = text.partition("*")
     # `MAC1` is a name, `RSSI_1` a level of the station 1.
     whole = role in heads.LEVELS and not LISTS["level"] & {*words_of(before + " " + after)}

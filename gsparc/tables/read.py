@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -43,7 +43,7 @@ from gsparc.tables.times import read_times
 
 def parse_table(
     path: str | Path,
-    columns: Said = {},
+    columns: Mapping[str, object] = {},
     stations_file: str | Path | None = None,
     stations: Collection[str] = (),
     guess: bool = False,
@@ -85,10 +85,10 @@ def parse_table(
         sheet.notes.append(f"columns are what {about} says")
     given = {key: value for key, value in columns.items() if value is not None}
     said |= {heads.OTHER_NAMES.get(key, key): value for key, value in given.items()}
-    settled = settle(build, said)
+    settled = settle(build, said, sheet.source)
     questions, raw = [role.question() for role in settled.asked], settled.raw
     if questions and not guess:
-        raise DataError(questions, path)
+        raise DataError([f"{sheet.source}: {question}" for question in questions], path)
     roles = (*settled.asked, *raw.roles)
     notes = (*questions, *raw.notes)
     return replace(raw, notes=notes, said=settled.said, roles=roles, heads=sheet.heads)
@@ -403,9 +403,9 @@ class Builder:
             for axis, words in heads.SHEET["likely"].items()
         }
         for pair in (("latitude", "longitude"), ("x", "y")):
-            found = [likely[axis] for axis in pair]
-            if all(len(names) == 1 for names in found):
-                names = [names[0] for names in found]
+            of_axes = [likely[axis] for axis in pair]
+            if all(len(heads_of_axis) == 1 for heads_of_axis in of_axes):
+                names = [heads_of_axis[0] for heads_of_axis in of_axes]
                 cells = " and ".join(map(self.sheet.first_cell, names))
                 readings = (Answer(dict(zip(pair, names, strict=True)), cells),)
                 why = f"{name_columns(names)} may be {' and '.join(pair)}"

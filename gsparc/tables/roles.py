@@ -103,12 +103,13 @@ class Settled:
 Build = Callable[[Said], tuple[Raw | None, list[Role], tuple[str, ...]]]
 
 
-def settle(build: Build, said: Said, compare: bool = True) -> Settled:
+def settle(build: Build, said: Said, source: str, compare: bool = True) -> Settled:
     """Read a table with the likeliest reading of each open role that builds arrays.
 
     Args:
         build: its arrays, roles that are open, and what is wrong, where settings say so much.
         said: settings.
+        source: for messages.
         compare: whether the other readings are tried, too; those that change nothing are not asked.
 
     Raises:
@@ -122,11 +123,12 @@ def settle(build: Build, said: Said, compare: bool = True) -> Settled:
     role, read, faults = asked[0], list[tuple[Answer, Settled]](), list[str]()
     for answer in role.readings if compare else role.readings[:1]:
         try:
-            read.append((answer, settle(build, {**said, **answer.said}, compare and not read)))
+            more = {**said, **answer.said}
+            read.append((answer, settle(build, more, source, compare and not read)))
         except DataError as error:
             faults = faults or [*error.problems]
     if not read:
-        raise DataError([role.question(), *faults])
+        raise DataError([f"{source}: {role.question()}", *faults])
     first = read[0][1]
     unlike = [read[0][0]]
     for answer, settled in read[1:]:

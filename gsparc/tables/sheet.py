@@ -7,7 +7,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -79,10 +79,9 @@ class Sheet:
 
     def ask(self, role: Role) -> Any:
         """Note a role that is open; returns None."""
-        role = replace(role, why=f"{self.source}: {role.why}")
-        return (
-            self.problems.append(role.question()) if self.asked is None else self.asked.append(role)
-        )
+        if self.asked is None:
+            return self.problems.append(f"{self.source}: {role.question()}")
+        return self.asked.append(role)
 
     def is_open(self) -> bool:
         """Tell whether anything is wrong, or open, so that nothing further can be said."""

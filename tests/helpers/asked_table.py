@@ -27,7 +27,7 @@ def files(folder: Path) -> Iterator[tuple[str, Path, dict]]:
     for path in sorted(REAL.rglob("*.*")):
         if path.suffix in SUFFIXES and not any(word in path.stem for word in LISTS):
             lists = [path.with_name(f"{SITES[s]}.csv") for s in SITES if path.stem.startswith(s)]
-            yield str(path.relative_to(REAL)), path, {"stations_file": f for f in lists}
+            yield str(path.relative_to(REAL)), path, {"stations_file": lists[0]} if lists else {}
     for number, (name, (content, settings, *_)) in enumerate(CASES.items()):
         (path := folder / f"case{number}.csv").write_text(content)
         yield f"case: {name}", path, settings
@@ -48,4 +48,4 @@ if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as folder:
         given = [(name, Path(name), {}) for name in sys.argv[1:]]
         for name, path, settings in given or files(Path(folder)):
-            print(name, *outcome(path, settings), sep="\t", flush=True)
+            sys.stdout.write("\t".join((name, *outcome(path, settings))) + "\n")

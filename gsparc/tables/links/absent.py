@@ -87,7 +87,7 @@ def add_unlisted(
     if bound is not None and absent == "auto" and not listened:
         how = "not heard, or not measured? say dataset.absent=weaker (below each station's "
         how += "weakest), or dataset.absent=unknown (not measured, and not used)"
-        check.notes.append(Question(f"{check.source}: {missing}: {how}"))
+        check.notes.append(Question(f"{missing}: {how}"))
     if bound is not None:
         (floor, may), lists = bound, replace(lists, length=0)
         how = (
