@@ -21,6 +21,7 @@ from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, fill_defaults
 from gsparc.runs.align_site import align_to_site
 from gsparc.runs.settings import RunSettings, to_dict
+from gsparc.tables.roles import say_quantity
 from gsparc.training import tracking
 from gsparc.training.effort import Effort
 
@@ -90,7 +91,11 @@ def _data(config: DictConfig, known: Measurements | None) -> DataModule:
     module.measurements  # noqa: B018 (read now, so that errors show the path that was typed)
     # As they were answered: other files are read so, too
     for quantity, column in module.said.items():
-        OmegaConf.update(config, f"dataset.columns.{quantity}", column, force_add=True)
+        OmegaConf.update(
+            config, f"dataset.columns.{say_quantity(quantity)}", column, force_add=True
+        )
+    if module.said:  # which holds what a file about columns says
+        OmegaConf.update(config, "dataset.columns_file", None, force_add=True)
     for key in ("root", "file"):  # absolute, so that a checkpoint finds its data from any folder
         location = None if OmegaConf.is_missing(config.dataset, key) else config.dataset.get(key)
         if location:

@@ -26,7 +26,7 @@ from gsparc.tables.heads import (
     unit_suits,
     words_of,
 )
-from gsparc.tables.roles import NONE, Answer, Role, Said, Sure, say_column, say_quantity
+from gsparc.tables.roles import NONE, Answer, Role, Said, Sure, say_column
 from gsparc.tables.sheet import Sheet
 from gsparc.tables.slots import ranked_names
 from gsparc.tables.times import find_times
@@ -117,10 +117,10 @@ Chosen = dict[str, tuple[Column, ...]]
 
 def list_roles(sheet: Sheet, chosen: Chosen, said: Said) -> list[Role]:
     """Return what all columns are taken for, in the order of quantities; like ones as one."""
-    roles = []
+    roles, settings = [], {heads.OTHER_NAMES.get(key, key): way for key, way in said.items()}
     for quantity, columns in chosen.items():
         names = [column.head for column in columns if column.head]
-        text = said.get(quantity, said.get(say_quantity(quantity)))
+        text = settings.get(quantity)
         if text is None and names:
             text = "+".join(names) if columns[0].label == JOINED else name_block(sheet, names)
         unit = columns[0].unit.name if columns[0].unit else columns[0].schema_unit

@@ -84,7 +84,8 @@ def parse_table(
         said |= read_columns(about, sheet.heads)
         sheet.notes.append(f"columns are what {about} says")
     given = {key: value for key, value in columns.items() if value is not None}
-    said |= {heads.OTHER_NAMES.get(key, key): value for key, value in given.items()}
+    others = {heads.OTHER_NAMES.get(key, key) for key in given}
+    said = {key: value for key, value in said.items() if key not in others} | given
     settled = settle(build, said, sheet.source)
     questions, raw = [role.question() for role in settled.asked], settled.raw
     if questions and not guess:

@@ -216,3 +216,16 @@ def test_names_in_numbered_columns_were_levels(write):
     columns = (names, RANKS[1], names, RANKS[3])
     data = read_any(write(table("x,y,bssid1,level1,bssid2,level2", *PLACES.T, *columns))).data
     assert {*data.site.stations.name} == {*names}
+
+
+def test_a_checkpoint_keeps_answers_and_a_later_setting_replaces_them(write, tmp_path):
+    """`height` of a later command was overridden by the `z` that training had kept."""
+    from gsparc.tables.columns_file import read_columns
+
+    path = write(table("x,y,floor,rssi", *PLACES.T, BAND, LEVELS[:, 0]))
+    raw = parse_table(path, {"height": "floor*3.2"})
+    assert raw.said == {"height": "floor*3.2"}
+    said(path, columns={"height": "floor*3.2"})
+    assert read_columns(beside(path), raw.heads)["z"] == "floor*3.2"
+    again = parse_table(path, {"height": "floor*4"}, columns_file=beside(path))
+    assert again.arrays["rx_position"][:, 2].max() == 4
