@@ -78,7 +78,8 @@ def check(
         # Of beams that point down nothing is known where both ends are at one height.
         warnings += [] if stations.position[:, 2].any() or heights.any() else [TILTED]
     doubts = group_warnings(warnings)
-    open_roles = [("asked", question) for question in questions]
+    guessed = bool(settings.get("guess"))
+    open_roles = [("guessed" if guessed else "asked", question) for question in questions]
     for topic, sentence in [*open_roles, *topics, *(("warning", doubt) for doubt in doubts)]:
         _line(console, f"{topic:<12}{sentence}")
     if draw is not None:
@@ -96,7 +97,7 @@ def check(
     except DataError as error:
         _line(console, f"{path}: readable, but too small to train on ({error})")
         return False
-    if questions:
+    if questions and not guessed:
         number = f"{len(questions)} question{'s' if len(questions) > 1 else ''}"
         answer = "say one of each, or dataset.guess=true, which takes the first"
         _line(console, f"{path}: {number}, on which training stops: {answer}")
