@@ -125,10 +125,10 @@ def run_each(
 
 
 def run_all(
-    work: Callable[[_Piece], _Result], pieces: Sequence[_Piece], what: str = ""
+    work: Callable[[_Piece], _Result], pieces: Sequence[_Piece], what: str = "", **how: Any
 ) -> list[_Result]:
     """Return what `work` makes of pieces in their order, whichever ends first; see `run_each`."""
-    results = dict(run_each(work, pieces, what))
+    results = dict(run_each(work, pieces, what, **how))
     return [results[number] for number in range(len(pieces))]
 
 

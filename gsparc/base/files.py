@@ -216,6 +216,19 @@ def write_archive(path: str | Path, arrays: Mapping[str, Any]) -> None:
         np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
+def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
+    """Write equally long columns as CSV, atomically; NaN becomes an empty cell.
+
+    Raises:
+        ValueError: columns are not of the same length.
+    """
+    import pandas as pd  # half a second, which most commands' --help does without
+
+    # object: pandas would write whole numbers beside empty cells as 3.0.
+    frame = pd.DataFrame(columns, dtype=object)
+    write_whole(path, frame.to_csv(index=False, lineterminator="\n"))
+
+
 @contextmanager
 def whole_folder(path: str | Path) -> Iterator[Path]:
     """Open an empty folder beside `path`, which must not exist,

@@ -13,7 +13,7 @@ from gsparc.evaluation.table import Column, Table
 from gsparc.ops.backends import backend_named
 from gsparc.prediction.bench import Call, kernel_cases, loss_case, training_step_case
 from gsparc.prediction.timing import ClockSettings, time_interleaved
-from gsparc.runs.output import finish_run, run_directory
+from gsparc.runs.output import Result, run_directory
 
 COLUMNS = (
     Column("kernel", ""),
@@ -27,7 +27,7 @@ REFERENCE = ClockSettings(rounds=3, least=1, warmup=0, rounds_s=0.5)
 
 
 def task(config: DictConfig) -> dict[str, Any]:
-    """Time all kernels; return the facts of `summary.json`, the table is also `bench.csv`."""
+    """Time all kernels, BLAS with its own threads; the table is also `bench.csv`."""
     clock = ClockSettings(rounds=config.rounds, least=2, warmup=1, rounds_s=config.rounds_s)
     check_arguments(config, device=choice("cpu", "cuda"))
     device = config.device
@@ -53,7 +53,7 @@ def task(config: DictConfig) -> dict[str, Any]:
     note = "medians of warm calls; -: the dense tensors of plain PyTorch would be too large"
     sheet = Table("", COLUMNS, rows, note)
     (run_directory() / "bench.csv").write_text(sheet.csv(), encoding="utf-8")
-    return finish_run(run_directory(), facts, sheet)
+    return Result(facts, [sheet]).show(run_directory())
 
 
 def median_s(call: Call, clock: ClockSettings) -> float:

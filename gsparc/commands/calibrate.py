@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import write_summary
@@ -17,16 +16,16 @@ from gsparc.prediction.confidence import Guarantee
 from gsparc.prediction.left_out import Evidence
 from gsparc.prediction.risk import SHARES, calibration_facts, explain_too_few, run_trials
 from gsparc.runs.open_runs import Unseen
-from gsparc.runs.output import begin_run, finish_run
+from gsparc.runs.output import CommandCall, Result, command
 
 log = logging.getLogger(__name__)
 
 
-def task(config: DictConfig) -> dict[str, Any]:
-    """Gather, resample, write; returns the facts of `summary.json`."""
-    run_dir, settings = begin_run(config)
-    paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
-    opened = [Unseen.open(path, settings["dataset"], settings["split"]) for path in paths]
+@command()
+def task(call: CommandCall) -> Result:
+    """Gather, resample, write."""
+    config, given = call.config, call.given
+    opened = [Unseen.open(path, given["dataset"], given["split"]) for path in call.paths]
     evidence, run_facts = Evidence.join([unseen.evidence for unseen in opened]), opened[0].facts
     promise = Guarantee(float(config.limit_db), float(config.alpha), float(config.delta))
     draws = int(config.draws), config.confidence, int(config.seed)
@@ -40,9 +39,9 @@ def task(config: DictConfig) -> dict[str, Any]:
         )
     facts = run_facts | calibration_facts(evidence, divisions, promise) | {"seed": config.seed}
     # Written before a threshold is stored: where storing fails, these figures are there.
-    write_summary(run_dir / "summary.json", facts)
+    write_summary(call.folder / "summary.json", facts)
     title = f"{run_facts['dataset/name']}, {run_facts['model/name']}"
-    draw_calibration(evidence, divisions, promise, title, run_dir / "confidence.png")
+    draw_calibration(evidence, divisions, promise, title, call.folder / "confidence.png")
     few = explain_too_few(len(evidence), promise)
     stored_lines = [] if few is None or config.store else [few]
     if config.store:
@@ -54,7 +53,7 @@ def task(config: DictConfig) -> dict[str, Any]:
             facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold
             # The confidence first, then what is promised of it: a line each.
             stored_lines += [f"{unseen.path}: {part}" for part in bound.split("; ", 1)]
-    return finish_run(run_dir, facts, *calibration_tables(facts), lines=stored_lines)
+    return Result(facts, calibration_tables(facts), stored_lines)
 
 
 def calibration_tables(facts: dict[str, Any]) -> list[Table]:

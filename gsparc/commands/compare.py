@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
-from omegaconf import DictConfig
 
-from gsparc.base.files import platform_cache
+from gsparc.base.files import platform_cache, write_samples
 from gsparc.commands.train import train_job
 from gsparc.evaluation.examples import join_examples
-from gsparc.evaluation.summary import provenance, write_samples, write_summary
+from gsparc.evaluation.summary import provenance, write_summary
 from gsparc.pictures.drawing import PRINTED, save
 from gsparc.pictures.pictures import draw_spectra
 from gsparc.pictures.plots import draw_efforts, draw_splits, draw_sweep
@@ -32,16 +31,16 @@ from gsparc.runs.experiment.table import (
     table_of,
     title_of,
 )
-from gsparc.runs.output import begin_run, show_result
+from gsparc.runs.output import CommandCall, command, show_result
 from gsparc.runs.run_lock import locked
 
 log = logging.getLogger(__name__)
 
 
-def task(config: DictConfig) -> pd.DataFrame:
+@command()
+def task(call: CommandCall) -> pd.DataFrame:
     """Compare as conf/compare.yaml says, see `compare`."""
-    run_dir, settings = begin_run(config)
-    return compare(settings, run_dir)
+    return compare(call.given, call.folder)
 
 
 def compare(settings: Mapping[str, Any], run_dir: Path) -> pd.DataFrame:

@@ -6,20 +6,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
 from gsparc.evaluation.results import Run, frame_of_runs
 from gsparc.evaluation.summary import remarks
-from gsparc.models import checkpoint
 from gsparc.pictures.confidence_pictures import PICTURES, draw_confidences
 from gsparc.pictures.plots import draw_sweep
 from gsparc.prediction.hearing import read_hearing
 from gsparc.runs.evaluate import Evaluation, evaluate
-from gsparc.runs.open_runs import open_files
-from gsparc.runs.output import begin_run, finish_run, tables_of
+from gsparc.runs.open_runs import open_run
+from gsparc.runs.output import CommandCall, Result, command, tables_of
 
 
 def evaluate_files(
@@ -36,14 +33,14 @@ def evaluate_files(
     from the rows that the models learned from.
 
     Args:
-        paths, dataset, split: see `open_files`.
+        paths, dataset, split: see `open_run` and `OpenRun.read`.
         eval_on: `train`, `val` or `test`.
         baselines: shown beside it; None: all plain methods that serve the data.
 
     Raises:
-        ValueError: as `open_files`.
+        ValueError: as these.
     """
-    run = open_files(paths, dataset, split, others_whole=True)
+    run = open_run(paths, dataset or {}).read(split, others_whole=True)
     other, without = run.data.site.sha256 != run.stored[0].site.sha256, None
     # Without the rows that the models learned from, baselines would have learned from others.
     if other and run.trained is None and (baselines is None or len(baselines)):
@@ -62,32 +59,28 @@ def evaluate_files(
         learned=run.trained if other else None,
         hearing=hearing,
     )
-    evaluation.facts.update({"split/foreign": run.doubt, "split/without_baselines": without})
+    # All folds of a run share its configuration, and so its seed.
+    seed = run.stored[0].configuration.get("seed")
+    evaluation.facts.update(
+        {"split/foreign": run.doubt, "split/without_baselines": without, "seed": seed}
+    )
     return evaluation, run.data, run.split
 
 
-def task(config: DictConfig) -> dict[str, Any]:
-    """Test checkpoints; return the facts written to `summary.json` in the run directory."""
-    run_dir, settings = begin_run(config)
-    paths = [config.ckpt] if isinstance(config.ckpt, str) else list(config.ckpt)
-    evaluation, data, split = evaluate_files(
-        paths,
-        settings["dataset"],
-        settings["split"],
-        eval_on=config.eval_on,
-        baselines=config.baselines,
-    )
-    # All folds of a run share its configuration, and so its seed.
-    seed = checkpoint.read(paths[0]).configuration.get("seed")
-    facts = {**evaluation.facts, "seed": seed, "ckpt": ", ".join(str(p) for p in paths)}
+@command()
+def task(call: CommandCall) -> Result:
+    """Test checkpoints."""
+    given, run_dir, paths = call.given, call.folder, call.paths
+    how = {"eval_on": given["eval_on"], "baselines": given["baselines"]}
+    evaluation, data, split = evaluate_files(paths, given["dataset"], given["split"], **how)
+    facts = {**evaluation.facts, "ckpt": ", ".join(paths)}
     evaluation.write(run_dir)
-    rows = frame_of_runs([Run(run_dir, facts)])
+    rows, eval_on = frame_of_runs([Run(run_dir, facts)]), given["eval_on"]
     if evaluation.columns:
-        draw_sweep(rows, f"{data.site.name}, {config.eval_on} rows", run_dir / "distributions.png")
-        draw_confidences(PICTURES, rows, f"{data.site.name}, {config.eval_on} rows", run_dir)
+        draw_sweep(rows, f"{data.site.name}, {eval_on} rows", run_dir / "distributions.png")
+        draw_confidences(PICTURES, rows, f"{data.site.name}, {eval_on} rows", run_dir)
     write_split(run_dir / "split.json", split, len(data), data.site.sha256)
-    title = f"{data.site.name}, split {split.title}, {config.eval_on}"
+    title = f"{data.site.name}, split {split.title}, {eval_on}"
     # Who opened the files has warned of it, and warnings are repeated below the table.
-    notes = remarks({**facts, "split/foreign": None}, config.eval_on)
-    tables = tables_of(facts, title, config.eval_on, evaluation.stations)
-    return finish_run(run_dir, facts, *tables, lines=notes)
+    notes = remarks({**facts, "split/foreign": None}, eval_on)
+    return Result(facts, tables_of(facts, title, eval_on, evaluation.stations), notes)

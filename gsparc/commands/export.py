@@ -5,11 +5,11 @@ and link simulators.
 from __future__ import annotations
 
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 
 import gsparc.ops
 from gsparc.apps.export.along import deepmimo
@@ -17,12 +17,11 @@ from gsparc.apps.export.along.taps import Trajectory, write_taps
 from gsparc.apps.export.compiled.blob import pack_form
 from gsparc.apps.export.compiled.make import FIGURES, compile_model
 from gsparc.base.files import whole_folder
-from gsparc.base.limits import POSITIVE, SettingError, check_arguments, choice, or_null, whole
+from gsparc.base.limits import POSITIVE, SettingError, choice, or_null, whole
 from gsparc.prediction.operating_point import load
 from gsparc.prediction.placing import fill_heights, to_world
 from gsparc.prediction.predictor import Predictor
-from gsparc.runs.output import begin_run, finish_run
-from gsparc.runs.settings import to_dict
+from gsparc.runs.output import CommandCall, Result, command
 from gsparc.tables.query_places import read_query_places, read_times
 
 SOURCES = Path(gsparc.ops.__file__).parent / "csrc"
@@ -33,25 +32,24 @@ LIMITS |= {"rate_hz": or_null(POSITIVE), "to": choice("c", "taps", "deepmimo")}
 Facts = tuple[dict[str, Any], list[str]]
 
 
-def task(config: DictConfig) -> dict[str, Any]:
-    """Export, and say what is lost; returns the facts of `summary.json`."""
-    run_dir, _ = begin_run(config)
-    check_arguments(config, **LIMITS)
-    path = Path(config.ckpt)
-    out = path.with_name(f"{path.stem}-{config.to}") if config.out is None else Path(config.out)
+@command(**LIMITS)
+def task(call: CommandCall) -> Result:
+    """Export, and say what is lost."""
+    given, path = call.given, Path(call.given["ckpt"])
+    out = Path(given["out"] or path.with_name(f"{path.stem}-{given['to']}"))
     # The files of an export belong together: none is written beside those of another one.
     if out.exists():
         raise SettingError(f"out={out}: is there already; remove it or name another folder")
-    predictor = load(path).select_station(config.station)
+    predictor = load(call.given["ckpt"]).select_station(given["station"])
     # The folder appears by renaming: an export that fails leaves nothing behind.
     with whole_folder(out) as folder:
-        facts, lines = WRITERS[config.to](predictor, config, folder, out)
+        facts, lines = WRITERS[given["to"]](predictor, given, folder, out)
     facts |= {"model/name": predictor.method.name, "out": str(out), "ckpt": str(path)}
-    return finish_run(run_dir, facts, lines=lines, before="summary ")
+    return Result(facts, (), lines, "summary ")
 
 
-def _library(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
-    result = compile_model(predictor, int(config.places))
+def _library(predictor: Predictor, given: Mapping[str, Any], folder: Path, out: Path) -> Facts:
+    result = compile_model(predictor, given["places"])
     blob = pack_form(result.form, np.asarray(predictor.site.origin), result.error, result.worst)
     (folder / "field.gsparc").write_bytes(blob)
     shutil.copy(SOURCES / "field" / "gsparc_field.h", folder)
@@ -66,22 +64,22 @@ def _library(predictor: Predictor, config: DictConfig, folder: Path, out: Path) 
     ]
 
 
-def _places(predictor: Predictor, config: DictConfig) -> np.ndarray:
-    """World places (n, 3) [m] of the moving end in `config.table`."""
-    if config.table is None:
-        raise SettingError(f"table=null: to={config.to} needs a file of places")
+def _places(predictor: Predictor, given: Mapping[str, Any]) -> np.ndarray:
+    """World places (n, 3) [m] of the moving end in `table`."""
+    if given["table"] is None:
+        raise SettingError(f"table=null: to={given['to']} needs a file of places")
     site = predictor.site
-    queries = fill_heights(read_query_places(config.table, (site.moving_end,)), site)
+    queries = fill_heights(read_query_places(given["table"], (site.moving_end,)), site)
     return to_world(queries, site)[site.moving_end]
 
 
-def _impulses(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
+def _impulses(predictor: Predictor, given: Mapping[str, Any], folder: Path, out: Path) -> Facts:
     # Taps sum tones with their phases, which rows of unknown factors do not have.
     predictor.site.need_phase("to=taps")
-    place, time_s = _places(predictor, config), read_times(config.table)
+    place, time_s = _places(predictor, given), read_times(given["table"])
     if time_s is None:
-        raise SettingError(f"table={config.table}: no column time_s [s]")
-    facts = write_taps(predictor, Trajectory(time_s, place), to_dict(config), folder / "taps.npz")
+        raise SettingError(f"table={given['table']}: no column time_s [s]")
+    facts = write_taps(predictor, Trajectory(time_s, place), given, folder / "taps.npz")
     taps, rate_hz = facts.pop("taps/count"), facts.pop("taps/rate_hz")
     line = (
         f"{taps} taps at {rate_hz / 1e6:g} MHz leave {facts['taps/residual_db']:.1f} dB of the "
@@ -92,8 +90,8 @@ def _impulses(predictor: Predictor, config: DictConfig, folder: Path, out: Path)
     return facts, [line]
 
 
-def _scenario(predictor: Predictor, config: DictConfig, folder: Path, out: Path) -> Facts:
-    place = _places(predictor, config)
+def _scenario(predictor: Predictor, given: Mapping[str, Any], folder: Path, out: Path) -> Facts:
+    place = _places(predictor, given)
     paths, rest = deepmimo.write_scenario(folder, predictor, place)
     facts = {"deepmimo/places": len(place), "deepmimo/paths": paths, "deepmimo/left_out": rest}
     return facts, [

@@ -10,15 +10,14 @@ from importlib.util import find_spec
 from typing import Any
 
 import torch
-from omegaconf import DictConfig
 
 from gsparc.apps.link.pictures import STYLES, draw_acceptance, draw_errors, draw_rates
 from gsparc.apps.link.run import LinkStudy
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import write_summary
 from gsparc.evaluation.table import Column, Table
-from gsparc.runs.open_runs import open_files
-from gsparc.runs.output import begin_run, finish_run
+from gsparc.runs.open_runs import open_run
+from gsparc.runs.output import CommandCall, Result, command
 
 log = logging.getLogger(__name__)
 
@@ -43,15 +42,16 @@ BEAMS = (
 )
 
 
-def task(config: DictConfig) -> dict[str, Any]:
-    """Run all three experiments on one checkpoint; return the facts of `summary.json`."""
+@command()
+def task(call: CommandCall) -> Result:
+    """Run all three experiments on one checkpoint."""
     # Before anything is read: rates and PUSCH are Sionna's.
     if find_spec("sionna") is None:
         raise ValueError("gsparc link needs Sionna: make sionna, or pip install 'gsparc[sionna]'")
-    run_dir, settings = begin_run(config)
+    run_dir, settings = call.folder, call.given
     # Bits, noise and channels of PUSCH are drawn from torch's global generator.
-    torch.manual_seed(int(config.seed))
-    run = open_files([str(config.ckpt)], settings["dataset"], settings["split"])
+    torch.manual_seed(settings["seed"])
+    run = open_run(settings["ckpt"], settings["dataset"]).read(settings["split"])
     # Seconds of the experiments alone: reading the data is not theirs.
     started = time.perf_counter()
     study = LinkStudy(run, settings)
@@ -73,7 +73,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         draw_acceptance(surest, facts["accepted"], run_dir / "acceptance.png")
     facts["time/total_s"] = time.perf_counter() - started
     parts = tables(facts, title, list(points), settings["mcs"]["snr_db"])
-    return finish_run(run_dir, facts, *parts, lines=flat_curves(facts, points))
+    return Result(facts, parts, flat_curves(facts, points))
 
 
 def flat_curves(facts: Mapping[str, Any], points: Mapping[str, list[float]]) -> list[str]:

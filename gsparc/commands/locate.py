@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Any
-
-from omegaconf import DictConfig
-
 from gsparc.apps.locate.fingerprints import locate_fingerprints
 from gsparc.apps.locate.judging import locate_by_model
 from gsparc.apps.locate.neighbours import PLAIN
@@ -14,15 +9,13 @@ from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.base.limits import (
     POSITIVE,
     SHARE,
-    check_arguments,
     choice,
     number,
     or_null,
     switch,
     whole,
 )
-from gsparc.runs.output import finish_run, run_directory
-from gsparc.runs.settings import RunSettings, to_dict
+from gsparc.runs.output import CommandCall, Result, command
 
 LIMITS = {
     "prior": choice("box", "trained"),
@@ -36,22 +29,13 @@ LIMITS = {
 }
 
 
-def task(config: DictConfig) -> dict[str, Any]:
-    """Locate rows; return the facts written to `summary.json` in the run directory."""
-    return locate(config, run_directory())
-
-
-def locate(config: DictConfig, run_dir: Path) -> dict[str, Any]:
-    """Locate as conf/locate.yaml says, into a folder; returns the facts of its `summary.json`."""
-    RunSettings.from_config(config)
-    check_arguments(config, **LIMITS)
+@command(**LIMITS)
+def task(call: CommandCall) -> Result:
+    """Locate rows, as conf/locate.yaml says."""
+    config = call.config
     for name in config.against:
         choice(*PLAIN).check("against", name)
     if config.dataset.name == "fingerprints":
-        facts, tables, lines = locate_fingerprints(config, run_dir)
-    else:
-        plan = read_plan_settings(to_dict(config))
-        facts, tables, lines = locate_by_model(
-            config, run_dir, None if plan is None else plan.is_open
-        )
-    return finish_run(run_dir, facts, *tables, lines=lines)
+        return Result(*locate_fingerprints(config, call.folder))
+    plan = read_plan_settings(call.given)
+    return Result(*locate_by_model(config, call.folder, None if plan is None else plan.is_open))

@@ -5,8 +5,6 @@ from __future__ import annotations
 from fnmatch import fnmatch
 from typing import Any
 
-from omegaconf import DictConfig
-
 from gsparc.apps.maps.changed import add_changes, change_layers
 from gsparc.apps.maps.covered import covered_between
 from gsparc.apps.maps.field_map import FieldMap, check_geotiff, write_classes, write_geotiff
@@ -17,10 +15,10 @@ from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.pictures import Layer, draw_layer, file_name, list_layers
 from gsparc.apps.maps.promise import PromiseSettings, map_notes, read_or_gather
 from gsparc.base.errors import DataError
-from gsparc.evaluation.summary import write_samples
-from gsparc.prediction.operating_point import load
+from gsparc.base.files import write_samples
 from gsparc.prediction.timing import peak_memory
-from gsparc.runs.output import begin_run, finish_run, warn_of_held_out
+from gsparc.runs.open_runs import open_run
+from gsparc.runs.output import CommandCall, Result, command
 
 SUFFIXES = (".png", ".pdf", ".svg")  # of pictures
 
@@ -44,51 +42,51 @@ def _layers(field: FieldMap) -> list[Layer]:
     return [*list_layers(field), *change_layers(field)]
 
 
-def _pictures(config: DictConfig, field: FieldMap) -> list[str]:
+def _pictures(call: CommandCall, field: FieldMap) -> list[str]:
     """Patterns of the files that layers are drawn to.
 
     Raises:
         DataError: `save` that no layer's file matches.
     """
-    save = [] if config.save is None else [str(config.save)]
+    save = [] if call.given["save"] is None else [str(call.given["save"])]
     names = [file_name(layer, suffix) for layer in _layers(field) for suffix in SUFFIXES]
     if save and not any(fnmatch(name, save[0]) for name in names):
         pdf_names = ", ".join(name for name in names if name.endswith(".pdf"))
         raise DataError(
             f"save={save[0]}: no layer's file is called so; there are *.pdf, *.svg, {pdf_names}"
         )
-    return [*(["*.png"] if config.pictures else []), *save]
+    return [*(["*.png"] if call.given["pictures"] else []), *save]
 
 
-def task(config: DictConfig) -> dict[str, Any]:
-    """Map, draw and write; returns the facts of `summary.json`."""
-    run_dir, settings = begin_run(config)
-    floor = read_plan_settings(settings)
-    predictor = load(config.ckpt)
-    warn_of_held_out(predictor)
-    how = PromiseSettings(**settings["promise"])
+@command()
+def task(call: CommandCall) -> Result:
+    """Map, draw and write."""
+    run_dir, config, floor = call.folder, call.config, read_plan_settings(call.given)
+    run = open_run(config.ckpt, call.given["dataset"])
+    predictor = run.predictor
+    how = PromiseSettings(**call.given["promise"])
     query = {
-        "area": settings["area"],
+        "area": call.given["area"],
         "height_m": config.height_m,
         "step_m": config.step_m,
         "threshold_db": float(config.threshold_db),
-        "stations": stations_of(settings["stations"]),
-        "load": settings["load"],
+        "stations": stations_of(call.given["stations"]),
+        "load": call.given["load"],
         "noise_db": config.noise_db,
-        "other_end": settings["other_end"],
+        "other_end": call.given["other_end"],
         "plan": floor,
         "share": how.share,
         "tolerance_db": float(config.tolerance_db),
         "unit": config.unit,
         "buildings": config.buildings,
-        "indoor_db": settings["indoor_db"],
+        "indoor_db": call.given["indoor_db"],
     }
     # Refuses what cannot be before any evidence is gathered.
     first = add_changes(predict_map(predictor, dry=True, **query), predictor, dry=True)
-    wanted = _pictures(config, first)
+    wanted = _pictures(call, first)
     # Refused before evidence is gathered, which takes minutes.
     tiff = check_geotiff(config.geotiff)
-    promise = read_or_gather(str(config.ckpt), settings)
+    promise = read_or_gather(run, call.given, renew=config.renew)
     field = add_changes(predict_map(predictor, promise=promise, **query), predictor)
     coverage = None if promise is None else cross_validate(promise.evidence, how.share)
     ends = None if promise is None else covered_between(field, predictor, promise)
@@ -122,7 +120,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "dataset/name": predictor.site.name,
         "dataset/kind": predictor.site.kind,
         "model/name": predictor.method.name,
-        "ckpt": str(config.ckpt),
+        "ckpt": config.ckpt,
         "promise/share": how.share,
         "promise/calibrated": int(promise is not None),
         **peak_memory(),
@@ -135,4 +133,4 @@ def task(config: DictConfig) -> dict[str, Any]:
     before = f"{facts['map/cells']} squares, {facts['map/stations']} station(s)"
     if field.calibrated:
         before += f", expected error {facts['map/expected_error_db']:.2f} dB of the strongest"
-    return finish_run(run_dir, facts, lines=lines, before=f"{before}; map ")
+    return Result(facts, (), lines, f"{before}; map ")

@@ -3,42 +3,38 @@
 from __future__ import annotations
 
 from math import isnan
-from typing import Any
-
-from omegaconf import DictConfig
 
 from gsparc.apps.maps import placing
 from gsparc.apps.maps.pictures import draw_placement
 from gsparc.apps.maps.promise import read_or_gather, reopen_training
-from gsparc.evaluation.summary import coordinates, write_samples
+from gsparc.evaluation.summary import coordinates
 from gsparc.models import checkpoint
 from gsparc.models.per_station import UNHEARD
-from gsparc.prediction.operating_point import load
-from gsparc.runs.output import begin_run, finish_run, warn_of_held_out
+from gsparc.runs.open_runs import open_run
+from gsparc.runs.output import CommandCall, Result, command
 
 
-def task(config: DictConfig) -> dict[str, Any]:
-    """Try candidates, draw and write; returns the facts of `summary.json`."""
-    (run_dir, settings), path = begin_run(config), str(config.ckpt)
+@command()
+def task(call: CommandCall) -> Result:
+    """Try candidates, draw and write."""
+    config, path = call.config, call.given["ckpt"]
     if str(UNHEARD) not in checkpoint.read(path).state.get("per_station", {str(UNHEARD): None}):
         raise placing.unheard_stations_error(path)  # before the copies of all stations are restored
-    predictor = load(path)
-    warn_of_held_out(predictor)
+    run = open_run(path, call.given["dataset"])
+    predictor = run.predictor
     where = {
-        "area": settings["area"],
+        "area": call.given["area"],
         "height_m": config.height_m,
         "sites": config.sites,
         "count": config.count,
         "station_height_m": config.station_height_m,
-        "antenna": placing.NewAntenna(**settings["antenna"]),
+        "antenna": placing.NewAntenna(**call.given["antenna"]),
     }
     placing.lay_candidates(predictor, **where)  # refuses before anything is fitted
-    promise, error = read_or_gather(path, settings), placing.NewStationError()
+    promise, error = read_or_gather(run, call.given), placing.NewStationError()
     # Stations left out one by one tell how far the level of a new one is off.
     if config.left_out:
-        error = placing.new_station_error(
-            reopen_training(path, settings["dataset"]), int(config.left_out)
-        )
+        error = placing.new_station_error(reopen_training(run), int(config.left_out))
     level, unit = float(config.threshold_db), predictor.site.level_unit
     placement = placing.place_station(
         predictor, threshold_db=level, promise=promise, error=error, **where
@@ -50,11 +46,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         **dict(zip(("low", "high", "gain_low", "gain_high"), placement.between.T, strict=True)),
         "nearest_m": placement.nearest_m,
     }
-    write_samples(
-        run_dir / "place.csv",
-        {name: v.tolist() for name, v in {**placement.given, **columns}.items()},
-    )
-    draw_placement(placement, run_dir / "place.png", level, unit)
+    draw_placement(placement, call.folder / "place.png", level, unit)
     # Candidates come best first.
     best = {
         name: None if isnan(values[0]) else float(values[0]) for name, values in columns.items()
@@ -97,4 +89,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         sentence.format(**best) + f"{100 * placement.gain[0]:.1f} points",
         interval.format(**best),
     ]
-    return finish_run(run_dir, facts, lines=lines, before=f"{len(placement.places)} candidates; ")
+    before, files = (
+        f"{len(placement.places)} candidates; ",
+        {"place.csv": {**placement.given, **columns}},
+    )
+    return Result(facts, (), lines, before, files)

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pandas as pd
-from omegaconf import DictConfig
 
 from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.apps.maps.geojson import write_shapes
@@ -14,38 +11,40 @@ from gsparc.apps.maps.pictures import draw_measurement_plan
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import read_or_gather
 from gsparc.commands.map import stations_of
-from gsparc.evaluation.summary import coordinates, write_samples
-from gsparc.prediction.operating_point import load
-from gsparc.runs.output import begin_run, finish_run, warn_of_held_out
+from gsparc.evaluation.summary import coordinates
+from gsparc.runs.open_runs import open_run
+from gsparc.runs.output import CommandCall, Result, command
 
 
-def task(config: DictConfig) -> dict[str, Any]:
-    """Choose, draw and write; returns the facts of `summary.json`."""
-    run_dir, settings = begin_run(config)
-    stations = stations_of(settings["stations"])
-    floor = read_plan_settings(settings)
+@command()
+def task(call: CommandCall) -> Result:
+    """Choose, draw and write."""
+    config, stations, floor = (
+        call.config,
+        stations_of(call.given["stations"]),
+        read_plan_settings(call.given),
+    )
     # Before anything is measured there is no model, and places are spread over the area.
-    predictor = None if config.ckpt is None else load(config.ckpt)
-    if predictor is not None:
-        warn_of_held_out(predictor)
-    promise = None if predictor is None else read_or_gather(str(config.ckpt), settings)
+    run = None if config.ckpt is None else open_run(config.ckpt, call.given["dataset"])
+    predictor = None if run is None else run.predictor
+    promise = None if run is None else read_or_gather(run, call.given)
     plan = plan_measurements(
         predictor,
         config.count,
-        settings["area"],
+        call.given["area"],
         height_m=config.height_m,
         walkable=config.walkable,
         plan=floor,
         stations=stations,
-        other_end=settings["other_end"],
+        other_end=call.given["other_end"],
         promise=promise,
         least_gain_db=float(config.least_gain_db),
         route=config.route,
-        start=settings["start"],
+        start=call.given["start"],
         route_m=config.route_m,
         length_m=config.length_m,
         goal=config.goal,
-        threshold_db=settings["threshold_db"],
+        threshold_db=call.given["threshold_db"],
     )
     columns = {"order": np.arange(1, len(plan.places) + 1), **coordinates(plan.places, predictor)}
     # Rows are in the order of the walk; the rank is that of their gains.
@@ -57,9 +56,8 @@ def task(config: DictConfig) -> dict[str, Any]:
         line = {"type": "LineString", "coordinates": way[at].to_numpy().tolist()}
         stops = pd.DataFrame(columns).to_dict("records")
         points = [({"type": "Point", "coordinates": [row[k] for k in at]}, row) for row in stops]
-        write_shapes(run_dir / "plan.geojson", [(line, {}), *points])
-    write_samples(run_dir / "plan.csv", {name: values.tolist() for name, values in columns.items()})
-    draw_measurement_plan(plan, run_dir / "plan.png", promise, predictor, floor)
+        write_shapes(call.folder / "plan.geojson", [(line, {}), *points])
+    draw_measurement_plan(plan, call.folder / "plan.png", promise, predictor, floor)
     facts = {
         "plan/places": len(plan.places),
         "plan/expected_error_db": plan.after_db,
@@ -69,7 +67,7 @@ def task(config: DictConfig) -> dict[str, Any]:
         "plan/scatter_db": plan.scatter_db,
         "plan/in_vain": int(bool(plan.in_vain)),
         "plan/promised": int(promise is not None),
-        "ckpt": None if config.ckpt is None else str(config.ckpt),
+        "ckpt": config.ckpt,
     }
     before = (
         f"{len(plan.places)} places: expected error {plan.before_db:.2f} -> {plan.after_db:.2f} dB"
@@ -95,4 +93,4 @@ def task(config: DictConfig) -> dict[str, Any]:
     )
     way_line = f"a way of {plan.length_m:.0f} m, {kind}; rows logged on the way do not count"
     lines = filter(None, (plan.stopped, plan.in_vain, way_line))
-    return finish_run(run_dir, facts, lines=lines, before=f"{before}; plan ")
+    return Result(facts, (), lines, f"{before}; plan ", {"plan.csv": columns})

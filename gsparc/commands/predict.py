@@ -4,29 +4,30 @@ as a table.
 
 from __future__ import annotations
 
-from typing import Any
-
-from omegaconf import DictConfig
-
 from gsparc.apps.maps.promise import read_promise
-from gsparc.evaluation.answers import predict_file
+from gsparc.prediction.answers import predict_file
 from gsparc.prediction.operating_point import load
-from gsparc.runs.output import begin_run, finish_run
+from gsparc.runs.output import CommandCall, Result, command
 
 
-def task(config: DictConfig) -> dict[str, Any]:
-    """Predict at places of a table; return the facts written to `summary.json`
-    in the run directory.
-    """
-    run_dir, settings = begin_run(config)
-    predictor = load(config.ckpt, confidence=config.confidence, unit=config.unit)
-    if config.frequency_hz is not None:
-        predictor = predictor.select_carrier(config.frequency_hz)
-    station = None if config.station is None else str(config.station)
+@command()
+def task(call: CommandCall) -> Result:
+    """Predict at places of a table."""
+    predictor = load(
+        call.given["ckpt"], confidence=call.given["confidence"], unit=call.given["unit"]
+    )
+    if call.given["frequency_hz"] is not None:
+        predictor = predictor.select_carrier(call.given["frequency_hz"])
     promise = read_promise(predictor.extra)
-    how: dict[str, Any] = {"columns": settings["columns"], "overwrite": bool(config.overwrite)}
-    how["tested"] = None if promise is None else promise.expected_errors
-    facts = predict_file(predictor, config.places, config.out, station=station, **how)
+    facts = predict_file(
+        predictor,
+        call.given["places"],
+        call.given["out"],
+        station=None if call.given["station"] is None else str(call.given["station"]),
+        columns=call.given["columns"],
+        overwrite=bool(call.given["overwrite"]),
+        tested=None if promise is None else promise.expected_errors,
+    )
     before, stations = f"{facts['predict/places']} places", facts["predict/stations"]
     if stations:
         before += f", {stations} station{'s' * (stations > 1)}"
@@ -45,4 +46,4 @@ def task(config: DictConfig) -> dict[str, Any]:
             "; deviations are the model's own: gsparc map ckpt=FILE tests them, then ask again"
         )
     before += "; summary "
-    return finish_run(run_dir, facts | {"ckpt": str(config.ckpt)}, before=before)
+    return Result(facts | {"ckpt": call.given["ckpt"]}, before=before)

@@ -4,23 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from gsparc.base.files import SUMMARY
 from gsparc.evaluation.results import PROBLEM, frame, own_rows, read_columns, read_summary
 from gsparc.pictures.drawing import PRINTED
 from gsparc.pictures.report.page import write_report
 from gsparc.runs.experiment.runner import time_again
-from gsparc.runs.output import finish_run, run_directory
+from gsparc.runs.output import CommandCall, Result, command
 
 
-def task(config: DictConfig) -> dict[str, Any]:
-    """Write one page about runs; return the facts written to `summary.json`
-    in the run directory.
-    """
+@command()
+def task(call: CommandCall) -> Result:
+    """Write one page about runs."""
+    config = call.config
     if OmegaConf.is_missing(config, "runs"):
         raise ValueError(
             "no run is named; say gsparc report RUN..., folders of runs or of whole sweeps"
@@ -32,11 +31,10 @@ def task(config: DictConfig) -> dict[str, Any]:
     # Times of other days and machines do not compare: every model is asked anew, here.
     if config.retime:
         rows = time_again(rows, rounds=int(config.rounds), rounds_s=float(config.rounds_s))
-    out = run_directory()
-    write_report(out, config.title, rows, _fronts(paths), config.figures)
+    write_report(call.folder, config.title, rows, _fronts(paths), config.figures)
     count, studies = len(own_rows(rows)), rows.groupby(PROBLEM, dropna=False).ngroups
     facts = {"report/runs": count, "report/studies": studies}
-    return finish_run(out, facts, before=f"{count} run{'s' * (count > 1)}; report.html ")
+    return Result(facts, before=f"{count} run{'s' * (count > 1)}; report.html ")
 
 
 def _fronts(paths: Sequence[Path]) -> list[tuple[str, dict[str, np.ndarray]]]:

@@ -10,14 +10,12 @@ from dataclasses import fields
 from functools import partial
 from importlib.util import find_spec
 
-from omegaconf import DictConfig
-
 from gsparc.base.errors import DataError
 from gsparc.base.limits import SettingError, whole
 from gsparc.evaluation.console import open_console
 from gsparc.models import checkpoint
 from gsparc.prediction.operating_point import load
-from gsparc.runs.settings import RunSettings
+from gsparc.runs.output import CommandCall, command
 
 
 def is_loopback(host: str) -> bool:
@@ -28,10 +26,10 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-def task(config: DictConfig) -> None:
+@command(port=whole(0, 65535))
+def task(call: CommandCall) -> None:
     """Serve until Ctrl-C or SIGTERM; requests under way are answered."""
-    RunSettings.from_config(config)
-    whole(0, 65535).check("port", config.port)
+    config = call.config
     token = config.token or os.environ.get("GSPARC_TOKEN")
     # Without a token only this machine's own users may be answered.
     if not token and not is_loopback(config.host):

@@ -13,11 +13,11 @@ from gsparc.base.instantiate import from_settings
 from gsparc.evaluation.console import open_console
 from gsparc.pictures import simulated
 from gsparc.prediction.timing import machine_facts
-from gsparc.runs.output import begin_run, finish_run
+from gsparc.runs.output import CommandCall, Result, command
 from gsparc.runs.run_lock import locked
 from gsparc.runs.settings import to_dict
 from gsparc.simulate.auto import AutoSettings
-from gsparc.simulate.campaign import Outcome, simulate
+from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.effects import from_config as effects_from_config
 from gsparc.simulate.raytracer import Sampling
@@ -57,23 +57,24 @@ def _effects(config: dict[str, Any]) -> Effects | AutoSettings:
     )
 
 
-def task(config: DictConfig) -> Outcome | None:
+@command()
+def task(call: CommandCall) -> Result | None:
     """Simulate, then table, summary and a floor plan; `scene=help` lists scenes."""
+    config = call.config
     if config.scene.name == "help":
         open_console().print(simulated.table_of_scenes(), OTHERS)
         return None
-    run_dir, _ = begin_run(config)
     out = Path(to_absolute_path(str(config.out)))
     begin, busy = time.perf_counter(), time.process_time()
     # The folder of parts is locked: a second run of the same file would add its shards to it.
     with locked(out.with_name(out.name + ".parts"), "out"):
         outcome = simulate(campaign(config), out)
     seconds = time.perf_counter() - begin
-    simulated.draw_floor_plan(outcome, run_dir / "floor_plan.png")
+    simulated.draw_floor_plan(outcome, call.folder / "floor_plan.png")
     triangles = outcome.survey.engine.triangles()
     # The exact shoebox has walls, but no triangles.
     if len(triangles):
-        write_walls(triangles, run_dir / "walls.yaml")
+        write_walls(triangles, call.folder / "walls.yaml")
     facts = {
         **machine_facts(),
         **summary_facts(outcome),
@@ -85,5 +86,4 @@ def task(config: DictConfig) -> Outcome | None:
     }
     tables = [] if outcome.decision is None else [choice_table(outcome.decision.choice)]
     lines = closing_sentences(outcome, seconds, facts["machine/load"])
-    finish_run(run_dir, facts, *tables, lines=lines, before=f"rows in {out}; summary and pictures ")
-    return outcome
+    return Result(facts, tables, lines, f"rows in {out}; summary and pictures ")

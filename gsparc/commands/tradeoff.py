@@ -14,7 +14,6 @@ import torch
 from omegaconf import DictConfig
 
 from gsparc.base.limits import whole
-from gsparc.evaluation.summary import write_samples
 from gsparc.evaluation.table import Column, Table
 from gsparc.models.reduced import list_settings, with_reduction
 from gsparc.pictures.drawing import save
@@ -23,8 +22,8 @@ from gsparc.prediction import operating_point
 from gsparc.prediction.timing import BLOCKS, peak_memory
 from gsparc.runs.experiment import tradeoff
 from gsparc.runs.ledger import FitInputs, measurements_hash, run_once
-from gsparc.runs.open_runs import Opened, open_files
-from gsparc.runs.output import finish_run, in_multirun, run_directory
+from gsparc.runs.open_runs import Opened, open_run
+from gsparc.runs.output import Result, in_multirun, run_directory
 from gsparc.runs.run_lock import locked
 from gsparc.runs.settings import to_dict
 from gsparc.training import tracking
@@ -35,7 +34,7 @@ log = logging.getLogger(__name__)
 def task(config: DictConfig) -> dict[str, Any]:
     """Sweep a checkpoint; return the facts of `summary.json`. A job of a multirun is done once."""
     run_dir = run_directory()
-    run = open_files([config.ckpt], to_dict(config.dataset), to_dict(config.split))
+    run = open_run(config.ckpt, to_dict(config.dataset)).read(to_dict(config.split))
     state = FitInputs.from_config(config, measurements_hash(run.data), run.split.sha256)
     # The front is stored in the file itself, which changes it
     trained = run.stored[0].extra.get("run_id")
@@ -64,7 +63,6 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     model_points = points[points.kept_with_model == 1]
     if config.store:
         operating_point.store_points(Path(config.ckpt), model_points.to_dict("records"), inputs)
-    write_samples(run_dir / "tradeoff.csv", points.drop(columns=tradeoff.MADE).to_dict("list"))
     title = f"{data.site.name}, split {run.split.title}, {config.eval_on}: {method.name}"
     save(draw_front(points, beside, method.name, title), run_dir / "tradeoff.png")
     facts = {
@@ -81,7 +79,9 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     with tracking.open_loggers(config) as loggers:
         tracking.log_picture(loggers, "operating points", run_dir / "tradeoff.png")
         tracking.log_table(loggers, "operating points", *sheet.texts())
-    finish_run(run_dir, facts, sheet, lines=tradeoff.why_irreducible(method))
+    columns = points.drop(columns=tradeoff.MADE).to_dict("list")
+    lines, files = tradeoff.why_irreducible(method), {"tradeoff.csv": columns}
+    Result(facts, [sheet], lines, columns=files).show(run_dir)
     # A front of one model's points alone would hide that another method is as fast and better.
     for row in best:
         if other := tradeoff.find_better(row, beside):

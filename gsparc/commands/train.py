@@ -54,6 +54,7 @@ def train(
         set_earlier_aside(run_dir, config.ckpt_path, config.get("init_from"))
         inputs = inputs or read_inputs(config)
         data, split, method, run_id = inputs.data, inputs.split, inputs.method, summary.new_run_id()
+        learned = inputs.errors.learned(data, split)
         resumes = folds.folds_to_resume(config.ckpt_path, method, split)
         if in_full:
             describe_inputs(config, inputs)
@@ -74,11 +75,12 @@ def train(
             contexts = folds.fold_contexts(whole, split, resumes)
             # `Method.fit` of every fold; models/{splat/method,peers/trained}.py call `Trainer.fit`.
             keep = partial(folds.keep_fold, split, contexts, run_id)
-            fits = folds.fit_folds(method, data, split, contexts, learned=inputs.learned, keep=keep)
+            fits = folds.fit_folds(method, *(learned or (data, split)), contexts, keep=keep)
             unused = options.warn_of_unheeded(config, fits.methods[0], data) if in_full else None
             how: dict[str, Any] = {"eval_on": config.eval_on, "baselines": config.baselines}
             how |= {"shared": same_as_baseline(config, method), "timed": in_full}
-            evaluation = evaluate(fits.methods, fits.train_s, data, split, **how)
+            asked, how["learned"] = inputs.errors.asked(data, split), learned
+            evaluation = evaluate(fits.methods, fits.train_s, asked, split, **how)
             folds.end_curves(contexts, fits.train_s, evaluation.columns, config.eval_on)
             facts = {**evaluation.facts, **summary.provenance(), **fits.facts(), "run_id": run_id}
             facts |= {"seed": int(config.seed), "options/unused": unused}
@@ -96,7 +98,7 @@ def train_job(job: Job, left: str | None) -> None:
     # Solved for another job, they would be missing from this one's processor seconds
     forget_vectors()
     config.ckpt_path = config.ckpt_path or left  # what the settings name to go on from wins
-    inputs = replace(read_inputs(config, job.data), split=job.split, learned=job.learned)
+    inputs = replace(read_inputs(config, job.data), split=job.split)
     _, trained_run = train(config, job.folder, inputs, in_full=False)
     for file in () if job.keeps_models else trained_run.checkpoints:
         file.unlink()

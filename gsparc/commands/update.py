@@ -4,17 +4,14 @@ and what changed.
 
 from __future__ import annotations
 
-import csv
-import io
 import logging
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from omegaconf import DictConfig
 
 from gsparc.base.errors import DataError
-from gsparc.base.files import write_whole
-from gsparc.base.limits import check_arguments, or_null, switch, whole
+from gsparc.base.limits import or_null, switch, whole
 from gsparc.evaluation.summary import coordinates
 from gsparc.evaluation.table import Column, Table
 from gsparc.models import checkpoint
@@ -23,7 +20,7 @@ from gsparc.prediction.operating_point import load
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.updating import LIMITS, ToldBefore, versions_extra
 from gsparc.runs.open_runs import read_like_stored
-from gsparc.runs.output import begin_run, finish_run
+from gsparc.runs.output import CommandCall, Result, command
 from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
@@ -33,10 +30,10 @@ OWN_LIMITS = {"undo": whole(0), "batch": or_null(whole(1)), "again": switch()}
 COLUMNS = ("station", "kind", "since", "at", "change_db", "x", "y")
 
 
-def task(config: DictConfig) -> dict[str, Any]:
-    """Condition a model on a file's rows, or go back; return the facts of `summary.json`."""
-    run_dir, settings = begin_run(config)
-    check_arguments(config, **LIMITS, **OWN_LIMITS)
+@command(**LIMITS, **OWN_LIMITS)
+def task(call: CommandCall) -> Result:
+    """Condition a model on a file's rows, or go back."""
+    config = call.config
     if (config.data is None) == (config.undo == 0):
         raise DataError(
             "gsparc update: say data=FILE to add rows, or undo=COUNT to take updates back"
@@ -48,17 +45,12 @@ def task(config: DictConfig) -> dict[str, Any]:
         if config.undo:
             predictor.undo(config.undo)
         else:
-            row_count, skipped = _add_rows(predictor, file.stored, config, settings)
+            row_count, skipped = _add_rows(predictor, file.stored, call.given)
         seconds, out = watch.seconds, config.out or config.ckpt
         file.store(versions_extra(predictor.versions))
     table = alarm_rows(predictor)
-    text = io.StringIO()
-    writer = csv.DictWriter(
-        text, dict.fromkeys([*COLUMNS, *(table or [{}])[0]]), lineterminator="\n"
-    )
-    writer.writeheader()
-    writer.writerows(table)
-    write_whole(run_dir / "changes.csv", text.getvalue())
+    heads = dict.fromkeys([*COLUMNS, *(table or [{}])[0]])
+    columns = {name: [row[name] for row in table] for name in heads}
     facts = {
         "ckpt": str(config.ckpt),
         "out": str(out),
@@ -73,28 +65,28 @@ def task(config: DictConfig) -> dict[str, Any]:
     message = f"back by {config.undo}: {len(predictor.rows)} rows kept" if config.undo else message
     message += f", {seconds:.2g} s"
     before = f"update: {message}; model in {out}; summary "
-    return finish_run(run_dir, facts, *[changes_table(table)] * bool(table), before=before)
+    tables = [changes_table(table)] if table else []
+    return Result(facts, tables, (), before, {"changes.csv": columns})
 
 
 def _add_rows(
     predictor: Predictor,
     stored: checkpoint.StoredModel,
-    config: DictConfig,
-    settings: dict[str, Any],
+    given: Mapping[str, Any],
 ) -> tuple[int, int]:
     """Tell the rows of a file; return how many are kept, and how many were skipped."""
-    data, placed = read_like_stored(stored, config.data)
+    data, placed = read_like_stored(stored, given["data"])
     if not placed:
-        raise DataError(f"{config.data}: has no places; later rows need them")
-    how = {name: settings[name] for name in ("window", "fade_db", "false_alarm")}
+        raise DataError(f"{given['data']}: has no places; later rows need them")
+    how = {name: given[name] for name in ("window", "fade_db", "false_alarm")}
     rows, row_count, skipped = read_level_rows(data, predictor.site), 0, 0
-    size, content = config.batch or len(rows), rows.content()
-    if content in predictor.told and not config.again:
-        fault = f"the same rows were told to {config.ckpt} before"
-        raise ToldBefore(f"{config.data}: {fault}; again=true tells them once more")
+    size, content = given["batch"] or len(rows), rows.content()
+    if content in predictor.told and not given["again"]:
+        fault = f"the same rows were told to {given['ckpt']} before"
+        raise ToldBefore(f"{given['data']}: {fault}; again=true tells them once more")
     for start in range(0, len(rows), size):
-        refit = config.refit and start + size >= len(rows)
-        key = content if start == 0 and not config.again else None
+        refit = given["refit"] and start + size >= len(rows)
+        key = content if start == 0 and not given["again"] else None
         added = predictor.update(
             rows.subset(slice(start, start + size)), refit=refit, key=key, **how
         )

@@ -7,8 +7,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from omegaconf import DictConfig
-
 from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.apps.view.building import cloud_colours, model_gaussians
 from gsparc.apps.view.ply import write_ply
@@ -19,38 +17,35 @@ from gsparc.base.files import write_whole
 from gsparc.base.limits import whole
 from gsparc.prediction.query import read_place
 from gsparc.prediction.timing import peak_memory
-from gsparc.runs.open_runs import check_dataset
-from gsparc.runs.output import begin_run, finish_run
+from gsparc.runs.output import CommandCall, Result, command
 
 log = logging.getLogger(__name__)
 
 SAVED = (".html", ".ply")
 
 
-def task(config: DictConfig) -> dict[str, Any]:
-    """Serve until Ctrl-C, or write what `save` names; returns the facts of `summary.json`."""
-    run_dir, settings = begin_run(config)
-    save = None if config.save is None else Path(str(config.save))
-    # Before model and data are read, which takes seconds.
-    check(save, int(config.port))
-    view = view_of(settings)
-    end = serve(view, str(config.host), int(config.port)) if save is None else write(view, save)
+@command(port=whole(0, 65535))
+def task(call: CommandCall) -> Result:
+    """Serve until Ctrl-C, or write what `save` names."""
+    config, save = call.config, None if call.config.save is None else Path(call.config.save)
+    check(save)  # before model and data are read, which takes seconds
+    view = view_of(call.given)
+    end = serve(view, config.host, config.port) if save is None else write(view, save)
     viewed, site = view.viewed, view.viewed.site
     facts = {
         "dataset/name": site.name,
         "dataset/kind": site.kind,
         "model/name": viewed.predictor.method.name,
-        "ckpt": str(config.ckpt),
+        "ckpt": config.ckpt,
         **peak_memory(),
     }
-    return finish_run(run_dir, facts, lines=[*viewed.notes, end], before="summary ")
+    return Result(facts, (), [*viewed.notes, end], "summary ")
 
 
-def check(save: Path | None, port: int) -> None:
+def check(save: Path | None) -> None:
     """Refuse, with `DataError`, what cannot be done before anything is read."""
     if save is not None and save.suffix.lower() not in SAVED:
         raise DataError(f"save={save}: expected a name that ends with {', '.join(SAVED)}")
-    whole(0, 65535).check("port", port)
     # Pages are made of viser's client; splat files are not.
     if (save is None or save.suffix.lower() == ".html") and find_spec("viser") is None:
         raise DataError(
@@ -64,8 +59,6 @@ def view_of(settings: dict[str, Any]) -> SiteView:
     `DataError` for a file or place that cannot be.
     """
     plan = read_plan_settings(settings)
-    # What else is wrong with data is a note alone
-    check_dataset(settings["ckpt"], settings["dataset"])
     viewed = open_model(*(settings[name] for name in ("ckpt", "dataset", "station", "unit")))
     at, other = (
         None if settings[k] is None else read_place(k, settings[k]) for k in ("at", "other_end")

@@ -27,6 +27,8 @@ class Target(ABC):
         is_complex: whether entries have a phase.
         is_image: whether its entries lie beside each other, as directions.
         is_level: whether it is one received level, whose errors are counted in decibels.
+        loss: of which the first printed figure is a mean: of squared errors, or of their
+            logarithms.
     """
 
     kind: ClassVar[Kind]
@@ -37,6 +39,7 @@ class Target(ABC):
     is_complex: ClassVar[bool] = False
     is_image: ClassVar[bool] = False
     is_level: ClassVar[bool] = False
+    loss: ClassVar[Literal["square", "log"]] = "square"
 
     @abstractmethod
     def describe(self, count: int, shape: tuple[int, ...]) -> str:
@@ -88,7 +91,7 @@ class Spectrum(Target):
     """Amplitudes over directions (H, W), in [0, 1]."""
 
     kind, called = "spectrum", "spectra"
-    is_image = True
+    is_image, loss = True, "log"
 
     def describe(self, count: int, shape: tuple[int, ...]) -> str:
         """See `Target.describe`."""

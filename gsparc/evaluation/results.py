@@ -57,6 +57,7 @@ HIDDEN = (
     "threads",
     "hydra",
     "experiment",
+    "kind=",
     "logger",
 )
 
@@ -127,7 +128,7 @@ class Run:
         short = [o.removeprefix("model.").removeprefix("trainer.") for o in named]
         rows = [run_row | {"setting": " ".join([str(run_row["method"]), *short])}]
         # A sweep may thin what baselines learn from; one that could not be fitted has no value.
-        of = [o for o in named if o.lstrip("+~").startswith(("split.", "dataset."))]
+        of = [o for o in named if o.lstrip("+~").startswith(("split.", "dataset.", "disturb"))]
         beside = {row["method"]: row for row in others if row["value"] is not None}
         rows += [
             beside[name] | {"setting": " ".join([f"{name} (baseline)", *of])}

@@ -18,10 +18,9 @@ from typing import Any, TypeVar
 from uuid import uuid4
 
 import numpy as np
-import pandas as pd
 
 from gsparc.base.executor import SAY_S
-from gsparc.base.files import write_whole
+from gsparc.base.files import write_samples, write_whole
 from gsparc.evaluation.metric_formats import (
     BEST_SERVER,
     CALIBRATION,
@@ -73,17 +72,6 @@ def write_summary(path: str | Path, facts: Mapping[str, Any]) -> None:
         {key: _value(key, facts[key]) for key in sorted(facts)}, indent=2, ensure_ascii=False
     )
     write_whole(path, text + "\n")
-
-
-def write_samples(path: str | Path, columns: Mapping[str, Any]) -> None:
-    """Write equally long columns as CSV, atomically; NaN becomes an empty cell.
-
-    Raises:
-        ValueError: columns are not of the same length.
-    """
-    # object: pandas would write whole numbers beside empty cells as 3.0.
-    frame = pd.DataFrame(columns, dtype=object)
-    write_whole(path, frame.to_csv(index=False, lineterminator="\n"))
 
 
 def write_as_found(

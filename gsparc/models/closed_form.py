@@ -41,6 +41,11 @@ class LeftOutRows:
     variance: Tensor
     group: np.ndarray | None = None
 
+    def mean_at(self, rows: np.ndarray) -> Tensor:
+        """Return predictions (m, ...) of some of the rows (m,)."""
+        order = np.argsort(self.rows)
+        return self.mean[order[np.searchsorted(self.rows, rows, sorter=order)]]
+
 
 class Moments(NamedTuple):
     """Means of what is predicted, and variances (m,) after and before rows were learned from.

@@ -20,7 +20,7 @@ from torch import Tensor
 from gsparc.data.query import Batch
 from gsparc.data.schema import Measurements
 from gsparc.models.closed_form import ClosedForm
-from gsparc.models.member_weights import to_real_entries
+from gsparc.models.stack import to_real_entries
 
 log = logging.getLogger(__name__)
 

@@ -23,7 +23,6 @@ from gsparc.models.abilities import HasMembers
 from gsparc.models.baselines.mean import Mean
 from gsparc.models.checkpoint import find_non_finite
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.member_weights import to_real_entries
 from gsparc.models.method import (
     Method,
     MethodFactory,
@@ -32,6 +31,7 @@ from gsparc.models.method import (
     import_path,
     predict_in_batches,
 )
+from gsparc.models.stack import to_real_entries
 from gsparc.models.target_rows import heard_rows
 from gsparc.processes.density import TINY
 from gsparc.processes.powers import MOST_ROWS
@@ -109,7 +109,7 @@ def _refuse_members(
     answers = {id(member): _rows_left_out(member, data, fold, asked) for _, member in members}
     rows = reduce(np.intersect1d, [answer.rows for answer in answers.values()])
     rows = _draw_over_stations(rows, data.stations_of(rows))
-    means = {name: _select_rows(answer, rows) for name, answer in answers.items()}
+    means = {name: answer.mean_at(rows) for name, answer in answers.items()}
     kept, texts = list[tuple[float, Method]](), list[str]()
     groups: dict[bool, list[tuple[float, Method]]] = {False: [], True: []}
     for weight, candidate in members:
@@ -157,11 +157,6 @@ def _has_gaussians(method: Method) -> bool:
     return bool(
         method.count_gaussians if isinstance(method, ClosedForm) else method.count_components()
     )
-
-
-def _select_rows(answer: LeftOutRows, rows: np.ndarray) -> Tensor:
-    order = np.argsort(answer.rows)
-    return answer.mean[order[np.searchsorted(answer.rows, rows, sorter=order)]]
 
 
 def _rows_left_out(method: Method, data: Measurements, fold: Fold, rows: np.ndarray) -> LeftOutRows:

@@ -16,13 +16,13 @@ from torch import Tensor
 
 from gsparc.base.limits import SHARE, Checked, setting
 from gsparc.data.query import Query
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import kernel_of_targets
-from gsparc.models.method import Method, Prediction, predict_with_threads
+from gsparc.models.method import Prediction, predict_with_threads
 from gsparc.physics.decibels import from_decibels
-from gsparc.prediction.query import Queries, match_input
+from gsparc.prediction.query import Asked, match_input
 from gsparc.processes.factor import Factor
 from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.kernel import Kernel
@@ -212,13 +212,9 @@ def confidence_threshold(kind: str, threshold: Threshold) -> float:
     return max(float(as_confidence(kind, value)), 0.0) if value < np.inf else float("inf")
 
 
-class ConfidenceMixin:
+class ConfidenceMixin(Asked):
     """What a `Predictor` says of how good its answers are."""
 
-    site: Site
-    method: Method
-    _whole: Method
-    queries: Queries
     trusted: Trusted
     kind: str | None
 

@@ -7,22 +7,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.data.schema import Site
 from gsparc.models.abilities import HasJoint, HasProcess, JointLevels
-from gsparc.models.method import Method
 from gsparc.models.station_views import OneStationView
 from gsparc.physics.decibels import to_decibels
-from gsparc.prediction.query import Queries
+from gsparc.prediction.query import Asked
 
 TOGETHER, UNREAD = 64, 1e12  # places at a time; variance of what is not measured [dB^2]
 
 
-class JointMixin:
+class JointMixin(Asked):
     """What a `Predictor` of powers says of several places or stations at once."""
-
-    site: Site
-    method: Method
-    queries: Queries
 
     def predict_joint(self, places: Any, stations: Any) -> JointLevels | None:
         """Return levels with the covariances of their errors, float64.

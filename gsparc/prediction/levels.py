@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 
 from gsparc.data.schema import Measurements
@@ -9,7 +12,9 @@ from gsparc.data.target import Kind
 from gsparc.data.units import power_in_decibels
 from gsparc.models.method import Prediction
 from gsparc.physics.decibels import to_decibels
+from gsparc.prediction.answers import ask
 from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.query import query_ends
 
 MAPPED: tuple[Kind, ...] = ("rssi", "csi")
 
@@ -48,6 +53,21 @@ def predicted_levels(
     if variance is None:
         spread[good] = 1.0
     return level, np.where(spread > 0, spread, np.nan)
+
+
+def predict_levels(
+    predictor: Predictor,
+    places: np.ndarray,
+    other_end: Sequence[float] | None = None,
+    station: np.ndarray | None = None,
+    **how: Any,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the level and its deviation (n,) [dB] at world places (n, 3).
+
+    See `predicted_levels`, `query_ends`, and of `how` `ask`.
+    """
+    ends = query_ends(predictor.site, places, other_end, station)
+    return predicted_levels(ask(predictor, ends, linear=True, **how), predictor.site.kind)
 
 
 def measured_levels(data: Measurements, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

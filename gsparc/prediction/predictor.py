@@ -12,11 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.data.query import Query
 from gsparc.data.schema import Site
 from gsparc.data.station_names import find_station
 from gsparc.data.target import Kind
-from gsparc.data.units import LINEAR, PowerUnit
+from gsparc.data.units import PowerUnit
 from gsparc.models.abilities import AddsCarriers, HasGaussians
 from gsparc.models.device_offsets import find_device
 from gsparc.models.method import MEAN_DEVICE, Method, Prediction, predict_with_threads
@@ -265,22 +264,6 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         return replace(
             self._in_unit(prediction, wanted), unknown=None if sure is None else 1 - sure
         )
-
-    def predict_query(self, query: Query) -> Prediction:
-        """Return what the model says of a query, whose places are local (less `site.origin`) [m].
-
-        In stored units: measured ones divided by `site.target_scale`;
-        `predict` answers in measured ones.
-        """
-        return predict_with_threads(self.method, query)
-
-    def predict_linear(self, tx: Any = None, rx: Any = None) -> Prediction:
-        """Return what `predict` says, powers as such: their levels are in `site.level_unit`.
-
-        >>> bool((predictor.predict_linear(rx=[2.0, 1.0, 1.5]).mean > 0).all())  # no decibels
-        True
-        """
-        return self.predict(tx, rx, unit=LINEAR if self.site.target.is_level else None)
 
     def std(self, tx: Any = None, rx: Any = None, *, unit: str | None = None) -> Any:
         """Return the expected root mean square error of an entry,

@@ -15,6 +15,7 @@ from gsparc.data.assemble import FARTHEST
 from gsparc.data.ends import SAME_PLACE_M
 from gsparc.data.query import Query
 from gsparc.data.schema import End, Site
+from gsparc.models.method import Method
 from gsparc.ops import Pose
 from gsparc.ops.transforms import to_numpy
 
@@ -180,10 +181,23 @@ def match_input(value: Tensor, single: bool, as_torch: bool) -> Any:
     return value.numpy() if value.ndim else float(value)
 
 
-class DegreesMixin:
-    """What a `Predictor` says of latitudes and longitudes."""
+class Asked:
+    """What all that a `Predictor` says rests on.
+
+    Attributes:
+        site: of the model, or what one of its stations sees.
+        method: answers.
+        queries: of the site.
+    """
 
     site: Site
+    method: Method
+    _whole: Method  # asked for variance and confidence, which `method` may spare
+    queries: Queries
+
+
+class DegreesMixin(Asked):
+    """What a `Predictor` says of latitudes and longitudes."""
 
     def metres(self, latitude: Any, longitude: Any, height: Any = None) -> np.ndarray:
         """Return world positions (B, 3) float64 [m] of places (B,) [deg], or (3,) of one place.

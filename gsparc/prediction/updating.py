@@ -39,7 +39,7 @@ from gsparc.prediction.later_rows import (
     read_level_arrays,
     read_level_rows,
 )
-from gsparc.prediction.query import Queries
+from gsparc.prediction.query import Asked
 from gsparc.processes.changes import Belief, LaterRows, learn, refit_scale
 from gsparc.processes.stored import Stored, from_plain, to_plain
 from gsparc.tables.own_checks import MOST_DB
@@ -96,14 +96,10 @@ class Found:
     skipped: int
 
 
-class UpdateMixin:
+class UpdateMixin(Asked):
     """What a `Predictor` of powers learns after its fit, at settings as they are."""
 
-    site: Site
-    method: Method
-    queries: Queries
     versions: tuple[Version, ...]
-    _whole: Method
     _prepared: list[Method]
     _model_site: Site
     _own_station: int | None

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from gsparc.base.files import write_samples
 from gsparc.data.assemble import identity_hash
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split, hash_indices
@@ -25,7 +26,6 @@ from gsparc.evaluation.intervals import pool_figures
 from gsparc.evaluation.metric_formats import OF_LISTS, WITHOUT_OFF, judged_by, paired_values
 from gsparc.evaluation.paired import lead_over_rows
 from gsparc.evaluation.scores import Scores, rows_to_score, score_methods, unseen_runs
-from gsparc.evaluation.summary import write_samples
 from gsparc.models.fitting import common_label
 from gsparc.models.method import Method
 from gsparc.physics.decibels import to_decibels

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
+from gsparc.base.instantiate import from_settings
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, Split
+from gsparc.data.splits import Split
 from gsparc.data.walls import read_walls
 from gsparc.datasets.datamodule import DataModule
 from gsparc.datasets.describe import summarise
@@ -20,6 +20,7 @@ from gsparc.models import checkpoint
 from gsparc.models.method import MethodFactory
 from gsparc.models.registry import build, fill_defaults
 from gsparc.runs.align_site import align_to_site
+from gsparc.runs.experiment.disturb import Disturbance
 from gsparc.runs.settings import RunSettings, to_dict
 from gsparc.tables.roles import say_quantity
 from gsparc.training import tracking
@@ -37,15 +38,14 @@ class RunInputs:
         method: unfitted, or what chooses it.
         module, split: the data, read, and their folds.
         walls: known ones, drawn beside what is found.
-        learned: what a fold learns from instead, such as displaced or fewer measurements; None:
-            these.
+        errors: that are added to what is learned from, or asked.
     """
 
     method: MethodFactory
     module: DataModule
     split: Split
-    walls: Any = None
-    learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None
+    walls: Any
+    errors: Disturbance
 
     @property
     def data(self) -> Measurements:
@@ -67,13 +67,14 @@ def read_inputs(config: DictConfig, known: Measurements | None = None) -> RunInp
     # Once: each fold, and each station, fits a copy of it
     method = build(fill_defaults(config.model))
     RunSettings.from_config(config)
+    errors = from_settings(Disturbance, to_dict(config.disturb), "disturb")
     tracking.refuse_missing_loggers(config)
     module = _data(config, known)
     split = split_for(to_dict(config.split), module.measurements)
     file = config.get("known_walls") or OmegaConf.select(config, "init.file")
     walls = None if file is None else read_walls(file)
     split.check()
-    return RunInputs(method, module, split, walls)
+    return RunInputs(method, module, split, walls, errors)
 
 
 def _data(config: DictConfig, known: Measurements | None) -> DataModule:

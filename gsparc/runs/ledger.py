@@ -36,6 +36,7 @@ log = logging.getLogger(__name__)
 # In a fit's folder: its state and program, when it began, and whether it has ended
 RECORD = "job.json"
 FAILURE = "failure.txt"  # why it has failed
+REFUSED = "not possible"  # in the error of an effect that the data do not allow
 # Of where, or whether, a fit is done
 WHERE = ("engine", "workers", "ray", "logger", "reuse", "ckpt_path")
 OF_DATA = (  # paths that stand for what was read from them, or is written there where nothing is

@@ -47,12 +47,62 @@ SAME_ROW_M = 1e-3  # rows of two files this near are of the same place
 
 
 @dataclass(frozen=True)
-class Opened:
-    """Checkpoints of one run with their data.
+class OpenRun:
+    """Checkpoints of one run, see `open_run`.
 
     Attributes:
         methods: one per fold.
         stored: contents of their files.
+        dataset: settings of their data that replace those stored in the first.
+    """
+
+    methods: list[Method]
+    stored: list[checkpoint.StoredModel]
+    dataset: Mapping[str, Any]
+
+    @property
+    def predictor(self) -> Predictor:
+        """The first method, as `gsparc.load` answers by it."""
+        site, extra = self.stored[0].site, self.stored[0].extra
+        return Predictor(self.methods[0], site, trusted=read_trusted(extra), extra=extra)
+
+    def read(self, split: Mapping[str, Any] | None = None, *, others_whole: bool = False) -> Opened:
+        """Read the data.
+
+        Args:
+            split: settings that replace those stored in the first checkpoint.
+            others_whole: other data than these checkpoints' are test rows throughout, where no
+                split is given.
+
+        Raises:
+            ValueError: unreadable or wrong kind of data, wrong number of checkpoints.
+        """
+        stored = self.stored
+        data = align_to_site(module_of(stored[0], self.dataset).measurements, stored[0].site)
+        other = data.site.sha256 != stored[0].site.sha256
+        # Other data than the model's were never learned from, so that all rows can be tested.
+        if other and others_whole and all(value is None for value in (split or {}).values()):
+            none, all_rows = np.zeros(0, np.int64), np.arange(len(data))
+            folds = (Fold(none, none, all_rows),) * len(stored)
+            chosen = Split("whole", folds)
+        else:
+            chosen = _folds(split_for(_settings("split", stored[0], split), data), stored)
+        foreign, learned, trained = _foreign(stored, data, chosen)
+        if foreign is not None:
+            level = logging.INFO if learned == 0 else logging.WARNING
+            log.log(level, "%s was trained on %s", stored[0].path, foreign)
+        if other and trained is not None:
+            chosen = answerable(chosen, data, trained)
+        return Opened(
+            **vars(self), data=data, split=chosen, foreign=foreign, learned=learned, trained=trained
+        )
+
+
+@dataclass(frozen=True)
+class Opened(OpenRun):
+    """Checkpoints of one run with their data.
+
+    Attributes:
         data: in the models' local coordinates and units.
         split: the folds the methods were trained on, or others that were asked for.
         foreign: what differs from what the methods were trained on, one clause; None: nothing.
@@ -62,8 +112,6 @@ class Opened:
             None where that is gone.
     """
 
-    methods: list[Method]
-    stored: list[checkpoint.StoredModel]
     data: Measurements
     split: Split
     foreign: str | None = None
@@ -81,12 +129,6 @@ class Opened:
     def doubt(self) -> str | None:
         """`foreign` where test rows may have been learned from."""
         return None if self.learned == 0 else self.foreign
-
-    @property
-    def predictor(self) -> Predictor:
-        """The first method, as `gsparc.load` answers by it."""
-        site, extra = self.stored[0].site, self.stored[0].extra
-        return Predictor(self.methods[0], site, trusted=read_trusted(extra), extra=extra)
 
     def retraining(self, effort: float | None = None, **others: Any) -> Learned:
         """Return the first method with what it learned from;
@@ -119,45 +161,27 @@ class Opened:
         return group[rows[cKDTree(self.data.moving[rows]).query(places)[1]]]
 
 
-def open_files(
-    paths: Sequence[str | Path],
-    dataset: Mapping[str, Any] | None = None,
-    split: Mapping[str, Any] | None = None,
-    *,
-    others_whole: bool = False,
-) -> Opened:
-    """Load checkpoints of one run, one per fold, and their data.
+def open_run(paths: str | Path | Sequence[str | Path], dataset: Mapping[str, Any]) -> OpenRun:
+    """Load a checkpoint, or those of one run, one per fold; their data are not read yet.
 
     Args:
         paths: checkpoint files in the order of their folds.
-        dataset, split: settings that replace those stored in the first checkpoint.
-        others_whole: other data than these checkpoints' are test rows throughout, where no split is
-            given.
+        dataset: settings that replace those stored in the first checkpoint, where they are not
+            null.
 
     Raises:
-        ValueError: unreadable checkpoint or data, wrong kind of data, wrong number of checkpoints.
+        ValueError: unreadable checkpoints, of several runs, or a setting that their data do not
+            have.
     """
+    paths = [paths] if isinstance(paths, str | Path) else paths
     loaded = [loading.load(path) for path in paths]
-    stored = [model for _, model in loaded]
+    methods, stored = ([*parts] for parts in zip(*loaded, strict=True))
     # Folds of two runs are of two splits: a test row of one may have taught the other.
     if len({model.extra.get("run_id") for model in stored}) > 1:
         raise ValueError(f"{', '.join(map(str, paths))}: of different runs; give the folds of one")
-    data = align_to_site(module_of(stored[0], dataset).measurements, stored[0].site)
-    other = data.site.sha256 != stored[0].site.sha256
-    # Other data than the model's were never learned from, so that all rows can be tested.
-    if other and others_whole and all(value is None for value in (split or {}).values()):
-        none, all_rows = np.zeros(0, np.int64), np.arange(len(data))
-        folds = (Fold(none, none, all_rows),) * len(stored)
-        chosen = Split("whole", folds)
-    else:
-        chosen = _folds(split_for(_settings("split", stored[0], split), data), stored)
-    foreign, learned, trained = _foreign(stored, data, chosen)
-    if foreign is not None:
-        level = logging.INFO if learned == 0 else logging.WARNING
-        log.log(level, "%s was trained on %s", stored[0].path, foreign)
-    if other and trained is not None:
-        chosen = answerable(chosen, data, trained)
-    return Opened([method for method, _ in loaded], stored, data, chosen, foreign, learned, trained)
+    if any(value is not None for value in dataset.values()):
+        module_of(stored[0], dataset)
+    return OpenRun(methods, stored, dataset)
 
 
 def read_like_stored(stored: checkpoint.StoredModel, path: str | Path) -> tuple[Measurements, bool]:
@@ -202,14 +226,6 @@ def module_of(stored: checkpoint.StoredModel, dataset: Mapping[str, Any] | None)
     )
     module.told = stored.extra.get("read_notes", ())
     return module
-
-
-def check_dataset(path: str | Path, dataset: Mapping[str, Any]) -> None:
-    """Raise ValueError for a setting that the data of a checkpoint do not have,
-    before they are needed.
-    """
-    if any(value is not None for value in dataset.values()):
-        module_of(checkpoint.read(path), dataset)
 
 
 def _settings(
@@ -369,12 +385,12 @@ class Unseen:
 
     @staticmethod
     def open(path: str, dataset: Mapping[str, Any], split: Mapping[str, Any]) -> Unseen:
-        """Ask a checkpoint about its test rows; see `open_files`.
+        """Ask a checkpoint about its test rows; see `open_run`.
 
         Raises:
             ValueError: it may have learned from some of them, so that no promise would hold.
         """
-        run = open_files([path], dataset, split, others_whole=True)
+        run = open_run(path, dataset).read(split, others_whole=True)
         if run.learned != 0:
             advice = "calibrate with the data and split of its training"
             raise ValueError(f"{path} was trained on {run.foreign}; {advice}")

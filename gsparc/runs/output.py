@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property, wraps
 from pathlib import Path
 from typing import Any
 
@@ -12,16 +14,22 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 from rich.console import RenderableType
 
+from gsparc.base.files import SUMMARY, write_samples
+from gsparc.base.limits import Limit, check_arguments
 from gsparc.data.splits import Split
 from gsparc.evaluation.by_station import worst_stations
 from gsparc.evaluation.console import open_console, repeated_warnings
-from gsparc.evaluation.summary import provenance, remarks, results_table, write_summary
+from gsparc.evaluation.summary import (
+    provenance,
+    remarks,
+    results_table,
+    write_summary,
+)
 from gsparc.evaluation.table import Table
-from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import machine_facts
 from gsparc.runs.settings import RunSettings, to_dict
 
-log = logging.getLogger(__name__)
+Task = Callable[..., Any]  # of a configuration, and of a folder other than Hydra's
 
 
 def run_directory() -> Path:
@@ -29,29 +37,84 @@ def run_directory() -> Path:
     return Path(HydraConfig.get().runtime.output_dir)
 
 
-def begin_run(config: DictConfig) -> tuple[Path, dict[str, Any]]:
-    """Check the settings of a run, before anything is read; return where it writes,
-    and plain settings.
+@dataclass(frozen=True)
+class CommandCall:
+    """What a command is called with.
+
+    Attributes:
+        config: its settings.
+        folder: where it writes.
+    """
+
+    config: DictConfig
+    folder: Path
+
+    @cached_property
+    def given(self) -> dict[str, Any]:
+        """Return the settings as plain containers; one that is missing is an error."""
+        return to_dict(self.config)
+
+    @property
+    def paths(self) -> list[str]:
+        """Return the files of `ckpt`, one or several."""
+        ckpt = self.given["ckpt"]
+        return [ckpt] if isinstance(ckpt, str) else ckpt
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a command ends with.
+
+    Attributes:
+        facts: of `summary.json`.
+        tables, lines: that are shown.
+        before: where everything was written is said after this.
+        columns: of CSV files, by their names.
+    """
+
+    facts: dict[str, Any]
+    tables: Sequence[RenderableType] = ()
+    lines: Iterable[str] = ()
+    before: str = ""
+    columns: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+
+    def show(self, folder: Path) -> dict[str, Any]:
+        """Write it with the program and the machine, and show it; returns the facts.
+
+        Of the machine, what they say of it stands.
+        """
+        for name, columns in self.columns.items():
+            write_samples(folder / name, columns)
+        whole = {**machine_facts(), **self.facts, **provenance()}
+        write_summary(folder / SUMMARY, whole)
+        show_result(folder, *self.tables, lines=self.lines, before=self.before)
+        return whole
+
+
+def command(**limits: Limit) -> Callable[[Callable[[CommandCall], Any]], Task]:
+    """Make a function of a `CommandCall` the task of a command.
+
+    Settings are checked before it, its `Result` is shown after it; the task returns the facts.
+
+    Args:
+        **limits: of settings of its own.
 
     Raises:
         ValueError: a setting that cannot be.
-        MissingMandatoryValue: one that was not given.
     """
-    RunSettings.from_config(config)
-    return run_directory(), to_dict(config)
 
+    def decorate(work: Callable[[CommandCall], Any]) -> Task:
+        @wraps(work)
+        def task(config: DictConfig, folder: Path | None = None) -> Any:
+            RunSettings.from_config(config)
+            check_arguments(config, **limits)
+            call = CommandCall(config, folder or run_directory())
+            result = work(call)
+            return result.show(call.folder) if isinstance(result, Result) else result
 
-def warn_of_held_out(predictor: Predictor) -> None:
-    """Warn of rows that were held out for a test:
-    to a map they are places where nobody measured.
-    """
-    if count := predictor.extra.get("tested"):
-        log.warning(
-            "%d rows of its file were held out for the test and count as not measured here: "
-            "train the final "
-            "model with split=none",
-            count,
-        )
+        return task
+
+    return decorate
 
 
 def in_multirun() -> bool:
@@ -113,16 +176,3 @@ def tables_of(
     """
     label, later = facts["model/label"], not facts.get("split/train")
     return [results_table(facts, label, title, eval_on), *worst_stations(stations, label, later)]
-
-
-def finish_run(
-    run_dir: Path, facts: Mapping[str, Any], *tables: RenderableType, **how: Any
-) -> dict[str, Any]:
-    """Write `summary.json` with the program and the machine, then `show_result`; returns the facts.
-
-    Of the machine, what `facts` says of it stands.
-    """
-    whole = {**machine_facts(), **facts, **provenance()}
-    write_summary(run_dir / "summary.json", whole)
-    show_result(run_dir, *tables, **how)
-    return whole

@@ -7,21 +7,21 @@ from __future__ import annotations
 import os
 import socket
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from filelock import FileLock, Timeout
+from filelock import AcquireReturnProxy, FileLock, Timeout
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.base.files import SUMMARY, delete_partial_files, set_aside
 
-LOCK, HOLDER = ".lock", ".held-by"
-_locks: list[FileLock] = []  # by the command that is running
+LOCK = ".run.lock"  # says who holds the folder, while it is held
+_held = ExitStack()  # folders of the command that is running
+release_folders = _held.close  # of this process; the files stay, or a third would pass the second
 
 
 class InUse(BaseException):
@@ -68,60 +68,40 @@ def hold_folder(folder: Path, jobs: bool = False) -> None:
         InUse: another process has locked it, a folder it lies in, or, with `jobs`, one in it: says
             which, since when, with which command. Or it cannot be locked.
     """
-    since = datetime.now().isoformat(sep=" ", timespec="seconds")
-    who = f"process {os.getpid()} on {socket.gethostname()} since {since}: {' '.join(sys.argv)}"
-    _locks.append(_lock(folder, holder=who))  # named before looking: of two, one sees the other
-    near = [parent / HOLDER for parent in folder.resolve().parents]
-    for other in near + (sorted(folder.rglob(HOLDER)) if jobs else []):
-        if other.exists() and other.parent != folder:
-            _lock(other.parent).release()
+    try:
+        _held.enter_context(locked(folder))  # before looking: of two, one sees the other
+        around = [parent / LOCK for parent in folder.resolve().parents]
+        for lock in around + (sorted(folder.rglob(LOCK)) if jobs else []):
+            if lock.exists():
+                locked(lock.parent).lock.release()
+    except ValueError as busy:
+        raise InUse(str(busy)) from None
     delete_partial_files(folder)
 
 
-@contextmanager
-def locked(folder: Path, setting: str = "hydra.run.dir") -> Iterator[None]:
-    """Hold the folder of a setting meanwhile; nothing where a command of this process holds it.
+def locked(folder: Path, setting: str = "hydra.run.dir") -> AcquireReturnProxy:
+    """Lock the folder of a setting, where it is not this thread's already; a `with` ends that.
 
     Raises:
-        ValueError: another process has locked it, or it cannot be locked.
+        ValueError: another process or thread has locked it, or it cannot be locked.
     """
-    if folder.resolve() in (Path(lock.lock_file).parent for lock in _locks):
-        yield
-        return
-    try:
-        lock = _lock(folder, setting)
-    except InUse as busy:
-        raise ValueError(str(busy)) from None
-    try:
-        yield
-    finally:
-        lock.release()
-
-
-def _lock(folder: Path, setting: str = "hydra.run.dir", holder: str = "") -> FileLock:
-    """Its lock, held, and beside it who holds it, where that is given."""
-    lock = FileLock(folder.resolve() / LOCK)
+    lock = FileLock(folder.resolve() / LOCK, is_singleton=True, on_acquired=_sign)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        lock.acquire(timeout=0)
-        if holder:
-            (folder / HOLDER).write_text(holder, encoding="utf-8")
-        return lock
+        return lock.acquire(timeout=0)
     except Timeout:
         other = ""
         with suppress(OSError):
-            other = f" ({(folder / HOLDER).read_text(encoding='utf-8')})"
+            other = f" ({Path(lock.lock_file).read_text(encoding='utf-8')})"
         why = f"another run writes here{other}; wait for its end, or"
     except (OSError, NotImplementedError) as error:
-        lock.release()
         why = f"cannot be locked ({error});"
-    raise InUse(f"{folder}: {why} give another {setting}=...")
+    raise ValueError(f"{folder}: {why} give another {setting}=...")
 
 
-def release_folders() -> None:
-    """Unlock what this process holds."""
-    while _locks:
-        lock = _locks.pop()
-        with suppress(OSError):
-            Path(lock.lock_file).with_name(HOLDER).unlink(missing_ok=True)
-        lock.release()  # the file stays: removing it would let a third run pass the second
+def _sign(lock: int) -> None:
+    since = datetime.now().isoformat(sep=" ", timespec="seconds")
+    who = f"process {os.getpid()} on {socket.gethostname()} since {since}: {' '.join(sys.argv)}"
+    with suppress(OSError):  # somebody else's file, of a run that has ended
+        os.ftruncate(lock, 0)
+        os.write(lock, who.encode())

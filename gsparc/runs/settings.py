@@ -40,9 +40,8 @@ class RunSettings(Checked):
         eval_on: rows that are scored.
         baselines: names of methods; None: all plain ones that serve the data.
         effort: that all counts of a fit are multiplied by.
-        rounds_s: seconds after which timing starts no round.
         stations: `auto`, `each` or `together`.
-        rounds, queries, draws: trainings of a study, timings of its rows, trials of a promise.
+        draws: trials of a promise.
     """
 
     seed: int = setting(0, whole(0, 2**32 - 1))
@@ -50,10 +49,7 @@ class RunSettings(Checked):
     eval_on: str = setting("test", choice("train", "val", "test"))
     baselines: tuple[str, ...] | None = ()
     effort: float = setting(1.0, POSITIVE)
-    rounds_s: float = setting(1.0, POSITIVE)
     stations: str = setting("auto", choice("auto", "each", "together"))
-    rounds: int = setting(1, whole(1))
-    queries: int = setting(1, whole(1))
     draws: int = setting(1, whole(1))
 
     @classmethod

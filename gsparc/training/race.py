@@ -4,9 +4,7 @@ one ends where its mean with the best could gain too little.
 Of errors x of the best and y of a candidate their mean of weight w has x + w (y - x). As a
 candidate learns, its own part of y falls, and what both miss stays. So does x y, and |x|^2 - x y is
 the most that a mean may gain, however far behind the candidate is now: errors say little about that
-(J. M. Bates and C. W. J. Granger, "The combination of forecasts", 1969, weigh by both). A candidate
-has settled where the last third of its looks moved its error by less than the standard error:
-then it is weighed as it is.
+(J. M. Bates and C. W. J. Granger, "The combination of forecasts", 1969, weigh by both).
 """
 
 from __future__ import annotations
@@ -23,7 +21,6 @@ from gsparc.processes.uncertainty import standard_error
 LEAST_GAIN = 0.03  # of the squared error of the best, by a mean with a candidate
 SURE = 1.0  # standard errors of paired rows
 FAR = 5.0  # times the error of the best: what stalls there has a part of its own that will not fall
-LEAST_THIRD = 2  # looks
 # Of a candidate's error a look ago: what falls more may yet learn what the best misses, too
 STALLED = 0.8
 
@@ -59,7 +56,12 @@ class Race:
         return Race(rows, missed, mean_square(missed) / max(mean_square(target), 1e-30), note)
 
     def check_candidate(
-        self, name: str, rows: np.ndarray, missed: Tensor, before: Sequence[float] = (0.0,)
+        self,
+        name: str,
+        rows: np.ndarray,
+        missed: Tensor,
+        before: Sequence[float] = (0.0,),
+        finished: bool = False,
     ) -> float:
         """Return the mean squared error of another candidate, where both left rows out.
 
@@ -67,6 +69,7 @@ class Race:
             name: of it, for the learning curve.
             rows: (m,) rows, which it missed by `missed` (m, ...).
             before: what was returned at earlier looks; empty at the first.
+            finished: whether it learns no more: then it need not have stalled.
 
         Raises:
             FellBehind: it is `STALLED` while `FAR` behind, or weighing it gains less than
@@ -76,14 +79,10 @@ class Race:
         self.note(name, now)
         _, own, theirs = np.intersect1d(self.rows, rows, return_indices=True)
         best, candidate = (each.detach().flatten(1) for each in (self.missed[own], missed[theirs]))
-        if now <= STALLED * (before[-1] if before else math.inf):
+        if not finished and now <= STALLED * (before[-1] if before else math.inf):
             return now
         difference, whole = best - candidate, max(float(best.abs().square().sum()), 1e-30)
         gains = (best * difference.conj()).real.double().sum(1) / whole
-        if has_settled([*before, now], candidate):
-            squares = difference.abs().double().square().sum(1) / whole
-            weight = min(max(float(gains.sum() / squares.sum().clamp_min(1e-30)), 0.0), 1.0)
-            gains = weight * (2 * gains - weight * squares)
         gain, error = float(gains.sum()), standard_error(gains.numpy()) * len(gains)
         reference = f"the best so far (error {self.error:.3f} of the energy of rows held out)"
         if now > FAR * mean_square(best):
@@ -95,16 +94,6 @@ class Race:
                 f"{name}: averaging it with {reference} gains {gain:.0%} ± {error:.0%}"
             )
         return now
-
-
-def has_settled(errors: Sequence[float], missed: Tensor) -> bool:
-    """Tell whether the last third of looks lowered the error by less
-    than its standard error over rows.
-    """
-    third, squares = len(errors) // 3, missed.abs().double().square().mean(1)
-    if third < LEAST_THIRD:
-        return False
-    return min(errors[:-third]) - min(errors[-third:]) < standard_error(squares.numpy())
 
 
 def mean_square(values: Tensor) -> float:

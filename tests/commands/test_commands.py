@@ -81,7 +81,7 @@ def test_help_says_what_a_command_does_and_what_its_settings_mean(command):
     assert answer.status == 0 and f"gsparc {command}" in text
     if COMMANDS[command].configured:
         assert "hydra.run.dir" not in text and "  # " in text
-    kinds = {"positions": "errors_deg", "measurements": "shares of the training rows"}
+    kinds = {"positions": "directions_deg", "measurements": "shares of the training rows"}
     for kind, setting in kinds.items() if command == "study" else ():
         assert any(setting in line for line in gsparc("study", f"kind={kind}", "-h").out)
 

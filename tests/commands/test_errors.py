@@ -18,11 +18,11 @@ HALL = f"{PRINTS} dataset.split=walks dataset.file={{prints}}/walks.npz"
 COMPARE = "compare +datasets.own.file={file} splits.random.datasets=[own] cells={folder}/cells"
 REFUSED = [
     ("study kind=efects", "kind=efects: no such choice; did you mean 'effects'?"),
-    ("study baselines=[gpp]", "baselines=['gpp']: a list of methods is needed, 'gpp' is none"),
-    ("study model.field.count=-1", "model.field.count=-1: a whole number of at least 0"),
+    ("train baselines=[gpp]", "baselines=['gpp']: a list of methods is needed, 'gpp' is none"),
+    ("train model.field.count=-1", "model.field.count=-1: a whole number of at least 0"),
+    ("study variant=plian", "variant=plian: no such choice; did you mean 'plain'?"),
+    ("train disturb.keep=0 dataset.file={file} dataset=own", "disturb.keep=0: a number above 0"),
     # No rounds ended in an IndexError, no draws in a maximum of nothing.
-    ("study rounds=0", "rounds=0: a whole number of at least 1"),
-    ("study queries=0", "queries=0: a whole number of at least 1"),
     ("tradeoff ckpt={spectra} rounds=0", "rounds=0: a whole number of at least 1"),
     ("calibrate ckpt={town} draws=0", "draws=0: a whole number of at least 1"),
     ("evaluate ckpt=none.ckpt", "none.ckpt: no such checkpoint"),

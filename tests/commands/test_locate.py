@@ -12,7 +12,7 @@ from PIL import Image
 
 from gsparc.apps.locate import locator
 from gsparc.base.errors import DataError
-from gsparc.commands.locate import locate
+from gsparc.commands.locate import task as locate
 from gsparc.evaluation.summary import write_as_found
 from gsparc.models import checkpoint
 

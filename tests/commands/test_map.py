@@ -136,7 +136,7 @@ def test_a_plan_for_some_stations_spoke_of_all(model, tmp_path):
 
 def test_a_model_that_cannot_place_was_restored_before_it_said_so(model, tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "gsparc.commands.place.load", lambda path: pytest.fail("all stations are restored")
+        "gsparc.commands.place.open_run", lambda *_: pytest.fail("all stations are restored")
     )
     answer = run("place", f"ckpt={model}", folder=tmp_path)
     assert_refused(answer, "train with stations=together", tmp_path)
@@ -218,7 +218,7 @@ def test_an_interrupt_leaves_no_half_written_file(model, tmp_path, monkeypatch):
         os.kill(os.getpid(), signal.SIGINT)
 
     monkeypatch.setattr(
-        "gsparc.commands.map.read_or_gather", lambda *_: Timer(0.3, interrupt).start()
+        "gsparc.commands.map.read_or_gather", lambda *_, **__: Timer(0.3, interrupt).start()
     )
     answer = run("map", f"ckpt={model}", "step_m=0.03", folder=tmp_path)
     assert answer.status == 130 and began, answer

@@ -21,10 +21,10 @@ from gsparc.commands.check import main as check
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.train import train
 from gsparc.data.splits import Fold
-from gsparc.evaluation.answers import predict_file
 from gsparc.models import checkpoint
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
+from gsparc.prediction.answers import predict_file
 from gsparc.prediction.left_out import HeldOutLevels
 from gsparc.prediction.predictor import Predictor
 from gsparc.runs.align_site import align_to_site

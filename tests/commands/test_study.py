@@ -1,64 +1,72 @@
-"""`gsparc study`: each kind leaves its table, figure and summary."""
+"""`gsparc study`: a multirun of trainings, of variants of a model or of errors of the data."""
 
-import csv
 import json
-from functools import partial
 
 import pytest
-from campaigns import compose, runs_in, spectra
+from campaigns import compose, powers, spectra
+from doors import knock
+from hydra import compose as compose_with_hydra
 from hydra import initialize_config_module
 
-from gsparc.commands.study import configs_of, task
-from gsparc.models.registry import build
+from gsparc.commands.listing import COMMANDS
+from gsparc.commands.train import train
+from gsparc.evaluation.results import read_columns
+from gsparc.models.registry import build, fill_defaults
 from gsparc.models.terms import EffectSettings
 
-HYDRA = partial(initialize_config_module, "gsparc.conf", version_base="1.3")
-PLAIN = "{effects: {array: false, residual: false}, field: {count: 20}}"
-LINES = {
-    "effects": ([], ["none"]),
-    "positions": (["kind.errors_m=[0.1]"], ["none", "query", "train", "train_known"]),
-    "measurements": (["kind.keep=[1,0.5]", "rounds=1"], ["keep", "keep"]),
-}
+VARIANTS = ("plain", "confidence", "distance", "array", "moving_array", "phase", "visibility")
+VARIANTS += ("power", "all", "simple")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", LINES)
-def test_a_study_leaves_a_table_a_figure_and_a_summary(kind, tmp_path, monkeypatch):
-    runs_in(monkeypatch, tmp_path)
-    more, conditions = LINES[kind]
-    config = compose(
-        "dataset=own",
-        f"dataset.file='{spectra(tmp_path / 'own.npz')}'",
-        f"kind={kind}",
-        "threads=1",
-        "~variants",
-        f"+variants={{plain: {PLAIN}}}",
-        "baselines=[mean]",
-        "query_s=0.5",
-        "trainer.max_steps=6",
-        "trainer.val_check_interval=3",
-        *more,
-        config="study",
+def test_a_study_is_a_multirun_and_leaves_out_what_the_data_do_not_allow(tmp_path):
+    answer = knock(
+        COMMANDS["study"].run,
+        "study",
+        [
+            "kind=effects",
+            "variant=plain,phase",
+            "dataset=own",
+            f"dataset.file={spectra(tmp_path / 'own.npz')}",
+            "threads=1",
+            "baselines=[mean]",
+            "model.field.count=20",
+            "trainer.max_steps=6",
+            "trainer.val_check_interval=3",
+            "logger=none",
+            "+hydra.callbacks.sweep.rounds=2",
+            f"hydra.sweep.dir={tmp_path / 'sweep'}",
+        ],
     )
-    with HYDRA():
-        rows = task(config)
-    assert list(rows.what) == 2 * conditions
-    facts = json.loads((tmp_path / "summary.json").read_text())
-    assert facts["study/rounds"] and facts["dataset/name"] == "own" and facts["seed"] == 0
-    assert (rows.train_s > 0).all() and (rows.query_ms > 0).all()
-    with (tmp_path / "study.csv").open() as file:
-        stored = list(csv.DictReader(file))
-    assert [float(row["value"]) for row in stored] == list(rows.value)
-    assert (tmp_path / "study.png").stat().st_size > 10_000
+    assert answer.status == 0, answer
+    assert "is left out: model.effects.phase=true is not possible" in " ".join(answer.out)
+    settings = read_columns(tmp_path / "sweep" / "sweep.csv")["method and setting"]
+    assert settings[0].startswith("gsparc variant=plain ") and settings[1] == "mean (baseline)"
+    assert json.loads((tmp_path / "sweep" / "summary.json").read_text())["sweep/runs"] == 1
 
 
 def test_variants_join_the_models_settings_where_they_are_interpolations():
     """Both studies of the pages ended after 8 s: `error: visibility: Missing key visibility`."""
-    config = compose("kind=effects", config="study")
-    with HYDRA():
-        configs = configs_of(config)
-    variants = {name: build(config.model) for name, config in configs.items()}
-    switches = {name: method.switches for name, method in variants.items() if name != "gp"}
-    assert len(switches) == 9 and all(isinstance(one, EffectSettings) for one in switches.values())
+    with initialize_config_module("gsparc.conf", version_base="1.3"):
+        chosen = {name: compose_with_hydra("study", [f"variant={name}"]) for name in VARIANTS}
+    switches = {name: build(fill_defaults(of.model)).switches for name, of in chosen.items()}
+    assert all(isinstance(switch, EffectSettings) for switch in switches.values())
     assert (switches["plain"].image, switches["plain"].phase) == (True, False)
     assert (switches["all"].image, switches["plain"].visibility) == ("auto", "auto")
+
+
+def test_errors_cost_an_interpolator_and_not_the_mean(tmp_path):
+    """A baseline learns from, and is asked about, the same disturbed rows as the model."""
+    file, rmse = powers(tmp_path / "own.npz"), {}
+    given = ("dataset=own", f"dataset.file={file}", "model=gp", "baselines=[mean,gp]")
+    for key in ("keep=1", "queries_m=0.5", "train_m=0.5", "keep=0.2"):
+        config = compose(*given, "logger=none", "threads=1", f"disturb.{key}")
+        facts, _ = train(config, tmp_path / key, in_full=False)
+        names = ("test", "baseline/gp", "baseline/mean")
+        rmse[key] = [facts[f"{name}/rmse_db"] for name in names]
+        rows = facts["split/train"] + facts["split/val"]
+        assert rows == (13 if key == "keep=0.2" else 64)  # that a model learned from
+    assert all(own == beside for own, beside, _ in rmse.values())
+    clean, *disturbed = rmse.values()
+    assert all(own > clean[0] + 0.3 for own, _, _ in disturbed)
+    assert all(mean == clean[2] for _, _, mean in disturbed[:2])

@@ -11,10 +11,10 @@ import pytest
 from gsparc.data.schema import LIGHT
 from gsparc.data.splits import Fold, Split
 from gsparc.datasets.own import read_any
-from gsparc.evaluation.answers import predict_file
 from gsparc.models import checkpoint, fitting
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
+from gsparc.prediction.answers import predict_file
 from gsparc.prediction.hearing import Hearing, read_hearing
 from gsparc.prediction.operating_point import load
 from gsparc.runs.align_site import align_to_site

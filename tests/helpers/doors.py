@@ -9,7 +9,7 @@ from pathlib import Path
 from unittest import mock
 
 WHOLE = re.compile(
-    r"\.hydra(/.*)?|(\.job/)?\.lock|\.job|[\w.]+\.log|split\.json|job\.json"
+    r"\.hydra(/.*)?|(\.job/)?\.run\.lock|\.job|[\w.]+\.log|split\.json|job\.json"
 )  # notes of a run before it computes anything
 
 

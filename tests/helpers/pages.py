@@ -278,7 +278,7 @@ class Tiny:
         gsparc = words.get("model", "gsparc") == "gsparc" and words.get("experiment") != "sionna"
         if name in ("train", "study") and gsparc:
             words |= FIELD
-        if name == "train" and "experiment" in words:
+        if name == "study" or (name == "train" and "experiment" in words):
             words["hydra.mode"] = "RUN"  # of its sweep one job
         words["hydra.run.dir"] = str(run)
         return [*dropped, *(f"{key}={value}" for key, value in words.items())]
@@ -316,14 +316,7 @@ SHORT = {"threads": "1"}
 FIELD = {"model.field.count": "20", "trainer.max_steps": "2", "trainer.val_check_interval": "1"}
 TINY = {  # what makes each command short
     "train": {**SHORT, "effort": "0.1", "baselines": "[mean]", "logger": "none"},
-    "study": {
-        **SHORT,
-        "effort": "0.1",
-        "baselines": "[]",
-        "query_s": "0.1",
-        "queries": "5",
-        "rounds": "1",
-    },
+    "study": {**SHORT, "effort": "0.1", "baselines": "[]", "logger": "none"},
     "tradeoff": {"threads": "[1]", "rounds": "2", "baselines": "[]"},
     "evaluate": {**SHORT, "baselines": "[mean]"},
     "locate": {**SHORT, "calibrate": "0", "rows": "3"},

@@ -11,9 +11,9 @@ import torch
 
 import gsparc
 from gsparc.data.splits import Fold, SplitSettings, make_split
-from gsparc.evaluation.answers import predict_file
 from gsparc.models.device_offsets import take_off_devices, without_devices
 from gsparc.models.method import Prediction
+from gsparc.prediction.answers import predict_file
 from gsparc.runs.baselines import fit_baseline
 from gsparc.tables.own import from_arrays
 

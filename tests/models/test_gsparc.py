@@ -20,8 +20,9 @@ from scenes import fold_of
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models import checkpoint, fitting, loading, member_weights
+from gsparc.models import checkpoint, fitting, loading
 from gsparc.models.gsparc import Gsparc
+from gsparc.models.image_sources import ensemble
 from gsparc.models.method import Method
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.methods import Powers
@@ -215,10 +216,10 @@ def test_the_log_begins_with_what_is_trained_and_ends_with_what_it_cost(name):
 
 @pytest.mark.slow
 def test_channels_are_a_mean_of_fields_that_is_stored_whole(monkeypatch, tmp_path):
-    equal = lambda gram, *unused: np.full(gram.shape[1], 1 / gram.shape[1])  # noqa: E731
-    monkeypatch.setattr(member_weights, "choose_weights", equal)
+    equal = lambda gram, *unused, **named: np.full(gram.shape[1], 1 / gram.shape[1])  # noqa: E731
+    monkeypatch.setattr(fit_candidates, "weigh", equal)
     monkeypatch.setattr(race, "LEAST_GAIN", -math.inf)
-    monkeypatch.setattr(fit_candidates, "CONVERGED_ERROR", 0.0)
+    monkeypatch.setattr(ensemble, "CONVERGED_ERROR", 0.0)
     few = ("init.searches=2", "init.search_rows=64", "init.max_sources=8")
     fitted = fit("channels", *few, effort=1.0)
     field = fitted.method

@@ -38,6 +38,7 @@ from gsparc.models.registry import build, built_in_methods, method_class
 from gsparc.models.splat.array import ArrayField
 from gsparc.models.uplink.search import SearchSettings as UplinkSearch
 from gsparc.ops import Pose
+from gsparc.prediction.answers import ask
 from gsparc.prediction.predictor import Predictor
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
@@ -334,7 +335,8 @@ def test_threads_of_a_query(monkeypatch, name, places, inside):
 def served(predictor: Predictor, data: Measurements, rows: np.ndarray) -> torch.Tensor:
     """What a user is answered at the places of rows (n,), in stored units."""
     places = data.moving[rows] + data.site.origin
-    return predictor.predict_linear(**{data.site.moving_end: places}).mean / data.site.target_scale
+    ends = {data.site.moving_end: places}
+    return ask(predictor, ends, linear=True).mean / data.site.target_scale
 
 
 @pytest.mark.slow

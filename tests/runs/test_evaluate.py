@@ -7,8 +7,9 @@ import pytest
 import torch
 from refusals import refused
 
+from gsparc.base.files import write_samples
 from gsparc.evaluation.scores import score_methods
-from gsparc.evaluation.summary import decided_by_a_row, results_table, write_samples, write_summary
+from gsparc.evaluation.summary import decided_by_a_row, results_table, write_summary
 from gsparc.models.baselines.idw import InverseDistance
 from gsparc.models.baselines.mean import Mean
 from gsparc.prediction.timing import ClockSettings

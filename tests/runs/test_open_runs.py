@@ -17,7 +17,7 @@ from gsparc.models.registry import method_class
 from gsparc.runs import open_runs
 from gsparc.runs.align_site import align_to_site
 from gsparc.runs.baselines import fit_baseline
-from gsparc.runs.open_runs import Opened, open_files
+from gsparc.runs.open_runs import Opened, open_run
 from gsparc.tables.own import from_arrays
 from gsparc.tables.read import parse_table
 from gsparc.training.context import FitContext
@@ -154,7 +154,7 @@ def test_places_in_degrees_were_said_to_be_apart_from_a_model_s_of_an_unknown_or
     degrees = {"latitude": 48 + place[:, 1] / 111_000, "longitude": 2 + place[:, 0] / 74_000}
     np.savez(tmp_path / "drive.npz", **degrees, rx_height=np.array(1.5), rssi_db=level)
     own = {"name": "own", "file": str(tmp_path / "drive.npz")}
-    run = open_files([tmp_path / "model.ckpt"], own, {"name": "random"})
+    run = open_run(tmp_path / "model.ckpt", own).read({"name": "random"})
     assert run.learned is None and "about an unknown origin" in run.foreign
 
 
@@ -169,7 +169,7 @@ def opened_beside_all(folder, monkeypatch, **changes):
         open_runs, "_trained", lambda stored, data: (align_to_site(learned, data.site), split)
     )
     own = {"name": "own", "file": str(folder / "drive.npz")}
-    return open_runs.open_files([folder / "model.ckpt"], own, None, others_whole=True)
+    return open_run(folder / "model.ckpt", own).read(others_whole=True)
 
 
 def test_test_rows_of_a_drive_counted_unlisted_cells_as_lines(tmp_path, monkeypatch):
@@ -245,7 +245,7 @@ def test_locate_built_whatever_class_a_checkpoint_named():
     """Settings that the stored class does not follow were instantiated, `os.system` as well."""
     settings = {"model": {"_target_": "os.system", "command": "true"}, "seed": 3, "effort": 2.0}
     split = SimpleNamespace(folds=[None])
-    run = Opened([None], [SimpleNamespace(configuration=settings, path="a.ckpt")], None, split)
+    run = Opened([None], [SimpleNamespace(configuration=settings, path="a.ckpt")], {}, None, split)
     refused(r"os\.system.*refused", run.retraining, 5.0)
     settings["model"] = {"_target_": "gsparc.models.baselines.nearest.Nearest"}
     context = run.retraining(5.0).context

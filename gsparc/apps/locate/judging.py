@@ -24,14 +24,15 @@ from gsparc.apps.locate.search import Nuisances
 from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import Scans, group_snapshots
 from gsparc.base.errors import DataError
+from gsparc.base.files import write_samples
 from gsparc.evaluation.console import to_dict
-from gsparc.evaluation.summary import coordinates, write_as_found, write_samples
+from gsparc.evaluation.summary import coordinates, write_as_found
 from gsparc.evaluation.table import Column, Table
 from gsparc.models import checkpoint
 from gsparc.pictures.drawing import PALETTE, panels, save
 from gsparc.prediction.predictor import Predictor
 from gsparc.processes.few_rows import draw_rows
-from gsparc.runs.open_runs import Opened, open_files, read_like_stored
+from gsparc.runs.open_runs import Opened, open_run, read_like_stored
 
 log = logging.getLogger(__name__)
 
@@ -137,7 +138,7 @@ def locate_by_model(
     Raises:
         ValueError: the model states no variance, or does not name its settings.
     """
-    run = open_files([config.ckpt], to_dict(config.dataset), to_dict(config.split))
+    run = open_run(config.ckpt, to_dict(config.dataset)).read(to_dict(config.split))
     data, fold = run.data, run.split.folds[0]
     learned = np.sort(fold.learned())
     unknown, share = (

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gsparc.apps.locate.snapshots import flatten_targets
 from gsparc.data.query import Query
+from gsparc.models.method import predict_with_threads
 from gsparc.prediction.predictor import Predictor
 
 # Values that are asked for at a time: all stations of some places, which share their work
@@ -65,7 +66,7 @@ class SiteField:
             torch.arange(self.count).repeat(len(places)) if site.stations is not None else None
         )
         query = Query.from_places(site, places.float().repeat_interleave(self.count, 0), station)
-        prediction = self.predictor.predict_query(query)
+        prediction = predict_with_threads(self.predictor.method, query)
         if prediction.variance is None:
             raise ValueError(
                 f"locate: {self.predictor.method.name} states no variance of what is heard"

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from gsparc.apps.maps.making import choose_stations, predict_levels
+from gsparc.apps.maps.making import choose_stations
 from gsparc.apps.maps.promise import Promise
+from gsparc.prediction.levels import predict_levels
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import query_ends, to_local
 

@@ -19,7 +19,7 @@ from gsparc.apps.maps.refining import sample_adaptively
 from gsparc.apps.maps.scoring import Scoring
 from gsparc.base import limits
 from gsparc.base.errors import DataError
-from gsparc.base.executor import run_each
+from gsparc.base.executor import run_all
 from gsparc.base.instantiate import suggest_or_list
 from gsparc.base.limits import finite_array
 from gsparc.data.schema import Site
@@ -27,12 +27,12 @@ from gsparc.data.spacing import neighbour_distance
 from gsparc.data.station_names import all_names, find_station
 from gsparc.data.units import PowerUnit
 from gsparc.models.powers.together.network import number_sites
-from gsparc.prediction.levels import MAPPED, joint_levels, predicted_levels
+from gsparc.prediction.answers import in_blocks
+from gsparc.prediction.levels import MAPPED, joint_levels, predict_levels
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.query import query_ends, to_local
+from gsparc.prediction.query import to_local
 from gsparc.processes.uncertainty import half_width
 
-CHUNK = 512  # cells at a time: memory, and how soon an interrupt is heeded
 MOST_DB = 1000.0  # of a level
 ALL_CELLS = 40_000  # of a map that are all asked about
 # What follows is cheap, but float64 arrays (T, n) of all cells of a city take gigabytes.
@@ -139,7 +139,7 @@ def predict_map(
     )
     values["overlap"] = np.full(grid.inside.shape, np.nan, np.float32)
     flat = {name: array.reshape(*array.shape[:-2], -1) for name, array in values.items()}
-    for cells in _chunks(inside, BANDS):
+    for cells in np.split(inside, range(BANDS, len(inside), BANDS)):
         mean, spread = (
             flat[name][:, cells].astype(np.float64) for name in ("power_db", "expected_error_db")
         )
@@ -290,10 +290,6 @@ def choose_stations(
     return list(dict.fromkeys(names)), notes
 
 
-def _chunks(rows: np.ndarray, size: int) -> list[np.ndarray]:
-    return [rows[start : start + size] for start in range(0, len(rows), size)]
-
-
 def _asker(
     predictor: Predictor,
     joint: bool,
@@ -308,46 +304,19 @@ def _asker(
     their errors with the strongest's.
     """
     model = predictor if joint else predictor.ask_station(int(numbers[0]))
-
-    def one(cells: np.ndarray) -> np.ndarray:
-        if (
-            levels := joint_levels(model, grid.places(cells), numbers) if joint else None
-        ) is not None:
-            return levels.reshape(len(cells), -1)
-        return np.column_stack(predict_levels(model, grid.places(cells), other_end))
-
-    name = f" of {names[0]}" if len(names) == 1 and names[0] else ""
+    what = f"blocks of cells of {names[0]}" if len(names) == 1 and names[0] else "blocks of cells"
+    how: dict[str, Any] = {"what": what, "threads": torch.get_num_threads()}
 
     def ask(cells: np.ndarray) -> np.ndarray:
-        levels, parts = (
-            np.zeros((len(cells), 3 * len(numbers) if joint else 2)),
-            _chunks(cells, CHUNK),
-        )
-        for number, values in run_each(
-            one, parts, f"blocks of cells{name}", threads=torch.get_num_threads()
-        ):
-            levels[number * CHUNK : number * CHUNK + len(values)] = values
-        return levels
+        places = grid.places(cells)
+        if not len(cells):
+            return np.zeros((0, 3 * len(numbers) if joint else 2))
+        if not joint:
+            return np.column_stack(predict_levels(model, places, other_end, **how))
+        parts = run_all(lambda part: joint_levels(model, part, numbers), in_blocks(places), **how)
+        return np.concatenate([part for part in parts if part is not None]).reshape(len(cells), -1)
 
     return ask
-
-
-def predict_levels(
-    predictor: Predictor,
-    places: np.ndarray,
-    other_end: Sequence[float] | None = None,
-    station: np.ndarray | None = None,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the level and its deviation (n,) [dB] at world places (n, 3).
-
-    See `predicted_levels` and `query_ends`.
-    """
-    parts = []
-    for part in _chunks(places, CHUNK):
-        ends = query_ends(predictor.site, part, other_end, station)
-        parts.append(predicted_levels(predictor.predict_linear(**ends), predictor.site.kind))
-    level, spread = np.concatenate(parts, axis=1)
-    return level, spread
 
 
 def _hearing_floors(

@@ -22,7 +22,7 @@ from gsparc.apps.maps.covered import (
     share_between,
 )
 from gsparc.apps.maps.geojson import draws_shapes
-from gsparc.apps.maps.making import predict_levels, predict_map
+from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
 from gsparc.apps.maps.promise import Promise
 from gsparc.base.errors import DataError
@@ -41,6 +41,7 @@ from gsparc.data.schema import Site, Stations
 from gsparc.data.splits import Fold
 from gsparc.models.powers.together.network import ONE_BAND, number_sites
 from gsparc.prediction.left_out import HeldOutLevels, leave_out
+from gsparc.prediction.levels import predict_levels
 from gsparc.prediction.placing import to_world
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.refit import Learned

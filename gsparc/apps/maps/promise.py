@@ -21,7 +21,7 @@ from gsparc.data.splits import SplitSettings
 from gsparc.models import checkpoint
 from gsparc.prediction.left_out import HeldOutLevels, leave_out, nearest_distances
 from gsparc.prediction.refit import Learned
-from gsparc.runs.open_runs import check_dataset, open_files
+from gsparc.runs.open_runs import OpenRun
 
 log = logging.getLogger(__name__)
 
@@ -153,52 +153,60 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
     return Promise(HeldOutLevels.join(parts), places, data.stations_of(learned.rows), side)
 
 
-def read_or_gather(path: str, settings: Mapping[str, Any]) -> Promise | None:
+def read_or_gather(
+    run: OpenRun, settings: Mapping[str, Any], renew: bool = False
+) -> Promise | None:
     """Return the evidence stored with a model, or gathered from its training data and then stored.
 
+    Rows that were held out for a test are warned of: to a map they are places where nobody
+    measured.
+
     Args:
-        path: the model's file.
-        settings: `promised`, without which there is none; `promise`, `dataset` and `renew` of
-            conf/map.yaml.
+        run: the model.
+        settings: `promised`, without which there is none; `promise` of conf/map.yaml.
+        renew: whether what is stored is gathered anew.
 
     Raises:
         DataError: the training data are gone, or are others.
     """
     how = PromiseSettings(**settings["promise"])
-    check_dataset(path, settings["dataset"])
+    if count := run.stored[0].extra.get("tested"):
+        log.warning(
+            "%d rows of its file were held out for the test and count as not measured here: "
+            "train the final model with split=none",
+            count,
+        )
     if not settings["promised"]:
         return None
-    stored = checkpoint.read(path)
-    promise = None if settings.get("renew") else read_promise(stored.extra)
+    promise = None if renew else read_promise(run.stored[0].extra)
     # Blocks of another size are other evidence.
     if promise is not None and how.block_m in (None, promise.block_m):
         return promise
-    learned = reopen_training(path, settings["dataset"])
+    learned = reopen_training(run)
     log.info("testing the intervals of maps: fits without blocks of places")
     promise = gather_promise(learned, how)
     # Too little evidence is said before anything is stored
     cross_validate(promise.evidence, how.share)
-    promise.store(path)
+    promise.store(run.stored[0].path)
     return promise
 
 
-def reopen_training(path: str, dataset: dict[str, Any]) -> Learned:
+def reopen_training(run: OpenRun) -> Learned:
     """Return a model with the very data and rows that it was trained on.
 
     Raises:
         DataError: they are gone, or are others.
     """
     try:
-        run = open_files([path], dataset)
-        learned = run.retraining()
+        opened = run.read()
+        learned = opened.retraining()
     except (ValueError, OSError) as error:
         why = f"{error}; held-out blocks need the training data"
         raise DataError(f"{why}: dataset.file=..., or promised=false") from None
     # Rows of other data are no evidence of what this model has not seen.
-    if run.learned != 0 or run.foreign is not None:
-        raise DataError(
-            f"{path} was trained on {run.foreign}; give its own data, or promised=false"
-        )
+    if opened.learned != 0 or opened.foreign is not None:
+        was = f"{run.stored[0].path} was trained on {opened.foreign}"
+        raise DataError(f"{was}; give its own data, or promised=false")
     return learned
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsparc.physics.decibels import from_decibels, to_decibels
+from gsparc.prediction.answers import ask
 from gsparc.prediction.channels import Paths
 from gsparc.prediction.levels import predicted_levels
 from gsparc.prediction.predictor import Predictor
@@ -63,9 +64,8 @@ def predict_answer(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answ
         ValueError: a place that cannot be.
     """
     site, facts = predictor.site, predictor.site.target
-    prediction = predictor.predict_linear(
-        **{end: np.atleast_2d(place) for end, place in ends.items()}
-    )
+    there = {end: np.atleast_2d(place) for end, place in ends.items()}
+    prediction = ask(predictor, there, linear=True)
     mean = prediction.mean[0].numpy()
     known = site.every_station.position[0] + site.origin
     still: dict[str, np.ndarray] = {} if np.isnan(known).any() else {site.still_end: known}

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsparc.apps.maps.area import Grid
-from gsparc.apps.maps.making import predict_levels
 from gsparc.apps.maps.pictures import Legend
 from gsparc.apps.view.scene import PlacedPicture
+from gsparc.prediction.levels import predict_levels
 from gsparc.prediction.predictor import Predictor
 
 FIRST = 400  # cells of the first, coarsest picture, about

@@ -13,10 +13,9 @@ import numpy as np
 from gsparc.apps.maps.making import choose_stations
 from gsparc.data.schema import End, Measurements, Site
 from gsparc.prediction import levels
-from gsparc.prediction.operating_point import load
 from gsparc.prediction.predictor import Predictor
 from gsparc.runs.align_site import align_to_site
-from gsparc.runs.open_runs import open_files
+from gsparc.runs.open_runs import open_run
 
 log = logging.getLogger(__name__)
 
@@ -128,22 +127,19 @@ def open_model(
         DataError: no station is called that.
         ValueError: no checkpoint that can be read.
     """
-    notes: list[str] = []
-    data = None
+    run, notes, data = open_run(path, dataset or {}), list[str](), None
+    predictor = run.predictor.in_levels(unit)
     try:
-        run = open_files([path], dataset)
-        predictor, data = run.predictor, run.data
-        if run.foreign is not None:
-            notes.append(f"measured points are other data: the model was trained on {run.foreign}")
+        opened = run.read()
+        data = align_to_site(opened.data, predictor.site)
+        if opened.foreign is not None:
+            learned = f"the model was trained on {opened.foreign}"
+            notes.append(f"measured points are other data: {learned}")
     # Data are gone or changed: a model can be looked at without them.
     except (ValueError, OSError) as error:
-        predictor = load(path)
         notes.append(
             f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=..."
         )
-    predictor = predictor.in_levels(unit)
-    site = predictor.site
-    data = None if data is None else align_to_site(data, site)
     names, missing = choose_stations(
         predictor, None if station is None else [station], key="station"
     )

@@ -16,6 +16,7 @@ from functools import partial, wraps
 from io import StringIO
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 import hydra
 import yaml
@@ -223,15 +224,15 @@ def help_text(answers: str, config: str) -> str:
     Read from files: Hydra's own list of all values has no comments.
     """
     offer_scenes()
-    text = (config_folder() / f"{config}.yaml").read_text(encoding="utf-8")
-    texts = [answers, text.partition("\nhydra:")[0].rstrip()]
-    defaults = yaml.safe_load(text).get("defaults", ())
-    groups = {
-        group: choice
-        for default in defaults
-        if isinstance(default, dict)
-        for group, choice in default.items()
-    }
+    files, texts, groups = [config], [answers], dict[str, Any]()
+    for name in files:
+        text = (config_folder() / f"{name}.yaml").read_text(encoding="utf-8")
+        texts.append(text.partition("\nhydra:")[0].rstrip())
+        for default in yaml.safe_load(text).get("defaults", ()):
+            if isinstance(default, dict):
+                groups |= default
+            elif "/" not in default and default != "_self_":  # all of another command's settings
+                files.append(default)
     if "kind" in groups:  # settings of the command itself
         kinds = [word.partition("=")[2] for word in sys.argv if word.startswith("kind=")]
         file = config_folder() / "kind" / f"{[groups['kind'], *kinds][-1]}.yaml"

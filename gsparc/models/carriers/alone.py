@@ -78,13 +78,17 @@ class CarriersAlone(Stored):
         return replace(self, means=means, processes=(*self.processes, None))
 
     def left_out(self, station: Tensor) -> Tensor:
-        """Return what other rows miss of each that it was conditioned on (n, P);
+        """Return what other rows, and their mean, miss of each that it was conditioned on (n, P);
         NaN without a process.
         """
         result = torch.full((len(station), self.means.shape[1]), torch.nan, dtype=torch.float64)
         for number, process in enumerate(self.processes):
             if process is not None:
-                result[station == number] = process.left_out_residuals().residual
+                residual = process.left_out_residuals().residual
+                alike = process.factor.solve(torch.ones_like(residual[:, :1]))
+                missed = alike / process.factor.precision[:, None]  # of a mean that is off by 1
+                away = process.given_values() / (len(residual) - 1)  # that a row takes the mean
+                result[station == number] = residual + missed * away
         return result
 
     def has_process(self, station: Tensor) -> Tensor:

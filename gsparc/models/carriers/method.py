@@ -23,8 +23,8 @@ from gsparc.models.carriers.alone import CarriersAlone
 from gsparc.models.carriers.array import OneArray
 from gsparc.models.carriers.geometry import SharedPaths, find_paths
 from gsparc.models.carriers.joint import Covariance, choose_joint, row_noise
-from gsparc.models.member_weights import choose_weights, error_products
 from gsparc.models.method import Prediction
+from gsparc.models.stack import error_products, weigh
 from gsparc.models.target_rows import training_targets
 from gsparc.physics.separable import Separable, separate_axes
 from gsparc.processes.factor import Factor
@@ -160,13 +160,13 @@ class CarrierField(OneArray):
         has_process = self.alone.has_process(station)
         missed, unit = self.alone.left_out(station)[has_process], place[has_process]
         new, seen = (
-            _second_share(unexplained[has_process], missed, unit)
+            _share_of_second(unexplained[has_process], missed, unit)
             for unexplained in (joint.new, joint.seen)
         )
         self.shares = new, seen
         # One carrier alone tells nothing of others.
         several = len(station.unique()) > 1
-        self.carried = _second_share(values, joint.carrier, station) if several else 1.0
+        self.carried = _share_of_second(values, joint.carrier, station) if several else 1.0
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; `query.station` says which carrier.
@@ -250,14 +250,14 @@ class CarrierField(OneArray):
         return ((self.expected(self.paths, places) - mean) @ to_values).double()
 
 
-def _second_share(first: Tensor, second: Tensor, unit: Tensor) -> float:
+def _share_of_second(first: Tensor, second: Tensor, unit: Tensor) -> float:
     """Weight of the second of two predictions by errors (n, P) of rows of units (n,);
     0 without rows.
     """
     if not len(unit):
         return 0.0
     products = error_products([first, second], torch.zeros_like(first))
-    return float(choose_weights(products, unit.numpy(), deviations=2.0)[1])
+    return float(weigh(products, unit.numpy(), "log", sure=0.0)[1])
 
 
 def _at_covering_places(places: np.ndarray, most: int) -> np.ndarray:

@@ -64,6 +64,8 @@ class DirectionalGP(SourcesInFrame):
 
     name = "directional_gp"
     posterior: SightedSources
+    receivers = np.zeros(0, np.int64)  # (n,) rows that the sources were found by
+    sighted: VisibilityGP  # at these
 
     def __init__(
         self, rows: int = SearchSettings.rows, seed: int = 0, visibility: bool = True
@@ -89,6 +91,7 @@ class DirectionalGP(SourcesInFrame):
             rows = np.sort(
                 np.random.default_rng(self.seed).choice(rows, MAX_RECEIVERS, replace=False)
             )
+        self.receivers = rows
         places = data.rx_position[rows].astype(np.float64)
         rays = Rays.from_receivers(
             places, [(data.directions[i] @ data.rx_rotation[i].T).astype(np.float64) for i in rows]
@@ -124,7 +127,7 @@ class DirectionalGP(SourcesInFrame):
         if self.visibility:
             pairs = self._update_visibility()
             changed = f"{pairs} pairs of receiver and source seen or hidden otherwise by channels; "
-        self.posterior.precompute()
+        self.sighted = self.posterior.precompute().visibility
         note = (
             f"directional_gp: {self.count_components()} sources where directions cross, "
             "direction error "
@@ -132,6 +135,26 @@ class DirectionalGP(SourcesInFrame):
             f"{self.posterior.kernel.constant:.1%} of the gains' variance alike at all places"
         )
         return FitReport(started.seconds, (note,))
+
+    def condition(self, data: Measurements, rows: np.ndarray) -> None:
+        """Set the weights from rows (n,): sources, and who sees them, stay as they were found.
+
+        Of receivers whose rays were not looked at they are sought anew.
+        """
+        order = np.argsort(self.receivers)
+        if not np.isin(rows, self.receivers).all():
+            return super().condition(data, rows)
+        some = torch.from_numpy(order[np.searchsorted(self.receivers, rows, sorter=order)])
+        thinned = rows_of_measurements(data, rows, self.row_limit, self.seed)
+        number = np.argsort(rows)[np.searchsorted(np.sort(rows), thinned.receiver.numpy())]
+        self.posterior = replace(
+            self.posterior,
+            rows=self._fitted_frame().normalise(thinned),
+            observer=torch.from_numpy(number),
+            visibility=VisibilityGP.from_visibility(
+                self.sighted.places[some], self.sighted.seen[some]
+            ),
+        ).precompute()
 
     def _thin_posterior(self, limit: int) -> SightedSources:
         """Every so many-th row, at most `limit`."""

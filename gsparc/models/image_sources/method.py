@@ -39,7 +39,6 @@ from gsparc.models.image_sources.rows import (
 )
 from gsparc.models.image_sources.scene import JITTER, SourceScene
 from gsparc.models.image_sources.search import Found, SearchSettings
-from gsparc.models.member_weights import weights_of_fits
 from gsparc.models.method import Method
 from gsparc.models.reduced import MeanOnly, Settings
 from gsparc.physics.mirror_planes import hesse_form, image_rotations
@@ -169,7 +168,9 @@ class ImageSourceGP(SourcesInFrame):
     def _set_members(self, rows: Rows, members: list[Member]) -> ImageSourceGP:
         """Say what these members say, with their weights (M,) float32 of sum 1."""
         self._set_posteriors(rows, [member.scene for member in members])
-        self.weights = weights_of_fits(torch.tensor([member.left_out for member in members]))
+        self.weights = ensemble.weights_of_fits(
+            torch.tensor([member.left_out for member in members])
+        )
         return self
 
     def _describe_search(self, members: list[Member]) -> list[str]:
@@ -227,6 +228,7 @@ class ImageSourceGP(SourcesInFrame):
         errors: list[float],
         rows: Rows,
         scene: SourceScene,
+        finished: bool,
     ) -> None:
         """Look at a search's scene by a batch of rows `group` (n,) that it left out;
         `FellBehind` ends it.
@@ -235,9 +237,8 @@ class ImageSourceGP(SourcesInFrame):
         mean = copy.copy(self)._set_members(rows, [Member(scene, 1.0)]).predict(batch).mean
         # Predictions are in stored units, the batch's targets already times the factors.
         missed = mean - batch.target / self.factors[:, None]
-        errors.append(
-            race.check_candidate(f"{len(scene.sequences)} sources", group, missed, errors)
-        )
+        text = f"{len(scene.sequences)} sources"
+        errors.append(race.check_candidate(text, group, missed, errors, finished))
 
     def _draw(
         self, data: Measurements, rows: np.ndarray, limit: int | None = None, number: int = 0

@@ -1,22 +1,27 @@
-"""Candidates are fitted with groups of rows held out, in a race on these."""
+"""Candidates are fitted with groups of rows held out, in a race on these, and weighed by them."""
 
 from __future__ import annotations
 
+import copy
+import functools
 import logging
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+import torch
 
-from gsparc.data.inner_folds import InnerFolds
+from gsparc.data.inner_folds import NOT_TESTED, InnerFolds
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
-from gsparc.models.closed_form import ClosedForm
-from gsparc.models.image_sources.ensemble import CONVERGED_ERROR
-from gsparc.models.member_weights import leave_out_groups
+from gsparc.models.closed_form import ClosedForm, LeftOutRows
+from gsparc.models.image_sources.ensemble import reached_noise_floor
+from gsparc.models.method import factors_to_measured
 from gsparc.models.mixture.candidates import Candidate
+from gsparc.models.stack import LEAST_HELD, error_products, to_real_entries, weigh
 from gsparc.models.terms import EffectSettings
+from gsparc.physics.decibels import TINY_POWER
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.race import FellBehind, Race, mean_square
 from gsparc.training.stopwatch import Stopwatch
@@ -58,6 +63,10 @@ def fit_candidates(
     several = cut is not None
     rows = fold.train if several else np.sort(fold.learned())
     groups = () if cut is None else _training_groups(cut, fold.train)
+    noise = 0.0
+    if data.noise_variance is not None:
+        energy = mean_square(data.batch(rows).target)
+        noise = float(np.mean(data.noise_variance[rows])) / max(energy, TINY_POWER)
     # Searches come last: they race against the best before them, and end where they fall behind.
     fields: dict[str, ClosedForm] = {}
     reports: dict[str, FitReport] = {}
@@ -67,8 +76,9 @@ def fit_candidates(
         context.log_curve(watch.seconds, what, error)
 
     for name in sorted(parts, key=OPEN_ENDED.__contains__):
-        if name in SEARCHES and (why := _why_not_searched(race)):
-            log.info("init=%s is left out: %s", name, why)
+        if name in SEARCHES and race and reached_noise_floor([race.error], noise, 1):
+            text = "init=%s is left out: another solution has an NMSE of %.4f on held-out rows"
+            log.info(text, name, race.error)
             continue
         began = watch.seconds
         try:
@@ -102,11 +112,76 @@ def fit_candidates(
     return fields, reports
 
 
-def _why_not_searched(race: Race | None) -> str | None:
-    """Why no search is begun: another solution is as near as searches come; else None."""
-    if race is None or race.error > CONVERGED_ERROR:
+def leave_out_groups(
+    member: ClosedForm, data: Measurements, rows: np.ndarray, groups: Sequence[np.ndarray]
+) -> LeftOutRows | None:
+    """Return predictions of every group of rows by a member conditioned on rows (n,)
+    without that group.
+
+    Its parameters stay those of all rows. None without groups. The member stays as it is.
+    """
+    if not groups:
         return None
-    return f"another solution has an NMSE of {race.error:.4f} on held-out rows"
+    answers, clone = [], copy.copy(member)
+    for group in groups:
+        clone.condition(data, np.setdiff1d(rows, group))
+        answers.append(clone.predict(data.batch(group)))
+    mean, variance = (
+        torch.cat([getattr(answer, name) for answer in answers]) for name in ("mean", "variance")
+    )
+    number = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    return LeftOutRows(np.concatenate(groups), mean, variance, number)
+
+
+def weigh_candidates(
+    members: Mapping[str, ClosedForm], data: Measurements, val: np.ndarray, cut: InnerFolds | None
+) -> dict[str, float]:
+    """Return weights of members where positive, by rows which none of them was conditioned on.
+
+    Args:
+        members: one or more; one alone needs no rows.
+        data: measurements.
+        val: (v,) rows that none learned from, which are compared beside those that all left out by
+            groups.
+        cut: of the groups; None only for one member.
+    """
+    first = next(iter(members))
+    if len(members) == 1:
+        return {first: 1.0}
+    left_out = [member.held for member in members.values()]
+    kept = [answers.rows for answers in left_out if answers is not None]
+    rows = np.zeros(0, np.int64)
+    if len(kept) == len(members):  # only rows that every member was without can be compared
+        rows = functools.reduce(np.intersect1d, kept)
+    predicted = [method.predict(data.batch(val)).mean for method in members.values()]
+    if len(rows):
+        pairs = zip(left_out, predicted, strict=True)
+        predicted = [
+            torch.cat([answers.mean_at(rows), mean])
+            for answers, mean in pairs
+            if answers is not None
+        ]
+    rows, target = np.concatenate([rows, val]), data.site.target
+    if len(rows) < LEAST_HELD:
+        log.info("%d rows are too few to weigh solutions by: init=%s alone", len(rows), first)
+        return {first: 1.0}
+    if data.site.unknown_factor != "none":  # errors are counted after it
+        predicted = [mean * factors_to_measured(mean, data, rows) for mean in predicted]
+    measured = target.in_error_unit(data.batch(rows).target)
+    assert cut is not None
+    single = cut.unit.max() + 1 + np.arange(len(cut.unit))  # of validation rows that no group has
+    unit = np.where(cut.unit == NOT_TESTED, single, cut.unit)[rows]
+    others = len(rows) / (len(rows) - 1)  # a row about the mean of the rest
+    plain = to_real_entries(others * (measured - measured.mean(0))).square().mean(1).numpy()
+    products = error_products([target.in_error_unit(mean) for mean in predicted], measured)
+    weights = weigh(
+        products, unit, target.loss, dear=[name in SEARCHES for name in members], plain=plain
+    )
+    power = max(float(to_real_entries(measured).square().mean()), TINY_POWER)
+    for name, error, weight in zip(members, products.mean(0).diagonal(), weights, strict=True):
+        text = "%d held-out rows: %s has an NMSE of %.3f, weight %.2f"
+        log.info(text, len(rows), name, error / power, weight)
+    return {name: float(weight) for name, weight in zip(members, weights, strict=True) if weight}
 
 
 def _training_groups(cut: InnerFolds, train: np.ndarray) -> tuple[np.ndarray, ...]:

@@ -26,13 +26,13 @@ from gsparc.models.abilities import HasPaths, HasProcess, QueryPaths
 from gsparc.models.channels.initial import estimate_run_factors
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, method_from_state, method_state
 from gsparc.models.image_sources.frame import merge_equal_paths
-from gsparc.models.member_weights import explained_variance, weigh_members
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.each_or_together import LearnsTogether
 from gsparc.models.refined_places import move_rows, position_errors, refine_places
 from gsparc.models.run_factors import RunFactors
+from gsparc.models.stack import explained_variance
 from gsparc.models.terms import EffectSettings
 from gsparc.processes.averages import mixture_moments
 from gsparc.processes.powers import PowerProcess
@@ -181,10 +181,7 @@ class Mixture(LearnsTogether, ClosedForm):
         fitted, reports = fit_candidates.fit_candidates(
             parts, init, self.switches, data, fold, context, watch, cut
         )
-        # Searches have errors of their own, and of few squares nothing is sure:
-        # a mixture need not be.
-        sure = 0.0 if set(fitted).intersection((*fit_candidates.SEARCHES, "neighbours")) else 1.0
-        chosen = weigh_members(fitted, data, fold.val, cut, sure)
+        chosen = fit_candidates.weigh_candidates(fitted, data, fold.val, cut)
         self.members, self.weights = [fitted[name] for name in chosen], tuple(chosen.values())
         self.started = "+".join(chosen)
         self.site, self.init_s = data.site, watch.seconds

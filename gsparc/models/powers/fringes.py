@@ -19,9 +19,9 @@ import torch
 from torch import Tensor
 
 from gsparc.data.spacing import neighbour_distance
-from gsparc.models.member_weights import best_weights
 from gsparc.models.powers.groups import SPREAD, number_squares, split_groups
 from gsparc.models.powers.waves import FLOOR, PlaneWaveBasis, field_db, fit_wave_weights, make_basis
+from gsparc.models.stack import best_weights
 from gsparc.physics.decibels import from_decibels, to_decibels
 from gsparc.processes.density import TINY
 from gsparc.processes.nearest import condition_on_nearest

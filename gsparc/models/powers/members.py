@@ -40,6 +40,7 @@ PLACE_NEEDS = 8  # rows that were heard, for a place that is sought
 LEARNED_ON = 500  # rows: numbers, and shares
 NEAREST_FROM = 1_000  # rows, from which on shape and numbers follow from the nearest ones
 WALKED = 15  # looks of a member that begins where the first ended, of one that hears of silence
+ASKED = 200  # places, whose error is foreseen
 MAP_PAYS = 0.05  # of the squared errors at rows left out that a map must take off
 
 
@@ -197,6 +198,28 @@ def learn_numbers(
         member.kernel, [view._replace(side=side)], looks, known, extent
     )
     return replace(member, kernel=kernel)
+
+
+def foresee_errors(rows: PowerRows, site: Site, further: int, seed: int = 0) -> tuple[float, float]:
+    """Return the error at places between rows that these leave, and the one that further rows there
+    would leave [dB].
+
+    Args:
+        rows: at least one.
+        site: where the still end is.
+        further: rows, at places drawn by chance.
+        seed: of these.
+    """
+    prior = weigh_members(rows, learn_members(rows, site, seed), seed)[0][0][1]
+    process, _ = condition_on_powers(rows, prior, seed)
+    rng, ends = np.random.default_rng(seed), (rows.places.min(0), rows.places.max(0))
+    asked, more = (rng.uniform(*ends, (count, len(ends[0]))) for count in (ASKED, further))
+    levels = process.mean_at(torch.from_numpy(more)).numpy()
+    parts = (rows.places, more), (rows.decibels, levels), (rows.side, np.zeros(further, np.int8))
+    wider, _ = condition_on_powers(PowerRows(*map(np.concatenate, parts)), prior, seed)
+    places = torch.from_numpy(asked)
+    now, later = (float(part.answer(places).variance.mean()) for part in (process, wider))
+    return math.sqrt(now), math.sqrt(later)
 
 
 def weigh_members(

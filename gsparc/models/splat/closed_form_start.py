@@ -24,8 +24,8 @@ from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
 from gsparc.models.array_vectors.splat_init import start_from_vectors
 from gsparc.models.baselines.gp import kernel_of_targets
-from gsparc.models.member_weights import LEAST_HELD
 from gsparc.models.splat.left_out_images import LeftOut, means_and_variances
+from gsparc.models.stack import LEAST_HELD
 from gsparc.models.target_rows import training_targets
 from gsparc.ops import Pose
 from gsparc.ops.transforms import full_precision

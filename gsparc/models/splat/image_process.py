@@ -18,27 +18,16 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.member_weights import (
-    LEAST_HELD,
-    choose_weights,
-    error_products,
-    explained_variance,
-    relative_to_row,
-)
 from gsparc.models.method import Method, Prediction
 from gsparc.models.reduced import Settings, average_with_process
 from gsparc.models.splat.auto_settings import resolve_auto
 from gsparc.models.splat.method import LearnedField
+from gsparc.models.stack import LEAST_HELD, error_products, explained_variance, weigh
 from gsparc.models.terms import array_obstacle
-from gsparc.physics.decibels import RELATIVE_DB
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 
 log = logging.getLogger(__name__)
-# A mean with the process takes several times as long: it must gain 2 standard errors, and .1 dB.
-SURE, LEAST_GAIN = 2.0, 0.1 / RELATIVE_DB
-# Fewer do not tell a weight from a half, where the two differ by less than twice the error
-FEW_ROWS = 40
 MOST_HELD = 1_000  # validation rows that the process is weighed on: memory
 BEYOND = 1e-3  # of the variance of targets, that an averaged process leaves out
 
@@ -142,9 +131,10 @@ class ImageProcess(LearnedField):
             )
         prediction, _, target = triples[0]
         self.explained = explained_variance(prediction, target, not data.site.target.is_complex)
-        gram = np.concatenate([error_products(both, target) for *both, target in triples])
-        gram = relative_to_row(gram) if data.site.target.is_image else gram
-        weight = float(choose_weights(gram, np.arange(len(gram)), SURE, LEAST_GAIN, FEW_ROWS)[1])
+        products = np.concatenate([error_products(both, target) for *both, target in triples])
+        # A mean with the process takes several times as long.
+        loss, dear = data.site.target.loss, (False, True)
+        weight = float(weigh(products, np.arange(len(products)), loss, dear=dear)[1])
         log.info(
             "%d held-out rows, %d training rows without their neighbours: weight of a Gaussian "
             "process %.2f",

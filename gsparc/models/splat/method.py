@@ -36,13 +36,13 @@ from gsparc.field.response import ResponseSettings
 from gsparc.models import checkpoint
 from gsparc.models.checkpoint import StoredModel
 from gsparc.models.fitting import Origin
-from gsparc.models.member_weights import LEAST_HELD
 from gsparc.models.method import Method, Prediction, to_double
 from gsparc.models.splat import reduce
 from gsparc.models.splat.auto_settings import Choices, apply_choices, resolve_auto
 from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, read_interrupted
 from gsparc.models.splat.closed_form_start import start_in_closed_form
 from gsparc.models.splat.left_out_images import LeftOut
+from gsparc.models.stack import LEAST_HELD
 from gsparc.ops import Pose
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport

@@ -19,7 +19,7 @@ from gsparc.base.errors import list_first
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import error_in_one_line, open_console
 from gsparc.runs.experiment.options import REDRAW
-from gsparc.runs.ledger import FAILURE
+from gsparc.runs.ledger import FAILURE, REFUSED
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,14 +57,15 @@ class SweepReport(Callback):
         error = job_return._return_value
         message = error_in_one_line(error) if isinstance(error, BaseException) else str(error)
         folder = Path(config.hydra.runtime.output_dir)
-        # The mark that `on_multirun_end` counts failures by:
-        # other processes' jobs are seen as files alone.
-        (folder / FAILURE).write_text(message + "\n", encoding="utf-8")
-        overrides = " ".join(config.hydra.overrides.task)
-        # The console shows the sentence, the job's own log the traceback, too.
-        log.error(
-            "job %s (%s) failed, others go on: %s", folder.name, overrides, message, exc_info=error
-        )
+        job = f"job {folder.name} ({' '.join(config.hydra.overrides.task)})"
+        if REFUSED in message:  # an effect, by these data
+            log.warning("%s is left out: %s", job, message)
+        else:
+            # The mark that `on_multirun_end` counts failures by:
+            # other processes' jobs are seen as files alone.
+            (folder / FAILURE).write_text(message + "\n", encoding="utf-8")
+            # The console shows the sentence, the job's own log the traceback, too.
+            log.error("%s failed, others go on: %s", job, message, exc_info=error)
         # Hydra raises the first failed job's error and ends the sweep:
         # it is told that the job ended well.
         job_return.status = JobStatus.COMPLETED

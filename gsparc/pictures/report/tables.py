@@ -235,7 +235,8 @@ def differing_settings(rows: pd.DataFrame) -> dict[str, str]:
     names = dict.fromkeys(name for settings in resolved.values() for name in settings)
     # As text: lists of settings cannot be put into a set.
     vary = [n for n in names if len({str(settings.get(n)) for settings in resolved.values()}) > 1]
-    if "model._target_" in vary:  # each model has settings of its own, which its name stands for
+    # Each model, and each variant of one, has settings of its own, which its name stands for.
+    if "model._target_" in vary or any(run.swept("variant") for run in firsts):
         vary = [n for n in vary if not n.startswith("model.")]
     return {
         str(setting): ", ".join(

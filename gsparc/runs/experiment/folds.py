@@ -59,6 +59,7 @@ class FoldFits:
         train_cpu_s: processor seconds of each fit, of all threads [s]: a busy machine does not
             inflate them.
         notes: what the first fold's fit said.
+        learned: rows of all folds that were learned from, by their subset.
         cost: of all fits together.
     """
 
@@ -66,6 +67,7 @@ class FoldFits:
     train_s: tuple[float, ...]
     train_cpu_s: tuple[float, ...]
     notes: tuple[str, ...]
+    learned: dict[str, int]
     cost: Cost = NO_COST
 
     def facts(self) -> dict[str, Any]:
@@ -75,6 +77,7 @@ class FoldFits:
         facts = {
             "time/train_cpu_s": fmean(self.train_cpu_s),
             "model/learned": "\n".join(notes) or None,
+            **{f"split/{subset}": count for subset, count in self.learned.items()},
         }
         facts["model/refused"] = (
             "\n".join(note for note in self.notes if isinstance(note, Severe)) or None
@@ -182,7 +185,6 @@ def fit_folds(
     split: Split,
     contexts: Sequence[FitContext],
     *,
-    learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None,
     keep: Callable[[int, Measurements, Fold, Method, FitReport], None] | None = None,
 ) -> FoldFits:
     """Fit an unfitted method on every fold.
@@ -191,7 +193,6 @@ def fit_folds(
         factory: an unfitted method, or what chooses one.
         data, split: learned from `train` and `val` of each fold.
         contexts: of each fold's fit.
-        learned: what is learned from instead, such as displaced or fewer measurements.
         keep: called after each fit with the fold's number, what it learned from, the method and its
             report.
 
@@ -204,16 +205,9 @@ def fit_folds(
     if uses_other_processes() and len(split.folds) > 1:
         contexts = [replace(context, loggers=(), datamodule=None) for context in contexts]
 
-    def of_fold(number: int) -> tuple[Measurements, Fold]:
-        fold = split.folds[number]
-        return (data, fold) if learned is None else learned(data, fold)
-
     def fitted(number: int) -> tuple[Method, FitReport]:
-        there, rows = of_fold(number)
-        # Stations are counted in the data that are learned from, which `learned` may have changed.
-        return fitting.fit_or_resume(
-            wrap_per_station(factory, there), there, rows, contexts[number]
-        )
+        whole = wrap_per_station(factory, data)
+        return fitting.fit_or_resume(whole, data, split.folds[number], contexts[number])
 
     by_fold: dict[int, tuple[Method, FitReport]] = {}
     try:
@@ -221,7 +215,7 @@ def fit_folds(
         for number, fit in run_each(fitted, range(len(split.folds)), "folds"):
             by_fold[number] = fit
             if keep is not None:
-                keep(number, *of_fold(number), *fit)
+                keep(number, data, split.folds[number], *fit)
     except KeyboardInterrupt as stopped:
         if len(contexts) == 1:
             raise
@@ -237,5 +231,6 @@ def fit_folds(
         tuple(report.seconds for report in reports),
         tuple(report.cpu_s for report in reports),
         reports[0].notes,
+        {name: sum(len(getattr(f, name)) for f in split.folds) for name in ("train", "val")},
         sum((report.cost for report in reports), NO_COST),
     )

@@ -21,24 +21,22 @@ from omegaconf import DictConfig
 
 from gsparc.base.errors import list_first
 from gsparc.base.executor import run_each
-from gsparc.base.files import is_out_of_space
+from gsparc.base.files import is_out_of_space, write_samples
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, Split
+from gsparc.data.splits import Split
 from gsparc.evaluation.console import error_in_one_line
 from gsparc.evaluation.metric_formats import number_format
 from gsparc.evaluation.results import as_frame, frame_of_runs, own_rows, read_run, read_summary
 from gsparc.evaluation.scores import rows_to_score
-from gsparc.evaluation.summary import write_samples
 from gsparc.models import loading
 from gsparc.models.method import Method
 from gsparc.prediction import timing
 from gsparc.prediction.timing import SPEED, Call, ClockSettings, time_beside_copy
-from gsparc.runs.ledger import RECORD, FitInputs, edited, read_finished, run_once
-from gsparc.runs.open_runs import open_files
+from gsparc.runs.ledger import RECORD, REFUSED, FitInputs, edited, read_finished, run_once
+from gsparc.runs.open_runs import open_run
 
 log = logging.getLogger(__name__)
 
-REFUSED = "not possible"  # in the error of an effect that the data do not allow
 # From here on a method would slow the rounds of the others: it has rounds of its own
 SLOW_MS = 200.0
 ENDLESS_MS = 10_000.0  # from here on it is timed once
@@ -62,8 +60,6 @@ class Job:
         folder: of the run.
         data, split: measurements and folds.
         content: hash of the measurements, see `measurements_hash`.
-        learned: what a fold learns from instead, such as displaced or fewer measurements; `name`
-            says of it.
         expected_s: seconds it may take, guessed [s].
         keeps_models: whether its models stay, to be asked later.
         reuse: whether a result of another program counts, too.
@@ -75,7 +71,6 @@ class Job:
     data: Measurements
     split: Split
     content: str
-    learned: Callable[[Measurements, Fold], tuple[Measurements, Fold]] | None = None
     expected_s: float = 0.0
     keeps_models: bool = True
     reuse: bool = False
@@ -83,9 +78,7 @@ class Job:
     @cached_property
     def state(self) -> FitInputs:
         """What its result is to be of."""
-        state = FitInputs.from_config(self.config, self.content, self.split.sha256)
-        extra = {} if self.learned is None else {"learned": str(self.name)}
-        return replace(state, settings=state.settings | extra)
+        return FitInputs.from_config(self.config, self.content, self.split.sha256)
 
     def row(self) -> dict[str, Any]:
         """Return the row of its result in the frame, by the names that it has in the list."""
@@ -278,7 +271,7 @@ def time_again(rows: pd.DataFrame, *, rounds: int = 40, rounds_s: float = 60.0) 
     runs, calls, threads = list(own_rows(rows).run), dict[int, Call](), dict[int, int]()
     for number, run in enumerate(runs):
         try:
-            opened = open_files(run.checkpoints[:1])
+            opened = open_run(run.checkpoints[:1], {}).read()
             # A folder used twice may hold the model of one run beside the summary of the other.
             if opened.stored[0].extra.get("run_id") != run.facts.get("run_id"):
                 raise ValueError("its checkpoint is of another run than its summary")

@@ -17,7 +17,7 @@ from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.site_field import SiteField
 from gsparc.apps.locate.snapshots import group_snapshots
 from gsparc.models import checkpoint
-from gsparc.prediction.predictor import Predictor
+from gsparc.models.method import predict_with_threads
 from gsparc.tables.own import from_arrays
 
 
@@ -97,9 +97,9 @@ def test_the_larger_box_was_asked_about_again_by_each_call(trained, tmp_path, mo
 
 def test_stations_at_one_place_were_asked_in_different_parts(tmp_path, monkeypatch):
     """What 42 antennas share of a place was computed for each part: 2 times as long."""
-    predictor, rows, answer = gsparc.load(towns.town_model()), [], Predictor.predict_query
-    counted = lambda self, query: rows.append(len(query)) or answer(self, query)  # noqa: E731
-    monkeypatch.setattr(Predictor, "predict_query", counted)
+    predictor, rows = gsparc.load(towns.town_model()), []
+    counted = lambda by, query: rows.append(len(query)) or predict_with_threads(by, query)  # noqa: E731
+    monkeypatch.setattr("gsparc.apps.locate.site_field.predict_with_threads", counted)
     monkeypatch.setattr("gsparc.apps.locate.site_field.CHUNK", 9)
     SiteField(predictor).moments_at(
         torch.from_numpy(np.tile(predictor.site.moving_box[:1, :3], (7, 1)))

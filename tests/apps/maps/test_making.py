@@ -102,7 +102,7 @@ def test_a_unit_of_maps_changed_their_names_alone():
 
 def test_chunks_do_not_change_a_map(predictor, monkeypatch):
     whole = predict_map(predictor, step_m=5.0)
-    monkeypatch.setattr("gsparc.apps.maps.making.CHUNK", 7)
+    monkeypatch.setattr("gsparc.prediction.answers.BLOCK", 7)
     monkeypatch.setattr("gsparc.apps.maps.making.BANDS", 13)
     assert np.allclose(predict_map(predictor, step_m=5.0).power_db, whole.power_db, atol=1e-4)
 

@@ -7,12 +7,12 @@ import pytest
 from campaigns import compose
 from towns import town_model
 
-from gsparc.apps.maps.making import predict_levels
 from gsparc.apps.view.building import GAUSSIANS, build_scene
 from gsparc.apps.view.viewed import open_model
 from gsparc.base.errors import DataError
 from gsparc.commands import view as command
 from gsparc.models import checkpoint
+from gsparc.prediction.levels import predict_levels
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from gsparc.models.image_sources.search import Search, SearchSettings
 from gsparc.models.mixture.candidates import CANDIDATES
 from gsparc.models.mixture.methods import ImageSources
 from gsparc.models.terms import EffectSettings
-from gsparc.runs.experiment.study import add_direction_errors
+from gsparc.runs.experiment.disturb import add_direction_errors
 from gsparc.training.context import FitContext
 
 
@@ -35,6 +35,20 @@ def fitted(data, fold, **settings):
 def pillar():
     data, fold, sources = directed(150, pillar=True)
     return data, fold, sources, fitted(data, fold)[0]
+
+
+def test_rows_left_out_were_told_by_other_sources_than_answer():
+    """Each group was triangulated anew: three fits more, whose errors were not those of this."""
+    data, fold, _ = directed(100)
+    method, _ = fitted(data, fold)
+    places, kernel = method.posterior.positions.points, method.posterior.kernel
+    part = np.sort(fold.learned())[::2]
+    method.condition(data, part)
+    assert method.posterior.positions.points is places and method.posterior.kernel is kernel
+    assert set(method.left_out().rows.tolist()) == set(part.tolist())
+    assert error(method, data, fold.test) < 0.1
+    method.condition(data, np.sort(np.r_[part, fold.test[:1]]))
+    assert method.posterior.positions.points is not places, "rays that nobody looked at"
 
 
 def test_few_receivers_are_enough_with_directions():

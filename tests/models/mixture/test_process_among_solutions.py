@@ -9,7 +9,7 @@ from gsparc.data.inner_folds import cut_folds
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.member_weights import weigh_members
+from gsparc.models.mixture.fit_candidates import weigh_candidates
 from gsparc.models.mixture.methods import Channels
 
 
@@ -22,7 +22,7 @@ def test_sources_of_few_rows_lost_a_decibel_to_the_process():
     spoilt.mean = spoilt.mean + 0.3
     fold = Fold(few, np.arange(24, 40), np.arange(40, 60))
     cut = cut_folds(data, fold, None, 3, 0)
-    assert weigh_members({"bearings": spoilt, "process": good}, data, fold.val, cut) == {
+    assert weigh_candidates({"bearings": spoilt, "process": good}, data, fold.val, cut) == {
         "process": 1.0
     }
 

@@ -75,7 +75,7 @@ def test_a_sweep_of_a_method_that_reads_an_uplink_ended_without_its_table(
         split=SimpleNamespace(folds=[Fold(*[np.arange(3)] * 3)]),
         data=SimpleNamespace(moving=np.zeros((3, 3))),
     )
-    monkeypatch.setattr(runner, "open_files", lambda files: opened)
+    monkeypatch.setattr(runner, "open_run", lambda *_: SimpleNamespace(read=lambda: opened))
     facts = {"model/name": "uplink", "test/nmse": 0.1, "dataset/kind": "csi", "split/sha256": "s"}
     (tmp_path / "summary.json").write_text(json.dumps(facts | {"time/train_s": 1.0}))
     assert len(runner.time_again(frame_of_runs([read_run(tmp_path)]), rounds=1)) == 1

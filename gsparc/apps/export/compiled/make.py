@@ -29,6 +29,7 @@ from gsparc.models.splat.image_process import ImageProcess
 from gsparc.models.splat.method import LearnedField
 from gsparc.ops import Pose
 from gsparc.physics.decibels import to_decibels
+from gsparc.prediction.answers import ask
 from gsparc.prediction.predictor import Predictor
 
 ANSWERED = {"csi": 1500, "rssi": 3000}  # places that distilled forms are made from
@@ -84,10 +85,7 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
     # or the error would be that of known places.
     near = near_places(site, max(1, count // 4), seed + 2)
     places = np.concatenate([random_places(site, count, seed + 1), near])
-    parts = [
-        _squares(form.predictor, predictor, places[i : i + 64]) for i in range(0, len(places), 64)
-    ]
-    squared, power = np.concatenate(parts, axis=1)
+    squared, power = _squares(form.predictor, predictor, places)
     # The worst may be near the station, the mean is over random places alone.
     errors = np.array([squared[:count].mean(), squared.max()])
     shares = errors / max(power[:count].mean(), 1e-300)
@@ -263,8 +261,7 @@ def near_places(site: Site, count: int, seed: int) -> np.ndarray:
 
 def ask_model(predictor: Predictor, places: np.ndarray) -> np.ndarray:
     """Return the model's answers (B, ...), powers linear, at local places (B, 3) or (B, 6) [m]."""
-    queries = [predictor.site.world_ends(places[i : i + 64]) for i in range(0, len(places), 64)]
-    return np.concatenate([predictor.predict_linear(**ends).mean.numpy() for ends in queries])
+    return ask(predictor, predictor.site.world_ends(places), linear=True).mean.numpy()
 
 
 def sample_model(predictor: Predictor, places: np.ndarray) -> Measurements:

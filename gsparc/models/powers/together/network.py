@@ -61,7 +61,7 @@ SUREST, TURNED = 0.75, 8  # of the largest gain, that are turned at a time; time
 TURNS = torch.arange(-180.0, 180.0, 10.0)  # of an azimuth [deg]
 GAINS = torch.arange(-12.0, 12.5, 2.0)  # [dB]
 ROUGH_LOOKS = 150  # evaluations, each of a sum over rows
-ROUGH_ON, LEARNED_ON = 20_000, 160  # rows of all sites; of each site, whose covariance is factored
+ROUGH_ON, LEARNED_ON = 20_000, 400  # rows of all sites; of each site, whose covariance is factored
 
 
 def find_sectors(data: Measurements, places: np.ndarray | None = None) -> Sectors | None:

@@ -1,10 +1,10 @@
-"""Predictions at the places of a file, station by station, and their CSV or npz file."""
+"""The door to answers at many places: in blocks, station by station, and as a CSV or npz file."""
 
 from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,11 @@ import numpy as np
 import torch
 
 from gsparc.base.errors import DataError
-from gsparc.base.executor import run_each
-from gsparc.base.files import write_archive
+from gsparc.base.executor import run_all
+from gsparc.base.files import write_archive, write_samples
 from gsparc.data.schema import End, Site
 from gsparc.data.target import Target
-from gsparc.data.units import PowerUnit, power_in_decibels
-from gsparc.evaluation.summary import write_samples
+from gsparc.data.units import LINEAR, PowerUnit, power_in_decibels
 from gsparc.models.device_offsets import find_device
 from gsparc.models.method import MEAN_DEVICE, Prediction
 from gsparc.prediction.hearing import read_hearing
@@ -35,8 +34,8 @@ from gsparc.tables.query_places import QueryPlaces, read_query_places
 
 log = logging.getLogger(__name__)
 
-# 512 spectra of 90 x 360 pixels take 66 MB in float32: what a block costs in memory.
-CHUNK = 512  # places predicted at a time
+# 512 spectra of 90 x 360 pixels take 66 MB in float32; an interrupt is heeded after a block
+BLOCK = 512  # places asked about at a time
 MOST_ENTRIES = 16  # of a channel, as columns of a table
 DIGITS = 6  # of decibels: `evaluate` and an error computed from the file agree so far
 ENDINGS = (".csv", ".npz")
@@ -74,6 +73,48 @@ class Answers:
     def count_refused(self) -> int | None:
         """Return how many are refused; None where no error was tested."""
         return None if self.refused is None else int(self.refused.sum())
+
+
+def in_blocks(rows: np.ndarray) -> list[np.ndarray]:
+    """Return rows (n, ...) in blocks of at most `BLOCK`."""
+    return np.split(rows, range(BLOCK, len(rows), BLOCK))
+
+
+def ask(
+    models: Predictor | Sequence[tuple[Predictor, np.ndarray]],
+    ends: Mapping[Any, np.ndarray],
+    *,
+    linear: bool = False,
+    what: str = "",
+    threads: int = 1,
+) -> Prediction:
+    """Return what is predicted at world places, in their order.
+
+    >>> ask(predictor, {"rx": np.zeros((2000, 3))}).mean.shape
+    torch.Size([2000, 1])
+
+    Args:
+        models: who is asked, each with the numbers (m,) of its places; one alone: all of them.
+        ends: by end, (n, 3) places, or (3,) of one that stands still [m].
+        linear: powers as such, whose levels are in `site.level_unit`.
+        what, threads: see `run_each`.
+
+    Raises:
+        ValueError: as `Predictor.predict`.
+    """
+    count = max(len(np.atleast_2d(places)) for places in ends.values())
+    models = [(models, np.arange(count))] if isinstance(models, Predictor) else models
+    blocks = [(model, part) for model, rows in models for part in in_blocks(rows)]
+
+    def predicted(block: tuple[Predictor, np.ndarray]) -> Prediction:
+        model, rows = block
+        where: Any = {end: at if at.ndim == 1 else at[rows] for end, at in ends.items()}
+        unit = LINEAR if linear and model.site.target.is_level else None
+        return model.predict(**where, unit=unit)
+
+    parts = run_all(predicted, blocks, what, threads=threads)
+    order = np.argsort(np.concatenate([rows for _, rows in blocks]), kind="stable")
+    return Prediction.joined(parts, torch.from_numpy(order))
 
 
 def predict_file(
@@ -260,8 +301,8 @@ def predict_places(
     """
     row, number = rows_and_stations(queries, predictor.site, station)
     named = station is not None or queries.station is not None
-    blocks: list[tuple[Predictor, np.ndarray]] = []
-    silent: list[str] = []
+    models, silent = list[tuple[Predictor, np.ndarray]](), list[str]()
+    device = np.full(len(queries), "") if queries.device is None else queries.device
     # By station: each may have a model of its own, whose matrices are then read once a block.
     for asked_station in np.unique(number):
         chosen = np.flatnonzero(number == asked_station)
@@ -274,35 +315,19 @@ def predict_places(
                 ) from None
             silent.append(f"left out: {error}")
             continue
-        of = np.full(len(chosen), "") if queries.device is None else queries.device[row[chosen]]
-        for device in np.unique(of):
-            device_model, rows = (
-                _select_device(model, str(device), queries.source),
-                chosen[of == device],
-            )
-            blocks += [
-                (device_model, some) for some in np.split(rows, range(CHUNK, len(rows), CHUNK))
-            ]
-    if not blocks:
+        of = device[row[chosen]]
+        for name in np.unique(of):
+            device_model = _select_device(model, str(name), queries.source)
+            models.append((device_model, chosen[of == name]))
+    if not models:
         raise DataError(silent[0])
-
-    def predicted(block: int) -> Prediction:
-        model, rows = blocks[block]
-        ends: dict[str, Any] = {end: places[row[rows]] for end, places in world.items()}
-        return model.predict(**ends)
-
-    parts: dict[int, Prediction] = {}
-    # Blocks may end in any order in other processes.
-    for block, prediction in run_each(predicted, range(len(blocks)), "blocks of places"):
-        if not parts:
-            check_fits(path, predictor.site.target, tuple(prediction.mean.shape[1:]))
-        parts[block] = prediction
+    ends: dict[Any, np.ndarray] = {end: places[row] for end, places in world.items()}
+    first = models[0][0].predict(**{end: places[models[0][1][:1]] for end, places in ends.items()})
+    check_fits(path, predictor.site.target, tuple(first.mean.shape[1:]))
+    result = ask(models, ends, what="blocks of places")
     for line in silent:
         log.warning(line)
-    rows = np.concatenate([blocks[block][1] for block in parts])
-    # Blocks are of stations, answers are wanted in the order of places.
-    result = Prediction.joined([*parts.values()], torch.from_numpy(np.argsort(rows, kind="stable")))
-    rows.sort()
+    rows = np.sort(np.concatenate([asked for _, asked in models]))
     of_row, called = number[rows], predictor.site.every_station.named.items()
     return Answers(row[rows], of_row, {head: np.array(of)[of_row] for head, of in called}, result)
 
