@@ -107,6 +107,12 @@ class Severe(Caution):
     """
 
 
+class Question(Severe):
+    """What may be read in several ways, with the setting of each:
+    training stops on it, unless it is answered or `dataset.guess=true`.
+    """
+
+
 class DataError(ValueError):
     """Input that was refused at load; nothing half-loaded exists when it is raised.
 

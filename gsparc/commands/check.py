@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
-from gsparc.base.errors import Caution, DataError, group_warnings
+from gsparc.base.errors import Caution, DataError, Question, group_warnings
 
 TILTED = (
     "antenna tilts are given, but no heights, so that all is at 0 m: give a column Height in the "
@@ -39,6 +39,8 @@ def check(
         draw: PNG file for a map; None draws none.
     """
     # Here: they bring torch, which --help does not need.
+    import numpy as np
+
     from gsparc.data.outliers import outlier_warnings
     from gsparc.datasets.campaign import find_implausible
     from gsparc.datasets.describe import describe
@@ -46,30 +48,39 @@ def check(
     from gsparc.datasets.own import read_any
     from gsparc.models.powers.together.network import check_azimuths
     from gsparc.tables.checks.array_layout import carrier_warnings, layout_warnings
+    from gsparc.tables.columns_file import write_columns
 
     try:
-        reading = read_any(path, columns=columns, stations_file=stations_file, **settings)
+        # Read on with the likeliest of what is open, so that all that is open is said.
+        table = {"columns": columns, "stations_file": stations_file, "guess": True}
+        reading = read_any(path, **{**settings, **table})
     except DataError as error:
         count = len(error.problems)
         for line in [*error.problems, f"{path}: refused, {count} problem{'s' * (count > 1)}"]:
             _line(console, line)
         return False
     implausible, levels, steps = find_implausible(reading.data, reading.file_row, most=math.inf)
-    notes = [*reading.notes, *check_azimuths(reading.data)]
-    warnings = outlier_warnings(reading.data) + [
-        note for note in notes if isinstance(note, Caution)
-    ]
+    stations, heights = reading.data.site.every_station, reading.data.moving[:, 2::3]
+    # Where no azimuth is given there is none to contradict
+    aimed = np.isfinite(stations.sector[:, 0]).any() if stations.sector is not None else False
+    notes = [*reading.notes, *(check_azimuths(reading.data) if aimed else ())]
+    questions = [note for note in notes if isinstance(note, Question)]
+    doubtful = [note for note in notes if isinstance(note, Caution) and note not in questions]
+    warnings = outlier_warnings(reading.data) + doubtful
     warnings += layout_warnings(reading.data) + carrier_warnings(reading.data) + implausible
     topics = describe(reading.data)
+    if reading.raw is not None and reading.raw.roles:
+        topics += [("columns", write_columns(path, reading.raw.roles, reading.raw.heads))]
     topics += [("note", note) for note in notes if not isinstance(note, Caution)]
     if any(" row " in warning for warning in warnings):
         topics += [("rows", "are counted from 0, as by split.leave_out and dataset.level_steps")]
-    stations, heights = reading.data.site.every_station, reading.data.moving[:, 2::3]
     if (abs(stations.beams[:, 1]) > 0).any():
         # Of beams that point down nothing is known where both ends are at one height.
         warnings += [] if stations.position[:, 2].any() or heights.any() else [TILTED]
     doubts = group_warnings(warnings)
-    for topic, sentence in [*topics, *(("warning", doubt) for doubt in doubts)]:
+    guessed = bool(settings.get("guess"))
+    open_roles = [("guessed" if guessed else "asked", question) for question in questions]
+    for topic, sentence in [*open_roles, *topics, *(("warning", doubt) for doubt in doubts)]:
         _line(console, f"{topic:<12}{sentence}")
     if draw is not None:
         from gsparc.pictures.site_plan import draw_site  # here: only a map needs it
@@ -85,6 +96,11 @@ def check(
         split_for({"name": "random"}, reading.data).check()
     except DataError as error:
         _line(console, f"{path}: readable, but too small to train on ({error})")
+        return False
+    if questions and not guessed:
+        number = f"{len(questions)} question{'s' if len(questions) > 1 else ''}"
+        answer = "say one of each, or dataset.guess=true, which takes the first"
+        _line(console, f"{path}: {number}, on which training stops: {answer}")
         return False
     verdict = (
         (f"readable, but see its {len(doubts)} warning{'s' * (len(doubts) > 1)}")

@@ -21,8 +21,8 @@ from gsparc.data.schema import Field, Measurements, TrainTest
 from gsparc.data.selection import Selection, take_selection
 from gsparc.datasets.datamodule import DataModule
 from gsparc.datasets.public.fetch import fetched_path, fetched_path_or_none
+from gsparc.tables.advice import run_warnings
 from gsparc.tables.checks.coherence import place_warnings
-from gsparc.tables.checks.column_effects import run_warnings
 from gsparc.tables.checks.conventions import convention_warnings
 from gsparc.tables.checks.gone import gone_warnings
 from gsparc.tables.checks.level_steps import LevelStep

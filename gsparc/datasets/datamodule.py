@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Self
@@ -132,6 +132,7 @@ class DataModule(pl.LightningDataModule, ABC):
     free = "auto"  # `dataset.align`: what of each row's factor is free
     notes: Sequence[str] = ()  # how the data were understood, once they are read
     told: Sequence[str] = ()  # notes that a user has seen, at the training of a model
+    said: Mapping[str, object] = {}  # of a table, its columns by quantity, answers included
 
     def __init__(self, name: str, batch_size: int = 16) -> None:
         super().__init__()

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import inspect
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gsparc.base.errors import DataError
+from gsparc.base.errors import DataError, Question
 from gsparc.base.instantiate import from_settings
 from gsparc.base.limits import finite_array, or_null, switch
+from gsparc.data.schema import Measurements
 from gsparc.data.selection import Selection, take_selection
 from gsparc.datasets.ble import BLE
 from gsparc.datasets.campaign import Campaign
@@ -26,11 +28,15 @@ from gsparc.tables.conventions import CONVENTIONS
 from gsparc.tables.own import Reading, interpret
 from gsparc.tables.raw import Raw, read_raw
 
+log = logging.getLogger(__name__)
+
 
 def read_own(
     path: str | Path,
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
+    guess: bool = False,
+    columns_file: str | Path | None = None,
     **settings: Any,
 ) -> Raw:
     """Read a file of docs/reference/schema.md, or a table under the schema's names.
@@ -39,13 +45,16 @@ def read_own(
         path: *.npz, *.h5 or *.hdf5, or a table: *.csv, *.tsv, *.txt or *.parquet.
         columns: of a table, by quantity, where the guess from their heads will not do.
         stations_file: of a table, a second one that lists the stations.
+        guess: whether the likeliest reading of what is open is taken.
+        columns_file: of a table, that says what its columns are.
         **settings: see `apply_settings`.
 
     Raises:
         DataError: bad input, or a file of another campaign.
         SettingError: see `apply_settings`.
     """
-    raw = apply_settings(read_file_or_table(path, columns, stations_file), **settings)
+    table = columns, stations_file, guess, columns_file
+    raw = apply_settings(read_file_or_table(path, *table), **settings)
     campaign = dataset_by_arrays(raw)
     if campaign is not None:
         raise DataError(
@@ -72,8 +81,9 @@ def apply_settings(
         not_heard: levels that mean that nothing was heard; None: those that stand apart from all
             others.
         absent: `silent`: a station without a level at a place where others have one was not heard
-            there; `auto`: one that a list of the strongest leaves out is below its weakest, levels
-            that are missing beside weak ones alone are below their station's; `unknown`: neither.
+            there; `weaker`: one that a list of the strongest leaves out is below its weakest,
+            levels that are missing beside weak ones alone are below their station's; `auto`: the
+            same, but the last is asked where no row names the pair; `unknown`: neither.
         saturation_db: level [dB] from which on powers are at least that; `auto`: the highest where
             it repeats; `none`: there is none.
         tx_position: of a transmitter that stood still, where the file does not say it [m].
@@ -107,7 +117,26 @@ class Own(Campaign):
     # Arguments of `apply_settings` but its data and its conventions, which are listed by name.
     switches = tuple(inspect.signature(apply_settings).parameters)[1:-1] + tuple(CONVENTIONS)
 
+    def raw(self) -> Raw:
+        """Read the file; answers to its questions are kept."""
+        raw = super().raw()
+        self.said = raw.said
+        for role in [role for role in raw.roles if role.readings]:
+            log.warning("dataset.guess=true takes %s", role.readings[0])
+        return raw
 
+    def load(self) -> Measurements:
+        """Read, and stop where readings differ that nothing decides,
+        unless training was answered.
+        """
+        data = super().load()
+        questions = [note for note in self.notes if isinstance(note, Question)]
+        if questions and not (self.settings.get("guess") or self.told):
+            raise DataError([f"{self.file}: {question}" for question in questions], self.file)
+        return data
+
+
+TABLE = ("columns", "stations_file", "guess", "columns_file")  # settings of tables
 CAMPAIGNS: tuple[type[Campaign], ...] = (Techtile, Powder, BLE, NeWRF, TechtilePower, WSR, WifiCsi)
 
 
@@ -145,7 +174,7 @@ def read_any(path: str | Path, **settings: Any) -> Reading:
     """
     path = Path(path)
     part = from_settings(Selection, take_selection(settings), "dataset")
-    table = {name: settings.pop(name, None) for name in ("columns", "stations_file")}
+    table = {name: settings.pop(name, None) for name in TABLE}
     # Releases before anything else: their folders may hold tables that look like one's own.
     release = dataset_by_path(path)
     if release is not None:
@@ -165,13 +194,20 @@ def read_any(path: str | Path, **settings: Any) -> Reading:
         if (campaign := dataset_by_arrays(raw)) is not None:
             raw, note = campaign.reader(path), f"this is a file of dataset={campaign.choice}"
     raw = replace(raw, notes=(*filter(None, [note]), *raw.notes))
-    return interpret(apply_settings(raw, **settings), path, part)
+    questions = [note for note in raw.notes if isinstance(note, Question)]
+    try:
+        return replace(interpret(apply_settings(raw, **settings), path, part), raw=raw)
+    except DataError as error:
+        asked = [f"{path}: {question}" for question in questions]
+        raise DataError([*asked, *error.problems], path) from None
 
 
 def read_file_or_table(
     path: str | Path,
     columns: Mapping[str, object] | None = None,
     stations_file: str | Path | None = None,
+    guess: bool | None = False,
+    columns_file: str | Path | None = None,
 ) -> Raw:
     """Read the arrays of a file of the schema, or of a table;
     notes say how its columns were understood.
@@ -181,11 +217,10 @@ def read_file_or_table(
     """
     if not is_table(path):
         named = any(value is not None for value in (columns or {}).values())
-        for name in [
-            name for name, entry in (("columns", named), ("stations_file", stations_file)) if entry
-        ]:
+        given = zip(TABLE, (named, stations_file, False, columns_file), strict=True)
+        for name in [name for name, entry in given if entry]:
             raise DataError(f"dataset.{name}: goes with tables (*.csv, *.parquet), not with {path}")
         return read_raw(path)
     from gsparc.tables.read import parse_table  # here, as pandas takes half a second to import
 
-    return parse_table(path, columns or {}, stations_file)
+    return parse_table(path, columns or {}, stations_file, (), bool(guess), columns_file)

@@ -22,6 +22,7 @@ from gsparc.models.registry import build, fill_defaults
 from gsparc.runs.align_site import align_to_site
 from gsparc.runs.experiment.disturb import Disturbance
 from gsparc.runs.settings import RunSettings, to_dict
+from gsparc.tables.roles import say_quantity
 from gsparc.training import tracking
 from gsparc.training.effort import Effort
 
@@ -89,6 +90,13 @@ def _data(config: DictConfig, known: Measurements | None) -> DataModule:
     if known is not None:
         module.measurements = known
     module.measurements  # noqa: B018 (read now, so that errors show the path that was typed)
+    # As they were answered: other files are read so, too
+    for quantity, column in module.said.items():
+        OmegaConf.update(
+            config, f"dataset.columns.{say_quantity(quantity)}", column, force_add=True
+        )
+    if module.said:  # which holds what a file about columns says
+        OmegaConf.update(config, "dataset.columns_file", None, force_add=True)
     for key in ("root", "file"):  # absolute, so that a checkpoint finds its data from any folder
         location = None if OmegaConf.is_missing(config.dataset, key) else config.dataset.get(key)
         if location:

@@ -26,6 +26,7 @@ PAIR = re.compile(rf"(?i)[\[(]?\s*({NUMBER}(?:(?:\s*[,;]\s*|\s+){NUMBER}){{1,2}}
 POINT = re.compile(
     rf"(?i)(?:SRID=\d+;)?\s*POINT\s*Z?M?\s*(?:\(\s*({NUMBER}(?:\s+{NUMBER})+)\s*\)|EMPTY)"
 )
+HALF = re.compile(r"(?i)(\d+(?:\.\d+)?)\s*°?\s*([nsew])\b")  # 51.49 N
 FINE = re.compile(r"\.\d{4}")  # digits of degrees that tell streets apart
 
 
@@ -106,6 +107,13 @@ def _record(cell: str, named: bool) -> dict[str, Any] | None:
                 return dict(read(cell))
     if point := POINT.fullmatch(cell):
         return {"point": [float(number) for number in (point[1] or "").split()]}
+    halves = {half.lower(): float(number) for number, half in HALF.findall(cell)}
+    if len(halves) == 2 and not HALF.sub("", cell).strip(" ,;"):
+        axes = (
+            halves.get("n", -halves.get("s", np.nan)),
+            halves.get("e", -halves.get("w", np.nan)),
+        )
+        return {"pair": [*axes]} if np.isfinite(axes).all() else None
     pair = PAIR.fullmatch(cell)
     numbers = re.split(r"[,;\s]+", pair[1]) if pair else []
     fine = named or (numbers and all(FINE.search(number) for number in numbers))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import fnmatch
 import math
 import re
-from collections.abc import Container, Iterable, Mapping
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -25,7 +26,9 @@ from gsparc.tables.heads import (
     unit_suits,
     words_of,
 )
+from gsparc.tables.roles import NONE, Answer, Role, Said, Sure, say_column
 from gsparc.tables.sheet import Sheet
+from gsparc.tables.slots import ranked_names
 from gsparc.tables.times import find_times
 
 MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in heads.LEVELS), CHANNELS, POLAR)
@@ -43,6 +46,7 @@ STATION = re.compile(
 )
 MOST_LOOKED_AT = 10_000  # rows, for columns that may be levels
 BY_ROW = "#"  # in place of a head: the number of the row; before heads: of what they hold together
+MOST_SHOWN = 3  # values of a column
 REPEATED = 4  # rows for each name of a column that may hold stations
 
 
@@ -55,6 +59,7 @@ class Column(Head):
         value: the number, or the first and the last of evenly spaced ones; none: the number of the
             row.
         plus: columns and numbers that are added to it.
+        sure: how it is known that it is this.
         **rest: see `Head`; no unit is the schema's, no word a column that was said.
     """
 
@@ -62,6 +67,7 @@ class Column(Head):
     head: str | None = None
     value: tuple[float, ...] = ()
     plus: tuple[Column, ...] = ()
+    sure: Sure = "named"
 
     @property
     def by_row(self) -> bool:
@@ -109,6 +115,26 @@ class Column(Head):
 Chosen = dict[str, tuple[Column, ...]]
 
 
+def list_roles(sheet: Sheet, chosen: Chosen, said: Said) -> list[Role]:
+    """Return what all columns are taken for, in the order of quantities; like ones as one."""
+    roles, settings = [], {heads.OTHER_NAMES.get(key, key): way for key, way in said.items()}
+    for quantity, columns in chosen.items():
+        names = [column.head for column in columns if column.head]
+        text = settings.get(quantity)
+        if text is None and names:
+            text = "+".join(names) if columns[0].label == JOINED else name_block(sheet, names)
+        unit = columns[0].unit.name if columns[0].unit else columns[0].schema_unit
+        unit = unit if KINDS[quantity] in SCHEMA else ""
+        role = Role(tuple(names), quantity, columns[0].sure, unit, column=text)
+        roles.append(replace(role, values=sheet.first_words(names, MOST_SHOWN)))
+    rest = [head for head in sheet.heads if head not in used_heads(chosen)]
+    for _, group in groupby(rest, lambda head: re.sub(r"\d+", "*", head)):
+        names = [*group]
+        role = Role(tuple(names), "", "usual", column=name_block(sheet, names))
+        roles.append(replace(role, values=sheet.first_words(names, MOST_SHOWN)))
+    return roles
+
+
 def used_heads(chosen: Chosen) -> set[str | None]:
     """Return the heads of all columns that are used."""
     columns = [column for group in chosen.values() for column in group]
@@ -129,12 +155,14 @@ def choose_columns(
         labelled: names of stations by heads of columns that are taken as their levels.
         only: quantities that are guessed; None: all.
     """
-    chosen: Chosen = {}
+    chosen, settled = dict[str, tuple[Column, ...]](), set[str]()
     for key, value in settings.items():
         columns = () if value is None else _by_setting(sheet, key, value)
+        # Settings come first: what is said needs no guess, and its column is not guessed again.
         if columns:
-            # Settings come first: what is said needs no guess, and its column is not guessed again.
-            chosen[columns[0].role] = columns
+            chosen[columns[0].role] = tuple(replace(column, sure="said") for column in columns)
+        elif value == NONE:
+            settled.add(heads.OTHER_NAMES.get(key, key))
     if sheet.problems:
         return chosen
     chosen_heads = used_heads(chosen)
@@ -149,7 +177,8 @@ def choose_columns(
         # `ci` is a cell identity only beside an area code: alone it may be a confidence interval.
         alone = bool(areas) and not any(areas & set(words_of(other)) for other in sheet.heads)
         # What was said of one way (metres) rules out guesses of another (degrees) for the same end.
-        if not role or alone or (only is not None and role not in only) or _settled(role, chosen):
+        unasked = role in settled or (only is not None and role not in only)
+        if not role or alone or unasked or _settled(role, chosen):
             continue
         if meaning.strange:
             expected = list_units(KINDS[role])
@@ -175,19 +204,21 @@ def choose_columns(
         # Columns of different words (`rssi_1`, `power_2`) are no family of stations.
         several &= len({column.word for column in candidates}) == 1
         several |= role == "station" and candidates[0].label == JOINED
+        # Of axes one that states its unit says more than others.
+        stated = [c for c in candidates if c.unit is not None and KINDS[role] == "length"]
+        candidates = stated if len(stated) == 1 else candidates
         # A head spelt as in the schema is a statement, no guess.
         exact = [column for column in candidates if column.head == role]
-        if len(candidates) > 1 and not several and not exact:
-            _ambiguous(sheet, role, candidates)
-            continue
         # `rssi_delta` or `predicted_rssi` are levels by their words and not what was received.
-        if (
-            role in heads.LEVELS
-            and len(candidates) == 1
-            and not _is_plain(candidates[0], labelled.values())
-        ):
-            fault = "a received level or power, or something else? if it is one, say "
-            sheet.refuse(fault + _choice(candidates[0]), candidates[0].head)
+        doubted = role in heads.LEVELS and not several and len(candidates) == 1
+        doubted = doubted and not _is_plain(candidates[0], labelled.values())
+        if doubted or (len(candidates) > 1 and not several and not exact):
+            _ask_which(sheet, role, candidates)
+            continue
+        if several and role in heads.LEVELS and _ask_ranks(sheet, role, candidates):
+            continue
+        if several and any(map(_is_rank, candidates)):
+            _ask_which(sheet, role, candidates)
             continue
         chosen[role] = tuple(candidates) if several else tuple((exact or candidates)[:1])
         if not exact or several:
@@ -196,10 +227,14 @@ def choose_columns(
         if not column.word and column.unit is not None and column.unit.changes:
             sheet.notes.append(_turned(column, column.unit))
     _one_unit(sheet, chosen)
-    # Only where nothing was found by its head: columns called like stations may be their levels.
-    if only is None and not any(roles[0] in chosen for roles in MEASURED):
+    if only is None and not sheet.asked:
         _wide_survey(sheet, chosen)
-    if only is None and "time_s" not in chosen and any(role in chosen for role in heads.MANY):
+        _ask_phase(sheet, chosen)
+    if (
+        only is None
+        and "time_s" not in {*chosen, *settled}
+        and any(role in chosen for role in heads.MANY)
+    ):
         timed = tuple(Column("time_s", head=head) for head in find_times(sheet, used_heads(chosen)))
         chosen |= {"time_s": timed} if timed else {}
     used = used_heads(chosen)
@@ -209,8 +244,6 @@ def choose_columns(
         sheet.notes.append(
             f"not used: column{'s' * (len(unused) > 1)} {list_first(unused, 8)}{timed}"
         )
-    if only is None:
-        _warn_of_levels(sheet, chosen.get("rssi_db", ()), used)
     return chosen
 
 
@@ -254,56 +287,118 @@ def _identity(sheet: Sheet, candidates: list[Column], always: bool) -> list[Colu
 
 MAC = re.compile(r"(?i)(?<![0-9a-f])(?:[0-9a-f]{2}[:-]){5}[0-9a-f]{2}(?![0-9a-f])")
 # With a number behind the word: `AP1` is a station's levels, `ap` a column of their names.
-NAMED = re.compile(rf"(?i)^[\W_]*({_STATIONS}|beam|ssb)[\W_]*[a-z]?\d+[\W_]*$")
+NAMED = re.compile(rf"(?i)^[\W_]*({_STATIONS}|beam|ssb|mac)[\W_]*[a-z]?\d+[\W_]*$")
 
 
 def _wide_survey(sheet: Sheet, chosen: Chosen) -> None:
-    """Take columns called like stations (`AP1`, `WAP001`, a MAC address) as their levels."""
+    """Take columns called like stations (`AP1`, `WAP001`, a MAC address) as their levels,
+    where no head says another measurement; ask about columns that hold values like levels.
+    """
+    levels = chosen.get("rssi_db", ())
+    measured = any(roles[0] in chosen for roles in MEASURED)
     used = used_heads(chosen)
     rest = [head for head in sheet.heads if head not in used]
     named = [head for head in rest if MAC.search(head) or NAMED.match(head)]
-    alike = named or [head for head in rest if _may_be_levels(sheet, head)]
-    if alike and "station" not in chosen:
-        chosen["rssi_db"] = tuple(
-            Column("rssi_db", head, head=head, word="station") for head in alike
-        )
-        note = _note(chosen["rssi_db"])
-        sheet.notes.append(note if named else Caution(f"{note}, by their values: no head says so"))
+    named = [head for head in named if _holds_numbers(sheet, head)]
+    if named and "station" not in chosen and not measured:
+        columns = (Column("rssi_db", head, head=head, word="station") for head in named)
+        chosen["rssi_db"] = tuple(columns)
+        return sheet.notes.append(_note(chosen["rssi_db"]))
+    if sheet.asked is None or (measured and len(levels) < 2):
+        return None
+    span = BY_VALUE
+    if measured:  # of the levels that are known
+        numbers = sheet.frame[[c.head for c in levels]].apply(pd.to_numeric, errors="coerce")
+        span = float(numbers.min(axis=None)), min(float(numbers.max(axis=None)), -1e-9)
+    if not (alike := _like_levels(sheet, rest, span)):
+        return None
+    names, holds = name_columns(alike), "hold" if len(alike) > 1 else "holds"
+    if measured:
+        whole = [head for head in sheet.heads if head in {*alike, *(c.head for c in levels)}]
+        how = say_column("rssi_db", name_block(sheet, whole))
+        finding = f"{names} {holds} values like these levels and are not used: of stations, too?"
+        return sheet.notes.append(Caution(f"{finding} {how}"))
+    several = len(alike) > 1 and "station" not in chosen
+    ways = [name_block(sheet, alike)] * several + alike[: MOST_READINGS - several]
+    why = f"{names} {holds} values like levels, no head says so: which are"
+    readings = tuple(Answer({"rssi_db": way}, _means(sheet, way)) for way in ways)
+    return sheet.ask(Role(tuple(alike), "rssi_db", "seen", readings=readings, why=why))
 
 
-def _may_be_levels(sheet: Sheet, head: str) -> bool:
-    """Whether a column holds numbers of `BY_VALUE` alone, but for one mark that repeats."""
-    if LISTS["no_level"] & set(words_of(head)):
+def name_block(sheet: Sheet, names: Sequence[str]) -> object:
+    """Return what a setting calls several columns: the first and the last, or a list."""
+    first = sheet.heads.index(names[0])
+    if len(names) > 2 and sheet.heads[first : first + len(names)] == tuple(names):
+        return f"{names[0]}...{names[-1]}"
+    return [*names] if len(names) > 1 else names[0]
+
+
+def _ask_ranks(sheet: Sheet, role: str, columns: Sequence[Column]) -> bool:
+    """Ask whether numbers of levels are ranks, where columns beside them hold names; whether so."""
+    parts = [(re.findall(r"\d+", column.label), column.head or "") for column in columns]
+    if sheet.asked is None or any(len(numbers) != 1 for numbers, _ in parts):
         return False
-    values = pd.to_numeric(sheet.frame[head].iloc[:MOST_LOOKED_AT], errors="coerce").dropna()
-    inside = values.between(*BY_VALUE)
-    return 2 * int(inside.sum()) > len(values) > 0 and values[~inside].nunique() < 2
+    numbered = {numbers[0]: head for numbers, head in parts}
+    if (names := ranked_names(sheet, numbered)) is None:
+        return False
+    levels = _pattern([*columns])
+    why = f"columns {names!r} hold names beside the levels of {levels!r}: are these the stations, "
+    why += "or the numbers"
+    block = name_block(sheet, [*numbered.values()])
+    readings = (
+        Answer({"station": names, role: levels}, "lists of the strongest"),
+        Answer({role: block}, "a station each"),
+    )
+    sheet.ask(Role(tuple(numbered.values()), role, "seen", readings=readings, why=why))
+    return True
+
+
+def _ask_phase(sheet: Sheet, chosen: Chosen) -> None:
+    """Ask whether a level beside a phase is the amplitude of a channel."""
+    levels = chosen.get("rssi_db", ())
+    rest = [head for head in sheet.heads if head not in used_heads(chosen)]
+    phases = [head for head in rest if words_of(unit_of(head)[0]) == ["phase"]]
+    if sheet.asked is None or len(levels) != 1 or levels[0].sure == "said" or len(phases) != 1:
+        return
+    level, phase = levels[0].head or "", phases[0]
+    why = (
+        f"{name_columns([level, phase])} are level and phase: of a channel, or is the phase unused"
+    )
+    readings = (
+        Answer({"rssi_db": level}, "levels"),
+        Answer({"csi_amp": level, "csi_phase": phase}, "channels"),
+    )
+    sheet.ask(Role((level, phase), "rssi_db", "seen", readings=readings, why=why))
+
+
+def _means(sheet: Sheet, way: object) -> str:
+    single = isinstance(way, str) and way in sheet.heads
+    return sheet.first_cell(str(way)) if single else "a station each"
+
+
+def _holds_numbers(sheet: Sheet, head: str) -> bool:
+    """Whether a column holds any number, or nothing: names of stations are no levels."""
+    values = sheet.frame[head].dropna()
+    return bool(pd.to_numeric(values, errors="coerce").notna().any() or (values == "").all())
 
 
 BY_VALUE = (-140.0, -20.0)  # dBm, of columns that no head says to be levels
 
 
-def _warn_of_levels(sheet: Sheet, columns: tuple[Column, ...], used: Container[str | None]) -> None:
-    """Warn of columns that are not used, with values like those of several `columns` of levels."""
-    if len(columns) < 2:
-        return
-    rest = [h for h in sheet.heads if h not in used and not LISTS["no_level"] & set(words_of(h))]
-    numbers = sheet.frame.iloc[:MOST_LOOKED_AT].apply(pd.to_numeric, errors="coerce")
-    levels = numbers[[column.head for column in columns]].stack()
-    low, high = levels.min(), min(levels.max(), 0)
-    alike = [
-        Column(head=h)
-        for h in rest
-        if (numbers[h].between(low, high) & (numbers[h] < 0)).mean() > 0.5
-    ]
-    if alike:
-        finding = (
-            f"{_names(alike)} hold{'s' * (len(alike) == 1)} values like these levels and "
-            "are not used: "
-        )
-        sheet.notes.append(
-            Caution(f"{finding}of stations, too? call them as {columns[0].head!r} is called")
-        )
+def _like_levels(sheet: Sheet, rest: Sequence[str], span: tuple[float, float]) -> list[str]:
+    """Return which of heads hold numbers of a span [dB] but for one mark that repeats,
+    and all that are called like one of them: of rarely heard stations, too.
+    """
+    alike, family = set[str](), {head: re.sub(r"\d+", "*", head) for head in rest}
+    for head in rest:
+        other = LISTS["no_level"] | LISTS["place"] | {*heads.AXIS_WORDS}
+        if (other - LISTS["statistic"]) & set(words_of(head)):
+            continue
+        values = pd.to_numeric(sheet.frame[head].iloc[:MOST_LOOKED_AT], errors="coerce").dropna()
+        inside = values.between(*span)
+        if 2 * int(inside.sum()) > len(values) > 0 and values[~inside].nunique() < 2:
+            alike.add(family[head])
+    return [head for head in rest if family[head] in alike]
 
 
 def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
@@ -316,23 +411,26 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     text = str(value).strip()
     if text.startswith(BY_ROW):  # before heads, whose words alone are compared
         return (Column(role, text.removeprefix(BY_ROW)),)
+    if isinstance(value, Sequence) and not isinstance(value, str):  # of stations each
+        listed = [column for text in value for column in _by_setting(sheet, key, text)]
+        return tuple(replace(c, label=_label(c.head or "", role)) for c in listed)
     head = _head(sheet, text)
     if head is not None:
         return (Column(role, unit=_unit(head, role), head=head),)
+    if text == NONE:
+        return ()
     # After the head as it is: heads may hold a `*`, a `+` or a `-`.
     if KINDS[role] != "text" and (column := _sum_of_columns(sheet, role, text)) is not None:
         return (column,)
     joined = [_head(sheet, part.strip()) for part in text.split("+")] if role in JOINT else []
     if len(joined) > 1 and all(joined):
         return tuple(Column(role, JOINED, head=part) for part in joined)
-    if "*" in text and role in heads.MANY:
-        named = [h for h in sheet.heads if fnmatch.fnmatchcase(h, text)]
-        # A pattern has one star: what it stands for in a head is the name of the station or tone.
-        before, _, after = text.partition("*")
-        labels = {h: unit_of(h[len(before) : len(h) - len(after)])[0].strip() for h in named}
-        if named and "*" not in after:
-            return tuple(Column(role, label, _unit(h, role), head=h) for h, label in labels.items())
-        fault = "expected one * only" if "*" in after else "no column is called so"
+    if role in heads.MANY and ("*" in text or "..." in text):
+        times = re.fullmatch(r"(.*[^*].*)\*([-+]?\d*\.?\d+)", text)
+        for pattern, factor in ((text, ""), times.groups() if times else ("", "")):
+            if named := _named_columns(sheet, role, pattern):
+                return tuple(_times(c, factor) for c in named) if factor else named
+        fault = "expected one * only" if text.count("*") > 1 else "no column is called so"
         return sheet.problems.add(where, fault) or ()
     # `FIRST:LAST` of frequencies, or one number for all rows;
     # other text becomes NaN and no constant.
@@ -343,6 +441,27 @@ def _by_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
     hint = suggest_name(text, sheet.heads, 0.4) or f"; there are {sheet.first_heads()}"
     hint += f"; or say dataset.columns.{key}=null"
     return sheet.problems.add(where, f"{sheet.source} has no such column{hint}") or ()
+
+
+def _named_columns(sheet: Sheet, role: str, text: str) -> tuple[Column, ...]:
+    """Columns that a pattern with one `*` names, or FIRST...LAST; what is left names stations."""
+    first, dots, last = (part.strip() for part in text.partition("..."))
+    if dots and {first, last} <= {*sheet.heads}:
+        begin, end = sheet.heads.index(first), sheet.heads.index(last)
+        listed = sheet.heads[begin : end + 1]
+        return tuple(Column(role, _label(h, role), _unit(h, role), head=h) for h in listed)
+    matches = heads.match_pattern(text, sheet.heads)
+    labels = {head: unit_of(part)[0].strip() for head, part in matches.items()}
+    before, _, after = text.partition("*")
+    # `MAC1` is a name, `RSSI_1` a level of the station 1.
+    whole = role in heads.LEVELS and not LISTS["level"] & {*words_of(before + " " + after)}
+    labels = {h: h if whole and label.isdigit() else label for h, label in labels.items()}
+    return tuple(Column(role, label, _unit(h, role), head=h) for h, label in labels.items())
+
+
+def _label(head: str, role: str) -> str:
+    station = role in heads.LEVELS
+    return heads.station_in_head(head) or head if station else heads.parse_head(head).label
 
 
 def _sum_of_columns(sheet: Sheet, role: str, text: str) -> Column | None:
@@ -395,7 +514,8 @@ def _unit(head: str, role: str) -> Unit | None:
         and unit_suits(role, UNITS[words[-1]])
     ):
         return UNITS[words[-1]]
-    return unit
+    # A level that is the amplitude of a channel
+    return UNITS["db"] if unit is None and role == "csi_amp" and LISTS["level"] & {*words} else unit
 
 
 def _settled(role: str, chosen: Chosen) -> bool:
@@ -417,10 +537,25 @@ def _one_way(sheet: Sheet, guesses: dict[str, list[Column]]) -> None:
             replace(cols[0], head=_pattern(cols)) if ways is MEASURED else cols[0]
             for cols in by_way
         ]
-        fault = f"{' and '.join(map(_names, by_way))} both say where"
-        if ways is MEASURED:
-            fault = f"{_names(first)} are different measurements"
-        sheet.refuse(f"{fault}; say {' or '.join(map(_choice, first))}")
+        which = " and ".join(map(_names, by_way))
+        fault = (
+            f"{which} both say where: which is meant"
+            if ways is not MEASURED
+            else (f"{_names(first)} are different measurements: which is meant")
+        )
+        answers = [
+            Answer({c.role: _pattern([o for o in columns if o.role == c.role]) for c in columns})
+            for columns in by_way
+        ]
+        sheet.ask(
+            Role(
+                tuple(c.head or "" for c in first),
+                first[0].role,
+                "open",
+                readings=tuple(answers),
+                why=fault,
+            )
+        )
         for role in sum(ways, ()):
             guesses.pop(role, None)
 
@@ -460,29 +595,36 @@ def _one_unit(sheet: Sheet, chosen: Chosen) -> None:
             sheet.refuse(f"{fault}; rename one, e.g. to '{plain} [{SCHEMA[kind]}]'")
 
 
-def say_column(role: str, text: str) -> str:
-    """Return the setting that says what a column is, as a shell takes it.
-
-    >>> print(say_column("rssi_db", "RSRP*-1"), say_column("station", "Cell id"))
-    dataset.columns.rssi_db=RSRP*-1 'dataset.columns.station="Cell id"'
-    """
-    name = role.replace("latitude", "lat").replace("longitude", "lon")
-    plain = re.fullmatch(r"[\w.*+-]+", text)
-    return f"dataset.columns.{name}={text}" if plain else f"'dataset.columns.{name}=\"{text}\"'"
+MOST_READINGS = 4  # of one question
 
 
-def _choice(column: Column) -> str:
-    return say_column(column.role, column.head or "")
+def _is_rank(column: Column) -> bool:
+    """Whether what is left of a level's head says which of a list it is, and no station's name."""
+    return bool({*words_of(column.label)} & LISTS["ranks"])
 
 
-def _ambiguous(sheet: Sheet, role: str, columns: list[Column]) -> None:
-    stations = role in heads.LEVELS and all(c.label for c in columns)
-    more = f", or dataset.columns.{role}='NAME_*' where they are stations" if stations else ""
-    sheet.refuse(f"{_names(columns)} could each be {role}; say which: {_choice(columns[0])}{more}")
+def _ask_which(sheet: Sheet, role: str, columns: list[Column]) -> None:
+    """Ask which of columns is a quantity, or of levels whether they are of a station each."""
+    names = [column.head or "" for column in columns]
+    ways: list[Any] = names[:MOST_READINGS]
+    if role in heads.LEVELS and len(columns) > 1 and all(column.label for column in columns):
+        block, ranks = name_block(sheet, names), any(map(_is_rank, columns))
+        ways = [*names[: MOST_READINGS - 1], block] if ranks else [block, *ways][:MOST_READINGS]
+    ways += [NONE] if KINDS[role] == "length" else []
+    why = f"{_names(columns)} could each be {role}: which is it"
+    if len(columns) == 1:
+        why = f"{_names(columns)}: a received level or power, or something else"
+    readings = [Answer({role: way}, "" if way == NONE else _means(sheet, way)) for way in ways]
+    sheet.ask(Role(tuple(names), role, "open", readings=tuple(readings), why=why))
 
 
 def _names(columns: Iterable[Column]) -> str:
-    quoted = [repr(column.head) for column in columns]
+    return name_columns(column.head or "" for column in columns)
+
+
+def name_columns(names: Iterable[str]) -> str:
+    """Return heads for messages."""
+    quoted = [*map(repr, names)]
     if len(quoted) > 4:
         quoted = [*quoted[:3], f"{len(quoted) - 3} more"]
     plural = f"columns {', '.join(quoted[:-1])} and {quoted[-1]}"
@@ -518,7 +660,8 @@ def _turned(column: Column, unit: Unit) -> str:
     value = float(unit.convert(np.array(100.0)))
     note = f"column {column.head!r} times {factor}{then}: 100 in the file is {value:g} {wanted}"
     if then and math.isclose(abs(float(factor)), UNITS[bare.lower()].factor):
-        return Caution(f"{note}; twice? {_choice(column)} turns {bare} alone")
+        way = say_column(column.role, column.head or "")
+        return Caution(f"{note}; twice? {way} turns {bare} alone")
     return note
 
 

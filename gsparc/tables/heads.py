@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any
@@ -103,6 +104,19 @@ def station_in_head(text: str) -> str:
     return re.sub(rf"(?i)^[\W_]*(?:{'|'.join(STATION_WORDS)})[\W_]+", "", unit_of(text)[0]).strip()
 
 
+def match_pattern(pattern: str, names: Iterable[str]) -> dict[str, str]:
+    """Return what the one `*` of a pattern stands for, by the heads that it names.
+
+    >>> match_pattern("RSSI_*", ["x", "RSSI_a", "RSSI_b"])
+    {'RSSI_a': 'a', 'RSSI_b': 'b'}
+    """
+    before, star, after = pattern.partition("*")
+    fits = [name for name in names if name.startswith(before) and name.endswith(after)]
+    one = star and "*" not in after
+    long = len(before) + len(after)
+    return {n: n[len(before) : len(n) - len(after)] for n in fits if one and len(n) > long}
+
+
 def unit_suits(role: str, unit: Unit) -> bool:
     """Tell whether a column of `role` can be in `unit`."""
     return KINDS[role] == unit.kind or (role, unit.kind) in (
@@ -134,7 +148,9 @@ def words_of(text: str) -> list[str]:
     text = re.sub(r"(?i)(?<![a-z])([eg])node[ _-]?b", r"\1nb", text)  # eNodeB is one word
     text = re.sub(r"(?i)physical[ _]*(?:layer[ _]*)?cell[ _]*id(?:entity)?", "pci", text)
     phrase = re.sub(r"(?<=[a-z0-9])(?=[A-Z])(?!Bm?\b|BW\b|Hz|W\b)", " ", text)
-    phrase = re.sub(r"(rssi|rsrp|rss|power)(?=\d)", r"\1 ", phrase, flags=re.IGNORECASE)
+    phrase = re.sub(
+        r"(rssi|rsrp|rss|power|level|signal|rscp|dbm)(?=\d)", r"\1 ", phrase, flags=re.IGNORECASE
+    )
     return [word for word in re.split(r"[^0-9a-zµμ°]+", phrase.lower()) if word]
 
 

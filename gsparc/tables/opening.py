@@ -154,7 +154,8 @@ def _decoded(path: Path) -> tuple[str, str]:
         )
     if b"\0" in content:
         why = f"byte {content.index(0)} is zero; UTF-16 without its mark?"
-        raise DataError(f"{path}: not text ({why}); save it as UTF-8")
+        how = "export a table of text (CSV); logs of Wi-Fi channels are read by dataset=wifi_csi"
+        raise DataError(f"{path}: not text ({why}); {how}")
     try:
         return content.decode("utf-8-sig"), "UTF-8"
     except UnicodeDecodeError:

@@ -51,11 +51,13 @@ class Reading:
         notes: remarks for the user, one line each; nothing is wrong.
         file_row: (S,) number of each row in its file from 0, as `dataset.level_steps` counts; None:
             its own.
+        raw: what the file holds, where a file was read.
     """
 
     data: Measurements
     notes: tuple[str, ...]
     file_row: np.ndarray | None = None
+    raw: Raw | None = None
 
 
 def load_own(path: str | Path) -> Measurements:

@@ -67,6 +67,9 @@ class Raw:
         notes: how it was understood and what of it was left out, for the user, one line each.
         explain: what there is to say of the measurements that these became, and (S,) the row of
             each, from 0.
+        said: of a table, its columns by quantity, as `dataset.columns` and answers say.
+        roles: of a table's columns (`gsparc.tables.roles`).
+        heads: of a table.
     """
 
     arrays: dict[str, np.ndarray]
@@ -74,6 +77,9 @@ class Raw:
     units: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     explain: Callable[[Any, np.ndarray], list[str]] = lambda data, file_row: []
+    said: Mapping[str, object] = field(default_factory=dict)
+    roles: tuple[Any, ...] = ()
+    heads: tuple[str, ...] = ()
 
 
 def read_raw(path: str | Path) -> Raw:

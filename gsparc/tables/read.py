@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections import Counter
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,21 +13,32 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from gsparc.base.errors import Caution, list_first, suggest_name
+from gsparc.base.errors import Caution, DataError, Problems, list_first, suggest_name
 from gsparc.data.schema import ENDS, OTHER
 from gsparc.data.units import UNITS, WATTS
 from gsparc.tables import heads, places
+from gsparc.tables.advice import advise
 from gsparc.tables.amplitudes import join_polar
-from gsparc.tables.columns import JOINED, Chosen, Column, choose_columns, say_column, used_heads
+from gsparc.tables.columns import (
+    JOINED,
+    Chosen,
+    Column,
+    choose_columns,
+    list_roles,
+    name_block,
+    name_columns,
+    used_heads,
+)
+from gsparc.tables.columns_file import beside, is_edited, read_columns
 from gsparc.tables.links.stations import PER_STATION
 from gsparc.tables.opening import read_sheet
 from gsparc.tables.own_checks import LOWEST_HZ, MOST_DB
 from gsparc.tables.places import Places, StationList
 from gsparc.tables.raw import Raw
+from gsparc.tables.roles import Answer, Role, Said, say_column, settle
 from gsparc.tables.sheet import MEASURED, Sheet
 from gsparc.tables.slots import unfold_slots, unfold_tones
 from gsparc.tables.times import read_times
-from gsparc.tables.unused import say_effects
 
 
 def parse_table(
@@ -35,26 +46,62 @@ def parse_table(
     columns: Mapping[str, object] = {},
     stations_file: str | Path | None = None,
     stations: Collection[str] = (),
+    guess: bool = False,
+    columns_file: str | Path | None = None,
 ) -> Raw:
     """Read the arrays of a table; notes say what was guessed.
 
     Args:
         path: *.csv, *.tsv, *.txt or *.parquet.
         columns: column by quantity (`heads.KINDS`) where a guess will not do; a number stands for
-            all rows, a pattern with a `*` for a column per station.
+            all rows, a pattern with a `*` or a list for a column per station.
         stations_file: a second table: name, x, y, z or latitude, longitude, height of each station.
         stations: names in place of such a list: where heads hold them, no others are levels.
+        guess: whether the likeliest reading of what is open is taken, and noted.
+        columns_file: that says what columns are (`columns_file`); None: the one beside the table,
+            if somebody edited it.
 
     Raises:
-        DataError: all problems, with row and column.
+        DataError: all questions and problems, with row and column.
     """
-    sheet = unfold_tones(unfold_slots(read_sheet(path), {str(value) for value in columns.values()}))
-    listed = None
+    sheet, listed = read_sheet(path), None
     if stations_file is not None:
         listed = places.read_stations(
             replace(read_sheet(stations_file, sheet.problems), notes=sheet.notes)
         )
         sheet.problems.raise_if_any()
+
+    def build(said: Said) -> tuple[Raw | None, list[Role], tuple[str, ...]]:
+        asked = list[Role]()
+        fresh = replace(sheet, problems=Problems(path), notes=[*sheet.notes], asked=asked)
+        fresh = replace(fresh, marks=Counter())
+        raw = _build(fresh, said, listed, stations)
+        return raw, asked, tuple(fresh.problems)
+
+    said: dict[str, object] = {}
+    about = beside(path) if columns_file is None else Path(columns_file)
+    if columns_file is not None or (about.exists() and is_edited(about)):
+        said |= read_columns(about, sheet.heads)
+        sheet.notes.append(f"columns are what {about} says")
+    given = {key: value for key, value in columns.items() if value is not None}
+    others = {heads.OTHER_NAMES.get(key, key) for key in given}
+    said = {key: value for key, value in said.items() if key not in others} | given
+    settled = settle(build, said, sheet.source)
+    questions, raw = [role.question() for role in settled.asked], settled.raw
+    if questions and not guess:
+        raise DataError([f"{sheet.source}: {question}" for question in questions], path)
+    roles = (*settled.asked, *raw.roles)
+    notes = (*questions, *raw.notes)
+    return replace(raw, notes=notes, said=settled.said, roles=roles, heads=sheet.heads)
+
+
+def _build(
+    sheet: Sheet, columns: Said, listed: StationList | None, stations: Collection[str]
+) -> Raw | None:
+    """The arrays; None where something is wrong, or open."""
+    given, whole = columns, sheet
+    sheet, columns = unfold_slots(sheet, columns)
+    sheet = unfold_tones(sheet)
     # The list of stations comes before the columns:
     # heads that hold its names are levels of stations.
     labelled: dict[str, str] = {}
@@ -65,10 +112,12 @@ def parse_table(
         sheet, labelled = _name_levels(sheet, stations)
     chosen = choose_columns(sheet, columns, labelled)
     # Everything after this trusts the choice of columns, so its problems are raised alone.
-    sheet.problems.raise_if_any()
+    if sheet.problems:
+        return None
     sheet = places.drop_rows_without_place(sheet, chosen)
     arrays = Builder(sheet, chosen, listed).build()
-    sheet.problems.raise_if_any()
+    if sheet.is_open():
+        return None
     power = next((chosen[role][0] for role in heads.LEVELS if role in chosen), None)
     about = {}
     if power is not None and "rssi_db" in chosen:
@@ -81,8 +130,14 @@ def parse_table(
         and not power.unit.times
     ):
         about["unit"] = power.unit.name
-    explain = partial(say_effects, sheet, chosen)
-    return Raw(arrays, about, notes=tuple(sheet.notes), explain=explain)
+
+    def reads(said: Said) -> Raw | None:
+        again = replace(whole, problems=Problems(sheet.source), notes=[], asked=[])
+        return _build(again, {**given, **said}, listed, stations)
+
+    explain = partial(advise, sheet, chosen, reads)
+    roles = tuple(list_roles(sheet, chosen, given))
+    return Raw(arrays, about, notes=tuple(sheet.notes), explain=explain, roles=roles)
 
 
 def _name_levels(sheet: Sheet, stations: Collection[str]) -> tuple[Sheet, dict[str, str]]:
@@ -156,28 +211,9 @@ class Builder:
         """Add the measurement; its quantity."""
         role = next((name for name in heads.MANY if name in self.chosen), None)
         if role is None:
-            fault = f"no column of levels, powers or channels among {self.sheet.first_heads()}"
-            for head in self.sheet.heads:
-                if {"loss", "pathloss", "pl"} & set(heads.words_of(head)):
-                    how = say_column("rssi_db", f"{head}*-1")
-                    return self.refuse(f"{fault}; {how} takes losses for levels")
-                if "asu" in heads.words_of(head):
-                    asu = pd.to_numeric(self.sheet.frame[head], errors="coerce")
-                    how = f"of LTE: {say_column('rssi_db', f'{head}-140')}"
-                    # Of LTE these would all be weak
-                    if (asu[asu != UNKNOWN_ASU] <= MOST_GSM).all():
-                        how = f"of GSM: {say_column('rssi_db', f'{head}*2-113')}; if weak, {how}"
-                    return self.refuse(f"{fault}; {head!r} is ASU, {how}")
-                if {"quality", "percent", "pct"} & set(heads.words_of(head)):
-                    return self.refuse(f"{fault}; {head!r} is {heads.PERCENT}")
-            numbered = Counter(re.sub(r"\d+(?=\D*$)", "*", head) for head in self.sheet.heads)
-            family, count = numbered.most_common(1)[0]
-            alike = (
-                (f"'{family}' (levels) or .csi_amp='{family}' (amplitudes)")
-                if count > 1
-                else "COLUMN"
-            )
-            return self.refuse(f"{fault}; say dataset.columns.rssi_db={alike}")
+            if not self._is_asked(heads.MANY):
+                self._ask_measurement()
+            return None
         if role not in heads.LEVELS:
             self._channels(heads.CHANNELS if role in heads.CHANNELS else heads.POLAR)
             return role
@@ -198,22 +234,58 @@ class Builder:
         guessed = role == "rssi_db" and first.unit is None and first.word not in ("", role)
         # Received levels in dBm are below 0: a column without one is a power, a share,
         # or lost its sign.
-        if guessed and not (values < 0).any():  # the head says neither decibels nor watts
-            choices = " or ".join(say_column(name, first.head or "") for name in heads.LEVELS)
-            fault = (
-                f"no value below 0: dBm or W, per cent, or dBm without a minus sign? say {choices}"
-            )
-            self.refuse(
-                f"{fault}, or {say_column('rssi_db', f'{first.head}*-1')}", first.head or ""
-            )
+        names = [column.head or "" for column in columns]
+
+        same = name_block(self.sheet, names)
+
+        def times(factor: str) -> object:
+            listed = isinstance(same, list)
+            return [f"{name}*{factor}" for name in names] if listed else f"{same}*{factor}"
+
+        # The head says neither decibels nor watts
+        if guessed and np.isfinite(values).any() and not (values < 0).any():
+            why = f"{name_columns(names)}: no value below 0: dBm without a minus sign, W or dBm"
+            self._ask(why, names[0], rssi_db=[times("-1")], rssi=[same])
         size = np.median(np.abs(np.unique(values[np.isfinite(values)])))  # a mark counts once
         if role == "rssi_db" and size > MOST_DB and first.head and first.unit is None:
-            how = say_column(role, f"{first.head}*{10.0 ** -np.ceil(np.log10(size / MOST_DB)):g}")
-            self.refuse(
-                f"most of it is beyond {MOST_DB} dB: in parts of a dB? say {how}", first.head
-            )
+            why = f"{name_columns(names)}: most of it is beyond {MOST_DB} dB: in parts of a dB"
+            factor = f"{10.0 ** -np.ceil(np.log10(size / MOST_DB)):g}"
+            self._ask(why, names[0], rssi_db=[times(factor)])
         self.arrays[role] = values[:, 0] if len(columns) == 1 else values
         return role
+
+    def _is_asked(self, roles: Collection[str]) -> bool:
+        """Whether a question about one of these quantities is open."""
+        return any(role.role in roles for role in self.sheet.asked or ())
+
+    def _ask(self, why: str, head: str, **ways: Sequence[object]) -> None:
+        """Ask about a column, by quantity what it may be."""
+        cell = self.sheet.first_cell(head)
+        answers = tuple(Answer({role: way}, cell) for role, each in ways.items() for way in each)
+        self.sheet.ask(Role((head,), next(iter(ways)), "open", readings=answers, why=why))
+
+    def _ask_measurement(self) -> None:
+        """Ask about a column that may be turned into levels, else refuse the table."""
+        fault = f"no column of levels, powers or channels among {self.sheet.first_heads()}"
+        for head in self.sheet.heads:
+            words = {*heads.words_of(head)}
+            if {"loss", "pathloss", "pl"} & words:
+                return self._ask(f"{fault}; {head!r} are losses", head, rssi_db=[f"{head}*-1"])
+            if "asu" in words:
+                asu = pd.to_numeric(self.sheet.frame[head], errors="coerce")
+                # Of LTE these would all be weak
+                low = (asu[asu != UNKNOWN_ASU] <= MOST_GSM).all()
+                ways = [f"{head}*2-113", f"{head}-140"] if low else [f"{head}-140"]
+                why = f"{fault}; {head!r} is ASU, {'of GSM (times 2) or LTE' if low else 'of LTE'}"
+                return self._ask(why, head, rssi_db=ways)
+            if {"quality", "percent", "pct"} & words:
+                return self.refuse(f"{fault}; {head!r} is {heads.PERCENT}")
+        numbered = Counter(re.sub(r"\d+(?=\D*$)", "*", head) for head in self.sheet.heads)
+        family, count = numbered.most_common(1)[0]
+        alike = (
+            (f"'{family}' (levels) or .csi_amp='{family}' (amplitudes)") if count > 1 else "COLUMN"
+        )
+        self.refuse(f"{fault}; say dataset.columns.rssi_db={alike}")
 
     def _channels(self, names: tuple[str, str]) -> None:
         """Add channels of columns of real and imaginary parts, or of amplitudes and phases."""
@@ -278,13 +350,15 @@ class Builder:
         coordinates = {
             f"{end}{axis}" for end in heads.ENDS[:-1] for axis in heads.AXES if axis != "z"
         }
+        if self._is_asked(coordinates) or self._ask_places(coordinates):
+            return None
         if coordinates.isdisjoint(self.chosen):
             fault = (
                 f"no coordinates among {self.sheet.first_heads()}; say "
                 "dataset.columns.x=COLUMN and .y"
             )
             return self.refuse(f"{fault}, or .lat, .lon")
-        if self.sheet.problems:
+        if self.sheet.is_open():
             return
         # Two named ends and one without a name: nothing says which
         # of the named ones it would replace.
@@ -321,6 +395,25 @@ class Builder:
             still = name != "station" and len(np.unique(other.all(), axis=0)) == 1
             self._add_places(name, other.take(np.array([0])) if still else other, still=still)
 
+    def _ask_places(self, coordinates: set[str]) -> bool:
+        """Ask about heads that hold words of coordinates, where none says more; whether it did."""
+        if not coordinates.isdisjoint(self.chosen):
+            return False
+        likely = {
+            axis: [head for head in self.sheet.heads if re.search(words, head)]
+            for axis, words in heads.SHEET["likely"].items()
+        }
+        for pair in (("latitude", "longitude"), ("x", "y")):
+            of_axes = [likely[axis] for axis in pair]
+            if all(len(heads_of_axis) == 1 for heads_of_axis in of_axes):
+                names = [heads_of_axis[0] for heads_of_axis in of_axes]
+                cells = " and ".join(map(self.sheet.first_cell, names))
+                readings = (Answer(dict(zip(pair, names, strict=True)), cells),)
+                why = f"{name_columns(names)} may be {' and '.join(pair)}"
+                self.sheet.ask(Role(tuple(names), pair[0], "open", readings=readings, why=why))
+                return True
+        return False
+
     def _moving(self, ends: dict[str, Places], stay: str) -> tuple[str, Places]:
         """Which end the rows are places of, where `stay` are stations;
         it is taken out of `ends`.
@@ -331,7 +424,8 @@ class Builder:
             # The end without a name is whichever the named one is not; unsaid, it is the receiver.
             moving = "tx" if named == ["rx_"] else "rx"
             station = self.chosen.get("station") or self.chosen.get("station_x") or ()
-            if not named and station and station[0].word in heads.LISTS["hearing"]:
+            words = {*heads.words_of(station[0].head or "")} if station else set()
+            if not named and words & heads.LISTS["hearing"]:
                 moving = "tx"
             if not named:
                 other = "tx" if moving == "rx" else "rx"
@@ -578,7 +672,7 @@ class Builder:
         # GHz are below 100.
         if (
             column.unit is None
-            and column.word
+            and column.head
             and np.nanmin(values) >= 100
             and np.nanmax(values) < LOWEST_HZ
         ):

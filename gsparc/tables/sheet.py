@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +15,7 @@ import pandas as pd
 
 from gsparc.base.errors import Problems
 from gsparc.tables.heads import PERCENT, SHEET, UNITS, Unit
+from gsparc.tables.roles import Role
 
 NOT_HEARD = re.compile(SHEET["not_heard"])
 REPEATS = 3
@@ -25,6 +26,7 @@ SEXAGESIMAL = re.compile(
     re.IGNORECASE,
 )
 
+MOVED = re.compile(r"[-+]?\d+(?:\.\d+){2,}")  # several points
 INVISIBLE = "[\u200b-\u200d\u2060\ufeff]"  # spaces of no width, which names are pasted with
 # 379.0 is 379: a name that a join of tables turned into a number
 WHOLE = re.compile(r"^(\d+)\.0+$")
@@ -43,6 +45,7 @@ class Sheet:
         marks: texts that stand for "not heard" among levels that were read, and how often each
             does.
         notes: how it was understood, for the user, one line each.
+        asked: takes roles that are open; None: they are refused.
     """
 
     source: str
@@ -52,6 +55,7 @@ class Sheet:
     problems: Problems = field(default_factory=lambda: Problems(""))
     marks: Counter[str] = field(default_factory=Counter)
     notes: list[str] = field(default_factory=list)
+    asked: list[Role] | None = None
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -72,6 +76,25 @@ class Sheet:
     def refuse(self, what: str, head: str | None = None) -> Any:
         """Note what is wrong with the table, or with a column; returns None."""
         return self.problems.add(self.source if head is None else self.describe_column(head), what)
+
+    def ask(self, role: Role) -> Any:
+        """Note a role that is open; returns None."""
+        if self.asked is None:
+            return self.problems.append(f"{self.source}: {role.question()}")
+        return self.asked.append(role)
+
+    def is_open(self) -> bool:
+        """Tell whether anything is wrong, or open, so that nothing further can be said."""
+        return bool(self.problems or self.asked)
+
+    def first_words(self, heads: Sequence[str], count: int) -> tuple[str, ...]:
+        """Return the first cells of the first of columns."""
+        return tuple(self.words(heads[0])[:count].tolist()) if heads else ()
+
+    def first_cell(self, head: str) -> str:
+        """Return the first value of a column, and where it stands, for messages."""
+        rows = np.flatnonzero(self.words(head) != "")
+        return f"{self.words(head)[rows[0]]} in {self.rows[rows[0]]}" if len(rows) else "empty"
 
     def refuse_rows(self, head: str | None, rows: np.ndarray, what: str) -> Any:
         """Note `what` for rows (n,) of a column; returns None."""
@@ -147,6 +170,12 @@ class Sheet:
             understood = [i for i in np.flatnonzero(bad) if read[cells[i]] is not None]
             values[understood] = [read[cells[i]] for i in understood]
             bad[understood] = False
+        moved = [i for i in np.flatnonzero(bad) if MOVED.fullmatch(str(column.iloc[i]).strip())]
+        if moved:
+            first = f"{column.iloc[moved[0]]!r} in {self.rows[moved[0]]}"
+            fault = f"{len(moved)} of {len(column)} cells hold several points, like {first}: a "
+            fault += "spreadsheet took them for marks of thousands; export the column anew, as text"
+            return self.refuse(fault, head)
         if bad.any():
             cells = column.astype(str).to_numpy(dtype=object)[bad]
             texts = (repr(cell if len(cell) <= 40 else cell[:37] + "...") for cell in cells)

@@ -4,17 +4,28 @@ rows of tones as columns.
 
 from __future__ import annotations
 
-from collections.abc import Container
+import re
+from collections import defaultdict
+from collections.abc import Mapping
 from dataclasses import replace
 
 import pandas as pd
 
 from gsparc.base.errors import list_first
-from gsparc.tables.heads import KINDS, LISTS, meaning_by_word, parse_head, unit_of, words_of
+from gsparc.tables.heads import (
+    KINDS,
+    LISTS,
+    match_pattern,
+    meaning_by_word,
+    parse_head,
+    unit_of,
+    words_of,
+)
+from gsparc.tables.roles import Said
 from gsparc.tables.sheet import Sheet
 
 HOLDS = meaning_by_word("slots")
-NEEDED, LEAST = {"PCI", "RSRP"}, 2  # of a slot; slots
+NEEDED, LEAST = ({"PCI", "RSRP"}, {"BSSID", "RSSI"}), 2  # of a slot, either; slots
 
 
 def find_slots(heads: tuple[str, ...]) -> dict[str, dict[str, str]]:
@@ -23,42 +34,92 @@ def find_slots(heads: tuple[str, ...]) -> dict[str, dict[str, str]]:
     """
     parts_of: dict[str, dict[str, str]] = {}
     for head in heads:
-        words = words_of(unit_of(head)[0])
+        words = _words(head)
         kinds = [HOLDS[word] for word in words if word in HOLDS]
         name = " ".join(word for word in words if word not in {*HOLDS, "cell", "dbm"})
         if len(kinds) == 1 and kinds[0] not in parts_of.setdefault(name, {}):
             parts_of[name][kinds[0]] = head
-    slots = {name: parts for name, parts in parts_of.items() if set(parts) >= NEEDED}
+    for needed in NEEDED:
+        slots = {name: parts for name, parts in parts_of.items() if set(parts) >= needed}
+        if len(slots) >= LEAST:
+            of_slot = needed | {"EARFCN"}
+            return {
+                name: {kind: head for kind, head in parts.items() if kind in of_slot}
+                for name, parts in slots.items()
+            }
+    return {}
+
+
+def _words(head: str) -> list[str]:
+    """Words of a head, numbers apart."""
+    return re.findall(r"[^\W\d_]+|\d+", " ".join(words_of(unit_of(head)[0])))
+
+
+def ranked_names(sheet: Sheet, numbered: Mapping[str, str]) -> str | None:
+    """Return the pattern of columns of names beside columns of levels, by their numbers: a name
+    that stands in several of them is a station's, and the number its rank; None without.
+    """
+    families: dict[str, dict[str, str]] = defaultdict(dict)
+    for head in sheet.heads:
+        if len(number := re.findall(r"\d+", head)) == 1 and head not in numbered.values():
+            families[head.replace(number[0], "*")][number[0]] = head
+    for pattern, members in families.items():
+        if not {*numbered} <= {*members} or len(numbered) < LEAST:
+            continue
+        ranks = [{*sheet.words(members[number]).tolist()} - {""} for number in numbered]
+        names = set[str]().union(*ranks)
+        again = len(names) < sum(map(len, ranks)) and 2 * len(names) < len(sheet) * len(ranks)
+        numbers = any(re.fullmatch(r"[-+]?\d*\.?\d*", name) for name in names)
+        if again and (not numbers or {*_words(pattern)} & LISTS["station"]):
+            return pattern
+    return None
+
+
+def _said_slots(sheet: Sheet, said: Said) -> dict[str, dict[str, str]]:
+    """Slots of two patterns, of names and of levels."""
+    patterns = {"BSSID": str(said.get("station", "")), "RSSI": str(said.get("rssi_db", ""))}
+    slots: dict[str, dict[str, str]] = defaultdict(dict)
+    for kind, pattern in patterns.items():
+        for head, number in match_pattern(pattern, sheet.heads).items():
+            slots[number][kind] = head
+    slots = {name: parts for name, parts in slots.items() if len(parts) == len(patterns)}
     return slots if len(slots) >= LEAST else {}
 
 
-def unfold_slots(sheet: Sheet, said: Container[str]) -> Sheet:
-    """Return a row per slot with a cell and its level, rows of one moment together; noted.
+def unfold_slots(sheet: Sheet, said: Said) -> tuple[Sheet, Said]:
+    """Return a row per slot with a station and its level, rows of one moment together; noted.
 
     Args:
         sheet: the table.
-        said: heads that settings name: their table is taken as it is.
+        said: columns by quantity; a table whose slots these name is taken as it is, unless by
+            patterns of names and of levels, which go.
     """
-    slots = find_slots(sheet.heads)
+    slots, texts = find_slots(sheet.heads), {str(value) for value in said.values()}
+    if patterns := _said_slots(sheet, said):
+        slots, said = patterns, {k: v for k, v in said.items() if k not in ("station", "rssi_db")}
     used = [head for parts in slots.values() for head in parts.values()]
-    if not slots or any(head in said for head in used):
-        return sheet
+    if not slots or (not patterns and any(head in texts for head in used)):
+        return sheet, said
     # A channel that only one slot has is the moment's.
     shared = next((parts["EARFCN"] for parts in slots.values() if "EARFCN" in parts), None)
-    level = next(iter(slots.values()))["RSRP"]
-    names = {"PCI": "PCI", "RSRP": f"RSRP{level[len(unit_of(level)[0]) :]}", "EARFCN": "EARFCN"}
+    name, level = next(
+        kinds for kinds in map(sorted, NEEDED) if {*kinds} <= {*next(iter(slots.values()))}
+    )
+    first = next(iter(slots.values()))[level]
+    unit = first[len(unit_of(first)[0]) :]
+    names = {name: name, level: f"{level}{unit}", "EARFCN": "EARFCN"}
     # What else is of one slot says nothing of the others.
-    slot_words = [{*name.split()} for name in slots if name]
+    slot_words = [{*slot.split()} for slot in slots if slot]
     rest = [head for head in sheet.heads if head not in used]
     common = [
-        h for h in rest if h in said or not any(words <= {*words_of(h)} for words in slot_words)
+        h for h in rest if h in texts or not any(words <= {*_words(h)} for words in slot_words)
     ]
     parts = []
     for slot in slots.values():
-        has_cell = (sheet.words(slot["PCI"]) != "") & (sheet.words(slot["RSRP"]) != "")
+        has_cell = (sheet.words(slot[name]) != "") & (sheet.words(slot[level]) != "")
         of_slot = {
-            head: name
-            for part, name in names.items()
+            head: kind
+            for part, kind in names.items()
             if (head := slot.get(part, shared)) is not None
         }
         parts.append(sheet.frame.loc[has_cell, [*common, *of_slot]].rename(columns=of_slot))
@@ -66,7 +127,7 @@ def unfold_slots(sheet: Sheet, said: Container[str]) -> Sheet:
     rows = tuple(sheet.rows[i] for i in whole.index)
     named = list_first([*map(repr, slots)], 3)
     sheet.notes.append(f"slots {named}: {len(rows)} rows of {len(sheet)} moments")
-    return replace(sheet, frame=whole.reset_index(drop=True), rows=rows)
+    return replace(sheet, frame=whole.reset_index(drop=True), rows=rows), said
 
 
 def unfold_tones(sheet: Sheet) -> Sheet:

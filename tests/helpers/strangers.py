@@ -237,13 +237,13 @@ CASES = {
     "arbitrary strength units": (
         table("x,y,asu", *PLACES.T, LEVELS[:, 0] + 140),
         {},
-        "'asu' is ASU, of LTE: dataset.columns.rssi_db=asu-140",
+        "'asu' is ASU, of LTE? say dataset.columns.rssi_db=asu-140",
         "GSM",
     ),
     "strength units of GSM": (
         table("x,y,asu", *PLACES.T, np.where(NINTH, 99, (LEVELS[:, 0] + 98) // 2)),
         {},
-        "'asu' is ASU, of GSM: dataset.columns.rssi_db=asu*2-113; if weak, of LTE:",
+        "of GSM (times 2) or LTE? say dataset.columns.rssi_db=asu*2-113",
         "saturat",
     ),
     "units that are said": (
@@ -268,7 +268,7 @@ CASES = {
     "losses": (
         table("x,y,path_loss", *PLACES.T, -LEVELS[:, 0]),
         {},
-        "rssi_db=path_loss*-1 takes losses",
+        "'path_loss' are losses? say dataset.columns.rssi_db=path_loss*-1",
         "",
     ),
     "losses that are said": (

@@ -1,5 +1,5 @@
-"""The table docs/results/strangers.csv: what `gsparc check` says of files of strangers,
-what heeding it buys.
+"""The table docs/results/strangers.csv: what columns of strangers' files are taken for, what is
+asked, and what the right answer buys.
 
     PYTHONPATH=tests/helpers python tests/helpers/strangers_table.py [FILE ...]
 
@@ -24,9 +24,10 @@ from gsparc.datasets.own import read_any
 from gsparc.runs.baselines import fit_baseline
 
 FILE = Path(__file__).parents[2] / "docs" / "results" / "strangers.csv"
-HEADS = ("file", "what is unusual", "check says", "as read", "advice followed", "advice", "right")
+HEADS = ("file", "what is unusual", "roles", "question", "as read", "answer", "answered", "before")
 SITES = {"stations_file": str(REAL / "strangers2/h01_sites.csv")}
 GATEWAY = {"stations_file": str(REAL / "strangers/c11_gw.csv")}
+SERVING = {"stations_file": str(REAL / "strangers3/serving_sites.csv")}
 POSTS = {"stations_file": str(REAL / "strangers/silent_sites.csv")}
 TWICE = "the same name on two carriers"
 
@@ -38,7 +39,7 @@ CASES: dict[str, tuple[str, dict, dict | None, dict | None]] = {
     "c02_20_null.csv": ("19 fixes at 0, 0", {}, None, None),
     "c03_percent.csv": ("a quality in per cent", {}, None, None),
     "c03_minus.csv": ("another sign for minus", {}, None, None),
-    "c03_survey.csv": ("heads BSSID;SSID", {}, {"absent": "silent"}, None),
+    "c03_survey.csv": ("heads BSSID;SSID", {}, None, None),
     "c04_ok.npz": ("nothing", {}, None, None),
     **{
         f"c04_{name}.npz": (what, {}, {setting: True}, None)
@@ -54,10 +55,10 @@ CASES: dict[str, tuple[str, dict, dict | None, dict | None]] = {
     "c05_zenith.npz": ("elevations from the zenith", {}, {"zenith": True}, None),
     "c05_clockwise.npz": ("azimuths clockwise", {}, {"clockwise": True}, None),
     "c05_db_positive.npz": ("decibels", {}, {"decibels": True}, None),
-    "c06_dms.csv": ("degrees, minutes, seconds", {}, {"absent": "silent"}, None),
+    "c06_dms.csv": ("degrees, minutes, seconds", {}, None, None),
     "c06_nmea.csv": ("ddmm.mmmm", {}, None, None),
-    "c06_glued.csv": ("heads again in the middle", {}, {"absent": "silent"}, None),
-    "c06_pci.csv": (TWICE, {}, {"absent": "silent"}, None),
+    "c06_glued.csv": ("heads again in the middle", {}, None, None),
+    "c06_pci.csv": (TWICE, {}, None, None),
     "c07_floors.csv": ("three floors", {}, {"columns": {"z": "FLOOR*3.2"}}, None),
     "c07_floors_st.csv": ("a station for each floor", {}, None, None),
     "c07_utm.csv": ("two zones of a projection", {}, None, None),
@@ -67,7 +68,7 @@ CASES: dict[str, tuple[str, dict, dict | None, dict | None]] = {
         {"columns": {"x": "LONGITUDE", "y": "LATITUDE"}},
         None,
     ),
-    "c08_gw_null.csv": ("a gateway at 0, 0", {}, None, None),
+    "c08_gw_null.csv": ("a gateway at 0, 0", {}, {"absent": "weaker"}, None),
     "c10_dji.csv": ("heights above the sea", {}, None, None),
     "c10_compound.h5": ("compounds of MATLAB", {}, None, None),
     "c10_ampphase.csv": (
@@ -126,6 +127,29 @@ CASES: dict[str, tuple[str, dict, dict | None, dict | None]] = {
     "h31_ok.npz": ("nothing", {}, None, None),
     "h31_cm.npz": ("centimetres", {}, {"centimetres": True}, None),
     "h31_ampphase.npz": ("amplitudes beside phases", {}, None, None),
+    "best2.csv": ("lists of the two strongest", SERVING, None, None),
+    "cm_lonshift.csv": ("a phone that lay still for minutes", {}, None, None),
+    "excel_thousands.csv": ("points moved by a spreadsheet", {}, None, None),
+    "nexmon_nulls.npz": ("8 constant tones 30 dB above all others", {}, None, None),
+    "nexmon_ok.npz": ("the others alone", {}, None, None),
+    "opentx_space.csv": ("latitude and longitude in one cell", {}, None, None),
+    "rfid_phase.csv": ("phase beside RSSI", {}, {"columns": {"rssi_db": "RSSI"}}, None),
+    "rsrp_gap_columns.csv": (
+        "levels, their shares and differences",
+        {},
+        {"columns": {"rssi_db": "rsrp_50_max_target_pcells", "lat": "grid_lat", "lon": "grid_lon"}},
+        None,
+    ),
+    "scan_pairs.csv": ("names and levels by rank", {}, None, None),
+    "serving_only.csv": ("the serving cell alone", SERVING, None, None),
+    "swapped_few.csv": ("latitude and longitude exchanged in a few rows", {}, None, None),
+    "unsigned_wide.csv": (
+        "no minus signs",
+        {},
+        {"columns": {"rssi_db": "RSSI A...RSSI C*-1"}},
+        None,
+    ),
+    "uwb_pairs.csv": ("pairs that were chosen", {}, {"columns": {"rssi_db": "RSL"}}, None),
 }
 
 
@@ -172,24 +196,33 @@ def _peaks(data: Measurements, test: np.ndarray) -> str:
     return f"{np.median(np.degrees(np.arccos(np.clip(cosine, -1, 1)))):.1f} deg"
 
 
-def row_of(name: str) -> list[str]:
+def row_of(name: str, before: str) -> list[str]:
     """The row of one file."""
-    what, first, advice, right = CASES[name]
+    what, first, answer, right = CASES[name]
     path = next(REAL.glob(f"strangers*/{name}"))
     found = said(path, **first).replace(f"{path.parent}/", "").splitlines()
-    doubts = [line.removeprefix("warning").strip() for line in found if line.startswith("warning")]
+    asked = [line.removeprefix("asked").strip() for line in found if line.startswith("asked")]
     refusals = found[:-1] if "refused" in found[-1] else []
-    says = "; ".join(doubts or refusals) or found[-1].partition(": ")[2]
-    read = error(path, first)
-    followed = read if advice is None else error(path, first | advice)
-    best = followed if right is None else error(path, first | right)
-    how = " ".join(f"{key}={value}" for key, value in (advice or {}).items()).replace("'", "")
-    return [name, what, says, read, followed if advice else "", how, best]
+    try:
+        raw = read_any(path, **first, guess=True).raw
+        roles = (
+            [] if raw is None else [role for role in raw.roles if role.role and not role.readings]
+        )
+    except DataError:
+        roles = []
+    held = "; ".join(f"{role.column}: {role.role} ({role.sure})" for role in roles)
+    read = "asked" if asked else error(path, first)
+    answered = read if answer is None else error(path, first | answer)
+    best = answered if right is None else error(path, first | right)
+    how = " ".join(f"{key}={value}" for key, value in (answer or {}).items()).replace("'", "")
+    return [name, what, held, "; ".join(asked or refusals), read, how, best, before]
 
 
 def main(names: list[str]) -> None:
     """Write the table, or rows of some files to the terminal."""
-    rows = [HEADS, *(row_of(name) for name in names or CASES)]
+    with FILE.open(encoding="utf-8", newline="") as file:
+        kept = {row["file"]: row.get("before") or row.get("right") for row in csv.DictReader(file)}
+    rows = [HEADS, *(row_of(name, kept.get(name) or "") for name in names or CASES)]
     with sys.stdout if names else FILE.open("w", encoding="utf-8", newline="") as file:
         csv.writer(file, lineterminator="\n").writerows(rows)
 

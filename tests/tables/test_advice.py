@@ -19,7 +19,7 @@ from gsparc.tables.own import write_own
 SETTING = re.compile(r"""'dataset\.[^']*'|\bdataset\.[\w.]+=(?:\[[^\]]*\]|'[^']*'|[^\s,;:()]+)""")
 # Words that stand for something a user has to fill in.
 OPEN = re.compile(r"=.*(?:COLUMN|NAME|HEAD|FILE|\.\.\.|X,Y,Z|STATION|NUMBER)")
-GIVEN = [*REAL.glob("strangers/*.*"), *REAL.glob("strangers2/*.*")]
+GIVEN = [file for file in REAL.glob("strangers*/*.*") if file.suffix != ".md"]
 
 
 def proposals(found: str) -> list[tuple[str, list[list[str]]]]:

@@ -459,22 +459,22 @@ SPOILT = {
     "two levels": (
         "x,y,RSRP,RSSI\n1,2,-80,-60\n",
         {},
-        "'RSRP' and 'RSSI' could each be rssi_db; say which",
+        "'RSRP' and 'RSSI' could each be rssi_db: which is it? say",
     ),
     "dBm and mW": (
         "x,y,power_dbm,power_mw\n1,2,-80,1\n",
         {},
-        "are different measurements; say dataset.col",
+        "are different measurements: which is meant? say dataset.col",
     ),
     "metres and degrees": (
         "x,y,lat,lon,rssi\n1,2,40,8,-80\n",
         {},
-        "both say where; say dataset.columns.x=x",
+        "both say where: which is meant? say dataset.columns.x=x",
     ),
     "dBm or watts": (
         "x,y,power\n1,2,3\n2,3,4\n",
         {},
-        "column 'power': no value below 0: dBm or W, per cent",
+        "column 'power': no value below 0: dBm without a minus sign, W or dBm?",
     ),
     "a misspelt column": (
         PLAIN,

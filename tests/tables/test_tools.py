@@ -11,10 +11,10 @@ import pytest
 from doors import said
 
 from gsparc.datasets.own import read_any
-from gsparc.tables.columns import say_column
 from gsparc.tables.own import interpret
 from gsparc.tables.raw import Raw
 from gsparc.tables.read import parse_table
+from gsparc.tables.roles import say_column
 
 COUNT, LIGHT = 60, 299792458.0
 RNG = np.random.default_rng(7)
@@ -260,14 +260,15 @@ def test_slots_of_tems_were_no_slots(tmp_path):
     assert not any("Serving Cell Identity" in note and "tells" in note for note in reading.notes)
 
 
-def test_networks_with_names_of_their_own_were_no_levels(tmp_path):
+def test_networks_with_names_of_their_own_were_no_levels(tmp_path, refused):
     path = tmp_path / "survey.csv"
     path.write_text(
         text("X,Y,Office WiFi,printer,noise floor", *ROOM.T[:2], *LEVEL.T, [-96] * COUNT)
     )
-    reading = read_any(path)
-    assert_levels(reading, ("Office WiFi", "printer"))
-    assert any("by their values: no head says so" in note for note in reading.notes)
+    refused("hold values like levels, no head says so: which are", read_any, path)
+    answer = {"rssi_db": ["Office WiFi", "printer"]}
+    assert_levels(read_any(path, columns=answer), ("Office WiFi", "printer"))
+    assert_levels(read_any(path, guess=True), ("Office WiFi", "printer"))
 
 
 def test_rows_between_two_fixes_were_refused_one_by_one(tmp_path):

@@ -22,7 +22,7 @@ from gsparc.data.moments import Snapshots
 from gsparc.data.schema import LIGHT, Measurements
 from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.level_field import fit_level_field
-from gsparc.tables.checks.column_effects import LevelsAtPlaces
+from gsparc.tables.advice import LevelsAtPlaces
 from gsparc.tables.conventions import CONVENTIONS, convert_conventions, known_array, traits
 
 RATIO = math.log(1000)  # of likelihoods

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from gsparc.data.selection import FROM_ROW
 from gsparc.physics.decibels import to_decibels
 from gsparc.tables.links.strongest import ALONE
 
+ORDERED, LEAST_PLACES = 0.5, 20  # of the distance of any two places; changes of place
 UNNAMED = "the station"  # a single one, of a file without stations
 
 
@@ -44,6 +46,20 @@ class LinkLevels:
     keys: list[str]
     station_position: np.ndarray
     limited: frozenset[int] = frozenset()
+
+    @cached_property
+    def ordered(self) -> bool:
+        """Whether rows are in an order of time or place: nearer to the one before than to others.
+
+        Where they are not, no question of the rows before and after means anything.
+        """
+        moves = np.r_[True, (np.diff(self.position, axis=0) != 0).any(1)]
+        place = self.position[moves]
+        if len(place) < LEAST_PLACES:
+            return True
+        other = np.random.default_rng(0).permutation(place)
+        step = np.linalg.norm(np.diff(place, axis=0), axis=1)
+        return bool(np.median(step) < ORDERED * np.median(np.linalg.norm(place - other, axis=1)))
 
     def heard(self) -> Iterator[tuple[int, np.ndarray]]:
         """Yield each station, and its rows (k,) with a value."""

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from gsparc.base.errors import Severe, list_first
 from gsparc.data.blocks import rows_by
+from gsparc.data.row_order import along_curve
 from gsparc.tables.checks.level_steps import MOST_BLOCKS, LevelStep, detect_level_steps
 from gsparc.tables.checks.link_levels import UNNAMED, LinkLevels
 from gsparc.tables.checks.misplaced import misplaced_warnings
@@ -38,9 +39,6 @@ LONG_GAP = 20  # rows without a value, or at one place, in one piece
 LEAST = 5
 # Between levels of one place, at least: fading of who stands still is faster than it is deep
 STILL_DB = 10.0
-FEW = 0.005  # of a station's rows: fewer are no sign of a limit
-WEAK_DB = 6.0  # above the weakest value: heard only just
-BESIDE, ODDS = 6, 3.0  # values around; of missing ones to lie beside weak ones, for one of values
 
 
 def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
@@ -246,7 +244,7 @@ def still_warnings(levels: LinkLevels) -> list[str]:
     """
     still: dict[tuple[str, str, int], dict[str, float]] = defaultdict(dict)
     alone: dict[str, float] = {}
-    for t, used in levels.heard():
+    for t, used in levels.heard() if levels.ordered else ():
         moves = np.flatnonzero(np.diff(levels.position[used], axis=0).any(axis=1)) + 1
         if not len(moves) and len(used) >= LEAST and np.ptp(levels.level_db[used]) > STILL_DB:
             alone[levels.names[t]] = float(np.ptp(levels.level_db[used]))
@@ -309,6 +307,7 @@ def find_outlier_rows(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]
     for t, used in levels.heard():
         if len(used) < 4 * NEIGHBOURS:
             continue
+        used = used if levels.ordered else used[np.argsort(along_curve(levels.position[used]))]
         level = levels.level_db[used]
         difference = np.abs(level - median_filter(level, 2 * NEIGHBOURS + 1, mode="mirror"))
         wild = difference > max(OUTLIER_DB, SPREADS * 1.4826 * float(np.median(difference)))
@@ -343,6 +342,8 @@ def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) ->
 
 def find_level_steps(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
     """Return stations and their steps, which name rows of `levels`."""
+    if not levels.ordered:
+        return []
     steps = []
     blocks = int(
         np.clip(20 * MOST_BLOCKS / max(len(np.unique(levels.station)), 1), 200, MOST_BLOCKS)
@@ -356,61 +357,32 @@ def find_level_steps(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
 
 
 def gap_warnings(levels: LinkLevels) -> list[str]:
-    """Warn of missing levels: long runs of rows (a station was off), scattered ones (not heard?).
-
-    Missing values count as not heard where they lie beside weak ones far oftener than values do:
-    places tell, not the order of rows. A long run of others is an outage.
-    """
+    """Warn of missing levels: long runs of rows in an order (a station was off), scattered ones."""
     names, rows, warnings = levels.names, levels.rows, list[str]()
     # By first row, last row, length
     outages: dict[tuple[str, str, int], list[str]] = defaultdict(list)
-    silent, faint, plain = list[str](), dict[str, int](), dict[str, int]()  # how many, by station
+    silent, plain = list[str](), dict[str, int]()  # how many, by station
     for t, used in rows_by(levels.station):
-        name = str(names[t])
-        level = levels.level_db[used]
-        missing = ~np.isfinite(level)
-        if missing.all() or not missing.any():
-            silent += [name] * bool(missing.all())
+        missing = ~np.isfinite(levels.level_db[used])
+        if missing.all():
+            silent.append(names[t])
             continue
-        beside = _levels_beside(levels.position[used], level)
-        weak = beside < float(np.percentile(level[~missing], 1)) + WEAK_DB
-        sides = [(weak[rows].sum() + 1, (~weak[rows]).sum() + 1) for rows in (missing, ~missing)]
-        unheard = (weak & missing).sum() >= FEW * len(used)
-        unheard &= sides[0][0] * sides[1][1] >= ODDS * sides[0][1] * sides[1][0]
-        absent, count = np.flatnonzero(missing & ~(weak & unheard)), int(missing.sum())
-        for piece in np.split(absent, np.flatnonzero(np.diff(absent) > 1) + 1):
+        absent, count = np.flatnonzero(missing), int(missing.sum())
+        pieces = np.split(absent, np.flatnonzero(np.diff(absent) > 1) + 1)
+        for piece in pieces if levels.ordered else ():
             if len(piece) >= LONG_GAP:
-                outages[rows[used[piece[0]]], rows[used[piece[-1]]], len(piece)].append(name)
+                outages[rows[used[piece[0]]], rows[used[piece[-1]]], len(piece)].append(names[t])
                 count -= len(piece)
-        if count:
-            (faint if unheard else plain)[name] = count
-    if faint:
-        # First of all: what is not heard and not said so leaves weak stations far too strong.
-        text = (
-            f"{sum(faint.values())} levels are missing{_of([*faint], len(names))}, beside the "
-            "weakest ones"
-        )
-        advice = "not heard? then say dataset.absent=silent"
-        warnings.append(f"{advice}: {text}; left out, weak levels are predicted too high")
+        plain |= {names[t]: count} if count else {}
     for (first, last, length), who in sorted(outages.items(), key=lambda item: -item[0][2]):
         where = f"no level in the {length} rows from {first} to {last}{_of(who, len(names))}"
-        warnings.append(f"{where}: off, or not listed; these rows are not used")
+        warnings.append(f"{where}: off, not listed or not heard; these rows are not used")
     if silent:
         warnings.append(f"no level in any row{_of(silent, len(names))}")
     if plain:
         text = f"{sum(plain.values())} single levels missing{_of([*plain], len(names))}"
-        warnings.append(f"{text}, few or beside strong ones: lost or not listed; they are not used")
+        warnings.append(f"{text}: lost, not listed or not measured; they are not used")
     return warnings
-
-
-def _levels_beside(place: np.ndarray, level: np.ndarray) -> np.ndarray:
-    """Mean levels (n,) of the values nearest to each place (n, d) of one station,
-    its own left out.
-    """
-    heard = np.flatnonzero(np.isfinite(level))
-    near = heard[cKDTree(place[heard]).query(place, range(1, min(BESIDE + 1, len(heard)) + 1))[1]]
-    others = near != np.arange(len(place))[:, None]
-    return (level[near] * others).sum(axis=1) / others.sum(axis=1).clip(1)
 
 
 def _of(who: list[str], total: int) -> str:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsparc.base.errors import Severe, list_first
+from gsparc.base.errors import Question, Severe, list_first
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.schema import OTHER, End, Stations
 from gsparc.data.selection import take_rows
@@ -47,8 +47,12 @@ def add_absent(check: Checker, measured: str, count: int) -> None:
     )
 
 
-def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -> int:
+def add_unlisted(
+    check: Checker, stations: Stations, static: End, absent: str, listened: bool
+) -> int:
     """Add rows, twice as many as are heard, of what lists of the strongest or a floor leave out.
+
+    Of pairs that no row names nobody knows whether a receiver `listened`: that is asked.
 
     Returns how many lists leave out. Where `absent` is not `auto` what it does
     to figures is said alone.
@@ -79,8 +83,13 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
     listed = "the strongest alone" if lists.length == 1 else f"the {lists.length} strongest"
     missing = f"lists of {listed} of {count} stations"
     if bound is not None:
-        (floor, may), lists = bound, replace(lists, length=0)
         missing = "levels are missing beside weak ones alone"
+    if bound is not None and absent == "auto" and not listened:
+        how = "not heard, or not measured? say dataset.absent=weaker (below each station's "
+        how += "weakest), or dataset.absent=unknown (not measured, and not used)"
+        check.notes.append(Question(f"{missing}: {how}"))
+    if bound is not None:
+        (floor, may), lists = bound, replace(lists, length=0)
         how = (
             f"not heard, below each station's weakest ({np.nanmin(floor):.4g} to "
             f"{np.nanmax(floor):.4g} dB)"
@@ -101,7 +110,7 @@ def add_unlisted(check: Checker, stations: Stations, static: End, absent: str) -
         how = "a station that a full list leaves out is learned as below its weakest level"
         how += f", in lists shorter than {lists.length}: "
         how += "unknown, strong ones are lost there" if is_lossy else f"below {floor.min():.4g} dB"
-    if absent != "auto":
+    if absent not in ("auto", "weaker"):
         does = "unlisted ones are predicted too high, and figures of listed rows do not show it"
         if absent == "silent":
             weakest = np.nanmin(lists.level[lists.full], 1)

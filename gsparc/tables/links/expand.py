@@ -169,7 +169,8 @@ def _with_table(check: Checker, measured: str, part: Selection) -> Links | None:
     if measured == "rssi_db":
         forget_unknown(check, ends[0])  # before lists are looked for, in which they would be strong
     absent = check.raw.attributes.get("absent", "auto")
-    unlisted = add_unlisted(check, stations, static, absent) if measured == "rssi_db" else 0
+    levels, listened = measured == "rssi_db", not long
+    unlisted = add_unlisted(check, stations, static, absent, listened) if levels else 0
     if absent == "silent":
         add_absent(check, measured, len(stations))
     return censor_rows(check, measured, Links(static, stations), unlisted)

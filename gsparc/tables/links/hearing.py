@@ -35,7 +35,7 @@ def _are_levels(value: Any) -> bool:
 # Of powers that were not measured, by a setting or an attribute of the file: the default,
 # and what may be.
 SAID = {
-    "absent": ("auto", choice("auto", "unknown", "silent")),
+    "absent": ("auto", choice("auto", "weaker", "unknown", "silent")),
     "not_heard": (None, or_null(Limit("a list of levels [dB] like [-999]", _are_levels))),
     "saturation_db": ("auto", or_word(or_word(number(-MOST_DB, MOST_DB), "auto"), "none")),
 }

@@ -63,6 +63,11 @@ def _without_fix(check: Checker, measured: str) -> None:
         if np.abs(np.median(fixes, axis=0)).max() > least:  # else 0, 0 is a place like any other
             _unknown_at_zero(check, degrees)
             faults[f"{'latitude and longitude' if degrees else 'x and y'} are 0: no fix"] = null
+        middle = np.median(fixes, axis=0)
+        swapped = (np.abs(place[:, ::-1] - middle) < NO_FIX_DEG).all(axis=1) & degrees
+        swapped &= (np.abs(place - middle) > NO_FIX_DEG).any(axis=1)
+        if 2 * swapped.sum() < rows:
+            faults["latitude and longitude are exchanged"] = swapped
         # One value that repeats is a mark of a logger; several are faults only where they are few.
         if off.sum() <= max(1, FEW * rows) or (
             2 * off.sum() < rows and not np.ptp(place[off], axis=0).any()
