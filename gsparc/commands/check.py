@@ -47,6 +47,7 @@ def check(
     from gsparc.datasets.load import split_for
     from gsparc.datasets.own import read_any
     from gsparc.models.powers.together.network import check_azimuths
+    from gsparc.prediction.foreseen import describe_few_rows
     from gsparc.tables.checks.array_layout import carrier_warnings, layout_warnings
     from gsparc.tables.columns_file import write_columns
 
@@ -72,6 +73,8 @@ def check(
     if reading.raw is not None and reading.raw.roles:
         topics += [("columns", write_columns(path, reading.raw.roles, reading.raw.heads))]
     topics += [("note", note) for note in notes if not isinstance(note, Caution)]
+    if not questions and (few := describe_few_rows(reading.data)) is not None:
+        topics += [("few rows", few)]
     if any(" row " in warning for warning in warnings):
         topics += [("rows", "are counted from 0, as by split.leave_out and dataset.level_steps")]
     if (abs(stations.beams[:, 1]) > 0).any():
