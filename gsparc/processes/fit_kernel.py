@@ -17,6 +17,7 @@ from torch import Tensor
 from gsparc.processes.censored import PseudoValues
 from gsparc.processes.density import (
     TINY,
+    LeftOutSums,
     NegativeLogEvidence,
     ProfiledDensity,
     left_out_density,
@@ -41,6 +42,7 @@ WAVES = (0.37, 2.8)  # of these, that a search starts from
 SPANS = 3.0  # spacings between places, that the longer length starts from at least
 NOISES = (1e-4, 10.0)  # of the signal's power
 LEARNED_ON, TWO_LENGTH_LOOKS = 400, 8  # rows, and looks at them
+TAILS = 3.0  # degrees of freedom of what is known of numbers: many rows may go far from it
 
 
 class KernelRows(NamedTuple):
@@ -214,10 +216,10 @@ class NumberPrior:
         sizes = kernel[:lengths] - math.log(extent), 0.5 * amplitude, 0.5 * (amplitude + kernel[-1])
         known = self.length, self.deviation, self.noise
         parts = (
-            ((size - math.log(middle)) / spread).square().sum()
+            ((size - math.log(middle)) / spread).square().div(TAILS).log1p().sum()
             for size, (middle, spread) in zip(sizes, known, strict=True)
         )
-        return 0.5 * sum(parts, amplitude.new_zeros(()))
+        return 0.5 * (TAILS + 1) * sum(parts, amplitude.new_zeros(()))
 
 
 def fit_kernel_by_evidence(
@@ -233,8 +235,9 @@ def fit_kernel_by_evidence(
         start: where the search begins.
         views: rows of independent processes of one prior, such as those of several stations.
         looks: at all of them.
-        known: of the numbers; columns of views then are in the values' unit,
-            else in deviations of the process.
+        known: of the numbers; columns of views then are in the values' unit, else in deviations of
+            the process, and where all was heard the density of rows left out counts as much as the
+            evidence, which a process of another shape misleads.
         extent: of the rows, which lengths are known by [m].
 
     Returns:
@@ -253,7 +256,11 @@ def fit_kernel_by_evidence(
             total = known.cost(at[:-1], at[-1], len(start.signals), extent)
         for view, side, before in zip(views, sides, last, strict=True):
             gram = at[-1].exp() * view.gram(kernel, unit)
-            total = total + NegativeLogEvidence.apply(gram, view.values[:, 0], side, before)  # type: ignore[no-untyped-call]
+            evidence = NegativeLogEvidence.apply(gram, view.values[:, 0], side, before)  # type: ignore[no-untyped-call]
+            if known is not None and not side.any():
+                squares, precisions = LeftOutSums.apply(gram, view.values)  # type: ignore[no-untyped-call]
+                evidence = 0.5 * evidence + 0.25 * (squares - precisions)
+            total = total + evidence
         return total / count
 
     best = np.append(start.parameters().numpy(), math.log(start.amplitude))

@@ -62,9 +62,16 @@ def process_and_notes(
         mean: the prior mean; `auto` chooses.
         seed: of the rows that are drawn where there are too many.
     """
-    best = choose_candidate(rows, _candidate_laws(rows, site, mean), seed, CHOSEN_ON)
+    best = likeliest_candidate(rows, site, mean, seed)
     process, more = condition_on_powers(rows, best.prior, seed)
     return process, (best.description, *best.notes, *more)
+
+
+def likeliest_candidate(
+    rows: PowerRows, site: Site, mean: MeanName = "auto", seed: int = 0
+) -> KernelCandidate:
+    """Return what `process_and_notes` conditions on rows."""
+    return choose_candidate(rows, _candidate_laws(rows, site, mean), seed, CHOSEN_ON)
 
 
 class MeanLaw(NamedTuple):

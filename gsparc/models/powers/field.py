@@ -106,11 +106,11 @@ class PowerField(ClosedForm):
             UserTerm.from_site(t, site).centre(torch.from_numpy(seen.places))
             for t in self.own_terms
         )
-        walls, remarks = tuple[Columns, ...](), list[str]()
+        walls, remarks, about = tuple[Columns, ...](), list[str](), list[str]()
         if self.walls is not None:
             known = walls_in_frame(self.walls, site.origin, site.static_position)
             walls = (replace(known, loss_db=WALL_DB),)
-            remarks.append(f"losses in {len(known.sizes)} known walls and floors")
+            about.append(f"losses in {len(known.sizes)} known walls and floors")
         members = learn_members(seen, site, self.seed, chosen_on, terms, walls)
         self.priors, notes = weigh_members(seen, members, self.seed, chosen_on)
         # A level that silent rows are below is no power that waves could be fitted to.
@@ -134,7 +134,7 @@ class PowerField(ClosedForm):
             remarks.append(note)
             if self.fringes is not None:  # their share was learned beside this process
                 self.priors = ((1.0, self.priors[0][1]),)
-        return (*remarks, *notes)
+        return (*about, *notes, *remarks)
 
     def _used_maps(self) -> list[PriorMap]:
         """Maps from before that the mean has a share of."""

@@ -17,6 +17,7 @@ import torch
 
 from gsparc.data.schema import ENDS, Site
 from gsparc.models.baselines.distance_law import UNSEEN, locate_still_end, say_estimated
+from gsparc.models.baselines.likeliest import likeliest_candidate
 from gsparc.models.powers.known_numbers import known_numbers
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, subtract_means
 from gsparc.models.powers.prior_map import PriorMap
@@ -36,6 +37,7 @@ LEVEL_DB = 20.0  # deviation of a level before any row
 # Before any row: of a law about a known place, about one that is sought, of no law; of shapes
 LAW, SOUGHT, NONE = 3.0, 1.0, 1.0
 SHAPES = (ExponentialShadowing, 3.0), (Shadowing, 1.0)
+FREE, FREE_FROM = 9.0, 100  # belief in free numbers, and rows that tell them
 PLACE_NEEDS = 8  # rows that were heard, for a place that is sought
 LEARNED_ON = 500  # rows: numbers, and shares
 NEAREST_FROM = 1_000  # rows, from which on shape and numbers follow from the nearest ones
@@ -122,11 +124,23 @@ def learn_members(
                 PowerMember(trend, belief * weight, kernel, notes) for kernel, weight in shapes
             ]
     members = [learn_numbers(few, member, known, extent, LOOKS) for member in members]
+    count = len(rows.places)
+    if FREE_FROM <= count <= NEAREST_FROM and not (rows.silent.any() or terms or walls):
+        members.append(_likeliest(few, site, seed))
     if rows.silent.any() and not rows.silent.all():
         part = rows.draw_subset(most, seed)
         doubtful = rows_in_doubt(part, members[0].prior)
         members = [learn_numbers(doubtful, member, known, extent, WALKED) for member in members]
     return members
+
+
+def _likeliest(rows: PowerRows, site: Site, seed: int) -> PowerMember:
+    """The process that `model=gp` has: its numbers are free, and it is printed beside the rest."""
+    best = likeliest_candidate(rows, site, seed=seed)
+    deviation = math.sqrt(best.kernel.amplitude)
+    # Its level and slope are unsure by the process's own deviation.
+    trend = replace(best.trend, level_db=deviation, spread=best.trend.spread / deviation)
+    return PowerMember(trend, FREE, best.kernel, best.notes)
 
 
 def extent_of(rows: PowerRows) -> float:

@@ -7,7 +7,6 @@ import torch
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint, loading
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.powers.members import learn_members
 from gsparc.models.target_rows import power_rows
 from gsparc.processes import powers
 from gsparc.processes.kernel import EndShadowing, Kernel, Shadowing, WhiteNoise
@@ -63,9 +62,7 @@ def test_gains_of_nodes_were_shadows_of_links(tmp_path):
 
 @pytest.mark.slow
 def test_links_without_gains_have_none():
-    data = mesh(0.0)
-    members = learn_members(power_rows(data, np.arange(KNOWN)), data.site, 0)
-    kernel = members[1].kernel
+    kernel = fitted(mesh(0.0))[0].powers.kernel
     assert all(term.share < 0.05 for term in kernel.signals if isinstance(term, EndShadowing))
 
 

@@ -57,7 +57,7 @@ def test_a_prior_of_numbers_costs_nothing_in_its_middle():
     at, logarithm = start.parameters(), torch.tensor(start.amplitude, dtype=torch.float64).log()
     assert float(known.cost(at, logarithm, 1, 50.0)) == pytest.approx(0.0, abs=1e-12)
     wider = float(known.cost(at, logarithm + 2 * 0.5, 1, 50.0))  # of both, by a deviation each
-    assert wider == pytest.approx(1.0)
+    assert wider == pytest.approx(2 * 2 * np.log1p(1 / 3))  # Student's t, three degrees
 
 
 def test_each_kind_of_site_teaches_the_others_alike():

@@ -61,7 +61,8 @@ SUREST, TURNED = 0.75, 8  # of the largest gain, that are turned at a time; time
 TURNS = torch.arange(-180.0, 180.0, 10.0)  # of an azimuth [deg]
 GAINS = torch.arange(-12.0, 12.5, 2.0)  # [dB]
 ROUGH_LOOKS = 150  # evaluations, each of a sum over rows
-ROUGH_ON, LEARNED_ON = 20_000, 400  # rows of all sites; of each site, whose covariance is factored
+# Rows of all sites; of each site, whose covariance is factored, and where some were silent
+ROUGH_ON, LEARNED_ON, WEIGHED_ON = 20_000, 400, 160
 
 
 def find_sectors(data: Measurements, places: np.ndarray | None = None) -> Sectors | None:
@@ -317,9 +318,8 @@ def _fit_by_evidence(
 ) -> tuple[float, Sectors, Kernel]:
     """The log evidence of some rows of each site, and all settings of the largest."""
     rows, bands = rows.select_complete_places(), len(rough.levels)
-    parts = [
-        rows.select_station(number).draw_stretches(LEARNED_ON, seed) for number in rows.stations
-    ]
+    most = WEIGHED_ON if rows.silent.any() else LEARNED_ON
+    parts = [rows.select_station(number).draw_stretches(most, seed) for number in rows.stations]
     places = [torch.from_numpy(part.places) for part in parts]
     values = [torch.from_numpy(part.decibels) for part in parts]
     side = [torch.from_numpy(part.side) for part in parts]
