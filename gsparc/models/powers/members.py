@@ -37,7 +37,7 @@ LEVEL_DB = 20.0  # deviation of a level before any row
 # Before any row: of a law about a known place, about one that is sought, of no law; of shapes
 LAW, SOUGHT, NONE = 3.0, 1.0, 1.0
 SHAPES = (ExponentialShadowing, 3.0), (Shadowing, 1.0)
-FREE, FREE_FROM = 9.0, 100  # belief in free numbers, and rows that tell them
+FREE, FREE_FROM = 1.0, 100  # belief in free numbers, and rows that tell them
 PLACE_NEEDS = 8  # rows that were heard, for a place that is sought
 LEARNED_ON = 500  # rows: numbers, and shares
 NEAREST_FROM = 1_000  # rows, from which on shape and numbers follow from the nearest ones
@@ -75,10 +75,10 @@ class PowerMember:
         """Both; the trend is relative to the kernel's deviation."""
         return Prior(self.kernel, self.trend.in_unit(math.sqrt(self.kernel.amplitude)))
 
-    @property
-    def description(self) -> str:
-        """One line of the settings."""
-        mean = "a constant" if self.trend.law is None else "a distance law"
+    def describe(self, exponent: float) -> str:
+        """Return one line of the settings, with the exponent that rows say of its law."""
+        law = f"a distance law of exponent {exponent:.3g}"
+        mean = "a constant" if self.trend.law is None else law
         share = " and a share of the map" if self.has_map else ""
         return f"{self.kernel.description}, mean: {mean}{share}"
 
@@ -250,7 +250,11 @@ def weigh_members(
         most: rows that shares are learned on.
     """
     part, belief = rows.draw_subset(most, seed), np.array([m.belief for m in members])
-    errors = np.stack([_left_out_errors(part, member.prior, seed) for member in members], 1)
+    processes = [condition_on_powers(part, member.prior, seed)[0] for member in members]
+    errors = np.stack([_left_out_errors(part, process) for process in processes], 1)
+    exponents = {
+        id(m.trend): exponent_of(process) for m, process in zip(members, processes, strict=True)
+    }
     shares = shrunk_weights(errors, belief)
     bare = np.array([not member.has_map for member in members])
     if bare.any() and not bare.all():
@@ -262,10 +266,11 @@ def weigh_members(
     if len(rows.places) > NEAREST_FROM and not rows.silent.any():
         weighed = _by_nearest(rows, weighed, seed)
     weighed = sorted(weighed, key=lambda pair: -pair[0])
-    texts = [f"{share:.0%} of {member.description}" for share, member in weighed]
+    texts = [member.describe(exponents[id(member.trend)]) for _, member in weighed]
     notes = dict.fromkeys(note for _, member in weighed for note in member.notes)
-    if len(weighed) == 1:
-        texts = [weighed[0][1].description]
+    if len(weighed) > 1:
+        pairs = zip(weighed, texts, strict=True)
+        texts = [f"{share:.0%} of {text}" for (share, _), text in pairs]
     return tuple((share, member.prior) for share, member in weighed), (*texts, *notes)
 
 
@@ -284,9 +289,9 @@ def _by_nearest(
     return result
 
 
-def _left_out_errors(rows: PowerRows, prior: Prior, seed: int) -> np.ndarray:
+def _left_out_errors(rows: PowerRows, process: PowerProcess) -> np.ndarray:
     """Errors (n,) [dB] of rows that were heard, each predicted from all others."""
-    posterior = condition_on_powers(rows, prior, seed)[0].posterior
+    posterior = process.posterior
     assert isinstance(posterior, Exact)
     if rows.silent.all():
         return np.zeros(0)
