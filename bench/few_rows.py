@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from station_numbers import Station, stations
 
 import gsparc
@@ -65,6 +66,10 @@ def main() -> None:
                             if key not in done:
                                 writer.writerow([*key, *measure(station, known, asked, method)])
                                 output.flush()
+    table = pd.read_csv(file).pivot_table(
+        index=["split", "rows"], columns="method", values=["rmse_db", "inside_90", "fit_cpu_s"]
+    )
+    sys.stdout.write(f"{table.round(3).to_string()}\n")
 
 
 def measure(station: Station, known: np.ndarray, asked: np.ndarray, method: str) -> list[str]:

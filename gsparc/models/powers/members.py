@@ -1,7 +1,7 @@
 """Processes of powers that one station's rows are predicted by, and their shares.
 
-A member has a mean, a distance law or none, and a shape, rough or smoother. Its numbers have the
-largest evidence with what stations elsewhere teach (`known_numbers.py`); level and exponent are
+A member has a mean, a distance law or none, and a shape, rough or smoother. Its numbers are
+the likeliest with what stations elsewhere teach (`known_numbers.py`); level and exponent are
 integrated out. Shares have the least squared error at rows left out, shrunk towards what is
 believed before any row: with few rows a mean of members is safer than the best of them.
 """
@@ -41,7 +41,7 @@ FREE, FREE_FROM = 1.0, 100  # belief in free numbers, and rows that tell them
 PLACE_NEEDS = 8  # rows that were heard, for a place that is sought
 LEARNED_ON = 500  # rows: numbers, and shares
 NEAREST_FROM = 1_000  # rows, from which on shape and numbers follow from the nearest ones
-WALKED = 15  # looks of a member that begins where the first ended, of one that hears of silence
+WALKED = 15  # looks at silent rows, from numbers that rows that were heard have
 ASKED = 200  # places, whose error is foreseen
 MAP_PAYS = 0.05  # of the squared errors at rows left out that a map must take off
 
@@ -61,7 +61,7 @@ class PowerMember:
     Attributes:
         trend: of which deviations are in decibels.
         belief: its weight before any row.
-        kernel: of the largest evidence.
+        kernel: see `fit_kernel_by_evidence`; before rows were looked at, the usual one.
         notes: what must be said of it.
     """
 
@@ -199,7 +199,7 @@ def means(rows: PowerRows, site: Site, walls: tuple[Columns, ...]) -> list[Level
 def learn_numbers(
     rows: PowerRows, member: PowerMember, known: NumberPrior, extent: float, looks: int
 ) -> PowerMember:
-    """Return the member with numbers of the largest evidence, beginning at its own.
+    """Return the member with its likeliest numbers, beginning at its own.
 
     Args:
         rows: at least one.
