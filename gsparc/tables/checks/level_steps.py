@@ -8,7 +8,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from gsparc.data.spacing import neighbour_distance
 from gsparc.processes.few_rows import evenly_spaced
 from gsparc.processes.level_field import NUGGETS, fit_level_field
 
@@ -19,6 +21,9 @@ LEAST_ROWS = 60
 SHORTEST = 1 / 20  # part of a station's rows between two steps
 LEAST_DB = 10.0  # smaller ones are common between campaigns, and cost a model little
 LEAST_SIGMAS = 6.0  # of the estimate; shadowing is not Gaussian, and every row is tried
+FAR_M = 1e9  # between devices, which share no place
+# Usual steps that rows of one place lie apart at most; of them before and after a step that tell
+SAME_PLACE, LEAST_PAIRS = 3.0, 5
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,7 @@ def detect_level_steps(
     level_db: np.ndarray,
     station_position: np.ndarray | None = None,
     most_blocks: int = MOST_BLOCKS,
+    device: np.ndarray | None = None,
 ) -> tuple[LevelStep, ...]:
     """Find where the level of one station changes though the places do not explain it.
 
@@ -49,13 +55,15 @@ def detect_level_steps(
     generalised least-squares estimate and its variance follow from two cumulative sums of the
     inverse covariance; the largest is kept, and the search repeated with it, like binary
     segmentation (Scott and Knott, Biometrics 30, 1974).
-    Places seen before and after a step count most, as they should.
+    Places seen before and after a step count most, as they should; one that the same device does
+    not see there is no step.
 
     Args:
         position: (n, 2) or (n, 3) [m], in the order of measuring.
         level_db: (n,) [dB], NaN where there is none.
         station_position: (2,) or (3,) [m]; None: the level is not tied to a distance.
         most_blocks: rows are averaged to at most so many (median), against outliers and for speed.
+        device: (n,) labels of what measured; None: one.
     """
     rows = np.flatnonzero(np.isfinite(level_db))
     if len(rows) < LEAST_ROWS or not np.ptp(position[rows], axis=0).any():
@@ -79,7 +87,34 @@ def detect_level_steps(
         for k, change in zip(*_search(precision, level, regressors), strict=True)
         if abs(change) >= LEAST_DB
     ]
-    return tuple(sorted(steps, key=lambda step: step.first))
+    steps.sort(key=lambda step: step.first)
+    edges = [0, *(step.first for step in steps), len(position)]
+    around = zip(steps, edges, edges[2:], strict=False)
+    place = (
+        position
+        if device is None
+        else np.c_[position, np.unique(device, return_inverse=True)[1] * FAR_M]
+    )
+    return tuple(
+        step for step, start, end in around if _seen_again(place, level_db, rows, step, start, end)
+    )
+
+
+def _seen_again(
+    place: np.ndarray, level_db: np.ndarray, rows: np.ndarray, step: LevelStep, start: int, end: int
+) -> bool:
+    """Whether rows at one place before and after a step, from `start` to `end`, differ by it."""
+    before, after = (
+        rows[(rows >= start) & (rows <= step.last)],
+        rows[(rows >= step.first) & (rows < end)],
+    )
+    apart, nearest = cKDTree(place[before]).query(place[after])
+    same = apart <= SAME_PLACE * neighbour_distance(place[rows])
+    change = level_db[after] - level_db[before[nearest]]
+    if same.sum() < LEAST_PAIRS:
+        return False
+    seen = float(np.median(change[same])) * np.sign(step.change_db)
+    return seen >= LEAST_DB
 
 
 def _blocks(rows: np.ndarray, most: int) -> list[np.ndarray]:

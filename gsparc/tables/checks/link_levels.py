@@ -9,14 +9,19 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.distance import cdist
 
 from gsparc.data.blocks import rows_by
 from gsparc.data.schema import Measurements
 from gsparc.data.selection import FROM_ROW
 from gsparc.physics.decibels import to_decibels
+from gsparc.processes.few_rows import evenly_spaced
 from gsparc.tables.links.strongest import ALONE
 
-ORDERED, LEAST_PLACES = 0.5, 20  # of the distance of any two places; changes of place
+# Moves of which that share lead to a place nearer than all but a tenth of the others are an order;
+# of a few places, to one of the nearest; changes of place that tell, and that are looked at
+ORDERED, NEARER, NEAREST = 0.8, 0.1, 8
+LEAST_PLACES, SAMPLE = 20, 500
 UNNAMED = "the station"  # a single one, of a file without stations
 
 
@@ -35,6 +40,7 @@ class LinkLevels:
         station_position: (T, 3), in the world [m]; NaN where it is not known.
         limited: stations with rows below a level of hearing that the file states, or that lists
             leave out.
+        device: (n,) int64, what measured a row; None where nothing tells.
     """
 
     position: np.ndarray
@@ -46,20 +52,22 @@ class LinkLevels:
     keys: list[str]
     station_position: np.ndarray
     limited: frozenset[int] = frozenset()
+    device: np.ndarray | None = None
 
     @cached_property
     def ordered(self) -> bool:
-        """Whether rows are in an order of time or place: nearer to the one before than to others.
+        """Whether rows are in an order of place: most moves lead to one of the places around.
 
-        Where they are not, no question of the rows before and after means anything.
+        Where they do not, no question of the rows before and after means anything. A median step
+        is no sign of it: one phone's rows may follow a way, and another's stand anyhow.
         """
-        moves = np.r_[True, (np.diff(self.position, axis=0) != 0).any(1)]
-        place = self.position[moves]
+        place = self.position[np.r_[True, (np.diff(self.position, axis=0) != 0).any(1)]]
         if len(place) < LEAST_PLACES:
             return True
-        other = np.random.default_rng(0).permutation(place)
         step = np.linalg.norm(np.diff(place, axis=0), axis=1)
-        return bool(np.median(step) < ORDERED * np.median(np.linalg.norm(place - other, axis=1)))
+        some, others = evenly_spaced(len(step), SAMPLE), evenly_spaced(len(place), SAMPLE)
+        nearer = (cdist(place[some], place[others]) < step[some, None]).mean(1)
+        return bool(np.quantile(nearer, ORDERED) <= max(NEARER, NEAREST / len(place)))
 
     def heard(self) -> Iterator[tuple[int, np.ndarray]]:
         """Yield each station, and its rows (k,) with a value."""
@@ -114,4 +122,7 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     number = of_row if file_row is None else file_row[of_row]
     place = data.moving[of_row] + site.origin
     positions = stations.position + site.origin
-    return LinkLevels(place, of_link, levels, of_file, number, names, keys, positions, limited)
+    device = None if data.device is None else data.device[of_row]
+    return LinkLevels(
+        place, of_link, levels, of_file, number, names, keys, positions, limited, device
+    )

@@ -351,7 +351,9 @@ def find_level_steps(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
     for t, used in rows_by(levels.station):
         where = levels.station_position[t]
         where = where if np.isfinite(where).all() else None
-        for step in detect_level_steps(levels.position[used], levels.level_db[used], where, blocks):
+        device = None if levels.device is None else levels.device[used]
+        rows = levels.position[used], levels.level_db[used]
+        for step in detect_level_steps(*rows, where, blocks, device):
             steps.append((t, replace(step, last=int(used[step.last]), first=int(used[step.first]))))
     return steps
 

@@ -420,3 +420,26 @@ def test_rows_in_dbw_beside_others_in_dbm_were_good(share):
     half = rng.random(len(levels.level_db)) < share
     (said,) = plausibility.two_unit_warnings(replace(levels, level_db=levels.level_db - 30 * half))
     assert said.endswith("in two units?")
+
+
+def test_rows_of_which_half_follow_a_way_are_in_no_order():
+    """A median step of 134 m where any two places lie 600 m apart was taken for an order: steps of
+    -16 and +14 dB were claimed of a file of two phones, one of which stands anyhow.
+    """
+    place, level, _ = walk(4, 400)
+    rows = np.r_[:200, 200 + np.random.default_rng(0).permutation(200)]
+    level[200:] += 20
+    links = as_links(place[rows], level[rows, None], ["a"])
+    assert as_links(place, level[:, None], ["a"]).ordered and not links.ordered
+    assert plausibility.find_level_steps(links) == []
+
+
+def test_a_step_is_claimed_from_places_that_one_device_saw_before_and_after():
+    """Another phone in the second half, or another street, was a station that had changed."""
+    place, level, station = walk(4, 400)
+    twice, again = np.tile(place, (2, 1)), np.r_[level, level + 20]
+    phone = np.repeat([0, 1], 400)
+    assert len(detect_level_steps(twice, again, station)) == 1
+    assert detect_level_steps(twice, again, station, device=phone) == ()
+    elsewhere = np.r_[place, place + [[1e3, 0]]]
+    assert detect_level_steps(elsewhere, again) == ()
