@@ -11,15 +11,17 @@ import weakref
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from gsparc.data.blocks import row_blocks, take
+from gsparc.data.blocks import row_blocks
 from gsparc.data.moments import number_moments
 from gsparc.data.schema import Measurements
 from gsparc.data.spacing import number_places
 from gsparc.data.splits import Fold
 
 BITS = 20  # of a coordinate, of three; of both ends half as many
-REVISITED = 0.25  # of the places with several rows: from there on equal powers were measured again
+PACKETS = 8  # different levels of a fix, from which on equal ones count as often as they are
+MARKED_DB = 20.0  # from the mean of a fix, that no level of it is away
 
 
 def hash_rows(*arrays: np.ndarray | None) -> np.ndarray:
@@ -43,38 +45,98 @@ def hash_rows(*arrays: np.ndarray | None) -> np.ndarray:
     return result
 
 
-def find_copies(place: np.ndarray, link: np.ndarray, values: np.ndarray) -> np.ndarray:
+def find_copies(link: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Tell which rows (n,) repeat earlier ones,
     as of a packet logged twice or of files that overlap.
 
-    Coarse levels of a place that was visited again agree by chance: where visits differ, rows are
-    copies only if all of them stand there equally often.
+    >>> find_copies(np.array([0, 1, 0]), np.array([[2j], [2j], [2j]]))
+    array([False, False,  True])
 
     Args:
-        place, link: (n,) numbers of where a row was measured, and of where and with which station.
+        link: (n,) numbers of where and with which station a row was measured.
         values: (n, ...) that were measured.
     """
-    of, size = np.unique(link, return_inverse=True, return_counts=True)[1:]
-    rows = np.flatnonzero(size[of] > 1)
-    copies, at = np.zeros(len(link), bool), place[rows]
-    if not len(rows):
-        return copies
-    first, which, count = np.unique(
-        hash_rows(link[rows], take(values, rows)),
-        return_index=True,
-        return_inverse=True,
-        return_counts=True,
-    )[1:]
-    turn = np.empty(len(rows), np.int64)  # how often each stood there before
-    turn[np.argsort(which, kind="stable")] = np.arange(len(rows)) - np.repeat(
+    turn, _ = _turns(hash_rows(link, values))
+    return turn > 0
+
+
+def merge_fixes(
+    position: np.ndarray,
+    link: np.ndarray,
+    fix: np.ndarray,
+    station: np.ndarray,
+    level_db: np.ndarray,
+    device: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return levels (n,), of rows of one fix their mean,
+    and which rows (n,) bool that leaves over.
+
+    A phone logs a fix several times, and copies: rows that agree better than those of places next
+    to each other are one measurement, with the error of its place. Where they differ as much they
+    are visits, which are copies only if all of them stand there equally often. The place of a copy
+    may jitter (`link`), that of a fix is one (`fix`).
+
+    >>> place, level = np.c_[[0.0, 0, 9, 20]], np.array([-70.0, -71, -90, -60])
+    >>> merge_fixes(place, *np.array([[0, 0, 1, 2]] * 2), np.zeros(4), level, np.zeros(4))
+    (array([-70.5, -71. , -90. , -60. ]), array([False,  True, False, False]))
+
+    Args:
+        position: (n, D) [m].
+        link, fix: (n,) numbers of where, with which station and by which device a row was measured.
+        station: (n,) labels.
+        level_db: (n,) [dB], not finite where nothing was heard.
+        device: (n,) labels, each of which is judged alone.
+    """
+    silent = ~np.isfinite(level_db)
+    result, over = level_db.copy(), silent.copy()
+    if silent.any():
+        over[silent] = find_copies(link[silent], level_db[silent])
+    for name in np.unique(device):
+        rows = np.flatnonzero((device == name) & ~silent)
+        if not len(rows):
+            continue
+        level, turned = level_db[rows], _turns(hash_rows(link[rows], level_db[rows]))
+        _, first, of = np.unique(fix[rows], return_index=True, return_inverse=True)
+        # Of different values alone, or copies would decide; sums in an order that no file has
+        _, once, copies = np.unique(np.c_[of, level], axis=0, return_index=True, return_counts=True)
+        differ = np.bincount(of[once])
+        copies = np.where(differ[of[once]] < PACKETS, 1, copies)
+        mean = np.bincount(of[once], copies * level[once]) / np.bincount(of[once], copies)
+        away = level[once] - mean[of[once]]
+        # Beyond that a mark of what was not heard stands among levels.
+        whole = np.bincount(of[once], np.abs(away) > MARKED_DB) == 0
+        away = away[whole[of[once]]]
+        within = float(away @ away) / max(int((differ[whole] - 1).sum()), 1)
+        if within <= _difference(position[rows[first]], station[rows[first]], mean):
+            result[rows[first[whole]]] = mean[whole]
+            over[rows] = (turned[0] > 0) | (whole[of] & (np.arange(len(rows)) != first[of]))
+        else:
+            over[rows] = turned[0] >= turned[1] // np.gcd.reduce(turned[1])
+    return result, over
+
+
+def _turns(number: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How often each of numbers (n,) stood there before, and stands there in all."""
+    _, which, count = np.unique(number, return_inverse=True, return_counts=True)
+    turn = np.empty(len(number), np.int64)
+    turn[np.argsort(which, kind="stable")] = np.arange(len(number)) - np.repeat(
         np.cumsum(count) - count, count
     )
-    differing = at[np.bincount(of[rows[first]])[of[rows]] > 1]
-    once = np.ones(len(count), np.int64)
-    if values[0].size == 1 and len(np.unique(differing)) >= REVISITED * len(np.unique(at)):
-        once = count // (np.gcd.reduce(count) if len(rows) == len(link) else 1)
-    copies[rows] = turn >= once[which]
-    return copies
+    return turn, count[which]
+
+
+def _difference(position: np.ndarray, station: np.ndarray, level: np.ndarray) -> float:
+    """Mean square of what levels (n,) [dB] of places next to each other differ by, halved;
+    infinite of one place.
+    """
+    squares = [np.zeros(0)]
+    for number in np.unique(station):
+        rows = np.flatnonzero(station == number)
+        if len(rows) > 1:
+            near = cKDTree(position[rows]).query(position[rows], k=2)[1][:, 1]
+            squares.append((level[rows] - level[rows[near]]) ** 2 / 2)
+    whole = np.concatenate(squares)
+    return float(whole.mean()) if len(whole) else np.inf
 
 
 def order_rows(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:

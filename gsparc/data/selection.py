@@ -19,14 +19,15 @@ from gsparc.base.errors import DataError, list_first, suggest_name
 from gsparc.base.limits import Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.blocks import take
-from gsparc.data.row_order import find_copies, hash_rows
+from gsparc.data.row_order import find_copies, hash_rows, merge_fixes
 from gsparc.data.schema import FIELDS, Stations, list_arrays_with_axis
 from gsparc.data.spacing import group_visits
 from gsparc.data.station_names import find_station
-from gsparc.physics.decibels import to_decibels
+from gsparc.physics.decibels import from_decibels, to_decibels
 
 FROM_ROW = " from row "  # in the name of a station that another one became by a step of its level
 FEWEST = 2  # rows of a dataset
+FIX_S = 60.0  # that rows of one fix are apart at most
 SEED = 0  # of the rows that `max_rows` keeps: the same in every run
 # Names of arrays with a row per sample or path, and how many axes they then have.
 ROW_AXES, PATH_AXES = list_arrays_with_axis("S"), list_arrays_with_axis("P")
@@ -177,9 +178,8 @@ def select(
             # NaN compares as False and stays missing.
             level = to_decibels(arrays[measured]) if measured == "rssi" else arrays[measured]
             arrays = kept(option, np.logical_not(level < part.min_rssi_db))
-    arrays = kept(
-        "copies of other rows (same places, station and values)", ~_copies(arrays, measured)
-    )
+    arrays, copies, how = _copies(arrays, measured)
+    arrays = kept(how, ~copies)
     if part.max_rows is not None:
         arrays = kept(
             f"dataset.max_rows={part.max_rows}", _spread(arrays["file_row"], part.max_rows)
@@ -187,15 +187,20 @@ def select(
     return arrays, stations, notes
 
 
-def _copies(arrays: Arrays, measured: str) -> np.ndarray:
+def _copies(arrays: Arrays, measured: str) -> tuple[Arrays, np.ndarray, str]:
+    """Arrays with means of levels that were read at one fix, the rows beyond,
+    and what these are.
+    """
     rows, number, device = len(arrays[measured]), arrays.get("station"), arrays.get("device")
     ends = [arrays.get(f"{end}_position", np.zeros(0)) for end in ("rx", "tx")]
     places = [
         end.astype(np.float64) for end in ends if end.shape == (rows, 3) and end.dtype.kind in "iuf"
     ]
+    how = "copies of other rows (same places, station and values)"
     if not places:  # one that repeats is no row's own
-        return np.zeros(rows, bool)
+        return arrays, np.zeros(rows, bool), how
     place, whole = hash_rows(*places), np.hstack(places)
+    exact = place.copy()
     valid = np.flatnonzero((np.abs(whole) <= FARTHEST).all(axis=1))
     # The position of a packet that is logged twice may jitter; real visits differ in their levels.
     if len(valid) > 1 and (near := group_visits(whole[valid])) is not None:
@@ -204,7 +209,26 @@ def _copies(arrays: Arrays, measured: str) -> np.ndarray:
     if device is not None:
         alike = np.unique(device.astype(str), return_inverse=True)[1].reshape(-1)
         device = alike if len(alike) == rows else None
-    return find_copies(place, hash_rows(place, number, device), arrays[measured])
+    values = arrays[measured]
+    if measured not in ("rssi", "rssi_db") or values.shape != (rows,) or values.dtype.kind != "f":
+        return arrays, find_copies(hash_rows(place, number, device), values), how
+    run, time, carrier = (arrays.get(n, np.zeros(0)) for n in ("run", "time_s", "carrier_hz"))
+    run = np.unique(run, return_inverse=True)[1].reshape(-1) if run.shape == (rows,) else None
+    carrier = carrier if carrier.shape == (rows,) else None
+    minute = time // FIX_S if time.shape == (rows,) and time.dtype.kind in "iuf" else None
+    link, fix = (hash_rows(at, number, device, run, minute, carrier) for at in (place, exact))
+    none = np.zeros(rows, np.int64)
+    of_row = (none if number is None else number), (none if device is None else device)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        level = to_decibels(values) if measured == "rssi" else values.astype(np.float64)
+    finite = np.where((np.abs(whole) <= FARTHEST).all(1), level, np.nan)
+    means, copies = merge_fixes(whole, link, fix, of_row[0], finite, of_row[1])
+    changed = np.isfinite(means) & (means != level)
+    if changed.any():
+        mean = from_decibels(means) if measured == "rssi" else means
+        arrays = {**arrays, measured: np.where(changed, mean, values).astype(values.dtype)}
+        how = "rows of one fix are one, with their mean level, and copies"
+    return arrays, copies, how
 
 
 def _there(stations: Stations | None, name: str, source: str) -> Stations:

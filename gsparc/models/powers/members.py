@@ -22,9 +22,10 @@ from gsparc.models.powers.known_numbers import known_numbers
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, subtract_means
 from gsparc.models.powers.prior_map import PriorMap
 from gsparc.models.stack import shrunk_weights
+from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.fit_kernel import LOOKS, NumberPrior, fit_kernel_by_evidence
 from gsparc.processes.kernel import ExponentialShadowing, Kernel, Shadowing
-from gsparc.processes.nearest import Nearest, choose_kernel_by_nearest
+from gsparc.processes.nearest import Nearest, choose_kernel_by_nearest, condition_on_nearest
 from gsparc.processes.places import has_both_ends
 from gsparc.processes.posterior import Exact
 from gsparc.processes.powers import PowerProcess, PowerRows, condition_on_powers, rows_in_doubt
@@ -41,6 +42,7 @@ FREE, FREE_FROM = 1.0, 100  # belief in free numbers, and rows that tell them
 PLACE_NEEDS = 8  # rows that were heard, for a place that is sought
 LEARNED_ON = 500  # rows: numbers, and shares
 NEAREST_FROM = 1_000  # rows, from which on shape and numbers follow from the nearest ones
+JUDGED_ON = 1_000  # places, that shares are learned on where the nearest rows tell of each
 WALKED = 15  # looks at silent rows, from numbers that rows that were heard have
 ASKED = 200  # places, whose error is foreseen
 MAP_PAYS = 0.05  # of the squared errors at rows left out that a map must take off
@@ -124,8 +126,7 @@ def learn_members(
                 PowerMember(trend, belief * weight, kernel, notes) for kernel, weight in shapes
             ]
     members = [learn_numbers(few, member, known, extent, LOOKS) for member in members]
-    count = len(rows.places)
-    if FREE_FROM <= count <= NEAREST_FROM and not (rows.silent.any() or terms or walls):
+    if len(rows.places) >= FREE_FROM and not (rows.silent.any() or terms or walls):
         members.append(_likeliest(few, site, seed))
     if rows.silent.any() and not rows.silent.all():
         part = rows.draw_subset(most, seed)
@@ -277,16 +278,24 @@ def weigh_members(
 def _by_nearest(
     rows: PowerRows, weighed: list[tuple[float, PowerMember]], seed: int
 ) -> list[tuple[float, PowerMember]]:
-    """A member for each mean, with a shape and numbers that rows say of others near them."""
-    result = []
+    """A member for each mean, with a shape and numbers that rows say of others near them,
+    and shares of the least error at places predicted from these.
+    """
+    result, values = [], rows.means_at_places()
+    some = torch.from_numpy(draw_rows(len(values.places), JUDGED_ON, seed))
+    errors = []
     for trend in {id(member.trend): member.trend for _, member in weighed}.values():
         alike = [(share, member) for share, member in weighed if member.trend is trend]
         member = max(alike, key=lambda pair: pair[0])[1]
         if member.kernel.is_isotropic:
-            kernel, how = choose_kernel_by_nearest(member.prior, rows.means_at_places(), seed)
+            kernel, how = choose_kernel_by_nearest(member.prior, values, seed)
             member = replace(member, kernel=kernel, notes=(*member.notes, f"then {how}"))
         result.append((sum(share for share, _ in alike), member))
-    return result
+        answers = condition_on_nearest(member.prior, values, seed).left_out(some).mean
+        errors.append((answers - values.values[some])[:, 0].numpy())
+    # Among many rows it hardly matters what levels are about: equals, before these errors.
+    shares = shrunk_weights(np.stack(errors, 1), np.ones(len(result)))
+    return [(float(shares[k]), result[k][1]) for k in np.flatnonzero(shares)]
 
 
 def _left_out_errors(rows: PowerRows, process: PowerProcess) -> np.ndarray:
