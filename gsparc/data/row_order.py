@@ -11,7 +11,6 @@ import weakref
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from gsparc.data.blocks import row_blocks
 from gsparc.data.moments import number_moments
@@ -20,6 +19,7 @@ from gsparc.data.spacing import number_places
 from gsparc.data.splits import Fold
 
 BITS = 20  # of a coordinate, of three; of both ends half as many
+REVISITED = 0.5  # of a device's places: where more hold different levels, rows are visits
 PACKETS = 8  # different levels of a fix, from which on equal ones count as often as they are
 MARKED_DB = 20.0  # from the mean of a fix, that no level of it is away
 
@@ -61,29 +61,21 @@ def find_copies(link: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def merge_fixes(
-    position: np.ndarray,
-    link: np.ndarray,
-    fix: np.ndarray,
-    station: np.ndarray,
-    level_db: np.ndarray,
-    device: np.ndarray,
+    link: np.ndarray, fix: np.ndarray, level_db: np.ndarray, device: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return levels (n,), of rows of one fix their mean,
     and which rows (n,) bool that leaves over.
 
-    A phone logs a fix several times, and copies: rows that agree better than those of places next
-    to each other are one measurement, with the error of its place. Where they differ as much they
-    are visits, which are copies only if all of them stand there equally often. The place of a copy
-    may jitter (`link`), that of a fix is one (`fix`).
+    A phone logs a fix several times, and copies: one measurement, with the error of its place.
+    Where most places hold several levels they were visited, and visits are copies only if all of
+    them stand there equally often. The place of a copy may jitter (`link`), that of a fix is one.
 
-    >>> place, level = np.c_[[0.0, 0, 9, 20]], np.array([-70.0, -71, -90, -60])
-    >>> merge_fixes(place, *np.array([[0, 0, 1, 2]] * 2), np.zeros(4), level, np.zeros(4))
+    >>> fix, level = np.array([0, 0, 1, 2]), np.array([-70.0, -71, -90, -60])
+    >>> merge_fixes(fix, fix, level, np.zeros(4))
     (array([-70.5, -71. , -90. , -60. ]), array([False,  True, False, False]))
 
     Args:
-        position: (n, D) [m].
         link, fix: (n,) numbers of where, with which station and by which device a row was measured.
-        station: (n,) labels.
         level_db: (n,) [dB], not finite where nothing was heard.
         device: (n,) labels, each of which is judged alone.
     """
@@ -102,12 +94,9 @@ def merge_fixes(
         differ = np.bincount(of[once])
         copies = np.where(differ[of[once]] < PACKETS, 1, copies)
         mean = np.bincount(of[once], copies * level[once]) / np.bincount(of[once], copies)
-        away = level[once] - mean[of[once]]
         # Beyond that a mark of what was not heard stands among levels.
-        whole = np.bincount(of[once], np.abs(away) > MARKED_DB) == 0
-        away = away[whole[of[once]]]
-        within = float(away @ away) / max(int((differ[whole] - 1).sum()), 1)
-        if within <= _difference(position[rows[first]], station[rows[first]], mean):
+        whole = np.bincount(of[once], np.abs(level[once] - mean[of[once]]) > MARKED_DB) == 0
+        if (differ > 1).mean() <= REVISITED:
             result[rows[first[whole]]] = mean[whole]
             over[rows] = (turned[0] > 0) | (whole[of] & (np.arange(len(rows)) != first[of]))
         else:
@@ -123,20 +112,6 @@ def _turns(number: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         np.cumsum(count) - count, count
     )
     return turn, count[which]
-
-
-def _difference(position: np.ndarray, station: np.ndarray, level: np.ndarray) -> float:
-    """Mean square of what levels (n,) [dB] of places next to each other differ by, halved;
-    infinite of one place.
-    """
-    squares = [np.zeros(0)]
-    for number in np.unique(station):
-        rows = np.flatnonzero(station == number)
-        if len(rows) > 1:
-            near = cKDTree(position[rows]).query(position[rows], k=2)[1][:, 1]
-            squares.append((level[rows] - level[rows[near]]) ** 2 / 2)
-    whole = np.concatenate(squares)
-    return float(whole.mean()) if len(whole) else np.inf
 
 
 def order_rows(data: Measurements, fold: Fold) -> tuple[Measurements, Fold]:

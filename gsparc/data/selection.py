@@ -217,12 +217,11 @@ def _copies(arrays: Arrays, measured: str) -> tuple[Arrays, np.ndarray, str]:
     carrier = carrier if carrier.shape == (rows,) else None
     minute = time // FIX_S if time.shape == (rows,) and time.dtype.kind in "iuf" else None
     link, fix = (hash_rows(at, number, device, run, minute, carrier) for at in (place, exact))
-    none = np.zeros(rows, np.int64)
-    of_row = (none if number is None else number), (none if device is None else device)
+    reader = np.zeros(rows, np.int64) if device is None else device
     with np.errstate(divide="ignore", invalid="ignore"):
         level = to_decibels(values) if measured == "rssi" else values.astype(np.float64)
     finite = np.where((np.abs(whole) <= FARTHEST).all(1), level, np.nan)
-    means, copies = merge_fixes(whole, link, fix, of_row[0], finite, of_row[1])
+    means, copies = merge_fixes(link, fix, finite, reader)
     changed = np.isfinite(means) & (means != level)
     if changed.any():
         mean = from_decibels(means) if measured == "rssi" else means

@@ -67,10 +67,9 @@ def test_rows_that_stand_twice_count_once(kind, copied):
 
 
 def visits():
-    """Places, links, stations, levels and devices of ten visits of twenty places."""
-    rng = np.random.default_rng(0)
+    """Links, fixes, levels and devices of ten visits of twenty places."""
     place = np.repeat(np.arange(20), 10)
-    return np.c_[7.0 * place], place, place, place * 0, np.round(rng.normal(-70, 1, 200)), place * 0
+    return place, place, np.round(np.random.default_rng(0).normal(-70, 1, 200)), place * 0
 
 
 def test_equal_whole_decibels_of_visits_are_measurements():
@@ -79,7 +78,7 @@ def test_equal_whole_decibels_of_visits_are_measurements():
     """
     rows = visits()
     levels, over = merge_fixes(*rows)
-    assert not over.any() and np.array_equal(levels, rows[4])
+    assert not over.any() and np.array_equal(levels, rows[2])
     twice = np.tile(np.arange(200), 2)
     assert merge_fixes(*(part[twice] for part in rows))[1].sum() == 200
 
@@ -88,11 +87,10 @@ def test_one_phone_that_copies_its_rows_does_not_decide_for_another():
     """A share of the file's places decided: of one file 7,440 rows were left out, of another with
     the same layout none.
     """
-    place, link, fix, station, level, device = visits()
-    level = level + np.random.default_rng(1).normal(0, 12, 20)[link]  # shadowing of each place
+    link, fix, level, device = visits()
     copied = np.repeat(np.arange(0, 200, 10), 30)
-    copied = [part[copied] for part in (place, link + 20, fix + 20, station, level, device + 1)]
-    parts = zip((*visits()[:5], device), copied, strict=True)
+    copied = [part[copied] for part in (link + 20, fix + 20, level, device + 1)]
+    parts = zip(visits(), copied, strict=True)
     _, over = merge_fixes(*(np.concatenate(part) for part in parts))
     assert not over[:200].any() and over[200:].sum() == 20 * 29
 
@@ -101,20 +99,16 @@ def test_one_phone_that_copies_its_rows_does_not_decide_for_another():
 def test_rows_of_one_fix_are_one_row_with_or_without_copies(copies):
     """A phone that stood for a minute at one fix counted as a hundred measurements there."""
     rng = np.random.default_rng(2)
-    place = np.c_[3.0 * np.arange(30)]
     level = rng.normal(-80, 6, 30).round()
     still = np.r_[np.arange(30), [4] * 40]
     levels = np.r_[level, level[4] + rng.choice([-1, 0, 1], 40)]
     rows = np.repeat(np.arange(70), copies)
-    none = np.zeros(70 * copies, np.int64)
-    merged, over = merge_fixes(
-        place[still[rows]], still[rows], still[rows], none, levels[rows], none
-    )
+    merged, over = merge_fixes(still[rows], still[rows], levels[rows], 0 * rows)
     assert (~over).sum() == 30
     assert merged[~over][4] == pytest.approx(level[4])  # of three values
     # A mark is no level of that fix, whose rows stay, each value once
     with_marks = np.where(np.arange(70) == 50, -140.0, levels)
-    _, over = merge_fixes(place[still], still, still, none[:70], with_marks, none[:70])
+    _, over = merge_fixes(still, still, with_marks, 0 * still)
     assert (~over).sum() == 29 + 4
 
 
