@@ -80,11 +80,12 @@ class Campaign(DataModule):
         """Read, select and interpret; what is left out and what looks wrong is logged."""
         reading = interpret(self.raw(), self.file, self.selection)
         self.notes = reading.notes
+        warnings, _, _ = find_implausible(reading.data, reading.file_row)
+        warnings += [note for note in reading.notes if isinstance(note, Caution)]
         for note in reading.notes:
-            careful = isinstance(note, Caution)
-            if careful or note not in self.told:
-                log.log(logging.WARNING if careful else logging.INFO, "%s: %s", self.file, note)
-        for warning in find_implausible(reading.data, reading.file_row)[0]:
+            if not isinstance(note, Caution) and note not in self.told:
+                log.info("%s: %s", self.file, note)
+        for warning in sorted(warnings, key=lambda text: not isinstance(text, Severe)):
             log.warning("%s: %s", self.file, warning)
         return reading.data
 

@@ -11,7 +11,6 @@ import sys
 from collections.abc import Iterable
 from importlib import import_module
 from pathlib import Path
-from textwrap import shorten
 from typing import Any, ClassVar
 
 from hydra import errors
@@ -26,7 +25,8 @@ from gsparc.base.instantiate import GROUPS, cause_of, plugin_node, plugins, sugg
 FULL_ERROR = "HYDRA_FULL_ERROR"
 CONFIGS = "pkg://gsparc.conf"
 WIDE = 120
-AGAIN = 40  # characters of a warning that tell it from others
+MOST_WARNINGS = 10  # lines of a run on the console, of which severe ones are said twice
+SAID = "[WARNING] - "  # in a line of a log's file
 READERS = "gsparc.datasets"  # loggers: one file may be read several times in a run
 PATH = r"^\S*/\S*: "  # at its head
 
@@ -44,7 +44,8 @@ def open_console() -> Console:
 
 
 class ConsoleHandler(logging.StreamHandler):  # type: ignore[type-arg]
-    """The log as the console shows it: messages alone, and of each kind of warning the first.
+    """The log as the console shows it: messages alone, of each kind of warning the first,
+    and of kinds a few.
 
     The log's file has every line, with time, level and module.
 
@@ -55,26 +56,38 @@ class ConsoleHandler(logging.StreamHandler):  # type: ignore[type-arg]
 
     # What was said of files, by any handler: jobs of a sweep have their own
     read: ClassVar[set[str]] = set()
+    # Warnings that a run said whose model is asked now, without paths
+    before: ClassVar[set[str]] = set()
 
     def __init__(self, quiet: Iterable[str] = (), stream: Any = None) -> None:
         super().__init__(stream or sys.stdout)
         self.quiet = tuple(f"{name}." for name in quiet)
-        self.warned: dict[str, dict[str, None]] = {}  # by kind: different texts, in their order
+        self.kinds: set[str] = set()  # of warnings that were shown
+        self.shown, self.hidden = set[str](), set[str]()
         self.severe: list[str] = []
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether a record is shown; counts warnings."""
+        """Return whether a record is shown; keeps warnings that are not."""
         message = record.getMessage()
         if record.levelno < logging.WARNING:
             text = re.sub(r"^\S*/", "", message) if record.name.startswith(READERS) else ""
             again = text in self.read
             self.read.update({text} - {""})
             return not again and not f"{record.name}.".startswith(self.quiet)
-        if isinstance(record.args, tuple) and any(isinstance(part, Severe) for part in record.args):
+        kind, text = warning_kind(message), re.sub(PATH, "", message)
+        severe = isinstance(record.args, tuple) and any(isinstance(a, Severe) for a in record.args)
+        if record.levelno == logging.WARNING and text in self.before | self.shown:
+            return False
+        if severe:
             self.severe.append(f"this may change the figures above: {message}")
-        first = warning_kind(message) not in self.warned
-        self.warned.setdefault(warning_kind(message), {})[message] = None
-        return first
+        # An error is always shown; what may change the figures before all the rest, and again.
+        room = len(self.kinds) + len(self.severe) < MOST_WARNINGS
+        if record.levelno > logging.WARNING or (kind not in self.kinds and room):
+            self.kinds.add(kind)
+            self.shown.add(text)
+            return True
+        self.hidden.add(text)
+        return False
 
     def format(self, record: logging.LogRecord) -> str:
         """Return the message; of a warning or an error after its level."""
@@ -82,20 +95,22 @@ class ConsoleHandler(logging.StreamHandler):  # type: ignore[type-arg]
         return level + record.getMessage().strip().partition("\n")[0]
 
 
-def repeated_warnings() -> list[str]:
-    """Return a command's last lines on warnings: severe ones,
-    and where its log's file has others.
-    """
+def last_warnings(file: str = "the log") -> list[str]:
+    """Return a command's last lines on warnings: severe ones, and how many more its `file` has."""
     screens = [
         handler for handler in logging.getLogger().handlers if isinstance(handler, ConsoleHandler)
     ]
-    more = [list(texts) for screen in screens for texts in screen.warned.values() if len(texts) > 1]
-    again = [
-        f"{len(a)} like '{shorten(re.sub(PATH, '', a[0]), AGAIN, placeholder='')} ...'"
-        for a in more
-    ]
     severe = dict.fromkeys(text for screen in screens for text in screen.severe)
-    return [*severe, *([f"repeated warnings: {', '.join(again)}"] if again else [])]
+    more = sum(len(screen.hidden) for screen in screens)
+    return [*severe, *([f"{more} more warnings in {file}"] if more else [])]
+
+
+def note_said(folder: Path) -> None:
+    """Take what the log in a run's folder, or in one above its part's, warned of as said."""
+    for file in (file for place in (folder, folder.parent) for file in place.glob("*.log")):
+        lines = file.read_text(encoding="utf-8", errors="replace").splitlines()
+        said = (line.partition(SAID)[2] for line in lines)
+        ConsoleHandler.before.update(re.sub(PATH, "", text) for text in said if text)
 
 
 def to_dict(node: DictConfig) -> dict[str, Any]:

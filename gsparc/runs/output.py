@@ -18,7 +18,7 @@ from gsparc.base.files import SUMMARY, write_samples
 from gsparc.base.limits import Limit, check_arguments
 from gsparc.data.splits import Split
 from gsparc.evaluation.by_station import worst_stations
-from gsparc.evaluation.console import open_console, repeated_warnings
+from gsparc.evaluation.console import last_warnings, note_said, open_console
 from gsparc.evaluation.summary import (
     provenance,
     remarks,
@@ -109,6 +109,9 @@ def command(**limits: Limit) -> Callable[[Callable[[CommandCall], Any]], Task]:
             RunSettings.from_config(config)
             check_arguments(config, **limits)
             call = CommandCall(config, folder or run_directory())
+            # What a run warned of is not said again by whoever asks its model.
+            for path in call.paths if config.get("ckpt") else ():
+                note_said(Path(path).parent)
             result = work(call)
             return result.show(call.folder) if isinstance(result, Result) else result
 
@@ -133,10 +136,9 @@ def show_result(
     for table in tables:
         console.print(table)
     # Hydra opens a log for every job; one without a line is not worth a word.
-    log = "".join(
-        f"; full log: {path.name}" for path in run_dir.glob("*.log") if path.stat().st_size
-    )
-    for line in (*repeated_warnings(), *lines, f"{before}written to {run_dir}{log}"):
+    logs = [path.name for path in run_dir.glob("*.log") if path.stat().st_size]
+    log = "".join(f"; full log: {name}" for name in logs)
+    for line in (*last_warnings(*logs[:1]), *lines, f"{before}written to {run_dir}{log}"):
         console.print(line, highlight=False)
     files = [
         handler

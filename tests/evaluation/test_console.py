@@ -15,7 +15,8 @@ from gsparc.evaluation.console import (
     ConsoleHandler,
     config_folder,
     error_in_one_line,
-    repeated_warnings,
+    last_warnings,
+    note_said,
 )
 
 
@@ -109,9 +110,37 @@ def test_twelve_stations_wrote_two_hundred_lines(monkeypatch, caplog):
         "warning: data/a.npz: 3 places were measured twice",
         "fitting",
     ]
-    assert repeated_warnings() == [
-        "repeated warnings: 12 like '5 s are too few ...', 12 like 'no level of station s0 ...'"
-    ]
+    assert last_warnings("train.log") == ["22 more warnings in train.log"]
+
+
+def test_a_run_of_ninety_kinds_of_warnings_shows_ten_lines(monkeypatch):
+    """98 were repeated of one file; those that change the answer stood anywhere."""
+    screen = ConsoleHandler([], io.StringIO())
+    monkeypatch.setattr(logging.getLogger(), "handlers", [screen])
+    log = logging.getLogger("gsparc.datasets.campaign")
+    log.warning("%s: %s", "a.npz", Severe("conjugate=true mends it"))
+    for letter in "abcdefghijklmnopqrstuvwxyz":
+        log.warning("%s: %s", "a.npz", f"{letter * 3} of {letter * 9} is odd")
+    log.error("the disk is full")
+    lines = screen.stream.getvalue().splitlines()
+    assert lines[0].endswith("conjugate=true mends it") and lines[-1] == "error: the disk is full"
+    again, more = last_warnings("train.log")
+    assert "conjugate=true" in again and more.startswith("18 more warnings")
+    assert len(lines[:-1]) + len([again]) == 10
+
+
+def test_what_a_run_warned_of_is_not_said_by_who_asks_its_model(tmp_path, monkeypatch):
+    monkeypatch.setattr(ConsoleHandler, "before", set())
+    (tmp_path / "train.log").write_text(
+        "[2026-01-01 10:00:00,000][gsparc.datasets][WARNING] - /data/a.csv: 3 wild rows\n"
+    )
+    note_said(tmp_path / "fold0")
+    monkeypatch.setattr(logging.getLogger(), "handlers", [ConsoleHandler([], io.StringIO())])
+    (screen,) = logging.getLogger().handlers
+    log = logging.getLogger("gsparc.datasets.campaign")
+    log.warning("%s: %s", "/moved/a.csv", "3 wild rows")
+    log.warning("%s: %s", "/moved/a.csv", "4 rows too far")
+    assert screen.stream.getvalue() == "warning: /moved/a.csv: 4 rows too far\n"
 
 
 def test_a_wrong_convention_was_said_once_far_above_the_table(monkeypatch):
@@ -121,9 +150,7 @@ def test_a_wrong_convention_was_said_once_far_above_the_table(monkeypatch):
     log.warning("%s: %s", "a.npz", Severe("conjugate=true mends it"))
     log.warning("%s: %s", "a.npz", "3 wild rows")
     # Untrue for powers given as losses: figures of nearest, idw, kriging and mean stayed the same.
-    assert repeated_warnings() == [
-        "this may change the figures above: a.npz: conjugate=true mends it"
-    ]
+    assert last_warnings() == ["this may change the figures above: a.npz: conjugate=true mends it"]
 
 
 def test_jobs_of_a_sweep_said_again_how_columns_are_read(monkeypatch):

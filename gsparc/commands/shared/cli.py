@@ -87,7 +87,8 @@ def run(task: Callable[[DictConfig], object], config: str) -> None:
     main = hydra.main(version_base="1.3", config_path=CONFIGS, config_name=config)(_bypass(task))
     logging.raiseExceptions = False  # a log that a full disk cannot take: results say so themselves
     interrupts: list[int] = []
-    console.ConsoleHandler.read.clear()
+    for said in (console.ConsoleHandler.read, console.ConsoleHandler.before):
+        said.clear()
     try:
         with _noting(interrupts):
             refuse_seconds(dict(word.lstrip("+").split("=", 1) for word in words if "=" in word))
