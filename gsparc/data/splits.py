@@ -109,14 +109,15 @@ class Split:
 def _are_rows(value: Any) -> bool:
     listed = value.tolist() if isinstance(value, np.ndarray) else value
     if isinstance(listed, str) or not isinstance(listed, Sequence):
-        return isinstance(listed, str) and listed == "outliers"
+        return isinstance(listed, str) and listed in NAMED
     return all(
         isinstance(r, int | np.integer) and not isinstance(r, bool) and r >= 0 for r in listed
     )
 
 
-LeaveOut = Sequence[int] | Literal["outliers"]
-ROWS = Limit("outliers, or a list of rows like [3, 17],", _are_rows)
+NAMED = ("outliers", "foreign")
+LeaveOut = Sequence[int] | Literal["outliers", "foreign"]
+ROWS = Limit("outliers, foreign, or a list of rows like [3, 17],", _are_rows)
 KNOWN = Limit(f"one of {', '.join(NAMES)}, file", lambda name: name in NAMES, (*NAMES, "file"))
 
 
@@ -150,7 +151,7 @@ class SplitSettings(Checked):
         thin: the same as a share in (0, 1]; smaller sets are subsets of larger ones.
         spacing_m: keep only training rows at least this far apart, before the other two [m]; None
             keeps all.
-        leave_out: rows that are neither learned from nor tested on, or `outliers`; of `stations`
+        leave_out: rows neither learned from nor tested on, `outliers` or `foreign`; of `stations`
             and `carriers`, how many are held out together, drawn by seed (0: each one in its turn).
     """
 
@@ -234,7 +235,7 @@ def make_split(
         positions: (S, 3) [m] of the moving end, or (S, 6) of both; squares are counted from zero.
         settings: how.
         release_split: (train, test) rows that the release names; used by `random` only.
-        outliers: (n,) rows that `leave_out=outliers` means.
+        outliers: (n,) rows that a name in `leave_out` means.
         place: (S,) int64; rows of one place stay together. None where every row is one.
         station: (S,) int64, of which station, carrier or run a row is; needed by the splits of
             these names.
@@ -312,7 +313,7 @@ def _pairs(positions: np.ndarray, taken: np.ndarray, settings: SplitSettings) ->
 
 def rows_to_leave_out(leave_out: LeaveOut, outliers: np.ndarray | None, rows: int) -> np.ndarray:
     """Return the rows (n,) int64 of `rows` that `leave_out` names, `outliers` (n,)
-    being those of that name.
+    being those of a name.
 
     >>> rows_to_leave_out([3, 17], None, rows=20)
     array([ 3, 17])

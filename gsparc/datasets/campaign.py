@@ -17,6 +17,7 @@ from gsparc.base.errors import Caution, DataError, Problems, Severe
 from gsparc.base.files import read_shipped_table, read_text
 from gsparc.base.limits import SettingError
 from gsparc.data.assemble import check_positions
+from gsparc.data.foreign import foreign_warnings
 from gsparc.data.schema import Field, Measurements, TrainTest
 from gsparc.data.selection import Selection, take_selection
 from gsparc.datasets.datamodule import DataModule
@@ -105,6 +106,7 @@ def find_implausible(
         note = "too many links to be looked at for implausible levels here; gsparc check does"
         return [*hints, note], None, []
     hints += map(Severe, [*convention_warnings(data), *place_warnings(data)])
+    hints += foreign_warnings(data)
     if (levels := link_levels(data, file_row)) is None:
         return hints, None, []
     steps, hints = find_level_steps(levels), [*hints, *run_warnings(data), *gone_warnings(data)]

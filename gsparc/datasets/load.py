@@ -20,6 +20,7 @@ from gsparc.base import instantiate
 from gsparc.base.errors import DataError, list_first
 from gsparc.base.limits import choice
 from gsparc.data import spacing, splits
+from gsparc.data.foreign import find_foreign
 from gsparc.data.outliers import find_outliers
 from gsparc.data.row_order import content_order
 from gsparc.data.schema import Measurements
@@ -100,7 +101,10 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         DataError: unknown name or key, impossible shares, or a file made for other data.
     """
     settings = split_settings(config)
-    wrong = np.concatenate([np.zeros(0, np.int64), *find_outliers(data).values()])
+    patches = find_outliers(data).values()
+    if settings.leave_out == "foreign":
+        patches = [rows for station in find_foreign(data).values() for rows in station]
+    wrong = np.concatenate([np.zeros(0, np.int64), *patches])
     if isinstance(settings, FileSettings):
         split = read_split(settings.path, len(data), data.site.sha256)
         absent = rows_to_leave_out(settings.leave_out, wrong, len(data))

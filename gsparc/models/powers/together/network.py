@@ -17,6 +17,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from gsparc.base.errors import Caution, list_first
+from gsparc.data.foreign import find_foreign_patches
 from gsparc.data.schema import Measurements, Stations
 from gsparc.data.station_names import site_name
 from gsparc.models.baselines.distance_law import fit_law
@@ -171,7 +172,7 @@ def _fit_azimuths(
     rows: StationRows, network: Sectors, names: tuple[str, ...], seed: int
 ) -> tuple[Sectors, Tensor, float, list[str]]:
     """What `_fit_rough` returns, with azimuths that rows do not contradict, and notes on these."""
-    few = rows.subset(draw_rows(len(rows.index), ROUGH_ON, seed))
+    few = _without_foreign(rows.subset(draw_rows(len(rows.index), ROUGH_ON, seed)))
     law = replace(fit_law(few, None), level=0.0, exponent=0.0)
     loud = few.heard_rows
     decades = law.decades(torch.from_numpy(loud.places))
@@ -201,6 +202,17 @@ def _fit_azimuths(
     notes = _note_turned(network.table[:, 0], rough.table[:, 0], names)
     notes += _note_untested(quiet, rough, gains, scale, names)
     return *(_fit_rough(few, rough) if piles else (rough, gains, scale)), notes
+
+
+def _without_foreign(rows: StationRows) -> StationRows:
+    """Rows less those that are another station's: far off and strong, they turned an azimuth."""
+    foreign, number = [np.zeros(0, np.int64)], sector_of(rows.places)
+    for sector in np.unique(number):
+        own = np.flatnonzero((number == sector) & ~rows.silent)
+        at, still = first_end(rows.places[own]), other_end(rows.places[own[:1]])
+        patches = find_foreign_patches(at, rows.decibels[own], still[0]) if len(own) else []
+        foreign += [own[patch] for patch in patches]
+    return rows.subset(np.setdiff1d(np.arange(len(rows.index)), np.concatenate(foreign)))
 
 
 def _misfits(mean: Tensor, rows: StationRows, scale: Tensor) -> Tensor:
