@@ -41,6 +41,7 @@ COVER, FEW = 2_000, 500  # rows that weigh the mean law, where it is to stay, an
 ENTRIES = 1_000_000  # of systems and values that are solved with at a time: memory
 LOOKED_AT = 1_200  # places whose density given their neighbours chooses the settings
 LOOKED_BY = 16  # their neighbours (M. L. Stein et al., J. R. Stat. Soc. B 66 (2004): few will do)
+SPARSEST = 60  # places of a set, whose neighbours lie so far apart that they show long lengths
 SHORTER = (0.3, 0.03)  # lengths that a search starts from beside the longest, of that
 JITTER = 1e-8  # of the amplitude, only so that a system of places millimetres apart can be solved
 EXCESS = 20.0  # nats, of an amplitude e times the variance of the values
@@ -360,7 +361,7 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
         prior, values.places, rest, start.noise / values.count, seed, FEW
     )
     rest = rest - prior.columns(places) @ about
-    level = Neighbourhood.from_places(values.places, seed).level
+    level = Neighbourhood.from_places(values.places, seed, SPARSEST).level
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]
     parts = []
     for members in sets:

@@ -41,10 +41,10 @@ class Neighbourhood(Stored):
     level: np.ndarray
 
     @classmethod
-    def from_places(cls, places: np.ndarray, seed: int) -> Neighbourhood:
-        """Draw sets of an eighth of the places, of an eighth of these, and so on."""
+    def from_places(cls, places: np.ndarray, seed: int, fewest: int = FEWEST) -> Neighbourhood:
+        """Draw sets of an eighth of the places, of an eighth of these, and so on to the fewest."""
         rows, sets = np.arange(len(places)), []
-        while len(rows) / SPARSER >= FEWEST:
+        while len(rows) / SPARSER >= fewest:
             rows = rows[covering_rows(places[rows], int(len(rows) / SPARSER), seed)]
             sets.append(rows)
         level = np.full(len(places), len(sets), np.int8)

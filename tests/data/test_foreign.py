@@ -31,7 +31,7 @@ def test_an_identity_that_is_used_again_elsewhere_is_named_and_left_out(tmp_path
     (rows,) = find_foreign(mixed)[number]
     assert mixed.site.every_station.shown[number] == "C" and len(rows) == len(mixed) - len(clean)
     (text,) = foreign_warnings(mixed)
-    assert f"C, 2009 m away ({len(rows)} rows: lines 18702 to" in text
+    assert f"C, 1856 m away ({len(rows)} rows: lines 18702 to" in text
     assert text.endswith("split.leave_out=foreign leaves them out")
     fold = split_for({"name": "random", "leave_out": "foreign"}, mixed).folds[0]
     assert not np.isin(np.concatenate([fold.train, fold.val, fold.test]), rows).any()
