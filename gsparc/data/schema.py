@@ -185,9 +185,9 @@ class Site:
             those of waves; `neighbours`, near rows were made alike. None where rows are as
             measured.
         device_names: (D,) what measured powers is called; None where nothing tells.
-        device_levels: (D + 1, 2) offset [dB] of each to their mean, which was taken off, and
-            variance [dB^2] of what is not known of it; the last of a device that nobody named. None
-            before that.
+        device_levels: (T, D + 1, 2) at each station the offset [dB] of each to their mean, taken
+            off, and variance [dB^2] of what is not known of it; the last of a device that
+            nobody named. None before that.
         measured: (A, K) bool, of a file's antennas and tones those that targets hold, as all others
             are constant or marked in every row; None: all.
     """

@@ -1,9 +1,11 @@
 """Offsets of the devices that measured: estimated from training rows,
 taken off before any method learns.
 
-Two phones at one place read levels that differ by a constant. One number for each device over all
-stations is estimated beside a field of levels at each, and belongs to the site: what methods learn
-and answer is the mean device's level, to which that of a named device is added.
+Two phones at one place read levels that differ by a constant: one for each device over all stations
+is estimated beside a field of levels at each. Antennas and filters differ from carrier to carrier:
+at a station whose own rows say so it is another, shrunk to the common one. Offsets belong to the
+site: what methods learn and answer is the mean device's level, to which that of a named device is
+added.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ log = logging.getLogger(__name__)
 
 # That tell; the cost is a station's cube
 MOST_ROWS, MOST_OF_STATION, LEAST_OF_STATION = 6000, 1000, 60
+SAID, TINY = 12, 1e-12  # stations, whose offsets are listed
 
 
 def take_off_devices(data: Measurements, fold: Fold) -> Measurements:
@@ -46,17 +49,53 @@ def take_off_devices(data: Measurements, fold: Fold) -> Measurements:
     device, heard = data.device[rows][some], np.unique(data.device[rows][some])
     each = [(device == number).astype(float) for number in heard[1:]]
     field = fit_level_field(data.moving[rows][some], level[some], station[some], each)
+    # As many columns as devices, of which the first has none
     offset = np.r_[0.0, field.slope]
-    offset -= offset.mean()
+    own = _offsets_of_stations(data.moving[rows][some], level[some], station[some], each, offset)
+    offsets = np.tile(offset, (len(data.site.every_station), 1))
+    offsets[[*own]] = np.array([*own.values()]).reshape(-1, len(offset))
+    offsets -= offsets.mean(1, keepdims=True)
     # The last row is of the mean device, and of those that nothing is known of.
-    spread = float(offset.var(ddof=1)) if len(offset) > 1 else 0.0
-    levels = np.tile([0.0, spread], (len(names) + 1, 1))
-    levels[heard] = np.c_[offset, np.zeros(len(heard))]
-    notes = [
-        f"{names[number]} {value:+.1f} dB" for number, value in zip(heard, offset, strict=True)
-    ]
-    log.info("devices: %s, beside their mean", list_first(notes, 6))
+    spread = offsets.var(1, ddof=1) if len(offset) > 1 else np.zeros(len(offsets))
+    levels = np.zeros((len(offsets), len(names) + 1, 2))
+    levels[:, :, 1] = spread[:, None]
+    levels[:, heard] = np.stack([offsets, 0 * offsets], -1)
+    shown = data.site.every_station.shown
+    for number in np.unique(station)[:SAID] if len(offset) > 1 else ():
+        notes = [f"{names[k]} {v:+.1f} dB" for k, v in zip(heard, offsets[number], strict=True)]
+        log.info("devices%s: %s", f" at {shown[number]}" * data.site.several, list_first(notes, 6))
     return without_devices(data, replace(data.site, device_levels=levels))
+
+
+def _offsets_of_stations(
+    place: np.ndarray,
+    level: np.ndarray,
+    station: np.ndarray,
+    each: list[np.ndarray],
+    common: np.ndarray,
+) -> dict[int, np.ndarray]:
+    """Offsets (D,) [dB] by station, the common ones (D,) before its rows: shrunk to these by how
+    much stations differ beside how unsure each is.
+    """
+    numbers = [n for n in np.unique(station).tolist() if (station == n).sum() >= LEAST_OF_STATION]
+    own, unsure = list[np.ndarray](), list[np.ndarray]()
+    for number in numbers:
+        rows = np.flatnonzero(station == number)
+        columns = [column[rows] for column in each]
+        field = fit_level_field(place[rows], level[rows], 0 * rows, columns)
+        precision = field.precision(place[rows])
+        ones = np.column_stack([np.ones(len(rows)), field.columns])
+        variance = np.linalg.pinv(ones.T @ precision @ ones).diagonal()[1:]
+        seen = np.array([0 < column.sum() < len(rows) for column in columns])
+        own.append(np.where(seen, field.slope, common[1:]))
+        unsure.append(np.where(seen, variance, np.inf))
+    if not each or not numbers:
+        return {}
+    away, known = np.array(own) - common[1:], 1 / np.array(unsure)
+    between = np.maximum((known * away**2).sum() - (known > 0).sum(), 0) / max(known.sum(), TINY)
+    share = between / (between + np.array(unsure))
+    moved = common + np.c_[np.zeros(len(numbers)), share * away]
+    return dict(zip(numbers, moved, strict=True))
 
 
 def without_devices(data: Measurements, site: Site) -> Measurements:
@@ -65,7 +104,7 @@ def without_devices(data: Measurements, site: Site) -> Measurements:
     """
     if data.device is None or site.device_levels is None:
         return data
-    factor = from_decibels(-site.device_levels[data.device, 0])
+    factor = from_decibels(-site.device_levels[data.stations_of(), data.device, 0])
     target = (data.target * factor[:, None]).astype(data.target.dtype)
     noise = (
         None

@@ -65,25 +65,36 @@ class Prediction:
         """Return 1 - `unknown`, (B,) in [0, 1]: larger is surer."""
         return None if self.unknown is None else (1 - self.unknown).clamp(0, 1)
 
-    def of_devices(self, site: Site, device: Tensor | int = MEAN_DEVICE) -> Prediction:
+    def of_devices(
+        self,
+        site: Site,
+        device: Tensor | int = MEAN_DEVICE,
+        station: Tensor | int | None = None,
+    ) -> Prediction:
         """Return what devices (B,), or one, would read, where this is the mean one's;
         variances add.
+
+        Stations (B,), or one, are those of the rows; None: of each column, or the mean of all.
         """
         if site.device_levels is None:
             return self
-        levels, shape = (
-            torch.from_numpy(site.device_levels)[torch.as_tensor(device)].reshape(-1, 2),
-            [1] * 3,
-        )
-        factor, spread = (
-            from_decibels(levels[:, 0]).to(self.mean.dtype),
-            levels[:, 1].to(self.mean.dtype),
-        )
-        many = factor.reshape(-1, *shape[: self.mean.ndim - 1])
+        table, device = torch.from_numpy(site.device_levels), torch.as_tensor(device)
+        table = table.reshape(-1, *table.shape[-2:])  # stored before stations had their own
+        columns = self.mean.shape[1:] == (len(table),) and len(table) > 1
+        if columns and station is None and device.ndim == 0:
+            levels, axes = table[:, device], (1, -1)
+        else:
+            levels = table.mean(0)[device] if station is None else table[station, device]
+            levels, axes = levels.reshape(-1, 2), (-1, *[1] * (self.mean.ndim - 1))
+        factor = from_decibels(levels[:, 0]).to(self.mean.dtype)
+        spread = levels[:, 1].to(self.mean.dtype)
+        many = factor.reshape(axes)
         mean, variance, explained = self.mean * many, self.variance, self.explained
         if variance is not None:
             device_variance = (mean / RELATIVE_DB).square() * spread.reshape(many.shape)
-            scale = factor.square().reshape(-1, *shape[: variance.ndim - 1])
+            # One of all entries, or each its own
+            alone = axes if axes[0] == 1 else (-1, *[1] * (variance.ndim - 1))
+            scale = factor.square().reshape(alone)
             variance = variance * scale + device_variance.reshape(variance.shape)
         return Prediction(
             mean, variance, self.unknown, None if explained is None else explained * many
@@ -373,7 +384,7 @@ def predict_in_batches(
                     if data.device is None
                     else torch.from_numpy(data.device[rows[chosen]])
                 )
-                answer = answer.of_devices(method.site, device)
+                answer = answer.of_devices(method.site, device, batch.station)
             yield chosen, batch, answer
 
     if data.site.unknown_factor == "none":

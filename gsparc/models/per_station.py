@@ -92,8 +92,10 @@ def station_site(site: Site, number: int) -> Site:
     rotation = site.rx_rotation if stations.rotation is None else stations.rotation[number]
     place = stations.position[number]
     array = site.array if stations.array is None else stations.array[number]
+    levels = site.device_levels
     return replace(
         site,
+        device_levels=None if levels is None else levels[number : number + 1],
         name=f"{site.name}{OF_STATION}{stations.shown[number]}",
         # Which way it looks is a fact of its own
         stations=None if stations.sector is None else stations.subset(np.array([number])),

@@ -201,7 +201,8 @@ def levels_near(
         )
         prediction = method.predict(query)
         if device is not None:
-            prediction = prediction.of_devices(site, torch.from_numpy(device[moment]))
+            named = torch.from_numpy(device[moment])
+            prediction = prediction.of_devices(site, named, torch.from_numpy(who))
         variance = torch.zeros(len(moment)) if prediction.variance is None else prediction.variance
         power = prediction.mean[:, 0].double().numpy() * site.target_scale
         with np.errstate(divide="ignore", invalid="ignore"):  # of no power, which has no decibels

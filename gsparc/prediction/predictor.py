@@ -506,7 +506,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
 
     def _in_unit(self, stored: Prediction, unit: PowerUnit) -> Prediction:
         """Of stored targets, as the chosen device reads them, in a unit."""
-        stored = stored.of_devices(self.site, self._device)
+        stored = stored.of_devices(self.site, self._device, self.queries.station)
         # In decibels a variance depends on the mean too.
         variance = None if stored.variance is None else unit.variance(stored.mean, stored.variance)
         explained = (
