@@ -66,7 +66,7 @@ def find_foreign(data: Measurements) -> dict[int, list[np.ndarray]]:
     heard, stations = np.flatnonzero(data.censored_side() == 0), data.site.every_station.position
     with np.errstate(divide="ignore"):
         level, number = to_decibels(data.powers()[:, 0]), data.stations_of()
-    result = {}
+    result = dict[int, list[np.ndarray]]()
     for t in np.unique(number[heard]).tolist():
         rows = heard[(number[heard] == t) & np.isfinite(level[heard])]
         patches = find_foreign_patches(data.moving[rows], level[rows], stations[t])

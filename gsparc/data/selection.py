@@ -212,11 +212,14 @@ def _copies(arrays: Arrays, measured: str) -> tuple[Arrays, np.ndarray, str]:
     values = arrays[measured]
     if measured not in ("rssi", "rssi_db") or values.shape != (rows,) or values.dtype.kind != "f":
         return arrays, find_copies(hash_rows(place, number, device), values), how
-    run, time, carrier = (arrays.get(n, np.zeros(0)) for n in ("run", "time_s", "carrier_hz"))
-    run = np.unique(run, return_inverse=True)[1].reshape(-1) if run.shape == (rows,) else None
-    carrier = carrier if carrier.shape == (rows,) else None
-    minute = time // FIX_S if time.shape == (rows,) and time.dtype.kind in "iuf" else None
-    link, fix = (hash_rows(at, number, device, run, minute, carrier) for at in (place, exact))
+    # What else tells rows of a place apart
+    told = [number, device]
+    for name, unit in (("run", None), ("time_s", FIX_S), ("carrier_hz", None)):
+        part = arrays.get(name, np.zeros(0))
+        if part.shape == (rows,):
+            part = part // unit if unit and part.dtype.kind in "iuf" else part
+            told.append(np.unique(part, return_inverse=True)[1].reshape(-1))
+    link, fix = hash_rows(place, *told), hash_rows(exact, *told)
     reader = np.zeros(rows, np.int64) if device is None else device
     with np.errstate(divide="ignore", invalid="ignore"):
         level = to_decibels(values) if measured == "rssi" else values.astype(np.float64)

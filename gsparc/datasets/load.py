@@ -101,7 +101,7 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         DataError: unknown name or key, impossible shares, or a file made for other data.
     """
     settings = split_settings(config)
-    patches = find_outliers(data).values()
+    patches = [*find_outliers(data).values()]
     if isinstance(settings.leave_out, str) and settings.leave_out == "foreign":
         patches = [rows for station in find_foreign(data).values() for rows in station]
     wrong = np.concatenate([np.zeros(0, np.int64), *patches])

@@ -81,11 +81,12 @@ class Prediction:
         table, device = torch.from_numpy(site.device_levels), torch.as_tensor(device)
         table = table.reshape(-1, *table.shape[-2:])  # stored before stations had their own
         columns = self.mean.shape[1:] == (len(table),) and len(table) > 1
+        axes: tuple[int, ...] = (-1, *[1] * (self.mean.ndim - 1))
         if columns and station is None and device.ndim == 0:
             levels, axes = table[:, device], (1, -1)
         else:
             levels = table.mean(0)[device] if station is None else table[station, device]
-            levels, axes = levels.reshape(-1, 2), (-1, *[1] * (self.mean.ndim - 1))
+            levels = levels.reshape(-1, 2)
         factor = from_decibels(levels[:, 0]).to(self.mean.dtype)
         spread = levels[:, 1].to(self.mean.dtype)
         many = factor.reshape(axes)

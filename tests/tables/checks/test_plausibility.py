@@ -441,5 +441,5 @@ def test_a_step_is_claimed_from_places_that_one_device_saw_before_and_after():
     phone = np.repeat([0, 1], 400)
     assert len(detect_level_steps(twice, again, station)) == 1
     assert detect_level_steps(twice, again, station, device=phone) == ()
-    elsewhere = np.r_[place, place + [[1e3, 0]]]
+    elsewhere = np.r_[place, place + np.array([1e3, 0])]
     assert detect_level_steps(elsewhere, again) == ()
