@@ -25,9 +25,9 @@ from gsparc.tables.advice import run_warnings
 from gsparc.tables.checks.coherence import place_warnings
 from gsparc.tables.checks.conventions import convention_warnings
 from gsparc.tables.checks.gone import gone_warnings
-from gsparc.tables.checks.level_steps import LevelStep
+from gsparc.tables.checks.level_steps import LevelStep, find_level_steps
 from gsparc.tables.checks.link_levels import LinkLevels, link_levels
-from gsparc.tables.checks.plausibility import find_level_steps, sanity_warnings
+from gsparc.tables.checks.plausibility import sanity_warnings
 from gsparc.tables.checks.unit_warnings import unit_warnings
 from gsparc.tables.own import interpret
 from gsparc.tables.own_checks import Checker

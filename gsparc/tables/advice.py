@@ -106,8 +106,7 @@ def find_effects(
     links, row, effects = links.take(dense), row[dense], list[Effect]()
     texts = {head: pd.factorize(words[row])[0] for head, words in columns.items()}
     while len(links) >= LEAST_ROWS and len(effects) < MOST_PIECES:
-        field = fit_level_field(links.place, links.level, links.station)
-        gram = field.kernel.gram(torch.from_numpy(links.place)).numpy()
+        gram = _gram(links)
         plain, _ = _leave_out(gram, links)
         rest = [head for head in columns if head not in {effect.head for effect in effects}]
         tried = [_try(gram, links, plain, h, texts[h], columns[h][row]) for h in rest]
@@ -152,10 +151,8 @@ def _try(
     values = pd.to_numeric(pd.Series(words), errors="coerce").to_numpy(float)
 
     def add(kind: Kind, errors: np.ndarray, part: np.ndarray, far: float, size: float) -> None:
-        fall = plain**2 - errors**2
-        clear = fall.mean() > SURE * fall.std() / math.sqrt(len(fall))
         near = float((errors**2).mean() / max((plain**2).mean(), 1e-12))
-        if clear and far > COPY and near < LESS * far:
+        if _fall(plain, errors) and far > COPY and near < LESS * far:
             both = math.sqrt((plain**2).mean()), math.sqrt((errors**2).mean())
             effects.append(Effect(head, kind, both, part, size))
 
@@ -179,6 +176,25 @@ def _try(
     alike = [effect for effect in effects if effect.error[1] <= ALIKE * least]
     # Of kinds that tell the same the simplest.
     return min(alike, key=lambda effect: KINDS.index(effect.kind), default=None)
+
+
+def _fall(plain: np.ndarray, errors: np.ndarray) -> bool:
+    """Whether squares of errors (n,) are below those of plain ones by more than chance."""
+    fall = plain**2 - errors**2
+    return bool(fall.mean() > SURE * fall.std() / math.sqrt(len(fall)))
+
+
+def is_better_parted(links: LevelsAtPlaces, code: np.ndarray) -> bool:
+    """Tell whether levels that are left out are predicted better with a station for each code."""
+    gram = _gram(links)
+    parted = replace(links, station=_pairs(links.station, code))
+    return _fall(_leave_out(gram, links)[0], _leave_out(gram, parted)[0])
+
+
+def _gram(links: LevelsAtPlaces) -> np.ndarray:
+    """Covariances (n, n) of the field of levels at the places of links."""
+    field = fit_level_field(links.place, links.level, links.station)
+    return field.kernel.gram(torch.from_numpy(links.place)).numpy()
 
 
 def _centred(value: np.ndarray, group: np.ndarray) -> np.ndarray:

@@ -1,6 +1,4 @@
-"""What spectra of an array tell by themselves: its plane, zenith angles, a mirrored axis,
-shifted rows.
-"""
+"""What spectra of an array tell by themselves: its plane, zenith angles."""
 
 from dataclasses import replace
 
@@ -11,7 +9,7 @@ import torch
 from gsparc.datasets.rfid import planar_array
 from gsparc.ops import SphereGrid
 from gsparc.physics.array_response import bartlett_spectrum, steering_matrix
-from gsparc.tables.checks.array_layout import carrier_warnings, layout_warnings
+from gsparc.tables.checks.array_layout import layout_warnings
 from gsparc.tables.conventions import convert_conventions
 from gsparc.tables.own import from_arrays
 
@@ -45,21 +43,10 @@ def rooms():
 
 
 def test_what_is_as_declared_is_not_doubted(rooms):
-    assert layout_warnings(rooms) == carrier_warnings(rooms) == []
+    assert layout_warnings(rooms) == []
 
 
 def test_zenith_angles_and_another_plane_were_taken_for_the_declared_ones(rooms):
     lying = replace(rooms, site=replace(rooms.site, array=UPRIGHT[:, [1, 2, 0]]))
     assert "in the plane yz" in layout_warnings(lying)[0]
     assert "dataset.zenith=true" in layout_warnings(convert_conventions(rooms, ["zenith"]))[0]
-
-
-def test_a_mirrored_azimuth_is_named(rooms):
-    assert "mirrored" in carrier_warnings(convert_conventions(rooms, ["clockwise"]))[0]
-
-
-def test_the_rows_of_one_carrier_were_shifted_by_one(rooms):
-    shifted, second = rooms.target.copy(), rooms.station == 1
-    shifted[second] = np.roll(shifted[second], 1, axis=0)
-    (warning,) = carrier_warnings(replace(rooms, target=shifted))
-    assert "300 MHz (before)" in warning or "299.822 MHz (before)" in warning
