@@ -302,7 +302,7 @@ def advise(
     said = {"rssi_db": f"{power.head}{times}"}
     said |= {"station": "+".join(c.head or "" for c in chosen.get("station", ()))}
     for effect in find_effects(links, row, words):
-        head, role, more = effect.head, "station", ""
+        head, role = effect.head, "station"
         if effect.kind == "number":
             role, size = "rssi_db", abs(effect.size)
             text = f"{'+' if effect.size < 0 else '-'}{head}{'' if size == 1 else f'*{size:g}'}"
@@ -313,15 +313,11 @@ def advise(
         elif effect.kind == "device":
             role, text, does = "device", f"+{head}", "takes each off"
             meaning = f"an offset of all levels for each value, up to {effect.size:.1f} dB: devices"
-            if all(word.lstrip("-").isdigit() for word in {*words[head]}):
-                meaning += ", or floors"
-                if not {"z", "rx_z", "tx_z"} & {*chosen}:
-                    more = f"; of floors {say_column('z', f'{head}*3.2')} takes 3.2 m each"
         else:
             text, meaning = f"+{head}", "another transmitter for each value"
             does = "tells them apart"
         said[role] = (said.get(role, "") + text).removeprefix("+")
-        how = f"{say_column(role, said[role])} {does}{more}"
+        how = f"{say_column(role, said[role])} {does}"
         if role == "station" and wide:
             how = "a file for each value takes them apart"
         elif not _reads_whole(reads({role: said[role]}), data):

@@ -230,6 +230,8 @@ def choose_columns(
     if only is None and not sheet.asked:
         _wide_survey(sheet, chosen)
         _ask_phase(sheet, chosen)
+        if not {"z", "rx_z", "tx_z"} & {*chosen, *settled}:
+            _ask_floor(sheet, chosen)
     if (
         only is None
         and "time_s" not in {*chosen, *settled}
@@ -369,6 +371,26 @@ def _ask_phase(sheet: Sheet, chosen: Chosen) -> None:
         Answer({"csi_amp": level, "csi_phase": phase}, "channels"),
     )
     sheet.ask(Role((level, phase), "rssi_db", "seen", readings=readings, why=why))
+
+
+STOREY_M = 3.2  # between floors, where nobody says more
+
+
+def _ask_floor(sheet: Sheet, chosen: Chosen) -> None:
+    """Ask whether numbers of floors are heights or name groups of rows."""
+    used = used_heads(chosen)
+    for head in [head for head in sheet.heads if head not in used]:
+        numbers = pd.to_numeric(pd.Series(sheet.words(head)), errors="coerce")
+        words = {*words_of(head)} - LISTS["labels"]
+        if words and words <= LISTS["floor"] and numbers.nunique() > 1:
+            ways = f"{head}*{STOREY_M:g}", head
+            readings = (
+                Answer({"z": ways[0]}, f"heights, {STOREY_M:g} m each"),
+                Answer({"z": NONE, "run": ways[1]}, "groups of rows at one height"),
+            )
+            why = f"column {head!r} numbers floors: heights, or groups of rows"
+            return sheet.ask(Role((head,), "z", "open", readings=readings, why=why))
+    return None
 
 
 def _means(sheet: Sheet, way: object) -> str:

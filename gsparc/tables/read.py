@@ -29,7 +29,7 @@ from gsparc.tables.columns import (
     name_columns,
     used_heads,
 )
-from gsparc.tables.columns_file import beside, is_edited, read_columns
+from gsparc.tables.columns_file import edited_beside, read_columns
 from gsparc.tables.links.stations import PER_STATION
 from gsparc.tables.opening import read_sheet
 from gsparc.tables.own_checks import LOWEST_HZ, MOST_DB
@@ -79,8 +79,8 @@ def parse_table(
         return raw, asked, tuple(fresh.problems)
 
     said: dict[str, object] = {}
-    about = beside(path) if columns_file is None else Path(columns_file)
-    if columns_file is not None or (about.exists() and is_edited(about)):
+    about = edited_beside(path) if columns_file is None else Path(columns_file)
+    if about is not None:
         said |= read_columns(about, sheet.heads)
         sheet.notes.append(f"columns are what {about} says")
     given = {key: value for key, value in columns.items() if value is not None}
