@@ -22,7 +22,6 @@ from gsparc.data.selection import Selection, take_selection
 from gsparc.datasets.datamodule import DataModule
 from gsparc.datasets.public.fetch import fetched_path, fetched_path_or_none
 from gsparc.tables.advice import run_warnings
-from gsparc.tables.checks.coherence import place_warnings
 from gsparc.tables.checks.conventions import convention_warnings
 from gsparc.tables.checks.gone import gone_warnings
 from gsparc.tables.checks.level_steps import LevelStep, find_level_steps
@@ -103,7 +102,7 @@ def find_implausible(
     if places * len(data.site.every_station) > most:
         note = "too many links to be looked at for implausible levels here; gsparc check does"
         return [*hints, note], None, []
-    hints += map(Severe, [*convention_warnings(data), *place_warnings(data)])
+    hints += map(Severe, convention_warnings(data))
     if (levels := link_levels(data, file_row)) is None:
         return hints, None, []
     steps, hints = find_level_steps(levels), [*hints, *run_warnings(data), *gone_warnings(data)]

@@ -19,7 +19,6 @@ import torch
 from scipy.spatial import cKDTree
 
 from gsparc.base.errors import Caution
-from gsparc.data.blocks import rows_by
 from gsparc.data.schema import Measurements
 from gsparc.physics.decibels import to_decibels
 from gsparc.processes.factor import Factor
@@ -30,15 +29,13 @@ from gsparc.tables.roles import say_column
 from gsparc.tables.sheet import Sheet
 
 LEAST_ROWS, MOST_ROWS = 60, 480  # links that tell; that are looked at
-CENTRES, NEAR = 6, 8  # about which those are chosen, so that they stay dense; rows beside one
+CENTRES = 6  # about which those are chosen, so that they stay dense
 REPEATED = 4  # rows for each value of a column that may name something
 MOST_PIECES = 5
 SURE = 3.0  # standard errors by which the squared error falls: many columns are tried
 LESS, COPY = 0.9, 0.1  # of near ones to far ones; of far ones that are left, at least
 SPREAD = 10.0  # variance of constants, parts of that of a field
 ALIKE = 1.03  # errors within this ratio are of columns that tell the same
-SMOOTH = 0.25  # of the variance about near rows: levels follow these rather than a receiver
-TRUTHS = ({"true", "false"}, {"0", "1"}, {"yes", "no"}, {"t", "f"}, {"y", "n"})
 Kind = Literal["transmitter", "device", "number"]
 KINDS: tuple[Kind, ...] = ("number", "device", "transmitter")
 
@@ -215,34 +212,6 @@ def _dense_rows(place: np.ndarray) -> np.ndarray:
     return np.unique(cKDTree(place).query(centres, k=MOST_ROWS // CENTRES)[1])
 
 
-def find_filled(
-    links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, np.ndarray]
-) -> dict[str, str]:
-    """Return columns of truths, and which of their values rows have that were filled
-    in from near ones.
-
-    What is interpolated has no noise of its own:
-    it differs far less from its neighbours than a measurement.
-    """
-    filled, delta = {}, np.full(len(links), np.nan)
-    for _, rows in rows_by(links.station):
-        if len(rows) > NEAR:
-            near = cKDTree(links.place[rows]).query(links.place[rows], k=NEAR // 2 + 1)[1][:, 1:]
-            delta[rows] = links.level[rows] - links.level[rows][near].mean(1)
-    for head, words in columns.items():
-        cells = np.char.lower(words[row])
-        names = np.unique(cells).tolist()
-        if {*names} not in TRUTHS:
-            continue
-        spread = {name: delta[(cells == name) & np.isfinite(delta)] for name in names}
-        less, more = sorted(names, key=lambda name: np.median(np.abs(spread[name])))
-        few = min(map(len, spread.values()))
-        ratio = math.log(max(np.var(spread[less]), 1e-12) / np.var(spread[more])) if few > 2 else 0
-        if few >= LEAST_ROWS / 3 and ratio < min(math.log(SMOOTH), -SURE * math.sqrt(4 / few)):
-            filled[head] = str(words[row][cells == less][0])
-    return filled
-
-
 def run_warnings(data: Measurements) -> list[str]:
     """Warn of runs that tell levels apart as a transmitter elsewhere would, or another gain."""
     if not data.site.maps_levels or data.run is None:
@@ -292,11 +261,6 @@ def advise(
         few = f"columns that are not used are tried from {LEAST_ROWS} links on, here are"
         return [f"{few} {len(links)}: devices, powers or other transmitters would pass unseen"]
     notes = list[str]()
-    for head, value in find_filled(links, row, words).items():
-        other = next(word for word in words[head][row] if word != value)
-        note = f"column {head!r}: levels of rows where it is {value!r} follow their neighbours, "
-        how = f"{say_column('run', head)} 'dataset.runs=[\"{other}\"]' leaves them out"
-        notes.append(Caution(f"{note}without noise: filled in, not measured? {how}"))
     power, wide = chosen["rssi_db"][0], len(chosen["rssi_db"]) > 1
     times = f"*{power.unit.times}" if power.unit is not None and power.unit.times else ""
     said = {"rssi_db": f"{power.head}{times}"}

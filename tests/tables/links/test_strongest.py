@@ -1,6 +1,5 @@
 """Lists of the strongest: recognised, what they leave out, and levels of single rows."""
 
-
 import numpy as np
 import pytest
 from networks import network
