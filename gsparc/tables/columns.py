@@ -672,19 +672,14 @@ def _note(columns: tuple[Column, ...]) -> str:
 
 
 def _turned(column: Column, unit: Unit) -> str:
-    """What becomes of a column that a setting chose;
-    with a caution where its unit is counted twice.
-    """
+    """What becomes of a column that a setting chose; a caution where its head says a unit, too."""
     factor, bare, wanted = unit.times, unit.name, column.schema_unit
     if not factor:
         return f"column {column.head!r}: {bare} turned into {wanted}"
     then = f", then {bare} (by its head) into {wanted}" if bare not in ("", wanted) else ""
     value = float(unit.convert(np.array(100.0)))
     note = f"column {column.head!r} times {factor}{then}: 100 in the file is {value:g} {wanted}"
-    if then and math.isclose(abs(float(factor)), UNITS[bare.lower()].factor):
-        way = say_column(column.role, column.head or "")
-        return Caution(f"{note}; twice? {way} turns {bare} alone")
-    return note
+    return Caution(note) if then else note
 
 
 def rename_for_stations(column: Column) -> Column:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -27,7 +26,6 @@ from gsparc.tables.columns import (
     list_roles,
     name_block,
     name_columns,
-    used_heads,
 )
 from gsparc.tables.columns_file import edited_beside, read_columns
 from gsparc.tables.links.stations import PER_STATION
@@ -165,7 +163,6 @@ def _name_levels(sheet: Sheet, stations: Collection[str]) -> tuple[Sheet, dict[s
 
 # Arbitrary strength units (3GPP TS 27.007, 8.5); LTE counts up to 97
 UNKNOWN_ASU, MOST_GSM = 99, 31
-MOST_NAMED = 3  # stations that a list lacks, each with a line of its own
 
 
 class Builder:
@@ -554,11 +551,6 @@ class Builder:
             for title, name in zip(names, self.listed.names, strict=True)
             if name not in labels
         ]
-        used = used_heads(self.chosen)
-        for name in silent:
-            # Heads that are used belong to other stations; 0.6 is difflib's own cutoff.
-            for head in difflib.get_close_matches(name, set(self.sheet.heads) - used, 1, 0.6):
-                self.refuse(f"no column of the listed station {name!r}, but {head!r}; the same?")
         if self.sheet.problems:
             return None
         self._note_silent("without a column, and left out", silent)
@@ -580,14 +572,12 @@ class Builder:
             self.listed = self.listed.add_missing(words, self.notes)
         names = {"", *self.listed.names}
         unlisted = [word for word in dict.fromkeys(words.tolist()) if word not in names]
-        place = f"{self.sheet.source}, " + ("the heads" if head is None else f"column {head!r}")
-        if len(unlisted) > MOST_NAMED:
-            fault = f"{list_first([*map(repr, unlisted)])} are no listed stations; the list has "
-            return self.sheet.problems.add(place, fault + list_first(self.listed.names))
-        for word in unlisted:
-            row = "" if head is None else f", {self.sheet.rows[int(np.argmax(words == word))]}"
-            fault = f"{word!r} is no listed station{suggest_name(word, self.listed.names)}"
-            self.sheet.problems.add(place + row, fault)
+        if unlisted:
+            place = "the heads" if head is None else f"column {head!r}"
+            hint = suggest_name(unlisted[0], self.listed.names)
+            fault = f"{list_first([*map(repr, unlisted)])}: no listed station"
+            fault += hint or f"; the list has {list_first(self.listed.names)}"
+            self.sheet.problems.add(f"{self.sheet.source}, {place}", fault)
 
     def _by_list(self, words: np.ndarray) -> StationList:
         assert self.listed is not None

@@ -176,7 +176,7 @@ def test_heads_that_hold_a_number_of_the_list_name_its_cells(tmp_path, form):
     wrong = write(tmp_path / "w.csv", ["x", "y", *(f"AP{c}" for c in range(count))], rows)
     with pytest.raises(DataError) as refused:
         read_any(wrong, stations_file=listed)
-    assert len(refused.value.problems) == 1 and ("'AP4' and 10 more are no listed") in str(
+    assert len(refused.value.problems) == 1 and ("and 10 more: no listed station") in str(
         refused.value
     )
 
@@ -230,7 +230,7 @@ def test_a_column_of_a_list_was_believed_at_any_magnitude(tmp_path, head, factor
         notes = str(refused)
     assert any(
         word in notes
-        for word in (head.partition(" [")[0] + "' holds", "earfcn: some", "are no listed stations")
+        for word in (head.partition(" [")[0] + "' holds", "earfcn: some", "no listed station")
     ), notes
 
 
