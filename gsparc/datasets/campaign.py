@@ -23,7 +23,6 @@ from gsparc.datasets.datamodule import DataModule
 from gsparc.datasets.public.fetch import fetched_path, fetched_path_or_none
 from gsparc.tables.advice import run_warnings
 from gsparc.tables.checks.conventions import convention_warnings
-from gsparc.tables.checks.gone import gone_warnings
 from gsparc.tables.checks.level_steps import LevelStep, find_level_steps
 from gsparc.tables.checks.link_levels import LinkLevels, link_levels
 from gsparc.tables.checks.plausibility import sanity_warnings
@@ -105,7 +104,7 @@ def find_implausible(
     hints += map(Severe, convention_warnings(data))
     if (levels := link_levels(data, file_row)) is None:
         return hints, None, []
-    steps, hints = find_level_steps(levels), [*hints, *run_warnings(data), *gone_warnings(data)]
+    steps, hints = find_level_steps(levels), [*hints, *run_warnings(data)]
     return [*hints, *sanity_warnings(levels, steps)], levels, steps
 
 
