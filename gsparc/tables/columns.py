@@ -323,8 +323,8 @@ def _wide_survey(sheet: Sheet, chosen: Chosen) -> None:
     several = len(alike) > 1 and "station" not in chosen
     ways = [name_block(sheet, alike)] * several + alike[: MOST_READINGS - several]
     why = f"{names} {holds} values like levels, no head says so: which are"
-    readings = tuple(Answer({"rssi_db": way}, _means(sheet, way)) for way in ways)
-    return sheet.ask(Role(tuple(alike), "rssi_db", "seen", readings=readings, why=why))
+    answers = [Answer({"rssi_db": way}, _means(sheet, way)) for way in ways]
+    return sheet.ask(why, *answers, sure="seen")
 
 
 def name_block(sheet: Sheet, names: Sequence[str]) -> object:
@@ -347,11 +347,8 @@ def _ask_ranks(sheet: Sheet, role: str, columns: Sequence[Column]) -> bool:
     why = f"columns {names!r} hold names beside the levels of {levels!r}: are these the stations, "
     why += "or the numbers"
     block = name_block(sheet, [*numbered.values()])
-    readings = (
-        Answer({"station": names, role: levels}, "lists of the strongest"),
-        Answer({role: block}, "a station each"),
-    )
-    sheet.ask(Role(tuple(numbered.values()), role, "seen", readings=readings, why=why))
+    lists = Answer({role: levels, "station": names}, "lists of the strongest")
+    sheet.ask(why, lists, Answer({role: block}, "a station each"), sure="seen")
     return True
 
 
@@ -366,11 +363,8 @@ def _ask_phase(sheet: Sheet, chosen: Chosen) -> None:
     why = (
         f"{name_columns([level, phase])} are level and phase: of a channel, or is the phase unused"
     )
-    readings = (
-        Answer({"rssi_db": level}, "levels"),
-        Answer({"csi_amp": level, "csi_phase": phase}, "channels"),
-    )
-    sheet.ask(Role((level, phase), "rssi_db", "seen", readings=readings, why=why))
+    polar = Answer({"csi_amp": level, "csi_phase": phase}, "channels")
+    sheet.ask(why, Answer({"rssi_db": level}, "levels"), polar, sure="seen")
 
 
 STOREY_M = 3.2  # between floors, where nobody says more
@@ -383,13 +377,10 @@ def _ask_floor(sheet: Sheet, chosen: Chosen) -> None:
         numbers = pd.to_numeric(pd.Series(sheet.words(head)), errors="coerce")
         words = {*words_of(head)} - LISTS["labels"]
         if words and words <= LISTS["floor"] and numbers.nunique() > 1:
-            ways = f"{head}*{STOREY_M:g}", head
-            readings = (
-                Answer({"z": ways[0]}, f"heights, {STOREY_M:g} m each"),
-                Answer({"z": NONE, "run": ways[1]}, "groups of rows at one height"),
-            )
             why = f"column {head!r} numbers floors: heights, or groups of rows"
-            return sheet.ask(Role((head,), "z", "open", readings=readings, why=why))
+            heights = Answer({"z": f"{head}*{STOREY_M:g}"}, f"heights, {STOREY_M:g} m each")
+            group = Answer({"z": NONE, "run": head}, "groups of rows at one height")
+            return sheet.ask(why, heights, group)
     return None
 
 
@@ -569,15 +560,7 @@ def _one_way(sheet: Sheet, guesses: dict[str, list[Column]]) -> None:
             Answer({c.role: _pattern([o for o in columns if o.role == c.role]) for c in columns})
             for columns in by_way
         ]
-        sheet.ask(
-            Role(
-                tuple(c.head or "" for c in first),
-                first[0].role,
-                "open",
-                readings=tuple(answers),
-                why=fault,
-            )
-        )
+        sheet.ask(fault, *answers)
         for role in sum(ways, ()):
             guesses.pop(role, None)
 
@@ -636,8 +619,7 @@ def _ask_which(sheet: Sheet, role: str, columns: list[Column]) -> None:
     why = f"{_names(columns)} could each be {role}: which is it"
     if len(columns) == 1:
         why = f"{_names(columns)}: a received level or power, or something else"
-    readings = [Answer({role: way}, "" if way == NONE else _means(sheet, way)) for way in ways]
-    sheet.ask(Role(tuple(names), role, "open", readings=tuple(readings), why=why))
+    sheet.ask(why, *(Answer({role: w}, "" if w == NONE else _means(sheet, w)) for w in ways))
 
 
 def _names(columns: Iterable[Column]) -> str:

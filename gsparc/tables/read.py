@@ -258,8 +258,8 @@ class Builder:
     def _ask(self, why: str, head: str, **ways: Sequence[object]) -> None:
         """Ask about a column, by quantity what it may be."""
         cell = self.sheet.first_cell(head)
-        answers = tuple(Answer({role: way}, cell) for role, each in ways.items() for way in each)
-        self.sheet.ask(Role((head,), next(iter(ways)), "open", readings=answers, why=why))
+        answers = [Answer({role: way}, cell) for role, each in ways.items() for way in each]
+        self.sheet.ask(why, *answers)
 
     def _ask_measurement(self) -> None:
         """Ask about a column that may be turned into levels, else refuse the table."""
@@ -405,9 +405,8 @@ class Builder:
             if all(len(heads_of_axis) == 1 for heads_of_axis in of_axes):
                 names = [heads_of_axis[0] for heads_of_axis in of_axes]
                 cells = " and ".join(map(self.sheet.first_cell, names))
-                readings = (Answer(dict(zip(pair, names, strict=True)), cells),)
                 why = f"{name_columns(names)} may be {' and '.join(pair)}"
-                self.sheet.ask(Role(tuple(names), pair[0], "open", readings=readings, why=why))
+                self.sheet.ask(why, Answer(dict(zip(pair, names, strict=True)), cells))
                 return True
         return False
 
