@@ -23,7 +23,7 @@ from gsparc.data.schema import Measurements
 from gsparc.physics.decibels import to_decibels
 from gsparc.processes.factor import Factor
 from gsparc.processes.level_field import fit_level_field
-from gsparc.tables.columns import Chosen, used_heads
+from gsparc.tables.column import Chosen, used_heads
 from gsparc.tables.heads import LISTS, words_of
 from gsparc.tables.roles import say_column
 from gsparc.tables.sheet import Sheet

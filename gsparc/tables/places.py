@@ -11,7 +11,8 @@ import pandas as pd
 
 from gsparc.base.errors import Caution, DataError, list_first, name_row_ranges
 from gsparc.data.georeference import find_invalid_coordinate
-from gsparc.tables.columns import BY_ROW, Chosen, choose_columns, rename_for_stations
+from gsparc.tables.column import BY_ROW, Chosen
+from gsparc.tables.columns import choose_columns, rename_for_stations
 from gsparc.tables.heads import AXES, ENDS, LISTS, OTHER_NAMES, TOGETHER, parse_head, words_of
 from gsparc.tables.links.stations import PER_STATION, SECTOR
 from gsparc.tables.opening import read_sheet

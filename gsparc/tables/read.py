@@ -18,15 +18,8 @@ from gsparc.data.units import UNITS, WATTS
 from gsparc.tables import heads, places
 from gsparc.tables.advice import advise
 from gsparc.tables.amplitudes import join_polar
-from gsparc.tables.columns import (
-    JOINED,
-    Chosen,
-    Column,
-    choose_columns,
-    list_roles,
-    name_block,
-    name_columns,
-)
+from gsparc.tables.column import JOINED, Chosen, Column, name_block, name_columns
+from gsparc.tables.columns import choose_columns, list_roles
 from gsparc.tables.columns_file import edited_beside, read_columns
 from gsparc.tables.links.stations import PER_STATION
 from gsparc.tables.opening import read_sheet
