@@ -16,11 +16,11 @@ from gsparc.tables.builder import Builder
 from gsparc.tables.columns import choose_columns, list_roles
 from gsparc.tables.columns_file import edited_beside, read_columns
 from gsparc.tables.opening import read_sheet
-from gsparc.tables.places import StationList
 from gsparc.tables.raw import Raw
 from gsparc.tables.roles import Role, Said, settle
 from gsparc.tables.sheet import Sheet
 from gsparc.tables.slots import unfold_slots, unfold_tones
+from gsparc.tables.station_list import StationList
 
 
 def parse_table(

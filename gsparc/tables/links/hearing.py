@@ -15,8 +15,9 @@ from gsparc.data.blocks import is_big
 from gsparc.data.schema import OTHER, Links
 from gsparc.data.selection import take_rows
 from gsparc.physics.decibels import to_decibels
+from gsparc.tables.array_checks import MOST_DB
 from gsparc.tables.checks.plausibility import APART_DB, find_marks, find_saturation
-from gsparc.tables.own_checks import MOST_DB, Checker
+from gsparc.tables.own_checks import Checker
 
 POWERS = ("rssi", "rssi_db")
 BESIDE, LEAST_MARKS = 6, 12  # rows around a mark; marks that tell
