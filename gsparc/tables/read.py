@@ -20,7 +20,7 @@ from gsparc.tables.raw import Raw
 from gsparc.tables.roles import Role, Said, settle
 from gsparc.tables.sheet import Sheet
 from gsparc.tables.slots import unfold_slots, unfold_tones
-from gsparc.tables.station_list import StationList
+from gsparc.tables.station_list import StationList, read_stations
 
 
 def parse_table(
@@ -48,7 +48,7 @@ def parse_table(
     """
     sheet, listed = read_sheet(path), None
     if stations_file is not None:
-        listed = places.read_stations(
+        listed = read_stations(
             replace(read_sheet(stations_file, sheet.problems), notes=sheet.notes)
         )
         sheet.problems.raise_if_any()

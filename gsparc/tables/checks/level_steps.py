@@ -4,19 +4,17 @@ another antenna.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from gsparc.processes.few_rows import evenly_spaced
-from gsparc.processes.level_field import NUGGETS, fit_level_field
+from gsparc.processes.level_field import fit_level_field
 from gsparc.tables.advice import MOST_ROWS, LevelsAtPlaces, is_better_parted
 from gsparc.tables.checks.link_levels import UNNAMED, LinkLevels
 
-MOST_BLOCKS = 1000  # of rows; the cost is their cube: 0.3 s
-LIKELIHOOD_BLOCKS = 300  # that choose the length of correlation
+MOST = 600  # rows of a station; the cost is their cube
 MOST_STEPS = 3
 AROUND = MOST_ROWS // 2  # rows before and after a step that it is tried on
 LEAST_ROWS = 60
@@ -45,13 +43,12 @@ def find_level_steps(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
     where levels that are left out are predicted better with a station from the step on.
     """
     steps = list[tuple[int, LevelStep]]()
-    share = 20 * MOST_BLOCKS / max(len(np.unique(levels.station)), 1)
-    blocks = int(np.clip(share, 200, MOST_BLOCKS))
     for t, used in levels.heard() if levels.ordered else ():
         where = levels.station_position[t]
-        where = where if np.isfinite(where).all() else None
         position, level = levels.position[used], levels.level_db[used]
-        for step in detect_level_steps(position, level, where, blocks):
+        for step in detect_level_steps(
+            position, level, where if np.isfinite(where).all() else None
+        ):
             near = np.arange(len(used))[max(step.first - AROUND, 0) : step.first + AROUND]
             links = LevelsAtPlaces(position[near], np.zeros(len(near), np.int64), level[near])
             if is_better_parted(links, near >= step.first):
@@ -83,10 +80,7 @@ def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) ->
 
 
 def detect_level_steps(
-    position: np.ndarray,
-    level_db: np.ndarray,
-    station_position: np.ndarray | None = None,
-    most_blocks: int = MOST_BLOCKS,
+    position: np.ndarray, level_db: np.ndarray, station_position: np.ndarray | None = None
 ) -> list[LevelStep]:
     """Find where the level of one station changes though the places do not explain it.
 
@@ -100,47 +94,30 @@ def detect_level_steps(
     Args:
         position: (n, 2) or (n, 3) [m], in the order of measuring.
         level_db: (n,) [dB], NaN where there is none.
-        station_position: (2,) or (3,) [m]; None: the level is not tied to a distance.
-        most_blocks: rows are averaged to at most so many (median), against outliers and for speed.
+        station_position: (2,) or (3,) [m]; None, or NaN: the level is not tied to a distance.
     """
     rows = np.flatnonzero(np.isfinite(level_db))
-    if len(rows) < LEAST_ROWS or not np.ptp(position[rows], axis=0).any():
+    rows = rows[evenly_spaced(len(rows), MOST)]
+    places, level, mean = position[rows], level_db[rows], list[np.ndarray]()
+    if len(rows) < LEAST_ROWS or not np.ptp(places, axis=0).any() or not np.ptp(level):
         return []
-    blocks = _blocks(rows, most_blocks)
-    places = np.array([np.median(position[b], axis=0) for b in blocks])
-    level = np.array([np.median(level_db[b]) for b in blocks])
-    if not np.ptp(level):
-        return []
-    mean: list[np.ndarray] = []
-    if station_position is not None:
+    if station_position is not None and np.isfinite(station_position).all():
         distance = np.linalg.norm(places - np.asarray(station_position)[: places.shape[1]], axis=1)
         mean.append(np.log10(np.maximum(distance, np.ptp(places, axis=0).max() / 300)))
-    some = evenly_spaced(len(level), LIKELIHOOD_BLOCKS)
-    # Medians of rows hold less noise than rows do.
-    of_some = places[some], level[some], np.zeros(len(some)), [column[some] for column in mean]
-    field = fit_level_field(*of_some, nuggets=NUGGETS[:-1])
-    precision, regressors = field.precision(places), np.column_stack([np.ones(len(level)), *mean])
-    after, change = _search(precision, level, regressors)
+    field = fit_level_field(places, level, np.zeros(len(level)), mean)
+    regressors = np.column_stack([np.ones(len(level)), *mean])
+    after, change = _search(field.precision(places), level, regressors)
     return [
-        LevelStep(int(blocks[k - 1][-1]), int(blocks[k][0]), float(by))
+        LevelStep(int(rows[k - 1]), int(rows[k]), float(by))
         for k, by in sorted(zip(after, change, strict=True))
         if abs(by) >= LEAST_DB
-    ]
-
-
-def _blocks(rows: np.ndarray, most: int) -> list[np.ndarray]:
-    """Consecutive rows in at most about `most` groups, none across a gap."""
-    size = max(3, math.ceil(len(rows) / most))  # a median of three does not see a single wrong row
-    pieces = np.split(rows, np.flatnonzero(np.diff(rows) > 10 * size) + 1)
-    return [
-        block for piece in pieces for block in np.array_split(piece, math.ceil(len(piece) / size))
     ]
 
 
 def _search(
     precision: np.ndarray, level: np.ndarray, regressors: np.ndarray
 ) -> tuple[list[int], np.ndarray]:
-    """First blocks after steps of `LEAST_SIGMAS` and more,
+    """First rows after steps of `LEAST_SIGMAS` and more,
     and estimates [dB] of all of them together.
     """
     margin, after, change = max(3, int(SHORTEST * len(level))), list[int](), np.zeros(0)
@@ -159,7 +136,7 @@ def _search(
 def _best(
     precision: np.ndarray, level: np.ndarray, mean: np.ndarray, steps: list[int], margin: int
 ) -> int:
-    """The block after the most significant step, besides `steps`."""
+    """The row after the most significant step, besides `steps`."""
     count = len(level)
     design = np.column_stack([mean, *(_step(count, k) for k in steps)])
     weighed = precision @ design

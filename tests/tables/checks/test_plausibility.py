@@ -187,15 +187,15 @@ def campus(stations=slice(None)) -> LinkLevels:
 
 
 def test_a_real_station_that_lost_its_gain():
-    """One of four changes: 17 dB more from row 350 on, 19 dB less from row 1161 on,
+    """One of four changes: 17 dB more from row 350 on, 19 dB less from row 1462 on,
     after it was off.
     """
     some = campus(slice(5, 9))
     found = step_warnings(some, find_level_steps(some))
-    # Two lines proposed [350] and [1161], of which the later setting replaces the first.
-    assert len(found) == 1 and "dataset.level_steps={ebc-nuc1-b210:[350,1161]}" in found[0]
-    assert "rises by 17 dB between row 349 and row 350 and falls" in found[0]
-    assert "falls by 19 dB between row 1160 and row 1161" in found[0]
+    # Two lines proposed [353] and [1462], of which the later setting replaces the first.
+    assert len(found) == 1 and "dataset.level_steps={ebc-nuc1-b210:[353,1462]}" in found[0]
+    assert "rises by 17 dB between row 345 and row 353 and falls" in found[0]
+    assert "falls by 19 dB between row 1155 and row 1462" in found[0]
 
 
 def test_the_setting_of_a_level_step_named_no_row_of_a_table(tmp_path):
