@@ -13,6 +13,7 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.ndimage import median_filter
+from scipy.spatial import cKDTree
 
 from gsparc.base.errors import Severe, list_first
 from gsparc.data.blocks import rows_by
@@ -25,10 +26,11 @@ NAMED = 5  # wild rows that a station may have, however few its rows
 SATURATED = 0.01  # of all levels, at least
 PILE = 0.05  # of all levels, at least: no level of a receiver holds as many by chance
 APART_DB, GAP_DB = 20.0, 3.0  # between a mark and all levels; below a pile that holds many
-REPEATS = 3  # of a mark
+REPEATS, FEW_APART = 3, 0.02  # of a mark, of rows far from the nearest; share of these
 # Width of a pile of a receiver's noise; its share of the levels, at least
 NOISE_DB, PILED = 4.0, 1 / 3
-HIGHEST_DBM = 60.0  # a kilowatt received
+HIGHEST_DBM, LOWEST_DBM = 60.0, -174.0  # a kilowatt received; thermal noise in a hertz
+NARROW_DB = 1.0  # between all levels of a site there is more
 OUTLIER_DB = 25.0  # from the rows before and after: more than fading does between neighbours
 SPREADS = 10.0  # scaled median absolute deviations of that difference
 NEIGHBOURS = 5  # rows on each side
@@ -44,7 +46,14 @@ def sanity_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) 
         levels: of powers.
         steps: `find_level_steps` them.
     """
-    severe = map(Severe, [*level_warnings(levels.level_db), *misplaced_warnings(levels)])
+    severe = map(
+        Severe,
+        [
+            *level_warnings(levels.level_db),
+            *two_unit_warnings(levels),
+            *misplaced_warnings(levels),
+        ],
+    )
     still, wild = still_warnings(levels), outlier_row_warnings(levels)
     return [*severe, *still, *wild, *step_warnings(levels, steps)]
 
@@ -62,15 +71,43 @@ def degree_warnings(latitude: np.ndarray, longitude: np.ndarray) -> list[str]:
 
 
 def level_warnings(level_db: np.ndarray) -> list[str]:
-    """Warn of levels (n,) [dB] that may be linear, percent or indices."""
+    """Warn of levels (n,) [dB] that may be linear, percent, indices or parts of decibels."""
     values = level_db[np.isfinite(level_db)]
-    low, high = values.min(initial=np.inf), values.max(initial=-np.inf)
-    whole = (np.abs(values - values.round()) < 1e-3).all()  # powers in single precision
-    if not (0 <= low < high and (high <= 1 or high > HIGHEST_DBM or whole)):
+    if not len(values):
         return []
-    finding = f"no level of {low:g} to {high:g} is below 0: losses (store minus them; "
-    finding += "dataset.columns.rssi_db=HEAD*-1), per cent, an index, or linear"
-    return [f"{finding} (give it as rssi, in W)?"]
+    low, high = float(values.min()), float(values.max())
+    whole = (np.abs(values - values.round()) < 1e-3).all()  # powers in single precision
+    positive = 0 <= low < high and (high <= 1 or high > HIGHEST_DBM or whole)
+    losses = "losses (store minus them; dataset.columns.rssi_db=HEAD*-1)"
+    doubts = {
+        f"no level of {low:g} to {high:g} is below 0: {losses}, per cent, an index, or linear "
+        "(give it as rssi, in W)?": positive,
+        f"levels of {low:.4g} to {high:.4g}, most below thermal noise of a hertz: in decibels?": (
+            np.median(values) < LOWEST_DBM
+        ),
+        f"levels differ by {high - low:.2g} dB in all: linear, or parts of a decibel?": (
+            0 < high - low < NARROW_DB
+        ),
+    }
+    return [text for text, holds in doubts.items() if holds][:1]
+
+
+def two_unit_warnings(levels: LinkLevels) -> list[str]:
+    """Warn of some levels in another unit, as dBW beside dBm: near rows agree, or are far apart."""
+    differences = [np.zeros(0)]
+    for _, used in levels.heard():
+        place, level = levels.position[used], levels.level_db[used]
+        if len(used) > NEIGHBOURS:
+            differences.append(np.abs(level - level[cKDTree(place).query(place, 2)[1][:, 1]]))
+    rows = np.concatenate(differences)
+    far, between = (
+        int((rows > APART_DB).sum()),
+        int(((rows > APART_DB / 2) & (rows <= APART_DB)).sum()),
+    )
+    if far <= max(REPEATS, FEW_APART * len(rows), between):
+        return []
+    finding = f"{far} of {len(rows)} levels are over {APART_DB:g} dB from that of the nearest row"
+    return [f"{finding}, {between} over {APART_DB / 2:g}: in two units?"]
 
 
 def find_noise(station: np.ndarray, level_db: np.ndarray) -> dict[int, tuple[float, float]]:

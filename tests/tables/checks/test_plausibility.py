@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from level_fields import flight
 from releases import real
 from scipy.spatial.distance import cdist
 
@@ -269,3 +270,34 @@ def test_rows_of_which_some_have_other_degrees_were_good():
     half = np.where(np.arange(80) % 2, latitude, latitude / 10)
     (said,) = unit_warnings(from_arrays({**arrays, "latitude": half}))
     assert said.startswith("two groups of places ") and "km apart" in said
+
+
+@pytest.mark.parametrize(
+    "other", [lambda v: v / 1e3, lambda v: v / 10, lambda v: 10 ** (v / 10), lambda v: v - 30]
+)
+@pytest.mark.parametrize("each", [2, 10])
+def test_some_levels_in_another_unit_are_named(other, each):
+    place, level, _ = walk(0)
+    assert not plausibility.two_unit_warnings(as_links(place, level[:, None], ["a"]))
+    level[::each] = other(level[::each])
+    (said,) = plausibility.two_unit_warnings(as_links(place, level[:, None], ["a"]))
+    assert said.endswith("in two units?"), said
+
+
+@pytest.mark.parametrize("factor, says", [(1e-2, "differ by"), (3.28, "thermal noise of a hertz")])
+def test_all_levels_in_another_unit_were_good(factor, says):
+    """-80 dBm as -.8, or as -262."""
+    level = room()[1]
+    found = plausibility.level_warnings((level - 40) * factor)
+    assert any(says in line for line in found), found
+
+
+@pytest.mark.parametrize("share", [0.5, 0.1])
+def test_rows_in_dbw_beside_others_in_dbm_were_good(share):
+    """Levels spread over 60 dB: no gap between two units, but none between near rows is as wide."""
+    rng, arrays = np.random.default_rng(0), flight(0)
+    levels = link_levels(from_arrays(arrays))
+    assert not plausibility.two_unit_warnings(levels)
+    half = rng.random(len(levels.level_db)) < share
+    (said,) = plausibility.two_unit_warnings(replace(levels, level_db=levels.level_db - 30 * half))
+    assert said.endswith("in two units?")
