@@ -38,6 +38,12 @@ USUAL = {
     **dict.fromkeys(TILTS, (0, 30, 12)),
     "station_power_db": (-20, 80, 15),
 }
+# In place of a value that nobody knows
+UNKNOWN = {
+    "station_azimuth": -1,
+    "station_power_db": 0,
+    **dict.fromkeys(("station_width", "station_thickness"), 0),
+}
 UNSAID_DBM = 30  # a lower power, where nobody says its unit, may be in watts
 FEW, LEAST = 0.2, 3  # share of a column up to which values are single ones; radians beside degrees
 CELL = re.compile(r"(?i)^\s*[bn]?([-+]?\d*\.?\d+(?:e[-+]?\d+)?)\s*([a-zµμ%°]*)(?:\s.*)?$")
@@ -104,12 +110,11 @@ def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndar
         if len(bad_rows):
             cells = list_first([f"'{sheet.words(head)[i]}' in {sheet.rows[i]}" for i in bad_rows])
             notes.append(Caution(f"{sheet.source}: column {head!r}: {cells}: no {name}; unknown"))
-        if name == "station_azimuth" and (values < 0).any() and (values[values < 0] == -1).all():
-            values, meaning = np.where(values < 0, np.nan, values), f"{name}, -1 unknown"
-        high = np.nanmedian(values) > UNSAID_DBM or not np.nan_to_num(values).any()
-        empty = "station_width", "station_thickness", *(["station_power_db"] if high else [])
-        if name in empty and (values == 0).any():
-            values, meaning = np.where(values == 0, np.nan, values), f"{name}, 0 unknown"
+        mark = UNKNOWN.get(name)
+        # A power of 0 dBm is one where others are about as low
+        low = name == "station_power_db" and 0 < abs(np.nanmedian(values)) <= UNSAID_DBM
+        if mark is not None and not low and (values == mark).any():
+            values, meaning = np.where(values == mark, np.nan, values), f"{name}, {mark} unknown"
         if name in TILTS and (values < 0).any() and not (values > 0).any():
             notes.append(
                 Caution(f"{sheet.source}: {head!r} are all below 0: read as below the horizon")
