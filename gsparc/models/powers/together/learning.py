@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -169,9 +170,16 @@ def _with_amplitude(kernel: Kernel, amplitude: float) -> Kernel:
     return replace(kernel, amplitude=max(amplitude, LEAST_DB2))
 
 
+class LeftOutStations(NamedTuple):
+    """Rows (n,) of stations left out, by their numbers in the measurements, and errors (n,) [dB]."""
+
+    rows: np.ndarray
+    errors: np.ndarray
+
+
 def learn_shared_terms(
     rows: StationRows, priors: StationPriors, seed: int
-) -> tuple[SharedTerms, float, str]:
+) -> tuple[SharedTerms, float, str, LeftOutStations | None]:
     """Return shared terms for stations that were never heard,
     of least squared error at left-out stations.
 
@@ -191,7 +199,7 @@ def learn_shared_terms(
         few, priors.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed
     )
     if len(few.stations) < LEAST_STATIONS:
-        return bare, 1.0, "no shared terms: too few stations to leave some out"
+        return bare, 1.0, "no shared terms: too few stations to leave some out", None
     processes = priors.condition(few, bare, seed).processes
     best = plain = bare, *_left_out_errors(processes, bare)
     for length in LENGTHS:
@@ -202,31 +210,34 @@ def learn_shared_terms(
             result = _left_out_errors(processes, terms)
             if (result[0] ** 2).mean() < (best[1] ** 2).mean():
                 best = terms, *result
-    (_, errors, *_), (_, others, _, station) = best, plain
+    (_, errors, *_), (_, others, _, station, _) = best, plain
     gain, unsure = mean_and_error(others**2 - errors**2, station)
-    terms, _, ratio, _ = best if gain > ERRORS * unsure else plain
+    terms, _, ratio, _, whole = best if gain > ERRORS * unsure else plain
     before, after = (math.sqrt(float((residuals**2).mean())) for residuals in (others, errors))
     remark = (
         f"stations left out, after one constant each: rmse {before:.3g} dB without shared terms, "
         f"{after:.3g} dB with them (gain {gain:.2g} +- {unsure:.2g} dB^2)"
     )
-    return terms, min(max(ratio, 1 / WIDEST), WIDEST), remark
+    index = np.concatenate([few.select_station(number).index for number in processes])
+    factor = min(max(ratio, 1 / WIDEST), WIDEST)
+    return terms, factor, remark, LeftOutStations(index, whole)
 
 
 def _left_out_errors(
     processes: Mapping[int, Exact], terms: SharedTerms
-) -> tuple[np.ndarray, float, np.ndarray]:
+) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
     """Errors (n,) [dB] of what was heard of stations left out, after a constant of each,
-    and their stations.
+    and their stations; and those without that constant.
 
     Between them the mean square of errors without that constant over their predicted variances.
     """
-    errors, ratios = [], []
+    whole, ratios = [], []
     blocks = [
         Block.from_process(process, terms.columns(process.rows)) for process in processes.values()
     ]
     for error, variance in left_out_processes(blocks):
         ratios.append(float((error.square() / variance).mean()))
-        errors.append((error - error.mean()).numpy())
-    station = np.repeat(np.arange(len(errors)), [len(part) for part in errors])
-    return np.concatenate(errors), float(np.mean(ratios)), station
+        whole.append(error.numpy())
+    errors = np.concatenate([error - error.mean() for error in whole])
+    station = np.repeat(np.arange(len(whole)), [len(part) for part in whole])
+    return errors, float(np.mean(ratios)), station, np.concatenate(whole)
