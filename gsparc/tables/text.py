@@ -261,26 +261,20 @@ def _without_comments(lines: Lines, delimiter: str, source: str, notes: list[str
     marked = [n for n in below if lines[n].lstrip().startswith(COMMENTS)]
     if not marked:
         return lines
-    cells = {n: _cells(line, delimiter) for n, line in lines.items()}
     # Between spaces a mark may be a cell
-    like = [_cells(lines[n].lstrip(" #%/"), delimiter) for n in marked]
-    if all(len(cells[heads]) != len(row) for row in (*like, *(cells[n] for n in marked))):
+    texts = [text for n in marked for text in (lines[n], lines[n].lstrip(" #%/"))]
+    if len(_cells(lines[heads], delimiter)) not in {len(_cells(text, delimiter)) for text in texts}:
         notes.append(f"{len(marked)} comments below the heads, the first in line {marked[0]}")
         return {n: line for n, line in lines.items() if n not in set(marked)}
-    first = {n: row[0].strip() for n, row in cells.items()}
+    first = {n: _cells(line, delimiter)[0].strip() for n, line in lines.items()}
     plain = [first[n] for n in below if n not in set(marked)]
-    numbers = bool(plain) and all(map(_is_number, plain))
+    taken, numbers = {*first.values(), ""}, bool(plain) and all(map(_is_number, plain))
     for n in marked:
-        # None in an empty cell
-        mark = next((mark for mark in COMMENTS if first[n].startswith(mark)), "")
-        name = first[n].removeprefix(mark).strip('"')
-        is_row = name.strip() and not name[0].isspace() and name not in first.values()
-        if not is_row or (numbers and _is_number(name)):
+        name = first[n].lstrip("".join(COMMENTS))
+        if name.lstrip() != name or name in taken or (numbers and _is_number(name)):
             begin = (first[n] or lines[n].strip())[:20]
-            fault = (
-                f"begins with {begin!r}: a row, or a comment? quote the cell or take the line out"
-            )
-            raise DataError(f"{source}, line {n}: {fault}")
+            fault = f"begins with {begin!r}: a row, or a comment?"
+            raise DataError(f"{source}, line {n}: {fault} quote the cell or take the line out")
     like_it = f"{first[marked[0]]!r} or the like, the first in line {marked[0]}"
     notes.append(f"{len(marked)} rows begin with {like_it}")
     return lines
