@@ -112,7 +112,7 @@ def _archive_sheet(path: str | Path) -> Sheet:
     columns = {
         f"{end}_{axis}": pd.Series(values)
         for end, place in places.items()
-        for axis, values in zip("xyz", place.T, strict=False)
+        for axis, values in zip("xyz", place.T, strict=True)
     }
     frame = pd.DataFrame(columns).ffill()  # one place of an end goes with all of the other's
     return Sheet(str(path), frame, tuple(f"row {number}" for number in range(len(frame))))
