@@ -30,12 +30,18 @@ from gsparc.models.powers.prior_map import NetworkMaps, describe_use
 from gsparc.models.powers.together.learning import (
     TRIED_EACH,
     StationPriors,
+    learn_own_settings,
     learn_shared_terms,
     learn_station_priors,
 )
 from gsparc.models.powers.together.links import LinkPriors, Links, both_ends_move, learn_links
 from gsparc.models.powers.together.network import find_sectors, learn_network, relabel_by_site
-from gsparc.models.powers.together.terms import SharedTerms, places_and_notes, rows_of_stations
+from gsparc.models.powers.together.terms import (
+    SharedTerms,
+    StationRows,
+    places_and_notes,
+    rows_of_stations,
+)
 from gsparc.models.target_rows import linear_moments
 from gsparc.processes.factor import Factor
 from gsparc.processes.neighbourhood import nearest_distance
@@ -107,6 +113,12 @@ class JointPowerField(ClosedForm):
         network = find_sectors(data, self.places)
         if network is None:
             self.own, remarks = learn_station_priors(used, self.seed)
+            if self.shared and both_ends_move(data, rows):
+                remarks.append(self._share_terms(used, by_links=True))
+            if self.link_priors is not None:
+                return (*notes, *remarks)
+            self.own, more = learn_own_settings(used, self.own, self.seed)
+            remarks += more
         else:
             measured, used = used, relabel_by_site(used, network)
             names = data.site.every_station.shown
@@ -126,17 +138,23 @@ class JointPowerField(ClosedForm):
             remarks.append(
                 f"at most {most} rows of each station are learned from, of up to {largest}"
             )
-        self.heard = self.unheard = SharedTerms.from_rows(
-            used, self.own.never.known_trend, 1.0, 0, self.seed
-        )
         if not self.shared or network is not None:
+            self.heard = self.unheard = self._law_alone(used)
             return (*notes, *remarks)
-        terms, self.inflation, remark, missed = learn_shared_terms(used, self.own, self.seed)
+        return (*notes, *remarks, self._share_terms(used))
+
+    def _law_alone(self, rows: StationRows) -> SharedTerms:
+        return SharedTerms.from_rows(rows, self.own.never.known_trend, 1.0, 0, self.seed)
+
+    def _share_terms(self, rows: StationRows, by_links: bool = False) -> str:
+        """Set what stations share, and links where these are better; what must be said."""
+        self.heard = self.unheard = self._law_alone(rows)
+        terms, self.inflation, remark, missed = learn_shared_terms(rows, self.own, self.seed)
         if terms.place_db:
-            self.unheard = terms.set_inducing(used, PLACES, self.seed)
-        if missed is not None and both_ends_move(data, rows):
-            self.link_priors, remark = learn_links(used, self.own.never, missed, self.seed)
-        return (*notes, *remarks, remark)
+            self.unheard = terms.set_inducing(rows, PLACES, self.seed)
+        if missed is not None and by_links:
+            self.link_priors, remark = learn_links(rows, self.own.never, missed, self.seed)
+        return remark
 
     @property
     def network(self) -> Sectors | None:

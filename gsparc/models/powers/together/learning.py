@@ -102,11 +102,12 @@ class StationPriors:
 
 
 def learn_station_priors(rows: StationRows, seed: int) -> tuple[StationPriors, list[str]]:
-    """Return the law and settings of own processes, and what must be said of them."""
+    """Return the law and settings of own processes, alike but for amplitudes, and what must be said
+    of them.
+    """
     trend, notes = _fit_site_law(rows, seed)
     heard, some_silent = rows.heard_rows, 0 < rows.silent.sum() < len(rows.silent)
     whole = rows.select_complete_places() if some_silent else heard
-    numbers = [number for number in whole.stations if (heard.station == number).sum() >= ENDS_FROM]
     kernel, priors = _fit_common_kernel(heard, trend, seed)
     if some_silent:
         each = whole.share_of(MOST_ROWS, WEIGHED_EACH)
@@ -119,6 +120,19 @@ def learn_station_priors(rows: StationRows, seed: int) -> tuple[StationPriors, l
         for number, prior in priors.items():
             kernel_here = replace(kernel, amplitude=wider * prior.kernel.amplitude)
             priors[number] = Prior(kernel_here, trend)
+    return StationPriors(Prior(kernel, trend), priors), notes
+
+
+def learn_own_settings(
+    rows: StationRows, alike: StationPriors, seed: int
+) -> tuple[StationPriors, list[str]]:
+    """Return the same with settings of their own for stations of many rows, and what must be said
+    of them.
+    """
+    heard, some_silent = rows.heard_rows, 0 < rows.silent.sum() < len(rows.silent)
+    whole = rows.select_complete_places() if some_silent else heard
+    numbers = [number for number in whole.stations if (heard.station == number).sum() >= ENDS_FROM]
+    priors, kernel, trend = dict(alike.heard), alike.never.kernel, alike.never.known_trend
     for number in numbers:
         if some_silent:
             some = whole.select_station(number).draw_stretches(ENDS_FROM, seed).view(trend)
@@ -127,8 +141,8 @@ def learn_station_priors(rows: StationRows, seed: int) -> tuple[StationPriors, l
             some = heard.select_station(number).thin_rows(ENDS_ON, seed).view(trend)
             _, kernel_here = fit_kernel_by_left_out([kernel], [some])
         priors[number] = Prior(_with_amplitude(kernel_here, kernel_here.amplitude), trend)
-    notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
-    return StationPriors(Prior(kernel, trend), priors), notes
+    notes = [f"settings of their own for {len(numbers)} stations"] if numbers else []
+    return replace(alike, heard=priors), notes
 
 
 def _fit_site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
@@ -171,7 +185,7 @@ def _with_amplitude(kernel: Kernel, amplitude: float) -> Kernel:
 
 
 class LeftOutStations(NamedTuple):
-    """Rows (n,) of stations left out, by their numbers in the measurements, and errors (n,) [dB]."""
+    """Rows (n,) of stations left out, of the measurements, and their errors (n,) [dB]."""
 
     rows: np.ndarray
     errors: np.ndarray
