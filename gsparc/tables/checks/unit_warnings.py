@@ -1,4 +1,4 @@
-"""Warnings about places that other units explain: millimetres, kilometres, degrees."""
+"""Warnings about places, arrays and grids that other units explain: millimetres, degrees."""
 
 from __future__ import annotations
 
@@ -7,22 +7,34 @@ import numpy as np
 from gsparc.data.outliers import find_gap
 from gsparc.data.schema import Measurements
 
+LONG_ARRAY = 100  # wavelengths: no array of one receiver
+ROUNDED = 0.02  # of a circle
 TINY_DEGREES = 1.0  # a campaign's extent in degrees
 # Heights 100 m apart, or a width of 10 km, are rarer than wrong units, as is a box of a centimetre
 HIGHEST, WIDEST, NARROWEST = 100.0, 1e4, 0.01
 
 
 def unit_warnings(data: Measurements) -> list[str]:
-    """Warn of readable but implausible places: of all, else of the end that moves,
-    as a static end elsewhere widens the box.
+    """Warn of readable but implausible places, arrays and grids. Places are those of both ends,
+    else of the one that moves, as a static end elsewhere widens the box.
     """
+    site = data.site
     if not np.ptp(data.moving, axis=0).any():
-        return ["all positions are the same, a box of 0 m: is it the moving end's column?"]
-    if data.site.georeference is not None:  # degrees became metres: no unit to mistake
-        return _group_hints(data.moving)
-    ends = np.concatenate([data.tx, data.rx_position]) + data.site.origin
-    places = ends[np.isfinite(ends).all(axis=1)], data.moving[:, :3] + data.site.origin
-    return next(filter(None, map(_position_hints, places)), [])
+        hints = ["all positions are the same, a box of 0 m: is it the moving end's column?"]
+    elif site.georeference is not None:  # degrees became metres: no unit to mistake
+        hints = _group_hints(data.moving)
+    else:
+        ends = np.concatenate([data.tx, data.rx_position]) + site.origin
+        places = ends[np.isfinite(ends).all(axis=1)], data.moving[:, :3] + site.origin
+        hints = next(filter(None, map(_position_hints, places)), [])
+    reach = 0.0 if site.array is None else float(np.ptp(site.array, axis=0).max())
+    if reach > LONG_ARRAY * (site.wavelength or np.inf):
+        hints = [*hints, f"the antennas reach over {reach:.4g} m: in mm?"]
+    turn = 0.0 if site.grid is None else site.grid.azimuth_step * site.grid.width
+    # Steps in radians taken for degrees: the columns then span 2 pi degrees.
+    if abs(np.degrees(turn) / (2 * np.pi) - 1) < ROUNDED:
+        hints = [*hints, "the columns span a full circle in radians; convert grid_deg"]
+    return hints
 
 
 def _position_hints(positions: np.ndarray) -> list[str]:
