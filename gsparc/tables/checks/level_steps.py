@@ -14,7 +14,7 @@ from gsparc.processes.level_field import fit_level_field
 from gsparc.tables.advice import MOST_ROWS, LevelsAtPlaces, is_better_parted
 from gsparc.tables.checks.link_levels import UNNAMED, LinkLevels
 
-MOST = 600  # rows of a station; the cost is their cube
+MOST, LEAST = 600, 200  # rows of a station, of many stations; the cost is their cube
 MOST_STEPS = 3
 AROUND = MOST_ROWS // 2  # rows before and after a step that it is tried on
 LEAST_ROWS = 60
@@ -43,6 +43,7 @@ def find_level_steps(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
     where levels that are left out are predicted better with a station from the step on.
     """
     steps = list[tuple[int, LevelStep]]()
+    most = int(np.clip(20 * MOST / max(len(levels.names), 1), LEAST, MOST))
     for t, used in levels.heard() if levels.ordered else ():
         where = levels.station_position[t]
         position, level = levels.position[used], levels.level_db[used]
@@ -80,7 +81,10 @@ def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) ->
 
 
 def detect_level_steps(
-    position: np.ndarray, level_db: np.ndarray, station_position: np.ndarray | None = None
+    position: np.ndarray,
+    level_db: np.ndarray,
+    station_position: np.ndarray | None = None,
+    most: int = MOST,
 ) -> list[LevelStep]:
     """Find where the level of one station changes though the places do not explain it.
 
@@ -95,9 +99,10 @@ def detect_level_steps(
         position: (n, 2) or (n, 3) [m], in the order of measuring.
         level_db: (n,) [dB], NaN where there is none.
         station_position: (2,) or (3,) [m]; None, or NaN: the level is not tied to a distance.
+        most: rows that are looked at.
     """
     rows = np.flatnonzero(np.isfinite(level_db))
-    rows = rows[evenly_spaced(len(rows), MOST)]
+    rows = rows[evenly_spaced(len(rows), most)]
     places, level, mean = position[rows], level_db[rows], list[np.ndarray]()
     if len(rows) < LEAST_ROWS or not np.ptp(places, axis=0).any() or not np.ptp(level):
         return []
