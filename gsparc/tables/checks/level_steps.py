@@ -45,11 +45,8 @@ def find_level_steps(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
     steps = list[tuple[int, LevelStep]]()
     most = int(np.clip(20 * MOST / max(len(levels.names), 1), LEAST, MOST))
     for t, used in levels.heard() if levels.ordered else ():
-        where = levels.station_position[t]
         position, level = levels.position[used], levels.level_db[used]
-        for step in detect_level_steps(
-            position, level, where if np.isfinite(where).all() else None
-        ):
+        for step in detect_level_steps(position, level, levels.station_position[t], most):
             near = np.arange(len(used))[max(step.first - AROUND, 0) : step.first + AROUND]
             links = LevelsAtPlaces(position[near], np.zeros(len(near), np.int64), level[near])
             if is_better_parted(links, near >= step.first):
