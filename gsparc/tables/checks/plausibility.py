@@ -85,9 +85,8 @@ def level_warnings(level_db: np.ndarray) -> list[str]:
         f"levels of {low:.4g} to {high:.4g}, most below thermal noise of a hertz: in decibels?": (
             np.median(values) < LOWEST_DBM
         ),
-        f"levels differ by {high - low:.2g} dB in all: linear, or parts of a decibel?": (
-            0 < high - low < NARROW_DB
-        ),
+        f"levels differ by {high - low:.2g} dB in all: linear, parts of a decibel, or another "
+        "column?": (len(values) > 1 and high - low < NARROW_DB),
     }
     return [text for text, holds in doubts.items() if holds][:1]
 
