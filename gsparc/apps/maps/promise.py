@@ -17,7 +17,7 @@ from gsparc.apps.maps.intervals import Coverage, IntervalScales, calibrate, cros
 from gsparc.base.errors import DataError
 from gsparc.base.executor import run_all
 from gsparc.base.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
-from gsparc.data.splits import SplitSettings
+from gsparc.data.splits import Fold, SplitSettings
 from gsparc.models import checkpoint
 from gsparc.prediction.left_out import HeldOutLevels, leave_out, nearest_distances
 from gsparc.prediction.refit import Learned
@@ -27,6 +27,7 @@ log = logging.getLogger(__name__)
 
 KEY = "map"
 SIDES = (1.0, 2.0)  # of blocks, by turns: near and far rows alike
+QUARTERS, TURNS = 4, 2  # of the places, as they lie and turned
 SHARE_OUT, ROWS_OUT = 0.2, 100  # of the rows, held out by each fit, and by all together at least
 
 
@@ -61,16 +62,19 @@ class Promise:
         known: (n, 3) or (n, 6) local places that the model learned from [m].
         station: (n,) int64, which each is of.
         block_m: side of the smaller blocks [m].
+        quarters: evidence of whole quarters held out, which tell of places that blocks are not as
+            far from rows as; None: such places are refused.
     """
 
     evidence: HeldOutLevels
     known: np.ndarray
     station: np.ndarray
     block_m: float
+    quarters: HeldOutLevels | None = None
 
     def calibration(self, share: float = 0.9) -> IntervalScales:
         """See `calibrate`."""
-        return calibrate(self.evidence, share)
+        return calibrate(self.evidence, share, self.quarters)
 
     def stations_of_place(self) -> int:
         """Return how many stations have a level at a place that was learned from, in the mean."""
@@ -78,11 +82,15 @@ class Promise:
         each = len(np.unique(links, axis=0)) / len(np.unique(self.known, axis=0))
         return max(round(each * float((self.evidence.side <= 0).mean())), 1)
 
-    def distance(self, places: np.ndarray, station: int) -> np.ndarray:
-        """Return how far local places (n, D) are from the nearest that was learned from (n,)
-        [m].
+    def distances(self, places: np.ndarray, station: np.ndarray) -> np.ndarray:
+        """Return how far local places (n, D) of stations (n,) are from the nearest that was learned
+        from (n,) [m].
         """
-        return nearest_distances(self.known, self.station, places, np.full(len(places), station))
+        return nearest_distances(self.known, self.station, places, station)
+
+    def distance(self, places: np.ndarray, station: int) -> np.ndarray:
+        """Return `distances` of one station."""
+        return self.distances(places, np.full(len(places), station))
 
     def expected_errors(
         self, places: np.ndarray, station: np.ndarray, spread_db: np.ndarray
@@ -92,7 +100,7 @@ class Promise:
 
         NaN where they are refused: farther from what was learned than any error was tested.
         """
-        far = nearest_distances(self.known, self.station, places, station)
+        far = self.distances(places, station)
         return self.calibration().half_and_error(spread_db, far, station)[1]
 
     def store(self, path: str | Path) -> None:
@@ -105,12 +113,15 @@ def read_promise(extra: Mapping[str, Any]) -> Promise | None:
     state = extra.get(KEY)
     if state is None:
         return None
-    evidence = HeldOutLevels(
-        **{name: np.asarray(value) for name, value in state["evidence"].items()}
-    )
-    return Promise(
-        evidence, np.asarray(state["known"]), np.asarray(state["station"]), state["block_m"]
-    )
+
+    def levels(name: str) -> HeldOutLevels | None:
+        stored = state.get(name)  # files of before hold no quarters
+        return stored and HeldOutLevels(**{key: np.asarray(v) for key, v in stored.items()})
+
+    evidence = levels("evidence")
+    assert evidence is not None
+    known, station = np.asarray(state["known"]), np.asarray(state["station"])
+    return Promise(evidence, known, station, state["block_m"], levels("quarters"))
 
 
 def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
@@ -148,9 +159,42 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
         unit = cut.unit[rows] + number * (len(data) + 1)
         return leave_out(learned, replace(inner, test=rows), unit, split)
 
+    def evidence_of_quarter(number: int) -> HeldOutLevels:
+        quarter = number_quarters(places, turned=number >= QUARTERS)
+        out = learned.rows[quarter == number % QUARTERS]
+        kept = learned.rows[quarter != number % QUARTERS]
+        inner = learned.drop_unlearned(Fold(kept, kept[:0], out))
+        rng = np.random.default_rng([settings.seed, number, 1])
+        rows = np.sort(rng.permutation(inner.test)[: settings.rows])
+        # Settings are learned anew: those of all rows would know the quarter's trend.
+        return leave_out(learned, replace(inner, test=rows), np.full(len(rows), number), anew=True)
+
     folds = range(max(settings.folds, int(np.ceil(ROWS_OUT / SHARE_OUT / len(learned.rows)))))
     parts = run_all(evidence_without, folds, "fits without blocks of places")
-    return Promise(HeldOutLevels.join(parts), places, data.stations_of(learned.rows), side)
+    turns = range(QUARTERS * TURNS)
+    quarters = run_all(evidence_of_quarter, turns, "fits without a quarter of the places")
+    return Promise(
+        HeldOutLevels.join(parts),
+        places,
+        data.stations_of(learned.rows),
+        side,
+        HeldOutLevels.join(quarters),
+    )
+
+
+def number_quarters(places: np.ndarray, turned: bool = False) -> np.ndarray:
+    """Number (n,), 0 to 3, the half of either half that places (n, D) lie in, as many in each;
+    `turned` by 45 degrees.
+    """
+    flat = places[:, -3:-1]
+    if turned:
+        flat = np.column_stack([flat.sum(1), flat @ [1.0, -1.0]])
+    east = flat[:, 0] > np.median(flat[:, 0])
+    north = np.zeros(len(flat), bool)
+    for side in (east, ~east):
+        if side.any():
+            north[side] = flat[side, 1] > np.median(flat[side, 1])
+    return 2 * east + north
 
 
 def read_or_gather(
@@ -179,8 +223,9 @@ def read_or_gather(
     if not settings["promised"]:
         return None
     promise = None if renew else read_promise(run.stored[0].extra)
-    # Blocks of another size are other evidence.
-    if promise is not None and how.block_m in (None, promise.block_m):
+    # Blocks of another size are other evidence, and files of before hold no quarters.
+    whole = promise is not None and promise.quarters is not None
+    if promise is not None and whole and how.block_m in (None, promise.block_m):
         return promise
     learned = reopen_training(run)
     log.info("testing the intervals of maps: fits without blocks of places")
