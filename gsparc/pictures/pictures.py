@@ -24,7 +24,7 @@ from gsparc.models.method import Method
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.terms import rows_of_stations
 from gsparc.pictures.drawing import PALETTE, panels, save
-from gsparc.pictures.site_plan import draw_found
+from gsparc.pictures.found_plan import draw_found
 from gsparc.prediction.confidence import Guarantee
 from gsparc.prediction.left_out import Evidence, predict_rows
 from gsparc.prediction.risk import Trial, bounded_loss

@@ -32,7 +32,9 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.datasets.own import read_any
 from gsparc.models import checkpoint
+from gsparc.models.fitting import fit_or_resume
 from gsparc.models.gsparc import Gsparc
+from gsparc.models.method import Method
 from gsparc.models.per_station import wrap_per_station
 from gsparc.prediction.left_out import predict_rows
 from gsparc.prediction.levels import measured_levels, predicted_levels
@@ -111,12 +113,18 @@ def quarter_of(places: np.ndarray) -> np.ndarray:
     return 2 * east + north
 
 
+def fit(data: Measurements, rows: np.ndarray, context: FitContext) -> Method:
+    """The default model of rows (n,)."""
+    fold = Fold(rows, rows[:0], rows[:0])
+    return fit_or_resume(wrap_per_station(Gsparc(), data), data, fold, context)[0]
+
+
 def learned(data: Measurements, rows: np.ndarray, file: Path) -> tuple[Predictor, Promise]:
     """A model of rows (n,) with its promise, from its file where it is there."""
     if not file.is_file():
-        method, fold = wrap_per_station(Gsparc(), data), Fold(rows, rows[:0], rows[:0])
+        fold = Fold(rows, rows[:0], rows[:0])
         context = FitContext(file.parent, stations="together")
-        method.fit(data, fold, context)
+        method = fit(data, rows, context)
         promise = gather_promise(Learned(method, Gsparc(), data, fold, context), PromiseSettings())
         checkpoint.save(file, method)
         promise.store(file)
@@ -214,8 +222,7 @@ def gains(name: str, folder: Path) -> Iterator[tuple]:
         base = np.flatnonzero(quarter_of(data.moving[:, -3:-1]) != quarter)
         for stops in (near[:0], near, drawn):
             more = np.sort(np.concatenate([base, rows[np.isin(where, stops)]]))
-            method, fold = wrap_per_station(Gsparc(), data), Fold(more, more[:0], more[:0])
-            method.fit(data, fold, FitContext(folder, stations="together"))
+            method = fit(data, more, FitContext(folder, stations="together"))
             said = predict_rows(method, data, rows[out])
             level = predicted_levels(said, data.site.kind, data.site.target_scale)[0]
             error = level - measured_levels(data, rows[out])[0]

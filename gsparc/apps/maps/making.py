@@ -11,7 +11,7 @@ import torch
 from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
-from gsparc.apps.maps import field_map
+from gsparc.apps.maps import field_map, strongest
 from gsparc.apps.maps.area import Grid, lay_grid
 from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.floor_plan import FloorPlan
@@ -106,7 +106,7 @@ def predict_map(
     grid = lay_grid(site, area, height_m, step_m, plan, len(names), buildings, loss is not None)
     numbers = np.array([site.every_station.name.index(name) for name in names])
     about = station_facts(site, numbers)
-    load_of = field_map.read_loads(load, names, about["stations"])
+    load_of = strongest.read_loads(load, names, about["stations"])
     level = PowerUnit.from_name(unit, site.level_unit, levels=True)
     # Inside, all is in the unit of the measurements: settings are converted once.
     threshold_db -= level.raised_db
