@@ -118,6 +118,10 @@ class FieldMap:
             "threshold_db": np.array(self.threshold_db),
             "unit": np.array(self.unit),
             "bands": np.array(self.bands, str),
+            # Of the metres, where places came in degrees: latitude and longitude
+            "origin": np.array(
+                [] if (at := self.grid.origin) is None else [at.latitude, at.longitude]
+            ),
             **{name: getattr(self, name) for name in ARRAYS},
             **self.extra,
         }
