@@ -17,8 +17,8 @@ from gsparc.processes.uncertainty import half_width, standard_error
 
 ALL_HOLD = 0.9
 RINGS = np.array([1.0, 2.0, 5.0]) * 10.0 ** np.arange(-1, 5)[:, None]  # ends of rings [m]
-SIDES = 5  # areas along the longer side of a drive, about
-LEAST_ROWS = 10  # of a part
+SIDES, SQUARES = 10, 40  # areas, and squares that err together, along the longer side of a drive
+LEAST_ROWS, LEAST_SQUARES = 10, 3  # of a part
 MOST_LISTED = 5  # parts that are surely off
 
 
@@ -48,7 +48,7 @@ class Drive:
     def area_m(self) -> float:
         """Side of an area [m], a round number."""
         wanted = max(float(np.ptp(self.place, axis=0).max()), 1e-3) / SIDES
-        return float(RINGS.ravel()[np.searchsorted(RINGS.ravel(), wanted).clip(max=RINGS.size - 1)])
+        return float(RINGS.ravel()[max(np.searchsorted(RINGS.ravel(), wanted) - 1, 0)])
 
     def parts(self) -> Iterator[tuple[str, str, np.ndarray]]:
         """Return kind, name and rows (n,) bool of all parts with rows enough; `all` first."""
@@ -74,14 +74,18 @@ class Drive:
         """Return a record for each part: rows, squares, bias with its interval, rmse [dB], share of
         rows within their own interval, None where none was said.
         """
-        parts = [part for part in self.parts() if part[2].sum() >= LEAST_ROWS]
-        square = number_squares(np.pad(self.place, ((0, 0), (0, 1))))
+        square = number_squares(np.pad(self.place, ((0, 0), (0, 1))), SQUARES)
+        parts = [
+            part
+            for part in self.parts()
+            if part[2].sum() >= LEAST_ROWS and len(np.unique(square[part[2]])) >= LEAST_SQUARES
+        ]
         wanted = 1 - (1 - ALL_HOLD) / max(len(parts), 1)
         records = []
         for kind, name, rows in parts:
             error, half, squares = self.error_db[rows], self.half_db[rows], square[rows]
             bias, count = float(error.mean()), len(np.unique(squares))
-            spread = half_width(wanted, max(count - 1, 1)) * standard_error(error, squares)
+            spread = half_width(wanted, count - 1) * standard_error(error, squares)
             said = np.isfinite(half)
             record = {"part": kind, "name": name, "rows": len(error), "squares": count}
             ends = {"bias_low_db": bias - spread, "bias_high_db": bias + spread}

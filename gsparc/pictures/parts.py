@@ -21,9 +21,10 @@ def draw_parts(drive: Drive, rows: Sequence[dict[str, Any]], title: str, path: P
     """Save bias with its interval by cell and ring, and by area, as `Drive.judge` has them."""
     bars = [row for row in rows if row["part"] != "area"][::-1]
     areas = [row for row in rows if row["part"] == "area"]
-    frames, side = split_frame(drive.place, drive.area_m), drive.area_m
+    frames, side = split_frame(drive.place, drive.area_m / 4), drive.area_m
     figure, (axes,), room = map_panels(frames, 1, 4.5, LINE * len(bars) + 2.0)
-    most = max([LEAST_DB, *(abs(row["bias_db"]) for row in areas)])
+    error = drive.error_db[np.isfinite(drive.error_db)]
+    most = max(LEAST_DB, float(np.quantile(np.abs(error), 0.9)))
     dots: dict[str, Any] = {"c": drive.error_db, "cmap": "RdBu_r", "vmin": -most, "vmax": most}
     for axis, (low, high) in zip(axes, frames, strict=True):
         marks = axis.scatter(*drive.place.T, s=5, linewidths=0, **dots)
@@ -31,7 +32,7 @@ def draw_parts(drive: Drive, rows: Sequence[dict[str, Any]], title: str, path: P
         for row in areas:
             middle = np.array(row["name"].split(), float)
             colour = marks.cmap(marks.norm(row["bias_db"]))
-            face = {"facecolor": colour, "alpha": 0.35, "edgecolor": "0.4", "zorder": 0}
+            face = {"facecolor": colour, "alpha": 0.5, "edgecolor": "0.6", "zorder": 0}
             axis.add_patch(Rectangle(middle - side / 2, side, side, **face))
             if (middle > low).all() and (middle < high).all():
                 annotate(axis, f"{row['bias_db']:+.1f}", middle)
@@ -43,6 +44,8 @@ def draw_parts(drive: Drive, rows: Sequence[dict[str, Any]], title: str, path: P
     ends = np.array([[row["bias_low_db"], row["bias_high_db"]] for row in bars]).reshape(-1, 2)
     reach = np.nan_to_num(np.abs(ends - bias[:, None]), posinf=0.0).T
     curve.barh(number, bias, xerr=reach, color=PALETTE[0], alpha=0.6, ecolor=GREY, capsize=2)
+    wide = 1.2 * max(LEAST_DB, np.abs(bias).max(), np.median(reach))
+    curve.set_xlim(-wide, wide)  # intervals of few squares leave the picture
     curve.axvline(0, color="black", linewidth=0.8)
     names = [
         f"{row['part']} {row['name']}, {row['rows']} rows\nrmse {row['rmse_db']:.1f} dB"
