@@ -93,7 +93,7 @@ def task(call: CommandCall) -> Result:
     field = add_changes(predict_map(predictor, promise=promise, **query), predictor)
     coverage = None if promise is None else cross_validate(promise.evidence, how.share)
     ends = None if promise is None else covered_between(field, predictor, promise)
-    lines = map_notes(field, coverage, ends)
+    lines = map_notes(field, coverage, ends, promise)
     size = f"height {field.grid.height:g} m, squares of {field.grid.step:.3g} m"
     layers = _layers(field)
     of_one = {f"power {station}" for station in field.stations}

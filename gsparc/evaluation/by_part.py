@@ -74,6 +74,8 @@ class Drive:
         """Return a record for each part: rows, squares, bias with its interval, rmse [dB], share of
         rows within their own interval, None where none was said.
         """
+        if not len(self.place):
+            return []
         square = number_squares(np.pad(self.place, ((0, 0), (0, 1))), SQUARES)
         parts = [
             part

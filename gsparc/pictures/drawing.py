@@ -12,6 +12,7 @@ import numpy as np
 from cycler import cycler
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 from matplotlib.ticker import LogLocator, NullFormatter
 from matplotlib.transforms import Bbox
 
@@ -142,6 +143,12 @@ def panels(
     return figure, axes
 
 
+def colour_bar(image: Any, axes: Any, label: str, **how: Any) -> None:
+    """Say what the colours of an image mean, beside one axes or several that share them."""
+    beside = np.ravel(axes).tolist()
+    beside[0].figure.colorbar(image, ax=beside, label=label, **{"shrink": 0.85, "pad": 0.02} | how)
+
+
 def set_log_axis(axes: Any, decades: float = 3.0) -> None:
     """Set the horizontal axis in decades, with plain numbers also between them
     where it has fewer `decades`.
@@ -196,19 +203,24 @@ def spread_labels(figure: Figure) -> None:
     """Move labels to where they cover neither one another, nor a labelled point, nor leave their
     axes; those that fit nowhere are hidden.
     """
-    labels = [text for axis in figure.axes for text in axis.texts if text.get_gid() == LABEL]
+    labels = [
+        (axis, text)
+        for axis in figure.axes
+        for text in axis.texts
+        if isinstance(text, Annotation) and text.get_gid() == LABEL
+    ]
     if not labels:
         return
     figure.draw_without_rendering()  # places the axes, which offsets count from
-    others = [text for axis in figure.axes for text in axis.texts if text not in labels]
-    taken = [text.get_window_extent() for text in others]
-    points = [label.axes.transData.transform(label.xy) for label in labels]
-    taken += [Bbox.from_bounds(*(point - 3), 6, 6) for point in points]
-    for label in labels:
+    texts = [text for axis in figure.axes for text in axis.texts if text.get_gid() != LABEL]
+    taken = [text.get_window_extent() for text in texts]
+    points = [axis.transData.transform(label.xy) for axis, label in labels]
+    taken += [Bbox([point - 3, point + 3]) for point in points]
+    for axis, label in labels:
         for x, y, across, up in OFFSETS:
             label.set(position=(x, y), ha=across, va=up)
             box = label.get_window_extent()
-            inside = label.axes.bbox.padded(1)
+            inside = axis.bbox.padded(1)
             within = inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1)
             if within and not box.count_overlaps(taken):
                 taken.append(box)

@@ -17,7 +17,7 @@ from matplotlib.transforms import Affine2D
 from numpy.typing import ArrayLike
 from scipy.ndimage import label as areas_of
 
-from gsparc.pictures.drawing import LABEL, panels
+from gsparc.pictures.drawing import LABEL, colour_bar, panels
 from gsparc.processes.few_rows import evenly_spaced
 
 Frame = tuple[np.ndarray, np.ndarray]  # corners (2,) [m]
@@ -140,7 +140,13 @@ def draw_measured(axis: Any, places: np.ndarray) -> None:
 
 
 def draw_values(
-    axes: Any, places: np.ndarray, values: np.ndarray, size: float, clipped: float, **bar: Any
+    axes: Any,
+    places: np.ndarray,
+    values: np.ndarray,
+    size: float,
+    clipped: float,
+    label: str,
+    **bar: Any,
 ) -> None:
     """Mark places (n, 2) [m] on axes, in the colours of values (n,), told by one `bar`.
 
@@ -148,9 +154,9 @@ def draw_values(
     a few outliers would leave one for the rest.
     """
     low, high = np.quantile(values, [clipped, 1 - clipped])
-    for axis in (axes := np.atleast_1d(axes).tolist()):
+    for axis in np.ravel(axes):
         dots = axis.scatter(*places.T, c=values, s=size, vmin=low, vmax=high, linewidths=0)
-    axes[0].figure.colorbar(dots, ax=axes, **bar)
+    colour_bar(dots, axes, label, **bar)
 
 
 def draw_walls(axis: Any, triangles: np.ndarray) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.patches import Rectangle
 
 from gsparc.evaluation.by_part import Drive
-from gsparc.pictures.drawing import GREY, PALETTE, save
+from gsparc.pictures.drawing import GREY, PALETTE, colour_bar, save
 from gsparc.pictures.from_above import annotate, map_panels, scale_bar, set_bounds, split_frame
 
 LEAST_DB = 3.0  # end of the colours
@@ -33,12 +33,11 @@ def draw_parts(drive: Drive, rows: Sequence[dict[str, Any]], title: str, path: P
             middle = np.array(row["name"].split(), float)
             colour = marks.cmap(marks.norm(row["bias_db"]))
             face = {"facecolor": colour, "alpha": 0.5, "edgecolor": "0.6", "zorder": 0}
-            axis.add_patch(Rectangle(middle - side / 2, side, side, **face))
+            axis.add_patch(Rectangle(tuple(middle - side / 2), side, side, **face))
             if (middle > low).all() and (middle < high).all():
                 annotate(axis, f"{row['bias_db']:+.1f}", middle)
         scale_bar(axis)
-    bar = {"label": "predicted less measured [dB]", "shrink": 0.85, "extend": "both"}
-    figure.colorbar(marks, ax=axes.tolist(), **bar)
+    colour_bar(marks, axes, "predicted less measured [dB]", extend="both")
     curve, number = figure.add_subplot(room), np.arange(len(bars))
     bias = np.array([row["bias_db"] for row in bars])
     ends = np.array([[row["bias_low_db"], row["bias_high_db"]] for row in bars]).reshape(-1, 2)

@@ -150,8 +150,8 @@ def draw_site(
     if places.level_db is not None:
         heard = heard & np.isfinite(places.level_db)
         if heard.any():
-            bar = {"label": places.label, "extend": "both", "shrink": 0.85, "pad": 0.02}
-            draw_values(axes[0], places.place[heard], places.level_db[heard], size, 0.01, **bar)
+            shown = places.place[heard], places.level_db[heard]
+            draw_values(axes[0], *shown, size, 0.01, places.label, extend="both")
     for axis, (low, high) in zip(axes[0], frames, strict=True):
         axis.grid(alpha=0.3)
         _draw_map(axis, data, places, low, high, jumping, size)

@@ -84,6 +84,32 @@ class FieldMap:
         """
         return np.nan_to_num(self.server_chance, nan=1.0) < 0.5
 
+    @property
+    def quiet(self) -> np.ndarray:
+        """Cells (ny, nx) bool where more likely than not no station is heard."""
+        return np.nan_to_num(self.heard_chance, nan=1.0) < 0.5
+
+    @property
+    def other_leads(self) -> np.ndarray:
+        """Cells (ny, nx) bool, of those where one is heard, that another leads more likely."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            lead = self.server_chance / self.heard_chance
+        return (np.nan_to_num(lead, nan=1.0) < 0.5) & ~self.quiet
+
+    @property
+    def without_ratio(self) -> np.ndarray:
+        """Cells (ny, nx) bool that have a level, and neither interference nor noise."""
+        return self.grid.inside & ~self.refused & ~np.isfinite(self.sinr_db)
+
+    def lone_squares(self) -> int:
+        """Count cells on one side of the threshold, all of whose neighbours are on the other."""
+        covered = np.where(np.isfinite(self.outage), self.outage < 0.5, np.nan)
+        around = np.pad(covered, 1, constant_values=np.nan)
+        shifts = [(i, j) for i in range(3) for j in range(3) if (i, j) != (1, 1)]
+        ny, nx = covered.shape
+        beside = np.stack([around[i : i + ny, j : j + nx] for i, j in shifts])
+        return int((beside == 1 - covered).all(0).sum())
+
     def at_best_server(self, layers: np.ndarray) -> np.ndarray:
         """Return, of layers (T, ny, nx), each cell's strongest station's (ny, nx);
         NaN where refused.

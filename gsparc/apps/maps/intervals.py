@@ -139,8 +139,8 @@ def calibrate(
     scaled = used.error / np.interp(used.distance, middle, rms)
     tail = np.quantile(scaled, TAIL) if heard.all() else None
     reach = float(np.quantile(used.distance, REACH))
-    scales = IntervalScales(share, middle, half, rms, tail, reach, station, least)
-    return scales if quarters is None else _with_quarters(scales, quarters)
+    near = IntervalScales(share, middle, half, rms, tail, reach, station, least)
+    return near if quarters is None else _with_quarters(near, quarters)
 
 
 def _with_quarters(near: IntervalScales, quarters: HeldOutLevels) -> IntervalScales:

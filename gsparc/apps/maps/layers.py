@@ -160,9 +160,7 @@ def list_layers(field: FieldMap) -> Iterator[Layer]:
     layer = field.layer("power_db")
     yield Layer("power", layer, Legend.over(f"received power{of} [{unit}]", layer))
     if several:
-        # Below one half of the named cell's lead over others, whether or not any is heard.
-        lead, quiet = field.server_chance / field.heard_chance < 0.5, field.heard_chance < 0.5
-        doubts = (lead & ~quiet, "////", UNSURE), (quiet, "....", SILENT)
+        doubts = (field.other_leads, "////", UNSURE), (field.quiet, "....", SILENT)
         best = field.layer("best_server")
         yield _servers("best_server", best, field.stations, field.site, doubts)
     for band in dict.fromkeys(field.bands):

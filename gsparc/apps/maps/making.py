@@ -122,14 +122,18 @@ def predict_map(
     inside = np.flatnonzero(grid.inside)
     # Where nothing is said nothing is asked; a margin, as stations are as far as their own rows.
     told = grid.inside if promise is None else grid.inside & _within_reach(grid, promise, site)
-    exact = promise is None or tolerance_db == 0 or len(inside) <= FEW_CELLS
-    sure = told if exact else told & _beside_rows(grid, promise, site)
+    sure = told
+    if promise is not None and tolerance_db > 0 and len(inside) > FEW_CELLS:
+        sure = told & _beside_rows(grid, promise, site)
     alike, computed = _fill_levels(
         values, predictor, grid, other_end, names, numbers, told, sure, tolerance_db
     )
-    if computed < len(names) * len(inside):
-        most = f"{computed} of {len(names) * len(inside)} levels were predicted"
-        notes.append(f"{most}, the others interpolated to about {tolerance_db:g} dB (tolerance_db)")
+    if computed < len(names) * told.sum():
+        most = f"{computed} of {len(names) * told.sum()} levels were predicted"
+        notes.append(
+            f"{most}, the others interpolated to about {tolerance_db:g} dB (tolerance_db) or a "
+            "tenth of their deviation"
+        )
     bands = about["bands"]
     carrier = np.unique(bands or ("",) * len(names), return_inverse=True)[1].reshape(-1)
     scoring = Scoring(

@@ -15,7 +15,7 @@ from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.layers import MOST_COLOURS, Layer, file_name, label_places
 from gsparc.pictures import from_above
-from gsparc.pictures.drawing import save
+from gsparc.pictures.drawing import colour_bar, save
 
 NAMED = 15  # stations; of more only their marks are drawn
 MOST_LISTED = 15  # a line for "5 more" would say no less than their names
@@ -58,8 +58,7 @@ def draw_layer(
         ends = {(True, True): "both", (True, False): "min", (False, True): "max"}.get(
             beyond, "neither"
         )
-        bar = {"shrink": 0.85, "pad": 0.02, "extend": ends, "label": legend.label}
-        figure.colorbar(image, ax=axes.ravel().tolist(), **bar)
+        colour_bar(image, axes, legend.label, extend=ends)
     if field.refused.any():
         axes[0].plot([], [], "s", color="0.89", label="too far from what was measured")
     if (field.grid.inside & ~field.refused & np.isnan(layer.values)).any() and layer.blank:

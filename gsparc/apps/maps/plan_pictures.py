@@ -14,7 +14,7 @@ from gsparc.apps.maps.placing import Placement
 from gsparc.apps.maps.planning import MeasurementPlan
 from gsparc.apps.maps.promise import Promise
 from gsparc.pictures import from_above
-from gsparc.pictures.drawing import panels, save
+from gsparc.pictures.drawing import colour_bar, panels, save
 from gsparc.prediction.predictor import Predictor
 
 CURVE = 3.6  # inches of the panel beside maps
@@ -57,7 +57,7 @@ def draw_measurement_plan(
         axis.plot(*batch.places[:, :2].T, "o", zorder=3, **dots)
         for number, place in enumerate(batch.places[:MOST_NUMBERS], 1):
             from_above.annotate(axis, str(number), place[:2])
-    figure.colorbar(mesh, ax=axes.ravel().tolist(), label="expected error [dB]", shrink=0.8)
+    colour_bar(mesh, axes, "expected error [dB]")
     curve = figure.add_subplot(room)
     expected = np.append(batch.before_db, batch.expected_db[np.argsort(batch.chosen)])
     curve.plot(expected, ".-")
@@ -82,7 +82,7 @@ def draw_placement(placing: Placement, path: Path, threshold_db: float, unit: st
         *placing.places[:, :2].T, c=placing.coverage, s=60, marker="s", cmap="viridis"
     )
     label = f"share of the predicted area with {threshold_db:g} {unit} or more, with a station here"
-    figure.colorbar(dots, ax=axis, label=label, shrink=0.85)
+    colour_bar(dots, axis, label)
     from_above.draw_stations(axis, placing.stations)
     from_above.draw_stations(
         axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18

@@ -308,7 +308,7 @@ def find_neighbours(places: np.ndarray, count: int) -> np.ndarray:
     distance, far = cdist(places, places), np.full(len(places), np.inf)
     # The farthest from all before, again and again: as even as a design gets.
     number = 0
-    for _ in range(min(count, len(places))):
+    for _ in range(max(min(count, len(places)) - 1, 1)):
         far = np.minimum(far, distance[number])
         number = int(far.argmax())
     return distance < far.max() / 2

@@ -21,6 +21,7 @@ from gsparc.data.splits import Fold, SplitSettings
 from gsparc.models import checkpoint
 from gsparc.prediction.left_out import HeldOutLevels, leave_out, nearest_distances
 from gsparc.prediction.refit import Learned
+from gsparc.processes.uncertainty import coverage_and_width
 from gsparc.runs.open_runs import OpenRun
 
 log = logging.getLogger(__name__)
@@ -256,17 +257,34 @@ def reopen_training(run: OpenRun) -> Learned:
 
 
 def map_notes(
-    field: FieldMap, coverage: Coverage | None, covered: tuple[float, float] | None = None
+    field: FieldMap,
+    coverage: Coverage | None,
+    covered: tuple[float, float] | None = None,
+    promise: Promise | None = None,
 ) -> list[str]:
     """Return what a reader of the map must know; `covered` is of `covered_between`."""
     notes = [*field.notes]
     figures = field.summarise()
-    if (unsure := figures["map/server_unsure"]) and len(field.stations) > 1:
-        chance = np.nanmean(field.server_chance[field.grid.inside])
-        doubt = f"unsure in {unsure:.1%} of squares (hatched): another or none is likelier"
+    if figures["map/server_unsure"] and len(field.stations) > 1:
+        inside = field.grid.inside
+        chance = np.nanmean(field.server_chance[inside])
+        quiet, lead = (layer[inside] for layer in (field.quiet, field.other_leads))
+        doubt = f"in {lead.mean():.1%} of squares another leads likelier (hatched)"
+        silent = f"in {quiet.mean():.1%} none is heard likelier than not (dotted)"
         notes.append(
-            f"best_server: the named cell is strongest with chance {chance:.2f} in the mean; "
-            f"{doubt}"
+            f"best_server: the named cell is strongest and heard with chance {chance:.2f} in the "
+            f"mean; {doubt}, {silent}"
+        )
+    if len(field.stations) > 1 and (blank := field.without_ratio).any():
+        where = (
+            f"in {blank.sum() / max((~field.refused & field.grid.inside).sum(), 1):.0%} of squares"
+        )
+        why = "no other cell is on the strongest's carrier, and noise_db= is not given"
+        notes.append(f"sinr: none {where}: {why}")
+    if (lone := field.lone_squares()) > 0:
+        notes.append(
+            f"{lone} single squares differ from all around them about {field.threshold_db:g} "
+            f"{field.unit}: rows in them say so, and shadows change within a square"
         )
     if (outage := figures["map/outage"]) is not None:
         level = f"{field.threshold_db:g} {field.unit} or more of some station (mean of 1 - outage)"
@@ -290,4 +308,22 @@ def map_notes(
     if figures["map/refused"]:
         squares = f"{figures['map/refused']} of {int(field.grid.inside.sum())} squares"
         notes.append(f"{squares} are refused: too far from measurements to promise anything")
+    if (quarters := describe_quarters(promise)) is not None:
+        notes.append(quarters)
     return notes
+
+
+def describe_quarters(promise: Promise | None) -> str | None:
+    """Return how far off whole quarters were, and what share of them their intervals held."""
+    if promise is None or promise.quarters is None:
+        return None
+    rows = promise.quarters.subset(promise.quarters.heard)
+    half = promise.calibration().half_of(rows)
+    held, _ = coverage_and_width(rows.level_db - rows.mean_db, half)
+    errors = [rows.subset(rows.block == number) for number in np.unique(rows.block)]
+    each = [float(np.sqrt(np.mean((part.level_db - part.mean_db) ** 2))) for part in errors]
+    ends = f"{min(each):.1f} to {max(each):.1f} dB" if each else "nothing"
+    return (
+        f"places farther from rows than blocks are judged by {len(each)} quarters of the places, "
+        f"each predicted from the others: rmse {ends}, {held:.0%} within 90% intervals"
+    )
