@@ -130,7 +130,7 @@ class Channel(Target):
 
     def to_targets(self, rows: Tensor, shape: tuple[int, ...]) -> Tensor:
         """See `Target.to_targets`."""
-        return torch.view_as_complex(rows.reshape(len(rows), -1, 2)).reshape(len(rows), *shape)
+        return torch.view_as_complex(rows.reshape(len(rows), *shape, 2))
 
 
 class Power(Target):

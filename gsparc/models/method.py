@@ -301,26 +301,19 @@ class Method(MethodFactory):
         """Return the number of Gaussians, sources or stored training samples."""
         return 0
 
-    @property
-    def reducible(self) -> Method | None:
-        """The part of it that answers faster and less accurately when asked to; None:
-        it does so itself.
-        """
-        return None
-
     def reduction_settings(self) -> tuple[str, ...]:
         """Return names of the settings of `reduce` that mean something to what was fitted;
         here none.
         """
-        return () if self.reducible is None else self.reducible.reduction_settings()
+        return ()
 
     def reduction_inputs(self, data: Measurements, rows: np.ndarray) -> dict[str, Tensor]:
         """Return what must be known of training rows (n,) to reduce it; stored with the model."""
-        return {} if self.reducible is None else self.reducible.reduction_inputs(data, rows)
+        return {}
 
     def reduce(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
         """Return a method that answers with these settings; this one is left as it is."""
-        return self if self.reducible is None else self.reducible.reduce(settings, measured)
+        return self
 
     def station_method(self, number: int) -> Method:
         """Return what answers for a station; of a method without copies by station, itself."""

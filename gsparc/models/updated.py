@@ -104,7 +104,7 @@ def map_level(method: Method, said: Prediction, site: Site) -> Level:
     process = method.process() if isinstance(method, HasProcess) else None
     if process is None:
         return Level(mean, SIGNAL * variance, (1 - SIGNAL) * variance)
-    noise = (variance * 0 + process.kernel.amplitude * process.kernel.noise).minimum(variance)
+    noise = variance.clamp_max(process.noise)
     return Level(mean, variance - noise, noise)
 
 

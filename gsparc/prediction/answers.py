@@ -15,7 +15,7 @@ import torch
 from gsparc.base.errors import DataError
 from gsparc.base.executor import run_all
 from gsparc.base.files import write_archive, write_samples
-from gsparc.data.schema import End, Site
+from gsparc.data.schema import ENDS, End, Site
 from gsparc.data.target import Target
 from gsparc.data.units import LINEAR, PowerUnit, power_in_decibels
 from gsparc.models.device_offsets import find_device
@@ -147,7 +147,9 @@ def predict_file(
     """
     site, places = predictor.site, Path(places)
     path = output_path(None if out is None else str(out), places, overwrite)
-    queries = fill_heights(read_query_places(places, site.moving_ends, columns or {}), site)
+    further = site.still_end if site.stations is not None and station is None else None
+    found = read_query_places(places, site.moving_ends, columns or {}, further)
+    queries = fill_heights(found, site)
     for note in _notes(queries, site):
         log.info("%s: %s", places, note)
     world = to_world(queries, site)
@@ -169,9 +171,11 @@ def predict_file(
             queries.rows[int(np.argmax(far))],
         )
     power = site.power_unit(predictor.unit) if site.target.is_level else None
-    if power is not None:
+    of_links = len(world) > len(site.moving_ends)
+    if power is not None and not of_links:
         predictions = _with_heard(predictor, queries, site.local_places(world), predictions, power)
-    if tested is not None and power is not None and predictions.said.variance is not None:
+    states = predictions.said.variance is not None and not of_links
+    if tested is not None and power is not None and states:
         local = site.local_places(world)[predictions.place]
         predictions = _with_tested(predictions, local, power, tested)
         if refused := predictions.count_refused():
@@ -299,6 +303,8 @@ def predict_places(
     Raises:
         DataError: a station that was asked for had too few training rows, or none has a model.
     """
+    if len(world) > len(predictor.site.moving_ends):
+        return _predict_links(predictor, queries, world, path)
     row, number = rows_and_stations(queries, predictor.site, station)
     named = station is not None or queries.station is not None
     models, silent = list[tuple[Predictor, np.ndarray]](), list[str]()
@@ -330,6 +336,20 @@ def predict_places(
     rows = np.sort(np.concatenate([asked for _, asked in models]))
     of_row, called = number[rows], predictor.site.every_station.named.items()
     return Answers(row[rows], of_row, {head: np.array(of)[of_row] for head, of in called}, result)
+
+
+def _predict_links(
+    predictor: Predictor, queries: QueryPlaces, world: dict[End, np.ndarray], path: Path
+) -> Answers:
+    """Answers between places of both ends, whoever stands there."""
+    rows, site = np.arange(len(queries)), predictor.site
+    try:
+        result = ask(predictor, world, what="blocks of places")
+    except ValueError as error:
+        stays = f"{ENDS[site.still_end]} (station=NAME, or no columns of its places)"
+        raise DataError(f"{queries.source}: {error}; ask about a {stays}") from None
+    check_fits(path, site.target, tuple(result.mean.shape[1:]))
+    return Answers(rows, np.zeros_like(rows), {}, result)
 
 
 def _select_device(predictor: Predictor, device: str, source: str) -> Predictor:

@@ -125,5 +125,4 @@ class JointMixin(Asked):
         # Who learned all stations together tells them by their places:
         # there both ends are a query's.
         places = query.places(getattr(self.method, "site", None) or self.site)
-        covariance = process.posterior.covariance(places)  # type: ignore[attr-defined]
-        return covariance.numpy(), process.kernel.amplitude * process.kernel.noise
+        return process.covariance(places).numpy(), process.noise

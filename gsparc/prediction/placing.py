@@ -29,6 +29,9 @@ def fill_heights(queries: QueryPlaces, site: Site) -> QueryPlaces:
     """
     ends, notes = dict(queries.ends), list(queries.notes)
     heights = usual_heights(site)
+    stood = site.every_station.position[:, 2] if site.stations is not None else np.zeros(0)
+    if len(np.unique(stood)) == 1:
+        heights[site.still_end] = round(float(stood[0] + site.origin[2]), 6)
     for end, where in queries.ends.items():
         if where.height is not None:
             continue

@@ -340,7 +340,9 @@ def nearest_density(
     return density + penalty * excess.square() / len(variance), amplitude
 
 
-def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tuple[Kernel, str]:
+def choose_kernel_by_nearest(
+    prior: Prior, values: PlaceValues, seed: int, looked_at: np.ndarray | None = None
+) -> tuple[Kernel, str]:
     """Choose the kernel most likely by rows that cover the site, and say on what it was chosen.
 
     Neighbours are looked for among all places, among an eighth of them, and so on: what is near
@@ -350,6 +352,7 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
         prior: mean law, and a kernel chosen on few rows.
         values: where something was heard.
         seed: of what is drawn.
+        looked_at: (T, 1 + k) rows, each before those that it is given; None: its nearest ones.
     """
     count, start = len(values.places), prior.kernel
     if count <= NEIGHBOURS:
@@ -362,8 +365,8 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
     rest = rest - prior.columns(places) @ about
     level = Neighbourhood.from_places(values.places, seed).level
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]
-    parts = []
-    for members in sets:
+    parts = [] if looked_at is None else [looked_at]
+    for members in sets if looked_at is None else ():
         row = covering_rows(values.places[members], LOOKED_AT // len(sets), seed)
         parts.append(members[rows_with_nearest(values.places[members], row, LOOKED_BY)])
     rows = np.concatenate(parts)
@@ -374,8 +377,10 @@ def choose_kernel_by_nearest(prior: Prior, values: PlaceValues, seed: int) -> tu
     starts = [Kernel.from_lengths((long * share, long), shares, start.noise) for share in SHORTER]
     if len(start.lengths) == 2:
         starts.append(start)
-    note = f"settings chosen on {len(rows)} of {count} places, each given its nearest {LOOKED_BY}"
-    among = f"among {' and '.join(str(len(members)) for members in sets)}"
+    given = rows.shape[1] - 1
+    note = f"settings chosen on {len(rows)} of {count} places, each given its nearest {given}"
+    if looked_at is None:
+        note += f" among {' and '.join(str(len(members)) for members in sets)}"
     bounds = starts[0].bounds(torch.from_numpy(scale))
     search = starts, bounds, LOOKS, SETTLED / len(rows)
-    return fit_kernel(lambda one: nearest_density(one, sample), *search)[1], f"{note} {among}"
+    return fit_kernel(lambda kernel: nearest_density(kernel, sample), *search)[1], note

@@ -213,17 +213,35 @@ class PowerProcess(Stored):
         return mixture_moments(parts)
 
     def with_exact_posterior(self) -> PowerProcess:
-        """Return the first alone, with covariances between places; of many rows,
-        given some of them.
-        """
+        """Return it with covariances between places; of many rows, given some of them."""
+        others = tuple((share, part.with_exact_posterior()) for share, part in self.others)
         nearest = self.posterior
         if not isinstance(nearest, Nearest):
-            return replace(self, others=())
+            return replace(self, others=others)
         few = covering_rows(self.places, MOST_ROWS, 0)
         places, prior = torch.from_numpy(self.places[few]), nearest.prior
         extra = nearest.noise[few] - prior.kernel.noise
         values = nearest.rest[few] + prior.mean(places)
-        return replace(self, posterior=Exact.from_values(prior, places, values, extra), others=())
+        exact = Exact.from_values(prior, places, values, extra)
+        return replace(self, posterior=exact, others=others)
+
+    @property
+    def noise(self) -> float:
+        """Variance of a measurement's noise [dB^2]."""
+        return sum(share * m.kernel.amplitude * m.kernel.noise for share, m in self.members)
+
+    @torch.no_grad()
+    def covariance(self, queries: Tensor) -> Tensor:
+        """Return the covariance (B, B) [dB^2] of levels at places (B, 3) or (B, 6) [m]; what
+        members disagree about is part of it.
+        """
+        exact, middle = self.with_exact_posterior(), self.mean_at(queries)
+        whole = queries.new_zeros(len(queries), len(queries))
+        for share, member in exact.members:
+            assert isinstance(member.posterior, Exact)
+            off = member.mean_at(queries) - middle
+            whole += share * (member.posterior.covariance(queries) + off.outer(off))
+        return whole
 
 
 def rows_in_doubt(rows: PowerRows, prior: Prior) -> PowerRows:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 
 from gsparc.base.errors import DataError
 from gsparc.data.schema import ENDS, End
@@ -14,6 +15,7 @@ from gsparc.tables.columns import choose_columns
 from gsparc.tables.heads import AXES
 from gsparc.tables.opening import read_sheet
 from gsparc.tables.places import Places, read_ends
+from gsparc.tables.raw import read_raw
 from gsparc.tables.sheet import Sheet
 
 # Only what a query needs: a column that looks like a level is none of its concern.
@@ -52,21 +54,28 @@ class QueryPlaces:
 
 
 def read_query_places(
-    path: str | Path, moving: Sequence[End], columns: Mapping[str, object] = {}
+    path: str | Path,
+    moving: Sequence[End],
+    columns: Mapping[str, object] = {},
+    further: End | None = None,
 ) -> QueryPlaces:
     """Read places of the ends that move.
 
     Args:
-        path: a table (*.csv, *.tsv, *.txt, *.parquet).
+        path: a table (*.csv, *.tsv, *.txt, *.parquet), or *.npz of `rx_position`, `tx_position`.
         moving: one end, or both.
         columns: of a table, by quantity, where the guess from their heads will not do.
+        further: the other end, whose places are read too where no station is named.
 
     Raises:
         DataError: no file, no places, or a place that is none; the first problem, with row and
             column.
     """
     try:
-        return _of_sheet(read_sheet(path), moving, columns)
+        archive = Path(path).suffix.lower() == ".npz"
+        return _of_sheet(
+            _archive_sheet(path) if archive else read_sheet(path), moving, columns, further
+        )
     except DataError as error:
         # Measurements are checked by `gsparc check`; places are not,
         # and here their settings are called so.
@@ -93,7 +102,26 @@ def read_times(path: str | Path) -> np.ndarray | None:
     return times
 
 
-def _of_sheet(sheet: Sheet, moving: Sequence[End], columns: Mapping[str, object]) -> QueryPlaces:
+def _archive_sheet(path: str | Path) -> Sheet:
+    """Places of an archive as columns of a table."""
+    arrays = read_raw(Path(path)).arrays
+    places = {
+        end: np.atleast_2d(arrays[f"{end}_position"]) for end in ENDS if f"{end}_position" in arrays
+    }
+    if not places:
+        raise DataError(f"{path}: no rx_position or tx_position (n, 3) [m]")
+    columns = {
+        f"{end}_{axis}": pd.Series(values)
+        for end, place in places.items()
+        for axis, values in zip("xyz", place.T, strict=True)
+    }
+    frame = pd.DataFrame(columns).ffill()  # one place of an end goes with all of the other's
+    return Sheet(str(path), frame, tuple(f"row {number}" for number in range(len(frame))))
+
+
+def _of_sheet(
+    sheet: Sheet, moving: Sequence[End], columns: Mapping[str, object], further: End | None
+) -> QueryPlaces:
     settings = {key: value for key, value in columns.items() if value is not None}
     # A head that a table of measurements would not be taken at its word for
     if "device" in sheet.heads:
@@ -112,6 +140,8 @@ def _of_sheet(sheet: Sheet, moving: Sequence[End], columns: Mapping[str, object]
             none = f"no coordinates of the {ENDS[end]} among {sheet.first_heads()}"
             raise DataError(f"{sheet.source}: {none}; say {axes}")
         ends[end] = rest.pop(named)
+    if further is not None and f"{further}_" in rest and "station" not in chosen:
+        ends[further] = rest.pop(f"{further}_")
     # Static ends stand where they were measured: a query cannot move them.
     other = [f"of the {ENDS[end]}" for end in ENDS if f"{end}_" in rest] + ["without a name"] * (
         "" in rest

@@ -192,7 +192,7 @@ class GaussianProcess(Differentiable, ClosedForm):
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
-        return None if self.powers is None else self.powers.with_exact_posterior()
+        return self.powers
 
     def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
         """See `Reconditions`; of powers alone."""

@@ -11,6 +11,7 @@ from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models.method import MethodFactory
 from gsparc.models.powers.own_terms import OwnTerms
+from gsparc.models.powers.together.links import both_ends_move
 from gsparc.models.powers.together.network import find_sectors
 from gsparc.models.target_rows import heard_rows
 from gsparc.training.context import FitContext
@@ -69,6 +70,8 @@ class LearnsTogether(MethodFactory):
                 "no station of the test rows was heard: what stations share answers for them",
             )
         rows = heard_rows(data, fold.learned())
+        if both_ends_move(data, rows):
+            return "together", "both ends move: links between near places are alike"
         if len(rows) > ONE_FACTOR:
             return "each", f"{len(rows)} rows are more than one factor holds ({ONE_FACTOR})"
         if find_sectors(data) is not None:

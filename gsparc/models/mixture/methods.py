@@ -52,7 +52,7 @@ class Channels(Mixture):
     def list_candidates(self, data: Measurements) -> Mapping[str, Candidate]:
         """See `Mixture`; no phase tells of paths where rows have phases of their own."""
         if data.site.phase_reference == "neighbours":
-            return _candidates("aligned", "neighbours")
+            return _candidates("aligned", "neighbours", "process")
         return _candidates("diffuse")
 
     def why_not(self, data: Measurements) -> str | None:

@@ -30,6 +30,7 @@ from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.each_or_together import LearnsTogether
+from gsparc.models.reduced import View
 from gsparc.models.refined_places import move_rows, position_errors, refine_places
 from gsparc.models.run_factors import RunFactors
 from gsparc.models.stack import explained_variance
@@ -241,7 +242,7 @@ class Mixture(LearnsTogether, ClosedForm):
         """See `Reconditions`; of fields whose parameters are few,
         such as those of powers without fringes.
         """
-        if self.member is None or not self.member.forgets:
+        if not all(member.forgets for member in self.members):
             return None
         # Deep, as members are conditioned in place and those of this method must stay as they are.
         result = copy.deepcopy(self)
@@ -264,6 +265,9 @@ class Mixture(LearnsTogether, ClosedForm):
         if len(result) == 1:
             return result[0]
         pairs = list(zip(self.weights, result, strict=True))
+        if any(prediction.variance is None for prediction in result):  # reduced
+            means = [weight * prediction.mean for weight, prediction in pairs]
+            return Prediction(torch.stack(means).sum(0))
         # Members are in closed form, and state both.
         moments = [(weight, pair.mean, cast(Tensor, pair.variance)) for weight, pair in pairs]
         mean, variance = mixture_moments(moments)
@@ -324,10 +328,21 @@ class Mixture(LearnsTogether, ClosedForm):
         """Return the member, where it is one."""
         return self.members[0] if len(self.members) == 1 else None
 
-    @property
-    def reducible(self) -> Method | None:
-        """See `Method.reducible`; what answers faster knows nothing of runs' factors."""
-        return self.member if len(self.runs) == 1 else None
+    def reduction_settings(self) -> tuple[str, ...]:
+        """See `Method.reduction_settings`; those of any member."""
+        named = (name for member in self.members for name in member.reduction_settings())
+        return tuple(dict.fromkeys(named))
+
+    def reduce(self, settings: Mapping[str, Any], measured: dict[str, Tensor]) -> Method:
+        """See `Method.reduce`; each member, by what it has of the settings."""
+        if not settings:
+            return self
+        result = copy.copy(self)
+        known = [set(member.reduction_settings()).intersection(settings) for member in self.members]
+        pairs = zip(self.members, known, strict=True)
+        lean = [member.reduce({name: settings[name] for name in has}, {}) for member, has in pairs]
+        result.members = cast(list[ClosedForm], lean)  # they answer, and are asked nothing else
+        return View(result)
 
     def weighted_members(self) -> Iterator[tuple[float, ClosedForm]]:
         """See `ClosedForm`."""

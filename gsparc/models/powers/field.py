@@ -169,7 +169,7 @@ class PowerField(ClosedForm):
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
-        return None if self.powers is None else self.powers.with_exact_posterior()
+        return self.powers
 
     def count_components(self) -> int:
         """See `ClosedForm.count_gaussians`; coherent waves count as Gaussians of no extent,

@@ -12,6 +12,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.powers.field import PowerField
+from gsparc.models.updated import map_level
 from gsparc.processes import powers
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
@@ -107,7 +108,33 @@ def test_a_mixture_is_the_mean_of_its_members(silent):
     left = field.left_out()
     assert torch.isfinite(left.mean).all() and (left.variance > 0).all()
     assert len(left.rows) == int((data.censored[:140] == 0).sum() if silent else 140)
-    assert process.with_exact_posterior().others == ()
+
+
+@pytest.mark.parametrize("nearest", [False, True])
+def test_errors_at_several_places_were_those_of_the_heaviest_member_alone(monkeypatch, nearest):
+    data, known = walks(), np.arange(140)
+    field, batch = fitted(data, known), data.batch(np.arange(140, 160))
+    monkeypatch.setattr(powers, "MOST_ROWS", 100 if nearest else 6_000)
+    field.condition(data, known)
+    process = field.process()
+    assert process is not None and len(process.members) > 1
+    places = batch.places(data.site)
+    covariance, answer = process.covariance(places), process.answer(places)
+    assert (covariance.diagonal() + process.noise).numpy() == pytest.approx(
+        answer.variance.numpy(), rel=0.5 if nearest else 1e-6
+    )
+    assert torch.linalg.eigvalsh(covariance).min() > -1e-9
+
+
+def test_a_query_of_an_updated_map_factored_thousands_of_rows_anew(monkeypatch):
+    """The noise alone was asked of a process with covariances."""
+    data, known = walks(), np.arange(140)
+    field, batch = fitted(data, known), data.batch(np.arange(140, 160))
+    monkeypatch.setattr(powers, "MOST_ROWS", 100)
+    field.condition(data, known)
+    monkeypatch.setattr(powers, "covering_rows", None)
+    level = map_level(field, field.predict(batch), data.site)
+    assert field.powers is not None and level.noise.numpy() == pytest.approx(field.powers.noise)
 
 
 @pytest.mark.parametrize("nearest", [False, True])

@@ -30,11 +30,18 @@ from gsparc.models.powers.prior_map import NetworkMaps, describe_use
 from gsparc.models.powers.together.learning import (
     TRIED_EACH,
     StationPriors,
+    learn_own_settings,
     learn_shared_terms,
     learn_station_priors,
 )
+from gsparc.models.powers.together.links import LinkPriors, Links, both_ends_move, learn_links
 from gsparc.models.powers.together.network import find_sectors, learn_network, relabel_by_site
-from gsparc.models.powers.together.terms import SharedTerms, places_and_notes, rows_of_stations
+from gsparc.models.powers.together.terms import (
+    SharedTerms,
+    StationRows,
+    places_and_notes,
+    rows_of_stations,
+)
 from gsparc.models.target_rows import linear_moments
 from gsparc.processes.factor import Factor
 from gsparc.processes.neighbourhood import nearest_distance
@@ -44,6 +51,7 @@ from gsparc.processes.powers import MOST_ROWS, REACH
 from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import NO_AZIMUTH, ROUND, Sectors
 from gsparc.processes.shared import SharedTermsPosterior
+from gsparc.processes.stored import from_plain, to_plain
 from gsparc.processes.trend import TINY_M
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.stopwatch import Stopwatch
@@ -78,6 +86,8 @@ class JointPowerField(ClosedForm):
         self.elsewhere: SharedTermsPosterior | None = None
         self.whole = 1.0  # variance of what was measured, of all stations [dB^2]
         self.rows: dict[int, Tensor] = {}  # of what was heard of each station
+        self.link_priors: LinkPriors | None = None  # where both ends move
+        self.links: Links | None = None
         self._reach: tuple[cKDTree, float] | None = None  # of what is known, made when it is asked
 
     def fit(self, data: Measurements, fold: Fold, context: FitContext) -> FitReport:
@@ -91,7 +101,7 @@ class JointPowerField(ClosedForm):
             raise ValueError("a process of many stations' powers needs several stations")
         if not len(rows):
             raise ValueError("a process of many stations' powers needs at least one row")
-        self.site, self.inflation = data.site, 1.0
+        self.site, self.inflation, self.link_priors = data.site, 1.0, None
         notes = self._learn(data, rows)
         self.condition(data, rows)
         return FitReport(watch.seconds, notes)
@@ -103,6 +113,12 @@ class JointPowerField(ClosedForm):
         network = find_sectors(data, self.places)
         if network is None:
             self.own, remarks = learn_station_priors(used, self.seed)
+            if self.shared and both_ends_move(data, rows):
+                remarks.append(self._share_terms(used, by_links=True))
+            if self.link_priors is not None:
+                return (*notes, *remarks)
+            self.own, more = learn_own_settings(used, self.own, self.seed)
+            remarks += more
         else:
             measured, used = used, relabel_by_site(used, network)
             names = data.site.every_station.shown
@@ -122,15 +138,23 @@ class JointPowerField(ClosedForm):
             remarks.append(
                 f"at most {most} rows of each station are learned from, of up to {largest}"
             )
-        self.heard = self.unheard = SharedTerms.from_rows(
-            used, self.own.never.known_trend, 1.0, 0, self.seed
-        )
         if not self.shared or network is not None:
+            self.heard = self.unheard = self._law_alone(used)
             return (*notes, *remarks)
-        terms, self.inflation, remark = learn_shared_terms(used, self.own, self.seed)
+        return (*notes, *remarks, self._share_terms(used))
+
+    def _law_alone(self, rows: StationRows) -> SharedTerms:
+        return SharedTerms.from_rows(rows, self.own.never.known_trend, 1.0, 0, self.seed)
+
+    def _share_terms(self, rows: StationRows, by_links: bool = False) -> str:
+        """Set what stations share, and links where these are better; what must be said."""
+        self.heard = self.unheard = self._law_alone(rows)
+        terms, self.inflation, remark, missed = learn_shared_terms(rows, self.own, self.seed)
         if terms.place_db:
-            self.unheard = terms.set_inducing(used, PLACES, self.seed)
-        return (*notes, *remarks, remark)
+            self.unheard = terms.set_inducing(rows, PLACES, self.seed)
+        if missed is not None and by_links:
+            self.link_priors, remark = learn_links(rows, self.own.never, missed, self.seed)
+        return remark
 
     @property
     def network(self) -> Sectors | None:
@@ -146,6 +170,8 @@ class JointPowerField(ClosedForm):
         """See `ClosedForm`; silent rows say that powers are below a level."""
         own_rows = rows_of_stations(data, rows, self.places)
         own_rows = own_rows if self.network is None else relabel_by_site(own_rows, self.network)
+        if self.link_priors is not None:
+            self.links = self.link_priors.condition(own_rows, self.seed)
         used = own_rows.thin_rows(rows_per_station(len(own_rows.stations)), self.seed)
         self.posterior, self._reach = self.own.condition(used, self.heard, self.seed), None
         elsewhere = self.posterior
@@ -174,7 +200,10 @@ class JointPowerField(ClosedForm):
         heard = torch.isin(number, torch.tensor([*posterior.processes]))
         exact = query.tx.dtype == torch.float64
         for of, inflation, chosen in ((posterior, 1.0, heard), (elsewhere, self.inflation, ~heard)):
-            if chosen.any():
+            if chosen.any() and self.links is not None:
+                mean[chosen], spread[chosen] = self.links.answer(places[chosen], of is posterior)
+                share[chosen] = spread[chosen] / self.whole
+            elif chosen.any():
                 mean[chosen], variance = of.answer(places[chosen], number[chosen], exact)
                 spread[chosen], share[chosen] = inflation * variance, variance / self.whole
         share = (share + self._law_share(first_end(places))).clamp_max(1.0)
@@ -206,6 +235,17 @@ class JointPowerField(ClosedForm):
             covariance[:, at[:, None], at] = inflation * block
             kernel = self.own.prior(station).kernel
             noise[at] = inflation * kernel.amplitude * kernel.noise
+            if (
+                self.links is not None
+            ):  # their covariances are as the station's own process has them
+                asked, is_heard = places[:, at], station in posterior.processes
+                level, variance = self.links.answer(asked.flatten(0, 1), is_heard)
+                mean[:, at], noise[at] = (
+                    level.unflatten(0, asked.shape[:2]),
+                    self.links.noise(is_heard),
+                )
+                scale = (variance.unflatten(0, asked.shape[:2]) / block.diagonal(0, 1, 2)).sqrt()
+                covariance[:, at[:, None], at] = scale[:, :, None] * block * scale[:, None]
         return JointLevels(mean, covariance, noise)
 
     def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
@@ -215,6 +255,8 @@ class JointPowerField(ClosedForm):
             ValueError: before `condition`.
         """
         posterior, _ = self._require_posteriors()
+        if self.links is not None:
+            return self.links.left_out(rows)
         means, spreads, known = [], [], []
         for number, process in posterior.processes.items():
             asked = slice(None) if rows is None else np.isin(self.rows[number], rows)
@@ -240,6 +282,8 @@ class JointPowerField(ClosedForm):
             "seed": self.seed,
             "whole": self.whole,
             "rows": {str(number): rows for number, rows in self.rows.items()},
+            "link_priors": to_plain(self.link_priors),
+            "links": to_plain(self.links),
         }
         if self.posterior is not None and self.elsewhere is not None:
             state["processes"] = {
@@ -260,6 +304,8 @@ class JointPowerField(ClosedForm):
         self.heard, self.unheard = (SharedTerms.read(state[name]) for name in ("heard", "unheard"))
         self.rows = {int(number): rows for number, rows in state["rows"].items()}
         self.inflation, self.whole = float(state["inflation"]), float(state["whole"])
+        parts = (from_plain(state.get(name)) for name in ("link_priors", "links"))
+        self.link_priors, self.links = parts
         if "processes" in state:
             processes = {
                 int(number): Exact.read(part) for number, part in state["processes"].items()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -101,11 +102,12 @@ class StationPriors:
 
 
 def learn_station_priors(rows: StationRows, seed: int) -> tuple[StationPriors, list[str]]:
-    """Return the law and settings of own processes, and what must be said of them."""
+    """Return the law and settings of own processes, alike but for amplitudes, and what must be said
+    of them.
+    """
     trend, notes = _fit_site_law(rows, seed)
     heard, some_silent = rows.heard_rows, 0 < rows.silent.sum() < len(rows.silent)
     whole = rows.select_complete_places() if some_silent else heard
-    numbers = [number for number in whole.stations if (heard.station == number).sum() >= ENDS_FROM]
     kernel, priors = _fit_common_kernel(heard, trend, seed)
     if some_silent:
         each = whole.share_of(MOST_ROWS, WEIGHED_EACH)
@@ -118,6 +120,19 @@ def learn_station_priors(rows: StationRows, seed: int) -> tuple[StationPriors, l
         for number, prior in priors.items():
             kernel_here = replace(kernel, amplitude=wider * prior.kernel.amplitude)
             priors[number] = Prior(kernel_here, trend)
+    return StationPriors(Prior(kernel, trend), priors), notes
+
+
+def learn_own_settings(
+    rows: StationRows, alike: StationPriors, seed: int
+) -> tuple[StationPriors, list[str]]:
+    """Return the same with settings of their own for stations of many rows, and what must be said
+    of them.
+    """
+    heard, some_silent = rows.heard_rows, 0 < rows.silent.sum() < len(rows.silent)
+    whole = rows.select_complete_places() if some_silent else heard
+    numbers = [number for number in whole.stations if (heard.station == number).sum() >= ENDS_FROM]
+    priors, kernel, trend = dict(alike.heard), alike.never.kernel, alike.never.known_trend
     for number in numbers:
         if some_silent:
             some = whole.select_station(number).draw_stretches(ENDS_FROM, seed).view(trend)
@@ -126,8 +141,8 @@ def learn_station_priors(rows: StationRows, seed: int) -> tuple[StationPriors, l
             some = heard.select_station(number).thin_rows(ENDS_ON, seed).view(trend)
             _, kernel_here = fit_kernel_by_left_out([kernel], [some])
         priors[number] = Prior(_with_amplitude(kernel_here, kernel_here.amplitude), trend)
-    notes += [f"settings of their own for {len(numbers)} stations"] if numbers else []
-    return StationPriors(Prior(kernel, trend), priors), notes
+    notes = [f"settings of their own for {len(numbers)} stations"] if numbers else []
+    return replace(alike, heard=priors), notes
 
 
 def _fit_site_law(rows: StationRows, seed: int) -> tuple[Trend, list[str]]:
@@ -169,9 +184,16 @@ def _with_amplitude(kernel: Kernel, amplitude: float) -> Kernel:
     return replace(kernel, amplitude=max(amplitude, LEAST_DB2))
 
 
+class LeftOutStations(NamedTuple):
+    """Rows (n,) of stations left out, of the measurements, and their errors (n,) [dB]."""
+
+    rows: np.ndarray
+    errors: np.ndarray
+
+
 def learn_shared_terms(
     rows: StationRows, priors: StationPriors, seed: int
-) -> tuple[SharedTerms, float, str]:
+) -> tuple[SharedTerms, float, str, LeftOutStations | None]:
     """Return shared terms for stations that were never heard,
     of least squared error at left-out stations.
 
@@ -191,7 +213,7 @@ def learn_shared_terms(
         few, priors.never.known_trend, LENGTHS[0] * short, TRIED_EACH, seed
     )
     if len(few.stations) < LEAST_STATIONS:
-        return bare, 1.0, "no shared terms: too few stations to leave some out"
+        return bare, 1.0, "no shared terms: too few stations to leave some out", None
     processes = priors.condition(few, bare, seed).processes
     best = plain = bare, *_left_out_errors(processes, bare)
     for length in LENGTHS:
@@ -202,31 +224,34 @@ def learn_shared_terms(
             result = _left_out_errors(processes, terms)
             if (result[0] ** 2).mean() < (best[1] ** 2).mean():
                 best = terms, *result
-    (_, errors, *_), (_, others, _, station) = best, plain
+    (_, errors, *_), (_, others, _, station, _) = best, plain
     gain, unsure = mean_and_error(others**2 - errors**2, station)
-    terms, _, ratio, _ = best if gain > ERRORS * unsure else plain
+    terms, _, ratio, _, whole = best if gain > ERRORS * unsure else plain
     before, after = (math.sqrt(float((residuals**2).mean())) for residuals in (others, errors))
     remark = (
         f"stations left out, after one constant each: rmse {before:.3g} dB without shared terms, "
         f"{after:.3g} dB with them (gain {gain:.2g} +- {unsure:.2g} dB^2)"
     )
-    return terms, min(max(ratio, 1 / WIDEST), WIDEST), remark
+    index = np.concatenate([few.select_station(number).index for number in processes])
+    factor = min(max(ratio, 1 / WIDEST), WIDEST)
+    return terms, factor, remark, LeftOutStations(index, whole)
 
 
 def _left_out_errors(
     processes: Mapping[int, Exact], terms: SharedTerms
-) -> tuple[np.ndarray, float, np.ndarray]:
+) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
     """Errors (n,) [dB] of what was heard of stations left out, after a constant of each,
-    and their stations.
+    and their stations; and those without that constant.
 
     Between them the mean square of errors without that constant over their predicted variances.
     """
-    errors, ratios = [], []
+    whole, ratios = [], []
     blocks = [
         Block.from_process(process, terms.columns(process.rows)) for process in processes.values()
     ]
     for error, variance in left_out_processes(blocks):
         ratios.append(float((error.square() / variance).mean()))
-        errors.append((error - error.mean()).numpy())
-    station = np.repeat(np.arange(len(errors)), [len(part) for part in errors])
-    return np.concatenate(errors), float(np.mean(ratios)), station
+        whole.append(error.numpy())
+    errors = np.concatenate([error - error.mean() for error in whole])
+    station = np.repeat(np.arange(len(whole)), [len(part) for part in whole])
+    return errors, float(np.mean(ratios)), station, np.concatenate(whole)

@@ -27,6 +27,7 @@ from gsparc.models.powers.together import learning
 from gsparc.models.powers.together.field import JointPowerField, rows_per_station
 from gsparc.models.powers.together.learning import (
     StationPriors,
+    learn_own_settings,
     learn_shared_terms,
     learn_station_priors,
 )
@@ -421,7 +422,7 @@ def test_lists_of_the_strongest_were_all_that_settings_were_learned_from(monkeyp
         who,
         np.arange(len(at)),
     )
-    priors, notes = learn_station_priors(rows, 0)
+    priors, notes = learn_own_settings(rows, learn_station_priors(rows, 0)[0], 0)
     # 64 of shadowing and 4 of noise; of what is listed alone 37.
     assert 50 < priors.variance < 90
     assert any("settings of their own" in note for note in notes)

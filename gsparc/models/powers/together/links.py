@@ -1,0 +1,165 @@
+"""Levels between two places: a process over places of both ends, given the links nearest to each.
+
+A link whose station was heard has that station's links among the nearest. One of a place that was
+never an end has others' alone: its settings are the likeliest ones where each link is given links
+of other stations.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from gsparc.data.schema import Measurements
+from gsparc.models.closed_form import LeftOutRows
+from gsparc.models.powers.together.learning import ERRORS, LeftOutStations
+from gsparc.models.powers.together.terms import StationRows
+from gsparc.models.target_rows import linear_moments
+from gsparc.processes.averages import MeanVariance
+from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.nearest import (
+    LOOKED_AT,
+    LOOKED_BY,
+    Nearest,
+    PlaceValues,
+    choose_kernel_by_nearest,
+    condition_on_nearest,
+)
+from gsparc.processes.neighbourhood import NEIGHBOURS
+from gsparc.processes.prior import Prior
+from gsparc.processes.stored import Stored
+from gsparc.processes.uncertainty import mean_and_error
+
+FOLDS = 10  # of stations, that are left out together
+MANY = 20  # places of stations, from which on both ends move
+
+
+@dataclass(frozen=True)
+class LinkPriors(Stored):
+    """Priors of levels over places of both ends.
+
+    Attributes:
+        heard: of links of stations that were heard.
+        unheard: of links of all others.
+    """
+
+    heard: Prior
+    unheard: Prior
+
+    def condition(self, rows: StationRows, seed: int) -> Links:
+        """Return what rows that were heard say."""
+        values = link_values(rows)
+        heard, unheard = (condition_on_nearest(p, values, seed) for p in (self.heard, self.unheard))
+        return Links(heard, unheard, torch.from_numpy(rows.index))
+
+
+@dataclass(frozen=True)
+class Links(Stored):
+    """Both, given the same rows.
+
+    Attributes:
+        heard, unheard: see `LinkPriors`.
+        index: (n,) int64, rows of the measurements.
+    """
+
+    heard: Nearest
+    unheard: Nearest
+    index: Tensor
+
+    def answer(self, places: Tensor, heard: bool) -> MeanVariance:
+        """Return mean [dB] and variance [dB^2] (B,) of a measurement at places (B, 6) [m]."""
+        process = self.heard if heard else self.unheard
+        mean, variance = process.answer(places)
+        return MeanVariance(mean[:, 0], process.prior.kernel.amplitude * variance)
+
+    def noise(self, heard: bool) -> float:
+        """Variance of a measurement's noise [dB^2]."""
+        kernel = (self.heard if heard else self.unheard).prior.kernel
+        return kernel.amplitude * kernel.noise
+
+    def left_out(self, rows: np.ndarray | None) -> LeftOutRows:
+        """Return the rows, or those of `rows` (m,) that it knows, each without itself; linear."""
+        every = np.arange(len(self.index))
+        some = every if rows is None else np.flatnonzero(np.isin(self.index.numpy(), rows))
+        mean, variance = self.heard.left_out(torch.from_numpy(some))
+        spread = self.heard.prior.kernel.amplitude * variance
+        moments = linear_moments(mean[:, 0].float(), spread.float())
+        return LeftOutRows(self.index.numpy()[some], *moments)
+
+
+def both_ends_move(data: Measurements, rows: np.ndarray) -> bool:
+    """Tell whether rows (n,) are levels between many places of either end; silent ones are not."""
+    places = np.asarray(data.site.every_station.position)[np.unique(data.stations_of(rows))]
+    heard = data.censored is None or not data.censored[rows].any()
+    return heard and bool(np.isfinite(places).all()) and len(np.unique(places, axis=0)) >= MANY
+
+
+def learn_links(
+    rows: StationRows, start: Prior, missed: LeftOutStations, seed: int
+) -> tuple[LinkPriors | None, str]:
+    """Return the likeliest settings, None where stations that are left out are told no better than
+    by `missed`, and what must be said of it.
+
+    Args:
+        rows: that were heard, of several stations.
+        start: the site's law, and a kernel to begin with.
+        missed: what terms that stations share miss of some rows.
+        seed: of rows that are looked at.
+    """
+    values, looked_at = link_values(rows), draw_rows(len(rows.index), LOOKED_AT, seed)
+    others = np.c_[looked_at, links_of_others(rows, looked_at, LOOKED_BY)]
+    kernels = (choose_kernel_by_nearest(start, values, seed, near)[0] for near in (None, others))
+    heard, unheard = (Prior(kernel, start.trend) for kernel in kernels)
+    order = np.argsort(rows.index)
+    chosen = order[np.searchsorted(rows.index, missed.rows, sorter=order)]
+    errors = errors_by_others(rows, unheard, chosen, seed)
+    gain, unsure = mean_and_error(missed.errors**2 - errors**2, rows.station[chosen])
+    before, after = (math.sqrt(float((part**2).mean())) for part in (missed.errors, errors))
+    used = gain > ERRORS * unsure
+    remark = (
+        f"stations left out: rmse {before:.3g} dB by what all share, {after:.3g} dB by the "
+        f"{NEIGHBOURS} links whose ends are nearest, which answer{'' if used else ' nothing'}"
+    )
+    return LinkPriors(heard, unheard) if used else None, remark
+
+
+def link_values(rows: StationRows) -> PlaceValues:
+    """Return levels over places of both ends, one for each row."""
+    once = torch.ones(len(rows.index), dtype=torch.float64)
+    return PlaceValues(rows.places, torch.from_numpy(rows.decibels)[:, None], once)
+
+
+def links_of_others(rows: StationRows, chosen: np.ndarray, most: int) -> np.ndarray:
+    """Return numbers (m, k) of the rows of other stations that are nearest to the chosen (m,)."""
+    result = np.empty((len(chosen), most), np.int64)
+    for of, others in _station_folds(rows, chosen):
+        near = cKDTree(rows.places[others]).query(rows.places[chosen[of]], np.arange(1, most + 1))
+        result[of] = others[near[1]]
+    return result
+
+
+def errors_by_others(rows: StationRows, prior: Prior, chosen: np.ndarray, seed: int) -> np.ndarray:
+    """Return errors (m,) [dB] of the chosen rows (m,), each predicted from other stations'."""
+    whole = condition_on_nearest(prior, link_values(rows), seed)
+    errors = np.empty(len(chosen))
+    for of, others in _station_folds(rows, chosen):
+        mean = whole.subset(others, seed).answer(torch.from_numpy(rows.places[chosen[of]])).mean
+        errors[of] = mean[:, 0].numpy() - rows.decibels[chosen[of]]
+    return errors
+
+
+def _station_folds(
+    rows: StationRows, chosen: np.ndarray
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Numbers of those of the chosen rows (m,) that are of a fold's stations, and all other rows
+    (n,) of other stations.
+    """
+    fold = np.unique(rows.station, return_inverse=True)[1].reshape(-1) % FOLDS
+    for number in np.unique(fold[chosen]):
+        yield np.flatnonzero(fold[chosen] == number), np.flatnonzero(fold != number)

@@ -1,0 +1,139 @@
+"""Levels between two places, neither of which was ever an end: of robots on one floor."""
+
+from functools import cache
+
+import numpy as np
+import pandas as pd
+import pytest
+import torch
+from closed import fitted_to, read_back
+from releases import real
+
+from gsparc.data.query import Query
+from gsparc.data.schema import Measurements
+from gsparc.data.splits import Fold
+from gsparc.models.baselines.distance_law import fit_law
+from gsparc.models.gsparc import Gsparc
+from gsparc.models.mixture.methods import Powers
+from gsparc.models.per_station import wrap_per_station
+from gsparc.models.powers.together.field import JointPowerField
+from gsparc.models.powers.together.links import links_of_others
+from gsparc.models.powers.together.terms import places_and_notes, rows_of_stations
+from gsparc.ops import Pose
+from gsparc.prediction.answers import predict_file
+from gsparc.prediction.predictor import Predictor
+from gsparc.processes.powers import PowerRows
+from gsparc.tables.own import from_arrays
+from gsparc.training.context import FitContext
+
+EACH, NEW = 60, 15  # rows of each transmitter's place, and places that are left out
+
+
+@cache
+def robots() -> Measurements:
+    """Some levels of each of 73 transmitter's places."""
+    with np.load(real("both-ends/robots.npz")) as stored:
+        arrays = {name: stored[name] for name in ("tx_position", "rx_position", "rssi_db")}
+        number = stored["tx_place"]
+    rng = np.random.default_rng(0)
+    chosen = [rng.permutation(np.flatnonzero(number == each))[:EACH] for each in np.unique(number)]
+    rows = np.concatenate(chosen)
+    places, station = np.unique(arrays["tx_position"][rows], axis=0, return_inverse=True)
+    return from_arrays(
+        {
+            "rx_position": arrays["rx_position"][rows],
+            "station_position": places,
+            "station": station.reshape(-1),
+            "rssi_db": arrays["rssi_db"][rows],
+        },
+        {"name": "robots"},
+    )
+
+
+@cache
+def fold() -> Fold:
+    data = robots()
+    new = np.random.default_rng(2).permutation(len(data.site.every_station))[:NEW]
+    is_new = np.isin(data.stations_of(np.arange(len(data))), new)
+    return Fold(np.flatnonzero(~is_new), np.zeros(0, np.int64), np.flatnonzero(is_new))
+
+
+@cache
+def field() -> JointPowerField:
+    return fitted_to(JointPowerField(), robots(), fold().train)[0]
+
+
+def errors_db(mean: torch.Tensor, rows: np.ndarray) -> np.ndarray:
+    levels = 10 * np.log10(np.stack([mean[:, 0].double().numpy(), robots().target[rows, 0]]))
+    return levels[0] - levels[1]
+
+
+def test_a_new_transmitter_was_told_by_the_law_alone():
+    """15 places left out: 4.48 dB, where kriging over both ends had 3.94."""
+    data, rows = robots(), fold().test
+    prediction = field().predict(data.batch(rows))
+    errors = errors_db(prediction.mean, rows)
+    learned = rows_of_stations(data, fold().train, field().places)
+    tested = rows_of_stations(data, rows, field().places)
+    law = fit_law(PowerRows(learned.places, learned.decibels, learned.side), None)
+    plain = law.mean(torch.from_numpy(tested.places)).numpy() - tested.decibels
+    assert np.sqrt((errors**2).mean()) < 0.9 * np.sqrt((plain**2).mean())
+    spread = prediction.variance.sqrt() / prediction.mean[:, 0] * 10 / np.log(10)
+    assert 0.8 < float((np.abs(errors) < 1.645 * spread.numpy()).mean()) < 0.97
+
+
+def test_no_link_of_the_same_fold_of_stations_is_among_the_nearest():
+    data = robots()
+    rows = rows_of_stations(data, fold().train, places_and_notes(data, fold().train)[0])
+    chosen = np.arange(0, len(rows.index), 97)
+    near = links_of_others(rows, chosen, 5)
+    assert not (rows.station[near] == rows.station[chosen][:, None]).any()
+
+
+def test_links_are_stored_and_left_out_rows_are_those_that_were_learned():
+    again, rows = read_back(field()), fold().test[::7]
+    batch = robots().batch(rows)
+    assert torch.allclose(again.predict(batch).mean, field().predict(batch).mean)
+    few = fold().train[::50]
+    left = again.left_out(few)
+    assert set(left.rows) == set(few)
+    assert 0 < np.sqrt((errors_db(left.mean, left.rows) ** 2).mean()) < 6
+
+
+def test_errors_together_are_those_of_each_link():
+    data, rows = robots(), fold().test[:40]
+    places, station = torch.from_numpy(data.moving[rows]), data.stations_of(rows)[:1]
+    poses = Pose(places, torch.eye(3).expand(40, 3, 3))
+    alone = field().predict(Query(torch.from_numpy(field().places[station]).expand(40, 3), poses))
+    joint = field().predict_joint(places[:, None], torch.from_numpy(station))
+    assert torch.allclose(joint.mean[:, 0], 10 * alone.mean[:, 0].double().log10(), atol=1e-3)
+    assert (joint.covariance[:, 0, 0] >= joint.noise).all()
+
+
+def test_a_copy_of_each_place_refused_a_new_one():
+    """From 6,000 rows on each of 73 places had a model, 76 seconds of them."""
+    data = robots()
+    seen = Fold(fold().train, fold().val, fold().train[:5])
+    kind, why = Powers().choose_stations(data, seen, FitContext())
+    assert kind == "together" and "both ends move" in why
+
+
+@pytest.mark.parametrize("ending", ["csv", "npz"])
+def test_a_table_of_both_ends_was_answered_for_the_known_transmitters(tmp_path, ending):
+    data, rows = robots(), fold().test[:20]
+    method = wrap_per_station(Gsparc(), data).create_for(data)
+    method.fit(data, fold(), FitContext())
+    predictor = Predictor(method, data.site)
+    still = np.asarray(data.site.every_station.position)[data.stations_of(rows)]
+    ends = {"tx": still + data.site.origin, "rx": data.moving[rows] + data.site.origin}
+    path = tmp_path / f"links.{ending}"
+    if ending == "csv":
+        named = zip(ends, ends.values(), strict=True)
+        table = {f"{e}_{a}": places[:, i] for e, places in named for i, a in enumerate("xyz")}
+        pd.DataFrame(table).to_csv(path, index=False)
+    else:
+        np.savez(path, **{f"{end}_position": places for end, places in ends.items()})
+    facts = predict_file(predictor, path, tmp_path / "out.csv")
+    answers = pd.read_csv(tmp_path / "out.csv")
+    assert facts["predict/predictions"] == len(answers) == 20
+    assert np.allclose(answers.rssi_db, predictor.rssi(**ends)[:, 0], atol=1e-4)
