@@ -193,8 +193,8 @@ def draw_spectra(examples: Examples, title: str) -> Figure:
         axis.set_xticks(np.arange(90 * np.ceil(edges[0] / 90), edges[1] + 1, 90))
         axis.tick_params(labelsize=7)
     figure.supylabel("elevation [°]", fontsize=9)
-    across = "relative strength; azimuth [°] runs across"
-    colour_bar(power, axes[:, :-1], across, location="bottom", aspect=40)
+    label = "relative strength; azimuth [°] runs across"
+    colour_bar(power, axes[:, :-1], label, location="bottom", aspect=40)
     colour_bar(error, axes[:, -1], "difference", location="bottom", aspect=10)
     figure.suptitle(title)
     figure.set_label("The same test rows, measured and predicted")
