@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from scipy.ndimage import maximum_filter
-from scipy.spatial import cKDTree
 
 from gsparc.apps.maps import field_map, strongest
 from gsparc.apps.maps.area import Grid, lay_grid
@@ -120,8 +119,11 @@ def predict_map(
     notes += _notes_of_threshold(threshold_db, promise, level)
     values: dict[str, Any] = field_map.empty_layers(len(names), grid.inside.shape)
     inside = np.flatnonzero(grid.inside)
-    # Where nothing is said nothing is asked; a margin, as stations are as far as their own rows.
-    told = grid.inside if promise is None else grid.inside & _within_reach(grid, promise, site)
+    # Where nothing is said nothing is asked.
+    told = grid.inside
+    if promise is not None:
+        local = grid.places(np.arange(told.size)) - site.origin
+        told = told & promise.within_reach(local).reshape(told.shape)
     sure = told
     if promise is not None and tolerance_db > 0 and len(inside) > FEW_CELLS:
         sure = told & _beside_rows(grid, promise, site)
@@ -209,13 +211,6 @@ def _notes_of_threshold(
         )
         return [f"{at}: hardly any place can reach it"]
     return []
-
-
-def _within_reach(grid: Grid, promise: Promise, site: Site) -> np.ndarray:
-    """Cells (ny, nx) bool that are near enough to any row for a promise."""
-    known = promise.known[:, -3:-1] + site.origin[:2]
-    far = cKDTree(known).query(grid.places(np.arange(grid.inside.size))[:, :2])[0]
-    return far.reshape(grid.inside.shape) <= promise.calibration().reach
 
 
 def _beside_rows(grid: Grid, promise: Promise, site: Site) -> np.ndarray:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from gsparc.apps.maps.area import Grid, lay_grid
@@ -203,9 +202,9 @@ def coarse_grid(
     fine = lay_grid(None if predictor is None else predictor.site, area, height_m, None, plan)
     if area is None and plan is None and promise is not None and predictor is not None:
         local = fine.places(np.arange(fine.inside.size)) - predictor.site.origin
-        far = cKDTree(promise.known[:, -3:]).query(local)[0].reshape(fine.inside.shape)
         # No farther than a promise reaches: where nothing is said, measuring cannot be weighed.
-        fine = replace(fine, inside=fine.inside & (far <= promise.calibration().reach))
+        told = promise.within_reach(local).reshape(fine.inside.shape)
+        fine = replace(fine, inside=fine.inside & told)
     west, east, south, north = fine.extent
     share = fine.inside.mean()
     step = float(np.sqrt((east - west) * (north - south) * share / count))

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.intervals import Coverage, IntervalScales, calibrate, cross_validate
@@ -92,6 +93,12 @@ class Promise:
     def distance(self, places: np.ndarray, station: int) -> np.ndarray:
         """Return `distances` of one station."""
         return self.distances(places, np.full(len(places), station))
+
+    def within_reach(self, places: np.ndarray) -> np.ndarray:
+        """Return which of local places (n, 3) may be near enough to a row for a promise (n,)."""
+        if self.known.shape[1] > 3:  # of two ends that moved, one place alone tells nothing
+            return np.ones(len(places), bool)
+        return cKDTree(self.known).query(places)[0] <= self.calibration().reach
 
     def expected_errors(
         self, places: np.ndarray, station: np.ndarray, spread_db: np.ndarray
