@@ -86,7 +86,7 @@ def test_no_link_of_the_same_fold_of_stations_is_among_the_nearest():
     data = robots()
     rows = rows_of_stations(data, fold().train, places_and_notes(data, fold().train)[0])
     chosen = np.arange(0, len(rows.index), 97)
-    near = links_of_others(rows, chosen, 5)
+    near = links_of_others(rows, rows.places, chosen, 5)
     assert not (rows.station[near] == rows.station[chosen][:, None]).any()
 
 
