@@ -128,7 +128,7 @@ def draw_site(
 ) -> None:
     """Save a map of places and stations as PNG and, beside it, the levels of stations that jump.
 
-    `levels` are the `link_levels` of powers, `steps` their `plausibility.find_level_steps`.
+    `levels` are the `link_levels` of powers, `steps` their `level_steps.find_level_steps`.
     """
     places = find_spots(data, levels)
     points = [places.place[~places.far], static_positions(data)]  # but those far outside
