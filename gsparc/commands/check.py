@@ -48,7 +48,6 @@ def check(
     from gsparc.datasets.own import read_any
     from gsparc.models.powers.together.network import check_azimuths
     from gsparc.prediction.foreseen import describe_few_rows
-    from gsparc.tables.checks.array_layout import carrier_warnings, layout_warnings
     from gsparc.tables.columns_file import write_columns
 
     try:
@@ -67,8 +66,7 @@ def check(
     notes = [*reading.notes, *(check_azimuths(reading.data) if aimed else ())]
     questions = [note for note in notes if isinstance(note, Question)]
     doubtful = [note for note in notes if isinstance(note, Caution) and note not in questions]
-    warnings = outlier_warnings(reading.data) + doubtful
-    warnings += layout_warnings(reading.data) + carrier_warnings(reading.data) + implausible
+    warnings = outlier_warnings(reading.data) + doubtful + implausible
     topics = describe(reading.data)
     if reading.raw is not None and reading.raw.roles:
         topics += [("columns", write_columns(path, reading.raw.roles, reading.raw.heads))]

@@ -6,12 +6,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from gsparc.apps.maps.against_rows import drive_beside_map, drive_beside_model
+from gsparc.apps.maps.promise import read_promise
+from gsparc.base.errors import DataError
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Split
+from gsparc.datasets.own import read_any
+from gsparc.evaluation.by_part import Drive, describe_parts
 from gsparc.evaluation.results import Run, frame_of_runs
 from gsparc.evaluation.summary import remarks
 from gsparc.pictures.confidence_pictures import PICTURES, draw_confidences
+from gsparc.pictures.parts import draw_parts
 from gsparc.pictures.plots import draw_sweep
 from gsparc.prediction.hearing import read_hearing
 from gsparc.runs.evaluate import Evaluation, evaluate
@@ -69,8 +75,10 @@ def evaluate_files(
 
 @command()
 def task(call: CommandCall) -> Result:
-    """Test checkpoints."""
+    """Test checkpoints, or a map's file."""
     given, run_dir, paths = call.given, call.folder, call.paths
+    if paths[0].endswith(".npz"):
+        return _judge_map(paths[0], given["dataset"], run_dir)
     how = {"eval_on": given["eval_on"], "baselines": given["baselines"]}
     evaluation, data, split = evaluate_files(paths, given["dataset"], given["split"], **how)
     facts = {**evaluation.facts, "ckpt": ", ".join(paths)}
@@ -83,4 +91,32 @@ def task(call: CommandCall) -> Result:
     title = f"{data.site.name}, split {split.title}, {eval_on}"
     # Who opened the files has warned of it, and warnings are repeated below the table.
     notes = remarks({**facts, "split/foreign": None}, eval_on)
-    return Result(facts, tables_of(facts, title, eval_on, evaluation.stations), notes)
+    tables = tables_of(facts, title, eval_on, evaluation.stations)
+    if "error_db" not in evaluation.columns or not len(evaluation.columns["error_db"]):
+        return Result(facts, tables, notes)
+    promise = read_promise(open_run(paths, given["dataset"]).stored[0].extra)
+    drive = drive_beside_model(evaluation.columns, data, promise)
+    lines, parts = _judge(drive, f"{data.site.name}, {eval_on} rows", run_dir)
+    return Result(facts, tables, [*notes, *lines], columns={"by_part.csv": parts})
+
+
+def _judge_map(path: str, dataset: Mapping[str, Any], folder: Path) -> Result:
+    """A map's file beside the rows of a data set."""
+    if dataset.get("file") is None:
+        raise DataError(f"ckpt={path}: rows to judge it by are needed: dataset.file=FILE")
+    given = {name: value for name, value in dataset.items() if name not in ("file", "name")}
+    data = read_any(dataset["file"], **given).data
+    drive = drive_beside_map(path, data)
+    lines, parts = _judge(drive, f"{Path(path).name} beside {data.site.name}", folder)
+    names = ("rows", "squares", "bias_db", "rmse_db", "within")
+    facts = {f"drive/{name}": parts[name][0] for name in names if parts}
+    return Result({**facts, "ckpt": path}, (), lines, columns={"by_part.csv": parts})
+
+
+def _judge(drive: Drive, title: str, folder: Path) -> tuple[list[str], dict[str, list[Any]]]:
+    """Lines and columns of `by_part.csv`, and the picture."""
+    records = drive.judge()
+    if records:
+        draw_parts(drive, records, title, folder / "drive.png")
+    columns = {name: [row[name] for row in records] for name in next(iter(records), ())}
+    return describe_parts(records, drive.share), columns

@@ -7,12 +7,15 @@ from typing import Any
 
 from gsparc.apps.maps.changed import add_changes, change_layers
 from gsparc.apps.maps.covered import covered_between
-from gsparc.apps.maps.field_map import FieldMap, check_geotiff, write_classes, write_geotiff
+from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.floor_plan import read_plan_settings
+from gsparc.apps.maps.geojson import read_outlines
+from gsparc.apps.maps.geotiff import check_geotiff, write_classes, write_geotiff
 from gsparc.apps.maps.intervals import cross_validate
 from gsparc.apps.maps.kmz import write_kmz
+from gsparc.apps.maps.layers import Layer, file_name, list_layers
 from gsparc.apps.maps.making import predict_map
-from gsparc.apps.maps.pictures import Layer, draw_layer, file_name, list_layers
+from gsparc.apps.maps.pictures import draw_layer
 from gsparc.apps.maps.promise import PromiseSettings, map_notes, read_or_gather
 from gsparc.base.errors import DataError
 from gsparc.base.files import write_samples
@@ -90,11 +93,12 @@ def task(call: CommandCall) -> Result:
     field = add_changes(predict_map(predictor, promise=promise, **query), predictor)
     coverage = None if promise is None else cross_validate(promise.evidence, how.share)
     ends = None if promise is None else covered_between(field, predictor, promise)
-    lines = map_notes(field, coverage, ends)
+    lines = map_notes(field, coverage, ends, promise)
     size = f"height {field.grid.height:g} m, squares of {field.grid.step:.3g} m"
     layers = _layers(field)
     of_one = {f"power {station}" for station in field.stations}
     title = f"{predictor.site.name}, {predictor.method.label}: {size}"
+    behind = read_outlines(call.given, field.grid.origin)
     field.save(run_dir / "map.npz")
     for layer in layers:
         for suffix in SUFFIXES:
@@ -102,7 +106,7 @@ def task(call: CommandCall) -> Result:
             if any(fnmatch(name, pattern) for pattern in wanted):
                 folder = run_dir / "stations" if layer.name in of_one else run_dir
                 folder.mkdir(exist_ok=True)
-                draw_layer(field, layer, folder / name, title, floor)
+                draw_layer(field, layer, folder / name, title, floor, behind)
         if layer.words:
             write_samples(run_dir / file_name(layer, ".csv"), layer.class_table())
         if layer.words and tiff:

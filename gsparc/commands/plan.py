@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 
 from gsparc.apps.maps.floor_plan import read_plan_settings
-from gsparc.apps.maps.geojson import write_shapes
-from gsparc.apps.maps.pictures import draw_measurement_plan
+from gsparc.apps.maps.geojson import read_outlines, write_shapes
+from gsparc.apps.maps.plan_pictures import draw_measurement_plan
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import read_or_gather
 from gsparc.commands.map import stations_of
@@ -57,7 +57,8 @@ def task(call: CommandCall) -> Result:
         stops = pd.DataFrame(columns).to_dict("records")
         points = [({"type": "Point", "coordinates": [row[k] for k in at]}, row) for row in stops]
         write_shapes(call.folder / "plan.geojson", [(line, {}), *points])
-    draw_measurement_plan(plan, call.folder / "plan.png", promise, predictor, floor)
+    behind = read_outlines(call.given, plan.grid.origin)
+    draw_measurement_plan(plan, call.folder / "plan.png", promise, predictor, floor, behind)
     facts = {
         "plan/places": len(plan.places),
         "plan/expected_error_db": plan.after_db,

@@ -23,12 +23,10 @@ from gsparc.data.selection import Selection, take_selection
 from gsparc.datasets.datamodule import DataModule
 from gsparc.datasets.public.fetch import fetched_path, fetched_path_or_none
 from gsparc.tables.advice import run_warnings
-from gsparc.tables.checks.coherence import place_warnings
 from gsparc.tables.checks.conventions import convention_warnings
-from gsparc.tables.checks.gone import gone_warnings
-from gsparc.tables.checks.level_steps import LevelStep
+from gsparc.tables.checks.level_steps import LevelStep, find_level_steps
 from gsparc.tables.checks.link_levels import LinkLevels, link_levels
-from gsparc.tables.checks.plausibility import find_level_steps, sanity_warnings
+from gsparc.tables.checks.plausibility import sanity_warnings
 from gsparc.tables.checks.unit_warnings import unit_warnings
 from gsparc.tables.own import interpret
 from gsparc.tables.own_checks import Checker
@@ -105,11 +103,11 @@ def find_implausible(
     if places * len(data.site.every_station) > most:
         note = "too many links to be looked at for implausible levels here; gsparc check does"
         return [*hints, note], None, []
-    hints += map(Severe, [*convention_warnings(data), *place_warnings(data)])
+    hints += map(Severe, convention_warnings(data))
     hints += foreign_warnings(data)
     if (levels := link_levels(data, file_row)) is None:
         return hints, None, []
-    steps, hints = find_level_steps(levels), [*hints, *run_warnings(data), *gone_warnings(data)]
+    steps, hints = find_level_steps(levels), [*hints, *run_warnings(data)]
     return [*hints, *sanity_warnings(levels, steps)], levels, steps
 
 

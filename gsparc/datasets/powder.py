@@ -96,7 +96,7 @@ def _of_npz(path: Path) -> Raw:
 
 
 def _of_csv(path: Path, table: Path) -> Raw:
-    from gsparc.tables.columns import Column  # here, as pandas takes half a second to import
+    from gsparc.tables.column import Column  # here, as pandas takes half a second to import
     from gsparc.tables.opening import read_sheet
     from gsparc.tables.places import read_places
 

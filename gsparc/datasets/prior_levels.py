@@ -16,9 +16,9 @@ from gsparc.data.units import UNITS
 from gsparc.datasets.own import read_own
 from gsparc.physics.decibels import to_decibels
 from gsparc.tables import is_table
+from gsparc.tables.array_checks import MOST_DB
 from gsparc.tables.checks.plausibility import find_marks
 from gsparc.tables.own import interpret
-from gsparc.tables.own_checks import MOST_DB
 
 log = logging.getLogger(__name__)
 

@@ -18,13 +18,13 @@ import torch
 import yaml
 from torch import Tensor
 
+from gsparc.base.archives import verified_archive
 from gsparc.base.errors import DataError
 from gsparc.base.files import list_causes, load_yaml, whole_file
 from gsparc.base.locks import hold_file
 from gsparc.data.schema import Site, Stations
 from gsparc.models.method import Method, import_path
 from gsparc.ops import SphereGrid
-from gsparc.tables.raw import verified_archive
 
 VERSION = 2  # of what a checkpoint holds
 FORMAT = "gsparc-checkpoint"

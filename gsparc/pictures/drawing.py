@@ -12,7 +12,9 @@ import numpy as np
 from cycler import cycler
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.text import Annotation
 from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.transforms import Bbox
 
 from gsparc.base.files import whole_file
 from gsparc.base.limits import choice
@@ -141,6 +143,12 @@ def panels(
     return figure, axes
 
 
+def colour_bar(image: Any, axes: Any, label: str, **how: Any) -> None:
+    """Say what the colours of an image mean, beside one axes or several that share them."""
+    beside = np.ravel(axes).tolist()
+    beside[0].figure.colorbar(image, ax=beside, label=label, **{"shrink": 0.85, "pad": 0.02} | how)
+
+
 def set_log_axis(axes: Any, decades: float = 3.0) -> None:
     """Set the horizontal axis in decades, with plain numbers also between them
     where it has fewer `decades`.
@@ -182,10 +190,50 @@ def set_latency_axes(
         axes.set_ylim(bottom=max(axes.get_ylim()[0], middle - max(3 * (best - middle), 5.0)))
 
 
+LABEL = "label"  # marks annotations that may be moved
+# Offsets [points] and alignments that are tried: beside the point first, then farther off
+OFFSETS = tuple(
+    (far * x, far * y, ("right", "center", "left")[x + 1], ("top", "center", "bottom")[y + 1])
+    for far in (6, 14, 26)
+    for x, y in ((1, 1), (-1, 1), (1, -1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1))
+)
+
+
+def spread_labels(figure: Figure) -> None:
+    """Move labels to where they cover neither one another, nor a labelled point, nor leave their
+    axes; those that fit nowhere are hidden.
+    """
+    labels = [
+        (axis, text)
+        for axis in figure.axes
+        for text in axis.texts
+        if isinstance(text, Annotation) and text.get_gid() == LABEL
+    ]
+    if not labels:
+        return
+    figure.draw_without_rendering()  # places the axes, which offsets count from
+    texts = [text for axis in figure.axes for text in axis.texts if text.get_gid() != LABEL]
+    taken = [text.get_window_extent() for text in texts]
+    points = [axis.transData.transform(label.xy) for axis, label in labels]
+    taken += [Bbox([point - 3, point + 3]) for point in points]
+    for axis, label in labels:
+        for x, y, across, up in OFFSETS:
+            label.set(position=(x, y), ha=across, va=up)
+            box = label.get_window_extent()
+            inside = axis.bbox.padded(1)
+            within = inside.contains(box.x0, box.y0) and inside.contains(box.x1, box.y1)
+            if within and not box.count_overlaps(taken):
+                taken.append(box)
+                break
+        else:
+            label.set_visible(False)
+
+
 def save(figure: Figure, path: Path, dpi: float = 110, also: Iterable[str] = ()) -> None:
     """Write a figure in the format of its ending, atomically, and beside it in others: `pdf`,
     `svg`.
     """
+    spread_labels(figure)
     for file in (path, *(path.with_suffix(f".{form}") for form in also)):
         with whole_file(file) as partial:
             figure.savefig(partial, dpi=dpi, format=file.suffix[1:].lower() or "png")

@@ -4,18 +4,26 @@ a scale bar.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
 from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Affine2D
 from numpy.typing import ArrayLike
+from scipy.ndimage import label as areas_of
 
+from gsparc.pictures.drawing import LABEL, colour_bar, panels
 from gsparc.processes.few_rows import evenly_spaced
 
+Frame = tuple[np.ndarray, np.ndarray]  # corners (2,) [m]
+INCHES = 6.5  # longer side of a map
+BETWEEN = 10  # squares along the longer side, of which an empty one parts patches
+MOST_COVERED, MOST_PATCHES = 0.6, 3  # of a map's area by patches, which then have panels
 MOST_POINTS = 1500  # measured places that are drawn
 # A city's mesh has millions of triangles; the short ones are not seen at this scale.
 MOST_WALLS = 50_000
@@ -51,6 +59,49 @@ def frame_of(places: np.ndarray, share: float = 0.06) -> tuple[np.ndarray, np.nd
     # 1 mm: a single place, or places at one point, have a frame all the same.
     margin = max(float((high - low).max()), 1e-3) * share
     return low - margin, high + margin
+
+
+def split_frame(places: np.ndarray, margin: float | None = None) -> list[Frame]:
+    """Return frames of patches of places (n, 2), the largest first; one of all, where that leaves
+    no large part of it empty. See `frame_of`, of `margin` [m] in place of its share.
+    """
+
+    def frame(some: np.ndarray) -> Frame:
+        return frame_of(some) if margin is None else (some.min(0) - margin, some.max(0) + margin)
+
+    whole = frame(places)
+    side = max(float((whole[1] - whole[0]).max()), 1e-6) / BETWEEN
+    where, which = np.unique(((places - whole[0]) / side).astype(int), axis=0, return_inverse=True)
+    used = np.zeros(where.max(axis=0) + 1, bool)
+    used[tuple(where.T)] = True
+    # Squares that touch, also at corners, are of one patch.
+    number = areas_of(used, np.ones((3, 3)))[0][tuple(where.T)][which.reshape(-1)]
+    order = np.argsort(-np.bincount(number)[1:]) + 1
+    frames = [frame(places[number == patch]) for patch in order]
+    covered = sum(float(np.prod(high - low)) for low, high in frames)
+    most = MOST_COVERED * float(np.prod(whole[1] - whole[0]))
+    return frames if 1 < len(frames) <= MOST_PATCHES and covered < most else [whole]
+
+
+def map_panels(
+    frames: Sequence[Frame], rows: int = 1, beside: float = 0.0, least: float = 0.0
+) -> tuple[Figure, np.ndarray, Any]:
+    """Return a figure, axes (rows, frames) for maps of these, and axes `beside` them, so many
+    inches wide, over all rows; None of 0. `least`: inches that it is high.
+    """
+    sides = np.array([high - low for low, high in frames])
+    tall = np.clip(sides[:, 1] / sides.max(), 0.45, 1.0).max() * INCHES / (1 + 0.3 * (rows > 1))
+    wide = np.clip(tall * sides[:, 0] / sides[:, 1], 0.45 * INCHES, INCHES)
+    ratios = [*wide, beside] if beside else [*wide]
+    height = max(rows * tall + 1.6, least)
+    how: dict[str, Any] = {"width_ratios": ratios, "grid": False}
+    figure, axes = panels(sum(ratios) + 1.9, height, rows, len(ratios), **how)
+    if not beside:
+        return figure, axes, None
+    place = axes[0, -1].get_gridspec()[:, -1]
+    for axis in axes[:, -1]:
+        axis.remove()
+    return figure, axes[:, :-1], place
 
 
 def draw_stations(axis: Any, places: np.ndarray, label: str | None = "station", **how: Any) -> None:
@@ -89,16 +140,23 @@ def draw_measured(axis: Any, places: np.ndarray) -> None:
 
 
 def draw_values(
-    axis: Any, places: np.ndarray, values: np.ndarray, size: float, clipped: float, **bar: Any
+    axes: Any,
+    places: np.ndarray,
+    values: np.ndarray,
+    size: float,
+    clipped: float,
+    label: str,
+    **bar: Any,
 ) -> None:
-    """Mark places (n, 2) [m] in the colours of values (n,), told by a `bar`.
+    """Mark places (n, 2) [m] on axes, in the colours of values (n,), told by one `bar`.
 
     A share `clipped` of the values has the colour at either end:
     a few outliers would leave one for the rest.
     """
     low, high = np.quantile(values, [clipped, 1 - clipped])
-    dots = axis.scatter(*places.T, c=values, s=size, vmin=low, vmax=high, linewidths=0)
-    axis.figure.colorbar(dots, ax=axis, **bar)
+    for axis in np.ravel(axes):
+        dots = axis.scatter(*places.T, c=values, s=size, vmin=low, vmax=high, linewidths=0)
+    colour_bar(dots, axes, label, **bar)
 
 
 def draw_walls(axis: Any, triangles: np.ndarray) -> None:
@@ -115,24 +173,18 @@ def draw_walls(axis: Any, triangles: np.ndarray) -> None:
     axis.add_collection(LineCollection(longest[rows], colors="0.45", linewidths=0.5, zorder=0))
 
 
-def annotate(
-    axis: Any, text: str, where: np.ndarray, colour: str = "black", above: bool = True
-) -> None:
-    """Write beside a point: above to its right, or below to its left,
-    where the map does not end there.
-    """
-    low, high = axis.get_xlim()
-    to_left = where[0] > low + (0.75 if above else 0.25) * (high - low)
+def annotate(axis: Any, text: str, where: np.ndarray, colour: str = "black") -> None:
+    """Write beside a point, where `save` finds room."""
     note = axis.annotate(
         text,
         where,
-        xytext=(-7 if to_left else 7, 5 if above else -12),
+        xytext=(6, 6),
         textcoords="offset points",
-        ha="right" if to_left else "left",
         fontsize="small",
         color=colour,
         path_effects=OUTLINE,
         zorder=5,
+        gid=LABEL,
     )
     # Text at the rim would otherwise take width from the axes, whose scales are equal.
     note.set_in_layout(False)
@@ -172,6 +224,11 @@ def scale_bar(axis: Any) -> None:
 
 def legend_below(figure: Any, columns: int = 3) -> Any:
     """Say beneath the map what marks are; returns the legend, None where nothing has a label."""
-    if not any(axis.get_legend_handles_labels()[0] for axis in figure.axes):
+    marks: dict[str, Any] = {}
+    for axis in figure.axes:
+        for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
+            marks.setdefault(label, handle)  # of several panels once
+    if not marks:
         return None
-    return figure.legend(loc="outside lower left", ncols=columns, fontsize="small", frameon=False)
+    how = {"loc": "outside lower left", "ncols": columns, "fontsize": "small", "frameon": False}
+    return figure.legend(marks.values(), marks.keys(), **how)

@@ -23,8 +23,8 @@ from gsparc.evaluation.summary import results_table
 from gsparc.models.method import Method
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.terms import rows_of_stations
-from gsparc.pictures.drawing import PALETTE, panels, save
-from gsparc.pictures.site_plan import draw_found
+from gsparc.pictures.drawing import PALETTE, colour_bar, panels, save
+from gsparc.pictures.found_plan import draw_found
 from gsparc.prediction.confidence import Guarantee
 from gsparc.prediction.left_out import Evidence, predict_rows
 from gsparc.prediction.risk import Trial, bounded_loss
@@ -82,17 +82,24 @@ def draw_predictions(
     scale = data.site.target_scale
     unit = data.site.level_unit if data.site.target.is_level else "dB"
     measured = data.censored_side(rows) == 0  # of a silent row the target is its level
-    draw_points(true[measured] * scale, predicted[measured] * scale, title, path, unit)
+    link = np.column_stack([data.moving[rows], data.stations_of(rows)])[measured]
+    fix = np.unique(link, axis=0, return_inverse=True)[1].reshape(-1)
+    draw_points(true[measured] * scale, predicted[measured] * scale, title, path, unit, fix)
 
 
 def draw_points(
-    target: np.ndarray, predicted: np.ndarray, title: str, path: Path, unit: str = "dB"
+    target: np.ndarray,
+    predicted: np.ndarray,
+    title: str,
+    path: Path,
+    unit: str = "dB",
+    fix: np.ndarray | None = None,
 ) -> None:
     """Save predicted against measured strength as PNG,
     and the error of the phase where there is one.
 
     `target` and `predicted`: (B, ...) complex channels or real powers, in physical units;
-    `unit` of levels.
+    `unit` of levels; `fix` (B,) int64: rows of one place, and of one station, have one prediction.
     """
     channels = np.iscomplexobj(target)
     figure, (axes,) = panels(8 if channels else 4.6, 4.2, 1, 2 if channels else 1)
@@ -105,7 +112,16 @@ def draw_points(
     low, high = np.percentile(true_db, [0.5, 100])
     quantity = "channel gain" if channels else "received power"
     axes[0].plot([low, high], [low, high], color="grey", linewidth=1)
-    axes[0].scatter(true_db, guess_db, s=6, alpha=0.5, color=PALETTE[0], linewidths=0)
+    _draw_dense(axes[0], true_db, guess_db)
+    count = np.zeros(0) if fix is None or channels else np.bincount(fix)
+    if many := (count >= MANY).nonzero()[0].tolist():
+        for number in many:
+            among = fix == number
+            ends = true_db[among].min(), true_db[among].max()
+            axes[0].plot(ends, guess_db[among][:2], color=PALETTE[1], linewidth=0.8, alpha=0.7)
+        label = f"{len(many)} places with {MANY} rows or more, {int(count[many].sum())} rows"
+        axes[0].plot([], [], color=PALETTE[1], label=label)
+        axes[0].legend(loc="upper left", fontsize=7)
     axes[0].set(xlim=(low - 3, high + 3), ylim=(low - 3, high + 3), aspect="equal")
     axes[0].set(xlabel=f"measured {quantity} [{unit}]", ylabel=f"predicted [{unit}]")
     # Errors of what lies below the axis would be those of nothing heard.
@@ -114,12 +130,25 @@ def draw_points(
     axes[0].set_title(f"{quantity}, median error {error:.1f} dB")
     if channels:
         turn = np.degrees(np.angle(predicted.ravel() * target.ravel().conj()))
-        axes[1].scatter(true_db, turn, s=6, alpha=0.5, color=PALETTE[0], linewidths=0)
+        _draw_dense(axes[1], true_db, turn)
         axes[1].set(xlim=(low - 3, high + 3), ylim=(-180, 180), yticks=range(-180, 181, 90))
         axes[1].set(xlabel="measured channel gain [dB]", ylabel="phase error [degrees]")
         axes[1].set_title(f"phase, median error {np.median(np.abs(turn)):.1f} degrees")
     figure.suptitle(title)
     save(figure, path)
+
+
+def _draw_dense(axis: Any, x: np.ndarray, y: np.ndarray) -> None:
+    """Points (n,), the darker the more of them lie together; the fewest are drawn last."""
+    x, y = np.stack([x, y])[:, np.isfinite(x + y)]
+    counts, *edges = np.histogram2d(x, y, bins=CELLS)
+    cell = (
+        np.searchsorted(e, v, "right").clip(1, CELLS) - 1
+        for e, v in zip(edges, (x, y), strict=True)
+    )
+    dense = np.log(counts[tuple(cell)])
+    order = np.argsort(-dense)
+    axis.scatter(x[order], y[order], s=6, c=dense[order], cmap="viridis_r", linewidths=0)
 
 
 def draw_spectra(examples: Examples, title: str) -> Figure:
@@ -164,16 +193,16 @@ def draw_spectra(examples: Examples, title: str) -> Figure:
         axis.set_xticks(np.arange(90 * np.ceil(edges[0] / 90), edges[1] + 1, 90))
         axis.tick_params(labelsize=7)
     figure.supylabel("elevation [°]", fontsize=9)
-    below: dict[str, Any] = {"location": "bottom", "shrink": 0.8, "aspect": 40}
-    figure.colorbar(
-        power, ax=axes[:, :-1], label="relative strength; azimuth [°] runs across", **below
-    )
-    figure.colorbar(error, ax=axes[:, -1], label="difference", **{**below, "aspect": 10})
+    label = "relative strength; azimuth [°] runs across"
+    colour_bar(power, axes[:, :-1], label, location="bottom", aspect=40)
+    colour_bar(error, axes[:, -1], "difference", location="bottom", aspect=10)
     figure.suptitle(title)
     figure.set_label("The same test rows, measured and predicted")
     return figure
 
 
+MANY = 5  # rows of one place and station, which are named
+CELLS = 40  # along each side of a scatter, in which points are counted
 NAMES = {
     "learned": "learned",
     "expected": "expected error",

@@ -150,12 +150,16 @@ class HeldOutLevels:
 
 
 def leave_out(
-    learned: Learned, fold: Fold, block: np.ndarray, split: SplitSettings | None = None
+    learned: Learned,
+    fold: Fold,
+    block: np.ndarray,
+    split: SplitSettings | None = None,
+    anew: bool = False,
 ) -> HeldOutLevels:
     """Return the test rows of a fold cut by `split` as its other rows predict them,
-    see `held_out_levels`.
+    see `held_out_levels` and, of `anew`, `Learned.unlearn`.
     """
-    return held_out_levels(learned.unlearn(fold, split), learned.data, fold, block)
+    return held_out_levels(learned.unlearn(fold, split, anew), learned.data, fold, block)
 
 
 def held_out_levels(

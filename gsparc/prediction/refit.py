@@ -51,12 +51,13 @@ class Learned:
             wrap_per_station(self.factory, self.data), self.data, fold, context
         )[0]
 
-    def unlearn(self, fold: Fold, split: SplitSettings | None = None) -> Method:
+    def unlearn(self, fold: Fold, split: SplitSettings | None = None, anew: bool = False) -> Method:
         """Return a method that knows nothing of the test rows of a fold, which was cut by `split`.
 
-        One that can forget rows does so, with its settings as they are; another one is fitted anew.
+        One that can forget rows does so, with its settings as they are; another one is fitted anew,
+        as all are where `anew`.
         """
-        if isinstance(self.method, Reconditions):
+        if not anew and isinstance(self.method, Reconditions):
             rows = np.sort(fold.learned())
             less = self.method.copy_conditioned(
                 without_devices(self.data, self.method.fitted_site), rows

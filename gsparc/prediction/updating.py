@@ -42,7 +42,7 @@ from gsparc.prediction.later_rows import (
 from gsparc.prediction.query import Asked
 from gsparc.processes.changes import Belief, LaterRows, learn, refit_scale
 from gsparc.processes.stored import Stored, from_plain, to_plain
-from gsparc.tables.own_checks import MOST_DB
+from gsparc.tables.array_checks import MOST_DB
 
 WINDOW = 1_000  # later rows of a station that are kept
 FADE_DB = 1.0  # deviation that a hundred later rows of a station add to one of it that came before

@@ -30,6 +30,7 @@ from gsparc.evaluation.results import read_summary
 from gsparc.evaluation.summary import provenance, run_git
 from gsparc.models.checkpoint import MODEL
 from gsparc.models.fitting import LAST, dotted_settings
+from gsparc.tables.columns_file import edited_beside
 
 log = logging.getLogger(__name__)
 
@@ -89,6 +90,8 @@ class FitInputs:
         whole: Any = OmegaConf.to_container(subset, resolve=True)  # what is missing is `???`
         named = dict(dotted_settings(whole))
         where = {name: named.pop(name) for name in OF_DATA if name in named}
+        about = edited_beside(str(where.get("dataset.file")))
+        where |= {"dataset.file (columns)": str(about)} if about else {}
         settings = json.loads(json.dumps(named, default=str))
         return cls(settings, _hashes(named), data, split, {} if data else _hashes(where))
 

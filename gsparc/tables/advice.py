@@ -19,26 +19,23 @@ import torch
 from scipy.spatial import cKDTree
 
 from gsparc.base.errors import Caution
-from gsparc.data.blocks import rows_by
 from gsparc.data.schema import Measurements
 from gsparc.physics.decibels import to_decibels
 from gsparc.processes.factor import Factor
 from gsparc.processes.level_field import fit_level_field
-from gsparc.tables.columns import Chosen, used_heads
+from gsparc.tables.column import Chosen, used_heads
 from gsparc.tables.heads import LISTS, words_of
 from gsparc.tables.roles import say_column
 from gsparc.tables.sheet import Sheet
 
 LEAST_ROWS, MOST_ROWS = 60, 480  # links that tell; that are looked at
-CENTRES, NEAR = 6, 8  # about which those are chosen, so that they stay dense; rows beside one
+CENTRES = 6  # about which those are chosen, so that they stay dense
 REPEATED = 4  # rows for each value of a column that may name something
 MOST_PIECES = 5
 SURE = 3.0  # standard errors by which the squared error falls: many columns are tried
 LESS, COPY = 0.9, 0.1  # of near ones to far ones; of far ones that are left, at least
 SPREAD = 10.0  # variance of constants, parts of that of a field
 ALIKE = 1.03  # errors within this ratio are of columns that tell the same
-SMOOTH = 0.25  # of the variance about near rows: levels follow these rather than a receiver
-TRUTHS = ({"true", "false"}, {"0", "1"}, {"yes", "no"}, {"t", "f"}, {"y", "n"})
 Kind = Literal["transmitter", "device", "number"]
 KINDS: tuple[Kind, ...] = ("number", "device", "transmitter")
 
@@ -106,8 +103,7 @@ def find_effects(
     links, row, effects = links.take(dense), row[dense], list[Effect]()
     texts = {head: pd.factorize(words[row])[0] for head, words in columns.items()}
     while len(links) >= LEAST_ROWS and len(effects) < MOST_PIECES:
-        field = fit_level_field(links.place, links.level, links.station)
-        gram = field.kernel.gram(torch.from_numpy(links.place)).numpy()
+        gram = _gram(links)
         plain, _ = _leave_out(gram, links)
         rest = [head for head in columns if head not in {effect.head for effect in effects}]
         tried = [_try(gram, links, plain, h, texts[h], columns[h][row]) for h in rest]
@@ -152,10 +148,8 @@ def _try(
     values = pd.to_numeric(pd.Series(words), errors="coerce").to_numpy(float)
 
     def add(kind: Kind, errors: np.ndarray, part: np.ndarray, far: float, size: float) -> None:
-        fall = plain**2 - errors**2
-        clear = fall.mean() > SURE * fall.std() / math.sqrt(len(fall))
         near = float((errors**2).mean() / max((plain**2).mean(), 1e-12))
-        if clear and far > COPY and near < LESS * far:
+        if _fall(plain, errors) and far > COPY and near < LESS * far:
             both = math.sqrt((plain**2).mean()), math.sqrt((errors**2).mean())
             effects.append(Effect(head, kind, both, part, size))
 
@@ -181,6 +175,25 @@ def _try(
     return min(alike, key=lambda effect: KINDS.index(effect.kind), default=None)
 
 
+def _fall(plain: np.ndarray, errors: np.ndarray) -> bool:
+    """Whether squares of errors (n,) are below those of plain ones by more than chance."""
+    fall = plain**2 - errors**2
+    return bool(fall.mean() > SURE * fall.std() / math.sqrt(len(fall)))
+
+
+def is_better_parted(links: LevelsAtPlaces, code: np.ndarray) -> bool:
+    """Tell whether levels that are left out are predicted better with a station for each code."""
+    gram = _gram(links)
+    parted = replace(links, station=_pairs(links.station, code))
+    return _fall(_leave_out(gram, links)[0], _leave_out(gram, parted)[0])
+
+
+def _gram(links: LevelsAtPlaces) -> np.ndarray:
+    """Covariances (n, n) of the field of levels at the places of links."""
+    field = fit_level_field(links.place, links.level, links.station)
+    return field.kernel.gram(torch.from_numpy(links.place)).numpy()
+
+
 def _centred(value: np.ndarray, group: np.ndarray) -> np.ndarray:
     """Values (n,) less the mean of their group (n,)."""
     which = np.unique(group, return_inverse=True)[1].reshape(-1)
@@ -197,34 +210,6 @@ def _dense_rows(place: np.ndarray) -> np.ndarray:
         return np.arange(len(place))
     centres = place[np.random.default_rng(0).choice(len(place), CENTRES, replace=False)]
     return np.unique(cKDTree(place).query(centres, k=MOST_ROWS // CENTRES)[1])
-
-
-def find_filled(
-    links: LevelsAtPlaces, row: np.ndarray, columns: Mapping[str, np.ndarray]
-) -> dict[str, str]:
-    """Return columns of truths, and which of their values rows have that were filled
-    in from near ones.
-
-    What is interpolated has no noise of its own:
-    it differs far less from its neighbours than a measurement.
-    """
-    filled, delta = {}, np.full(len(links), np.nan)
-    for _, rows in rows_by(links.station):
-        if len(rows) > NEAR:
-            near = cKDTree(links.place[rows]).query(links.place[rows], k=NEAR // 2 + 1)[1][:, 1:]
-            delta[rows] = links.level[rows] - links.level[rows][near].mean(1)
-    for head, words in columns.items():
-        cells = np.char.lower(words[row])
-        names = np.unique(cells).tolist()
-        if {*names} not in TRUTHS:
-            continue
-        spread = {name: delta[(cells == name) & np.isfinite(delta)] for name in names}
-        less, more = sorted(names, key=lambda name: np.median(np.abs(spread[name])))
-        few = min(map(len, spread.values()))
-        ratio = math.log(max(np.var(spread[less]), 1e-12) / np.var(spread[more])) if few > 2 else 0
-        if few >= LEAST_ROWS / 3 and ratio < min(math.log(SMOOTH), -SURE * math.sqrt(4 / few)):
-            filled[head] = str(words[row][cells == less][0])
-    return filled
 
 
 def run_warnings(data: Measurements) -> list[str]:
@@ -276,17 +261,12 @@ def advise(
         few = f"columns that are not used are tried from {LEAST_ROWS} links on, here are"
         return [f"{few} {len(links)}: devices, powers or other transmitters would pass unseen"]
     notes = list[str]()
-    for head, value in find_filled(links, row, words).items():
-        other = next(word for word in words[head][row] if word != value)
-        note = f"column {head!r}: levels of rows where it is {value!r} follow their neighbours, "
-        how = f"{say_column('run', head)} 'dataset.runs=[\"{other}\"]' leaves them out"
-        notes.append(Caution(f"{note}without noise: filled in, not measured? {how}"))
     power, wide = chosen["rssi_db"][0], len(chosen["rssi_db"]) > 1
     times = f"*{power.unit.times}" if power.unit is not None and power.unit.times else ""
     said = {"rssi_db": f"{power.head}{times}"}
     said |= {"station": "+".join(c.head or "" for c in chosen.get("station", ()))}
     for effect in find_effects(links, row, words):
-        head, role, more = effect.head, "station", ""
+        head, role = effect.head, "station"
         if effect.kind == "number":
             role, size = "rssi_db", abs(effect.size)
             text = f"{'+' if effect.size < 0 else '-'}{head}{'' if size == 1 else f'*{size:g}'}"
@@ -297,15 +277,11 @@ def advise(
         elif effect.kind == "device":
             role, text, does = "device", f"+{head}", "takes each off"
             meaning = f"an offset of all levels for each value, up to {effect.size:.1f} dB: devices"
-            if all(word.lstrip("-").isdigit() for word in {*words[head]}):
-                meaning += ", or floors"
-                if not {"z", "rx_z", "tx_z"} & {*chosen}:
-                    more = f"; of floors {say_column('z', f'{head}*3.2')} takes 3.2 m each"
         else:
             text, meaning = f"+{head}", "another transmitter for each value"
             does = "tells them apart"
         said[role] = (said.get(role, "") + text).removeprefix("+")
-        how = f"{say_column(role, said[role])} {does}{more}"
+        how = f"{say_column(role, said[role])} {does}"
         if role == "station" and wide:
             how = "a file for each value takes them apart"
         elif not _reads_whole(reads({role: said[role]}), data):

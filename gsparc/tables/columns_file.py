@@ -26,6 +26,11 @@ def beside(path: str | Path) -> Path:
     return Path(f"{path}.columns.yaml")
 
 
+def edited_beside(path: str | Path) -> Path | None:
+    """Return the file about a table's columns beside it, where somebody edited it: it is taken."""
+    return about if (about := beside(path)).is_file() and is_edited(about) else None
+
+
 def hash_heads(heads: Sequence[str]) -> str:
     """Return a short hash of the heads of a table."""
     return hashlib.sha256("\n".join(heads).encode()).hexdigest()[:12]
@@ -36,7 +41,7 @@ def write_columns(path: str | Path, roles: Sequence[Role], heads: Sequence[str])
     return one line that says so.
     """
     to = beside(path)
-    if to.exists() and is_edited(to):
+    if edited_beside(path):
         return f"{to} was edited, and is taken"
     asked = {name: role for role in roles for answer in role.readings for name in answer.said}
     lines = []

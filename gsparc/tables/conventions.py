@@ -23,6 +23,7 @@ from gsparc.ops import SphereGrid
 from gsparc.physics.decibels import from_decibels
 
 FOOT = UNITS["ft"].factor
+KILOMETRES = np.array([1e3, 1e3, 1.0])  # heights beside them are in metres
 Change = Callable[[Measurements], Measurements]
 
 
@@ -197,6 +198,16 @@ CONVENTIONS = {
         "places of rows in feet beside stations in metres",
         "metres",
         _places(lambda p: p * FOOT, "moving"),
+    ),
+    "static_kilometres": Convention(
+        "places of stations in kilometres beside rows in metres",
+        "metres",
+        _places(lambda p: p * KILOMETRES, "static"),
+    ),
+    "moving_kilometres": Convention(
+        "places of rows in kilometres beside stations in metres",
+        "metres",
+        _places(lambda p: p * KILOMETRES, "moving"),
     ),
     "heights_feet": Convention(
         "heights of rows in feet", "heights", _places(lambda p: p * [1, 1, FOOT], "moving")

@@ -17,20 +17,19 @@ import numpy as np
 
 from gsparc.base.errors import Caution
 from gsparc.base.limits import number, or_null
-from gsparc.data.assemble import centre_positions, check_positions, rounded_rms
-from gsparc.data.blocks import is_big, write_blocks
-from gsparc.data.outliers import check_static_ends, find_strong_outliers, peak_magnitudes
+from gsparc.data.assemble import centre_positions, check_positions
+from gsparc.data.outliers import check_static_ends
 from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, OTHER, Links, Measurements, Site
 from gsparc.data.selection import WHOLE, Selection
-from gsparc.data.target import TARGETS, Kind
+from gsparc.data.target import TARGETS
 from gsparc.data.units import LINEAR, PowerUnit
-from gsparc.physics.decibels import from_decibels
 from gsparc.tables.amplitudes import amplitudes_to_levels
 from gsparc.tables.checks.constant import leave_out_unmeasured, mark_constants
 from gsparc.tables.conventions import convert_conventions
 from gsparc.tables.links.expand import expand_links
 from gsparc.tables.other_names import name_arrays
 from gsparc.tables.own_checks import Checker, are_infinite, rows_with
+from gsparc.tables.own_values import read_directions, read_measured, read_not_negative, scale_values
 from gsparc.tables.raw import Raw, read_raw, write_raw
 
 log = logging.getLogger(__name__)
@@ -143,7 +142,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     has_unknown = links.stations is not None and np.isnan(links.stations.position).any()
     has_unknown |= links.unknown_transmitter
     check.unknown = f"{links.static_end}_position" if has_unknown else None
-    values, kind = _measured(check, measured)
+    values, kind = read_measured(check, measured)
     if values is None:
         # Positions are checked all the same, so that one message lists everything that is wrong.
         for name in ("rx_position", "tx_position"):
@@ -176,11 +175,11 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     if array is not None:
         antenna = [f"antenna {i}" for i in range(len(array))]
         check_positions(check.problems, check.describe_array("array_position"), array, antenna)
-    noise = _not_negative(check, "noise_variance", rows)
+    noise = read_not_negative(check, "noise_variance", rows)
     # Decibels have no additive noise variance: it belongs to linear powers.
     if noise is not None and measured == "rssi_db":
         check.refuse("noise_variance", "cannot go with rssi_db; expected rssi (linear)")
-    position_std = _not_negative(check, "position_std", rows)
+    position_std = read_not_negative(check, "position_std", rows)
     about["device_names"], devices = check.read_devices(rows, kind)
     offsets = check.read_ragged(rows)
     release_split = check.read_split(rows)
@@ -191,7 +190,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     assert rotation is not None
     # Copies, as broadcast views are read-only.
     rx, tx = (np.broadcast_to(np.asarray(ends[end]), (rows, 3)).copy() for end in ("rx", "tx"))
-    directions = _directions(check, offsets, rx, rotation)
+    directions = read_directions(check, offsets, rx, rotation)
     if facts.is_image and min(values.shape[1:]) < SSIM_WINDOW:
         check.notes.append(
             f"images of {values.shape[1]} x {values.shape[2]} pixels are smaller than SSIM's "
@@ -234,7 +233,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     data = leave_out_unmeasured(convert_conventions(data, named))
     if facts.is_complex:
         _note_plane(check, tx if links.static_end == "rx" else rx, carrier)
-    target, scale = _scaled(measured, data.target, data.mask, data.censored)
+    target, scale = scale_values(measured, data.target, data.mask, data.censored)
     # A damaged row of 1e300 overflows float32 once it is divided by the others' scale: it is named.
     if scale > 0:
         huge = "beyond float32 in units of the other rows; is it damaged?"
@@ -288,39 +287,6 @@ def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, An
     }
 
 
-def _measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
-    """The measurement as (S, H, W), (S, A, K) or (S, 1), and its kind; None when unusable."""
-    kind: Kind = "spectrum" if name == "spectrum" else "csi" if name == "csi" else "rssi"
-    facts = TARGETS[kind]
-    array = check.read_array(name, *([(None,)] if facts.is_level else FIELDS[name].shapes))
-    if array is None:
-        return None, kind
-    if facts.is_complex and array.size:
-        array = array.reshape(len(array), -1, array.shape[-1] if array.ndim > 1 else 1)
-    if is_big(array) and not facts.is_level and len(array) > 1 and "mask" not in check.raw.arrays:
-        return array, kind  # its blocks are cast where they are read
-    # Magnitudes of complex64 overflow, units of 1e-42 are lost.
-    if facts.is_level or array.dtype.kind in "fc":
-        array = array.astype(np.complex128 if array.dtype.kind == "c" else np.float64)
-    if facts.is_level:
-        array = array[:, None]
-    if len(array) < 2 or array.size == 0:
-        fault = f"shape {array.shape} holds too little; expected two rows or more"
-        return check.refuse(name, fault), kind
-    return array, kind
-
-
-def _not_negative(check: Checker, name: str, rows: int) -> np.ndarray | None:
-    """An array () or (S,) as (S,) float64."""
-    array = check.read_real(name, (), (rows,))
-    if array is None:
-        return None
-    values = np.broadcast_to(array, (rows,)).copy()
-    bad = ~(np.isfinite(values) & (values >= 0))
-    check.refuse_rows(name, bad, "expected a finite number, at least 0")
-    return values
-
-
 def _static(check: Checker, links: Links, ends: Mapping[str, Any], rotation: Any) -> None:
     """Refuse ends of which neither moves, a static receiver that turns,
     and static ends far from all rows.
@@ -364,68 +330,3 @@ def _note_plane(check: Checker, moving: np.ndarray, carrier_hz: float | None) ->
             "plane: a source and its mirror image in it look the same; several heights tell them "
             "apart"
         )
-
-
-def _directions(
-    check: Checker, offsets: np.ndarray | None, rx: np.ndarray, rotation: np.ndarray
-) -> list[np.ndarray] | None:
-    """Unit vectors (paths, 3) of each sample in the receiver's frame."""
-    present = check.present("path_direction", "path_last_point")
-    if offsets is None or not present:
-        return None
-    name = present[0]
-    vectors = check.read_real(name, (int(offsets[-1]), 3))
-    if vectors is None:
-        return None
-    owner = np.repeat(np.arange(len(rx)), np.diff(offsets))
-    if name == "path_last_point":
-        # Transposed rotation: from the world to the receiver's frame,
-        # in which spectra and arrays are.
-        vectors = np.einsum("pji,pj->pi", rotation[owner], vectors - rx[owner])
-    # Directions of any length are taken, so that overflow here is a row to refuse, not an error.
-    with np.errstate(over="ignore"):
-        length = np.linalg.norm(vectors, axis=-1)
-    bad = np.flatnonzero(~(np.isfinite(length) & (length > 0)))
-    if len(bad):
-        paths, expected = (f"path {i}" for i in bad), "expected a direction that is not zero"
-        return check.problems.add_rows(check.describe_array(name), paths, expected)
-    return np.split((vectors / length[:, None]).astype(np.float32), offsets[1:-1])
-
-
-def _scaled(
-    name: str, values: np.ndarray, mask: np.ndarray | None, censored: np.ndarray | None
-) -> tuple[np.ndarray, float]:
-    """The target as stored and the constant it was divided by (0 for silence);
-    censored rows are levels.
-    """
-    mask_or_level = mask
-    if censored is not None:
-        # A censored row's target is the level of hearing,
-        # which the loss needs though the mask says False.
-        bound = censored[:, None] != 0
-        mask_or_level = bound if mask is None else mask | bound
-    if mask_or_level is not None:
-        values = np.where(mask_or_level, values, np.zeros((), values.dtype))
-    if values.dtype == np.uint8:
-        return values, 1.0 if values.any() else 0.0
-    if name == "rssi_db":
-        values = from_decibels(values) * (1 if mask_or_level is None else mask_or_level)
-    if name == "spectrum":
-        highest = peak_magnitudes(values)
-        largest = float(highest[~find_strong_outliers(highest)].max(initial=0.0))
-        scale = 1.0 if 0.1 <= largest <= 1 else largest
-    elif name == "csi":
-        scale = rounded_rms(values, mask)
-    else:
-        scale = rounded_rms(np.sqrt(values), mask) ** 2
-    if scale <= 0:
-        return values, 0.0
-    lift = 2.0**200 if scale < 1e-290 else 1.0  # exact; units of 1e-310 have no reciprocal
-    divisor = scale * lift
-    stored, exact = (np.complex64, np.complex128) if name == "csi" else (np.float32, np.float64)
-    with np.errstate(over="ignore"):  # what is then infinite is refused by row
-        if mask_or_level is not None or name == "rssi_db" or not is_big(values):
-            return (values * lift / divisor).astype(stored), scale
-        return write_blocks(
-            values.shape, stored, lambda at: values[at].astype(exact) * lift / divisor
-        ), scale

@@ -7,68 +7,25 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from gsparc.base.errors import Problems, list_first, suggest_name
+from gsparc.base.errors import list_first, suggest_name
 from gsparc.data.assemble import check_positions
 from gsparc.data.blocks import row_blocks
-from gsparc.data.schema import FIELDS, HOLDS, MEASUREMENTS, POWER, Stations, TrainTest
+from gsparc.data.schema import FIELDS, MEASUREMENTS, Stations, TrainTest
 from gsparc.data.target import TARGETS, Kind
 from gsparc.ops import SphereGrid
-from gsparc.tables.raw import Raw, numbered_rows
+from gsparc.tables.array_checks import MOST_DB, ArrayChecker
+from gsparc.tables.raw import numbered_rows
+from gsparc.tables.rotations import is_rotation, is_unit, quaternion_to_matrix
 
 # From long wave (100 kHz) to the far infrared: what lies outside was mostly given in MHz or GHz.
 LOWEST_HZ, HIGHEST_HZ = 1e5, 1e13
-MOST_DB = 400  # of any level
-
-Shape = tuple[int | str | None, ...]
 
 
-def _fits(sizes: tuple[int, ...], shape: Shape) -> bool:
-    return len(sizes) == len(shape) and all(
-        want in (None, n) for want, n in zip(shape, sizes, strict=True)
-    )
-
-
-class Checker:
-    """Takes arrays out of a `Raw`, noting what is wrong;
-    a method returns None when its array is unusable.
-    """
-
-    def __init__(self, raw: Raw, source: str) -> None:
-        # HDF5 holds attributes that are arrays: lists can be compared with words.
-        plain = {
-            k: v.tolist() if isinstance(v, np.ndarray) else v for k, v in raw.attributes.items()
-        }
-        self.raw, self.source = replace(raw, attributes=plain), source
-        self.problems = Problems(source)
-        self.notes, self.given = [*raw.notes], raw.arrays
-        self.row_names: list[str] = []
-        self.unknown: str | None = None  # a position that nobody gave
-        self.sizes: dict[str, int] = {}  # of axes by their letter
-
-    def describe_array(self, name: str) -> str:
-        """Say how messages name an array of this file."""
-        return f"{self.source}, {name}"
-
-    def refuse(self, name: str, what: str) -> Any:
-        """Note what is wrong with an array; returns None, so that a check can end with it."""
-        self.problems.add(self.describe_array(name), what)
-
-    def refuse_rows(self, name: str, bad: np.ndarray, what: str) -> bool:
-        """Note `what` for the rows of an array where `bad` (S, ...) has a True;
-        returns whether one does.
-        """
-        rows = np.flatnonzero(bad.reshape(len(bad), -1).any(axis=1))
-        self.problems.add_rows(self.describe_array(name), (self.row_names[i] for i in rows), what)
-        return len(rows) > 0
-
-    def present(self, *names: str) -> list[str]:
-        """Return those of `names` that the file holds."""
-        return [name for name in names if name in self.raw.arrays]
+class Checker(ArrayChecker):
+    """Takes out what the schema knows: names, the measurement, ends, frequencies, grids, splits."""
 
     def check_names(self) -> None:
         """Refuse misspelt names and foreign units; note that other unknown names are ignored.
@@ -135,46 +92,6 @@ class Checker:
             named = [f"{row}, station {labels[t]}" for row, t in pairs]
         self.row_names = named
         return named
-
-    def read_array(self, name: str, *shapes: Shape, holds: str = "") -> np.ndarray | None:
-        """Return array `name` if it `holds` what it should and fits one
-        of `shapes` (None: any length).
-        """
-        array, holds = self.raw.arrays.get(name), holds or FIELDS[name].holds
-        if array is None:
-            return None
-        # Images of uint16 hold no stated largest value; of uint8 it is 255.
-        wide = holds == POWER and array.dtype.kind == "u" and array.itemsize > 1
-        if array.dtype.kind not in HOLDS[holds] or wide:
-            return self.refuse(name, f"expected {holds}, found dtype {array.dtype}")
-        return array if self.has_shape(name, array, *shapes) else None
-
-    def read_real(self, name: str, *shapes: Shape) -> np.ndarray | None:
-        """Return the same as float64."""
-        array = self.read_array(name, *shapes)
-        return None if array is None else array.astype(np.float64)
-
-    def has_shape(self, name: str, array: np.ndarray, *shapes: Shape) -> bool:
-        """Tell whether `array` has one of `shapes`, letters for sizes found before;
-        note it when not.
-        """
-        wanted = [
-            tuple(self.sizes.get(a) if isinstance(a, str) else a for a in shape) for shape in shapes
-        ]
-        if not wanted or any(_fits(array.shape, shape) for shape in wanted):
-            return True
-        # Samples come first: an array of three rows is mostly (3, S) instead of (S, 3).
-        turned = array.ndim > 1 and (
-            len(array) == 3 or any(_fits(array.shape[::-1], s) for s in wanted)
-        )
-        sizes = " or ".join(map(str, wanted))
-        sizes = f", here {sizes}" if any(wanted) and "None" not in sizes else ""
-        layout = (
-            FIELDS[name].shape if name in FIELDS else " or ".join(map(str, shapes)).replace("'", "")
-        )
-        fault = f"found {array.shape}{'; transposed?' if turned else ''}"
-        self.refuse(name, f"expected shape {layout}{sizes}, {fault}")
-        return False
 
     def read_positions(self, name: str, rows: int | None) -> np.ndarray | None:
         """Return (S, 3) or (3,) float64 [m]."""
@@ -444,29 +361,3 @@ def rows_with(
 def are_infinite(values: np.ndarray) -> np.ndarray:
     """Tell which of `values` are NaN or infinite, bool."""
     return ~np.isfinite(np.abs(values))
-
-
-UNIT_TOLERANCE = 1e-2  # releases print quaternions with few digits; beyond this they are refused
-
-
-def is_unit(quaternion: np.ndarray) -> np.ndarray:
-    """Tell whether quaternions (..., 4) are finite, of length 1 within `UNIT_TOLERANCE`: (...)
-    bool.
-    """
-    with np.errstate(over="ignore", invalid="ignore"):
-        return np.abs(np.linalg.norm(quaternion, axis=-1) - 1) <= UNIT_TOLERANCE
-
-
-def quaternion_to_matrix(quaternion: np.ndarray, *, scalar_first: bool) -> np.ndarray:
-    """Return rotation matrices (..., 3, 3), local to world, of quaternions (..., 4) of length 1."""
-    # SciPy expects the scalar last and normalises, which removes the rounding of printed digits.
-    q = np.roll(quaternion, -1, axis=-1) if scalar_first else quaternion
-    return Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3)
-
-
-def is_rotation(matrix: np.ndarray, tolerance: float = 1e-3) -> np.ndarray:
-    """Tell whether matrices (..., 3, 3) are orthogonal with determinant +1: (...) bool."""
-    # Products of huge or missing numbers are refused below, so that NumPy need not warn.
-    with np.errstate(over="ignore", invalid="ignore"):
-        error = np.abs(matrix @ np.swapaxes(matrix, -1, -2) - np.eye(3)).max(axis=(-1, -2))
-        return (error <= tolerance) & (np.linalg.det(matrix) > 0)

@@ -95,10 +95,9 @@ def read_times(path: str | Path) -> np.ndarray | None:
     if "time_s" not in sheet.heads:
         return None
     times = sheet.numbers("time_s")
+    if times is not None:
+        sheet.refuse_rows("time_s", np.flatnonzero(np.isnan(times)), "no number; expected seconds")
     sheet.problems.raise_if_any()
-    assert times is not None
-    for row in np.flatnonzero(np.isnan(times)):
-        raise DataError(f"{path}, time_s, {sheet.rows[row]}: no number; expected seconds")
     return times
 
 

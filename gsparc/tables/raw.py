@@ -7,16 +7,12 @@ import json
 import math
 import re
 import struct
-import tempfile
 import zipfile
 import zlib
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from io import BytesIO
 from pathlib import Path
-from shutil import disk_usage
 from tokenize import TokenError
 from typing import Any
 
@@ -27,10 +23,12 @@ from numpy.lib.format import read_array_header_1_0 as header_1
 from numpy.lib.format import read_array_header_2_0 as header_2
 from scipy.io import loadmat, netcdf_file
 
+from gsparc.base.archives import is_archive
 from gsparc.base.errors import DataError, absent, explain_error, readable
 from gsparc.base.files import check_fetched, whole_file
 from gsparc.base.hdf5_text import hdf5_text_error
-from gsparc.data.blocks import BIG, is_big, iterate_bytes, machine_memory, map_from_disk
+from gsparc.data.blocks import is_big, iterate_bytes, map_from_disk
+from gsparc.tables.array_sizes import Stated, check_array_sizes
 
 HDF5_SUFFIXES = (".h5", ".hdf5")
 NETCDF_SUFFIXES = (".nc", ".nc3", ".nc4", ".cdf")
@@ -163,53 +161,6 @@ def _digest(raw: Raw) -> str:
     for name, value in sorted(raw.attributes.items()):
         digest.update(f"{name}={np.asarray(_plain(value)).tolist()!r};".encode())
     return digest.hexdigest()
-
-
-def is_archive(path: Path) -> bool:
-    """Tell whether a file is a zip archive from its first byte on."""
-    try:
-        with path.open("rb") as file:
-            if file.read(4) != b"PK\x03\x04":
-                return False
-        return zipfile.is_zipfile(path)
-    except zipfile.BadZipFile:  # a damaged directory of a large archive
-        return False
-
-
-def verified_archive(path: Path) -> BytesIO:
-    """Return what `torch.save` wrote, written anew from bytes whose checksums are right.
-
-    torch looks at no checksum, takes entries marked as folders for read, and inflates what is
-    deflated whatever its size.
-
-    Raises:
-        ValueError: it is damaged, or nothing that torch writes.
-    """
-    clean = BytesIO()
-    if not is_archive(path):
-        raise ValueError("not a gsparc checkpoint, or cut short")
-    try:
-        with zipfile.ZipFile(path) as archive, zipfile.ZipFile(clean, "w") as copy:
-            entries = archive.infolist()
-            names = {entry.filename for entry in entries}
-            stored = all(entry.compress_type == zipfile.ZIP_STORED for entry in entries)
-            stored &= sum(entry.file_size for entry in entries) <= path.stat().st_size
-            faults = {
-                "an archive, but not a gsparc checkpoint": not any(
-                    n.endswith("/data.pkl") for n in names
-                ),
-                "damaged (an entry is there twice)": len(names) < len(entries),
-                "damaged (entries are compressed, or larger than the file)": not stored,
-            }
-            wrong = next((fault for fault, holds in faults.items() if holds), None)
-            for entry in () if wrong else entries:
-                copy.writestr(entry.filename, archive.read(entry))
-    except Exception as error:  # whatever a damaged archive raises
-        wrong = f"damaged ({type(error).__name__}: {error})"
-    if wrong:
-        raise ValueError(wrong)
-    clean.seek(0)
-    return clean
 
 
 def _read_npz(path: Path) -> Raw:
@@ -353,47 +304,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, bytes):
         return value.decode("utf-8", errors="replace")
     return value.item() if isinstance(value, np.generic) else value
-
-
-LARGEST = 2**40  # bytes of a file's arrays, ten times the largest campaign that is published
-# Times a file's bytes, as deflate packs 1,032 to one at best: the rest was never written
-MOST_PACKED = 1100
-# Bytes of disk that other programs keep; of memory half, for what is made of the arrays
-SPARE = 2**30
-# Shapes, and bytes that are taken when they are read
-Stated = dict[str, tuple[tuple[int, ...], int]]
-
-
-def check_array_sizes(path: Path, stated: Stated, to_disk: bool = False) -> None:
-    """Raise DataError before an array is read that the file cannot hold,
-    or for which there is no room.
-
-    Args:
-        path: of the file.
-        stated: of its arrays, by the file, which may lie.
-        to_disk: whether large ones are copied to TMPDIR.
-    """
-    rows = Counter(shape[0] for shape, _ in stated.values() if shape)
-    name, (shape, size) = max(stated.items(), key=lambda item: item[1][1], default=("", ((), 0)))
-    total, packed, disk = (
-        sum(size for _, size in stated.values()),
-        path.stat().st_size,
-        tempfile.gettempdir(),
-    )
-    copied = sum(size for _, size in stated.values() if size >= BIG) * to_disk
-    most, room = min(max(BIG, MOST_PACKED * packed), LARGEST), max(BIG, machine_memory() / 2)
-    memory = total - copied
-    faults = {
-        f"a file of {packed:,} bytes does not hold that": total > most,
-        f"no other array has {shape[:1]} rows": size >= BIG
-        and rows[shape[0]] < 2
-        and name[:5] != "path_",
-        f"{disk} has no room; set TMPDIR to a larger disk": copied
-        > max(disk_usage(disk).free - SPARE, 0),
-        f"too little memory for {memory:,}; HDF5 without a mask may stay on disk": memory > room,
-    }
-    for fault in (text for text, holds in faults.items() if holds):
-        raise DataError(f"{path}, {name}: shape {shape}, {size:,} bytes: {fault}")
 
 
 def numbered_rows(count: int) -> np.ndarray:

@@ -114,19 +114,17 @@ def _of_columns(content: dict[str, Any]) -> list[dict[str, Any]]:
     {column: {row: value}}, {row: {column: value}}, {column: [value]},
     or columns beside rows of data.
     """
-    if isinstance(rows := content.get("data"), list) and isinstance(
-        heads := content.get("columns"), list
-    ):
-        return [dict(zip(heads, row, strict=True)) for row in rows]
     values = [*content.values()]
-    if all(isinstance(value, dict) for value in values) and all(map(str.isdigit, content)):
-        return values if len(values) > 1 else []
-    columns = [list(c.values()) if isinstance(c, dict) else c for c in values]
-    if len(columns) < 2 or not all(
-        isinstance(c, list) and len(c) == len(columns[0]) > 1 for c in columns
-    ):
+    if {"data", "columns"} <= content.keys():
+        frame = pd.DataFrame(content["data"], columns=content["columns"])
+    elif {*map(type, values)} == {dict} and len({*map(tuple, values)}) == 1:
+        by_row = all(map(str.isdigit, content))
+        frame = pd.DataFrame.from_dict(content, orient="index" if by_row else "columns")
+    elif {*map(type, values)} == {list} and len({*map(len, values)}) == 1:
+        frame = pd.DataFrame(content)
+    else:
         return []
-    return [dict(zip(content, row, strict=True)) for row in zip(*columns, strict=True)]
+    return frame.to_dict("records") if len(frame) > 1 and frame.shape[1] > 1 else []
 
 
 def _of_xml(text: str) -> list[dict[str, Any]]:

@@ -10,7 +10,7 @@ import pandas as pd
 
 from gsparc.base.errors import Caution, DataError, list_first
 from gsparc.base.files import read_shipped_table
-from gsparc.data.units import UNITS, Unit
+from gsparc.data.units import UNITS, Unit, list_units
 from gsparc.physics.decibels import to_decibels
 from gsparc.tables.heads import LISTS, SHEET, unit_of, words_of
 from gsparc.tables.sheet import Sheet
@@ -37,6 +37,12 @@ USUAL = {
     "height": (0, 9000, 500),
     **dict.fromkeys(TILTS, (0, 30, 12)),
     "station_power_db": (-20, 80, 15),
+}
+# In place of a value that nobody knows
+UNKNOWN = {
+    "station_azimuth": -1,
+    "station_power_db": 0,
+    **dict.fromkeys(("station_width", "station_thickness"), 0),
 }
 UNSAID_DBM = 30  # a lower power, where nobody says its unit, may be in watts
 FEW, LEAST = 0.2, 3  # share of a column up to which values are single ones; radians beside degrees
@@ -104,18 +110,17 @@ def read_sectors(sheet: Sheet, used: Container[str | None]) -> dict[str, np.ndar
         if len(bad_rows):
             cells = list_first([f"'{sheet.words(head)[i]}' in {sheet.rows[i]}" for i in bad_rows])
             notes.append(Caution(f"{sheet.source}: column {head!r}: {cells}: no {name}; unknown"))
-        if name == "station_azimuth" and (values < 0).any() and (values[values < 0] == -1).all():
-            values, meaning = np.where(values < 0, np.nan, values), f"{name}, -1 unknown"
-        high = np.nanmedian(values) > UNSAID_DBM or not np.nan_to_num(values).any()
-        empty = "station_width", "station_thickness", *(["station_power_db"] if high else [])
-        if name in empty and (values == 0).any():
-            values, meaning = np.where(values == 0, np.nan, values), f"{name}, 0 unknown"
+        mark = UNKNOWN.get(name)
+        # A power of 0 dBm is one where others are about as low
+        low = name == "station_power_db" and 0 < abs(np.nanmedian(values)) <= UNSAID_DBM
+        if mark is not None and not low and (values == mark).any():
+            values, meaning = np.where(values == mark, np.nan, values), f"{name}, {mark} unknown"
         if name in TILTS and (values < 0).any() and not (values > 0).any():
             notes.append(
                 Caution(f"{sheet.source}: {head!r} are all below 0: read as below the horizon")
             )
             values = -values
-        _doubt(sheet, head, name, values, written, unit is None)
+        _doubt(sheet, head, name, values, unit is None)
         columns[name] = values
         heads.append(f"{head!r} as {meaning}")
     parts = [columns.pop(name) for name in TILTS if name in columns]
@@ -187,58 +192,30 @@ def _fits(unit: Unit, values: np.ndarray, name: str) -> bool:
     )
 
 
-def _doubt(
-    sheet: Sheet, head: str, name: str, values: np.ndarray, written: np.ndarray, unsaid: bool
-) -> None:
-    """Refuse values (T,) that cannot be (DataError), doubt rare ones,
-    and name the unit that fits.
-    """
+def _doubt(sheet: Sheet, head: str, name: str, values: np.ndarray, unsaid: bool) -> None:
+    """Refuse values (T,) that cannot be (DataError), and doubt rare ones."""
     if name not in RANGES or np.isnan(values).all():
         return
-    (least, most, _, kind), (low, high, spread) = (
-        RANGES[name],
-        USUAL.get(name, (*RANGES[name][:2], np.inf)),
-    )
-    low, middle = UNSAID_DBM if unsaid and kind == "power" else low, np.nanmedian(values)
+    least, most, _, kind = RANGES[name]
+    low, high, spread = USUAL.get(name, (least, most, np.inf))
+    low = UNSAID_DBM if unsaid and kind == "power" else low
     refused, off = not _fits(UNITS["m"], values, name), (values < least) | (values > most)
     if not off.any():
+        few = max(LEAST, FEW * len(values))
         off = refused & np.isfinite(values) | (values < low) | (values > high)
         # Degrees of azimuths are seldom as small
-        turned = (values % 1 != 0) & (np.abs(values) < 2 * np.pi)
-        off |= (
-            turned & (name == "station_azimuth") & (turned.sum() >= max(LEAST, FEW * len(values)))
-        )
-        single = np.abs(values - middle) > spread
+        turned = (values % 1 != 0) & (np.abs(values) < 2 * np.pi) & (name == "station_azimuth")
+        off |= turned & (turned.sum() >= few)
+        single = np.abs(values - np.nanmedian(values)) > spread
         off |= single & (single.sum() <= FEW * len(values))
-    if not off.any():
-        return
-    rest = values[~off & np.isfinite(values)]
-    middle = float(np.median(rest)) if off.sum() <= FEW * len(values) and len(rest) else np.nan
-    others = [
-        other
-        for other in UNITS.values()
-        if other.kind == kind and (other.changes or kind == "power")
-    ]
-    least_usual, written = USUAL.get(name, (least,))[0], written[off]
-    trials = {other.name: _convert(other, written) for other in others}
-    usual = {
-        key: (v >= least_usual) & (v <= high) & ~(abs(v - middle) > spread)
-        for key, v in trials.items()
-    }
-    fitting = [key for key, holds in usual.items() if holds.all()]
-    cells = [f"{values[i]:g} in {sheet.rows[i]}" for i in np.flatnonzero(off)]
-    fault = f"{sheet.source}: column {head!r} holds {list_first(cells, 3)}; expected {name} of "
-    fault += f"{low:g} to {high:g}" + ("" if np.isnan(middle) else f", {middle:g} of most")
-    if fitting and np.isfinite(middle):
-        fault += f"; in {fitting[0]}? then write so, as '{written[0]:g} {fitting[0]}'"
-    elif fitting:
-        fitting[2:] = ["dBm"] if kind == "power" and not refused else fitting[2:3]
-        fault += f"; name its unit, as in '{unit_of(head)[0]} [{fitting[0]}]'"
-        if len(fitting) > 1:
-            fault += f", where {' or '.join(fitting)} would fit"
-    if refused:
-        raise DataError(fault)
-    sheet.notes.append(Caution(fault))
+    if off.any():
+        cells = [f"{values[i]:g} in {sheet.rows[i]}" for i in np.flatnonzero(off)]
+        fault = f"{sheet.source}: column {head!r} holds {list_first(cells, 3)}; expected {name} of "
+        fault += f"{low:g} to {high:g}; in another unit? say in the cell, or in brackets in the "
+        fault += f"head, which: {list_units(kind)}"
+        if refused:
+            raise DataError(fault)
+        sheet.notes.append(Caution(fault))
 
 
 def number_sites(sheet: Sheet) -> tuple[str, np.ndarray] | None:

@@ -15,7 +15,7 @@ import pandas as pd
 
 from gsparc.base.errors import Problems
 from gsparc.tables.heads import PERCENT, SHEET, UNITS, Unit
-from gsparc.tables.roles import Role
+from gsparc.tables.roles import Answer, Role, Sure
 
 NOT_HEARD = re.compile(SHEET["not_heard"])
 REPEATS = 3
@@ -77,8 +77,9 @@ class Sheet:
         """Note what is wrong with the table, or with a column; returns None."""
         return self.problems.add(self.source if head is None else self.describe_column(head), what)
 
-    def ask(self, role: Role) -> Any:
-        """Note a role that is open; returns None."""
+    def ask(self, why: str, *answers: Answer, sure: Sure = "open") -> Any:
+        """Note what is open, and the answers to it, the likeliest first; returns None."""
+        role = Role((), next(iter(answers[0].said)), sure, readings=answers, why=why)
         if self.asked is None:
             return self.problems.append(f"{self.source}: {role.question()}")
         return self.asked.append(role)

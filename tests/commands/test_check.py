@@ -50,16 +50,12 @@ def test_good_file_is_described(tmp_path, arrays):
             {"array_position": np.array([[0.0, 0, 0], [160.0, 0, 0]]), "carrier_hz": np.array(9e8)},
             ": in mm?",
         ),
-        (
-            {"spectrum": None, "rssi_db": np.geomspace(1e-9, 1e-5, 10)},
-            "if they are linear, call them rssi",
-        ),
     ],
 )
 def test_suspicious_units_are_said_by_check_and_by_training(
     tmp_path, arrays, change, warning, caplog
 ):
-    """Radians in grid_deg, an array of 160 m and powers called rssi_db were good without a word."""
+    """Radians in grid_deg and an array of 160 m were good without a word."""
     kept = {name: value for name, value in {**arrays, **change}.items() if value is not None}
     write_own(tmp_path / "a.npz", kept)
     good, text = _said(tmp_path / "a.npz")

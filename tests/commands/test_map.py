@@ -225,3 +225,22 @@ def test_an_interrupt_leaves_no_half_written_file(model, tmp_path, monkeypatch):
     assert not [
         file for file in tmp_path.iterdir() if file.suffix in (".npz", ".png", ".html", ".partial")
     ]
+
+
+def test_a_map_and_its_model_are_judged_by_later_rows_alike(model, tmp_path):
+    """By cell, ring and area, with a picture; rows are asked for where none are given."""
+    rows, quick = town_file(tmp_path / "later.npz", rows=400, seed=1), f"ckpt={model}"
+    how = "step_m=1", "pictures=false", "promised=false", "geotiff=false"
+    assert run("map", quick, *how, folder=tmp_path / "map").status == 0
+    file, parts = tmp_path / "map" / "map.npz", {}
+    for name, judged in (("map", file), ("model", model)):
+        out = tmp_path / f"by_{name}"
+        done = run("evaluate", f"ckpt={judged}", f"dataset.file={rows}", "baselines=[]", folder=out)
+        assert done.status == 0 and (out / "drive.png").exists(), done
+        assert "predicted less measured" in " ".join(done.out)
+        table = pd.read_csv(out / "by_part.csv")
+        assert {"all", "cell", "ring", "area"} == {*table.part}
+        parts[name] = table[table.part == "cell"].set_index("name").rmse_db
+    assert {*parts["map"].index} == {"east", "west"}
+    assert np.allclose(parts["map"], parts["model"][parts["map"].index], atol=0.4)
+    assert_refused(run("evaluate", f"ckpt={file}", folder=tmp_path / "no"), "dataset.file=FILE")

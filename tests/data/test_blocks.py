@@ -19,7 +19,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.datasets.own import read_any
 from gsparc.datasets.rfid import load_rfid
 from gsparc.models.target_rows import training_targets
-from gsparc.tables import raw
+from gsparc.tables import array_sizes
 from gsparc.tables.checks.constant import leave_out_unmeasured, mark_constants
 from gsparc.tables.own import load_own, write_own
 
@@ -199,14 +199,14 @@ def test_an_npz_that_inflates_without_end_took_all_memory(tmp_path, monkeypatch,
     # 80 MiB in an eighth of a megabyte
     zeros = {**arrays(), "csi": np.zeros((2**18, 40), np.complex64)}
     np.savez_compressed(tmp_path / "own.npz", **zeros)
-    monkeypatch.setattr(raw, "BIG", 2**26)
+    monkeypatch.setattr(array_sizes, "BIG", 2**26)
     monkeypatch.setattr(
         np, "load", lambda *unused, **named: pytest.fail("read before it was refused")
     )
     refused("csi: shape .* no other array has .262144,. rows", load_own, tmp_path / "own.npz")
     zeros |= {"rx_position": np.zeros((2**18, 3))}
     np.savez_compressed(tmp_path / "own.npz", **zeros)
-    monkeypatch.setattr(raw, "machine_memory", lambda: 2**27)
+    monkeypatch.setattr(array_sizes, "machine_memory", lambda: 2**27)
     refused("csi: .* too little memory for 90,", load_own, tmp_path / "own.npz")
     with (
         zipfile.ZipFile(tmp_path / "lies.npz", "w") as archive,
@@ -218,8 +218,8 @@ def test_an_npz_that_inflates_without_end_took_all_memory(tmp_path, monkeypatch,
 
 
 def test_a_copy_leaves_room_on_the_disk(tmp_path, small, monkeypatch, refused):
-    monkeypatch.setattr(raw, "SPARE", 2**60)
-    monkeypatch.setattr(raw, "BIG", 1024)
+    monkeypatch.setattr(array_sizes, "SPARE", 2**60)
+    monkeypatch.setattr(array_sizes, "BIG", 1024)
     with h5py.File(tmp_path / "own.h5", "w") as file:
         for name, one in arrays().items():
             file.create_dataset(name, data=one, chunks=one.ndim > 1 or None)

@@ -32,10 +32,10 @@ from scipy.special import ndtr
 import gsparc
 from gsparc.apps.maps import planning
 from gsparc.apps.maps.covered import covered_between
-from gsparc.apps.maps.field_map import outage_probability
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.planning import coarse_grid
 from gsparc.apps.maps.promise import Promise, PromiseSettings, gather_promise, read_promise
+from gsparc.apps.maps.strongest import outage_probability
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.by_station import unlisted_stations

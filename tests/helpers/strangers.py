@@ -90,7 +90,7 @@ CASES = {
     "a mark that is none": (
         wide(100),
         {"not_heard": []},
-        "394 levels above 60 dBm",
+        "394 of 720 levels are exactly 100, the most: a receiver in saturation?",
         "taken as not heard",
     ),
     "no fix": (

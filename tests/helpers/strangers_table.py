@@ -65,7 +65,7 @@ CASES: dict[str, tuple[str, dict, dict | None, dict | None]] = {
     "c07_uji.csv": (
         "metres called degrees",
         {},
-        {"columns": {"x": "LONGITUDE", "y": "LATITUDE"}},
+        {"columns": {"x": "LONGITUDE", "y": "LATITUDE", "z": "FLOOR*3.2"}},
         None,
     ),
     "c08_gw_null.csv": ("a gateway at 0, 0", {}, {"absent": "weaker"}, None),

@@ -8,11 +8,11 @@ from matplotlib.figure import Figure
 
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
-from gsparc.pictures import site_plan
-from gsparc.pictures.site_plan import draw_found, draw_site, find_spots
-from gsparc.tables.checks.level_steps import LevelStep
+from gsparc.pictures import found_plan, site_plan
+from gsparc.pictures.found_plan import draw_found
+from gsparc.pictures.site_plan import draw_site, find_spots
+from gsparc.tables.checks.level_steps import LevelStep, find_level_steps
 from gsparc.tables.checks.link_levels import link_levels
-from gsparc.tables.checks.plausibility import find_level_steps
 from gsparc.tables.own import from_arrays
 
 
@@ -24,7 +24,8 @@ def scattered(count=80):
 def figures(monkeypatch):
     """The figures that were drawn; nothing is written."""
     kept: list[Figure] = []
-    monkeypatch.setattr(site_plan, "save", lambda figure, path: kept.append(figure))
+    for module in (site_plan, found_plan):
+        monkeypatch.setattr(module, "save", lambda figure, path: kept.append(figure))
     return kept
 
 

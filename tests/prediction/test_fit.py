@@ -199,9 +199,9 @@ def test_the_mask_of_an_array_was_thrown_away():
 @pytest.mark.parametrize(
     "rssi, says",
     [
-        (np.full(60, -60.0), "all levels are -60 dB: is it the column of levels"),
+        (np.full(60, -60.0), "levels differ by 0 dB in all"),
         (-np.round(POWERS), "is below 0: losses"),
-        (POWERS, "if these are kilometres"),
+        (POWERS, "in kilometres?"),
     ],
 )
 def test_arrays_were_not_asked_what_files_are(rssi, says, caplog):

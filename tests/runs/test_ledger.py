@@ -28,6 +28,7 @@ from gsparc.runs.ledger import (
     read_finished,
     run_once,
 )
+from gsparc.tables.columns_file import beside
 
 
 def state(**changes) -> FitInputs:
@@ -181,6 +182,17 @@ def test_a_job_found_done_read_its_data_first(tmp_path):
     assert not FitInputs.from_config(
         compose("dataset=rfid", "dataset.root=null", "model=mean")
     ).tells_data
+
+
+def test_a_job_was_done_though_the_file_about_its_columns_was_edited(tmp_path):
+    (file := tmp_path / "log.csv").write_text("x,y,rssi\n0,0,-60\n")
+    config = compose("dataset=own", f"dataset.file='{file}'", "model=mean")
+    before = FitInputs.from_config(config)
+    run_once(tmp_path, replace(before, data="d", split="s"), ends(tmp_path))
+    beside(file).write_text("heads: 0\ncolumns: []\nwritten: by hand\n")
+    edited_since = FitInputs.from_config(config)
+    assert edited_since.changes(vars(before), reuse=True) == ["unread.dataset.file (columns)"]
+    assert read_finished(tmp_path, edited_since, reuse=True) is None
 
 
 @pytest.fixture

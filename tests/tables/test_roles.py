@@ -98,7 +98,7 @@ def test_ranks_were_taken_for_stations(write, heads):
 
 def test_ranks_beside_names_of_another_word_are_asked(write):
     path = write(table("x,y,who1,rssi1,who2,rssi2", *PLACES.T, *RANKS))
-    with pytest.raises(DataError, match=r"station=who\* dataset.columns.rssi_db=rssi\*"):
+    with pytest.raises(DataError, match=r"rssi_db=rssi\* dataset.columns.station=who\*"):
         Own(path).load()
     lists = {"station": "who*", "rssi_db": "rssi*"}
     assert set(read_any(path, columns=lists).data.site.stations.name) == set("abc")
@@ -136,6 +136,17 @@ def test_a_level_beside_a_phase_is_asked(write):
     polar = {"csi_amp": "RSSI", "csi_phase": "phase"}
     csi = parse_table(write(PHASES), polar).arrays["csi"]
     np.testing.assert_allclose(20 * np.log10(abs(csi)), LEVELS[:, 0])
+
+
+def test_a_floor_is_a_height_or_a_group_of_rows(write):
+    path = write(table("x,y,Floor ID,rssi", *PLACES.T, BAND, LEVELS[:, 0]))
+    with pytest.raises(DataError, match=r'z="Floor ID\*3.2".*, or dataset.columns.z=none .*run='):
+        Own(path).load()
+    heights = Own(path, columns={"z": "Floor ID*3.2"}).load().moving[:, 2]
+    assert np.ptp(heights) == pytest.approx(3.2)
+    group = Own(path, columns={"z": "none", "run": "Floor ID"}).load()
+    assert not np.ptp(group.moving[:, 2]) and len(np.unique(group.run)) == 2
+    Own(write(table("x,y,floor,rssi", *PLACES.T, 0 * BAND, LEVELS[:, 0]))).load()  # one alone
 
 
 GRID = 47.4 + PLACES / 1e4

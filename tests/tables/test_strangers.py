@@ -91,7 +91,7 @@ def test_saturated_levels_were_learned_and_scored_as_measured(write):
 
 
 def test_the_log_of_a_run_left_out_what_check_warns_of(write, caplog):
-    path = write(long("Storey", FLOOR, level=ALONG, places=STUCK))
+    path = write(long("phone", FLOOR, level=ALONG, places=STUCK))
     Own(path).load()
     warned = [
         line.removeprefix("warning").strip()

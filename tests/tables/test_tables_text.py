@@ -10,7 +10,7 @@ import yaml
 from gsparc.base import limits
 from gsparc.base.errors import DataError
 from gsparc.base.files import load_yaml, read_csv
-from gsparc.tables import opening
+from gsparc.tables import text as text_file
 from gsparc.tables.own import interpret
 from gsparc.tables.read import parse_table
 
@@ -98,7 +98,7 @@ def test_a_comment_mark_after_an_empty_cell_was_a_crash(write, refused):
 )
 def test_lines_and_heads_without_end_took_all_memory(write, refused, monkeypatch, content, says):
     """A line of 200 MB took 10.4 GiB; 1e8 cells of a head did not end in a minute."""
-    monkeypatch.setattr(opening, "MOST_CELLS", 30_000)
+    monkeypatch.setattr(text_file, "MOST_CELLS", 30_000)
     refused(says, parse_table, write(content))
     monkeypatch.setenv(limits.LIFTED_BY, "1000")
     refused(
@@ -119,7 +119,7 @@ def test_a_small_file_that_unpacks_to_a_large_table_took_all_memory(tmp_path, re
         path,
     )
     assert time.process_time() - began < 2
-    monkeypatch.setattr(opening, "MOST_CELLS", 1000)  # read to here, as it is lifted
+    monkeypatch.setattr(text_file, "MOST_CELLS", 1000)  # read to here, as it is lifted
     monkeypatch.setenv(limits.LIFTED_BY, str(2**27))
     refused("1,000 cells are read", parse_table, path)
     monkeypatch.setenv(limits.LIFTED_BY, "1e9")

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsparc.apps.maps.field_map import FieldMap
-from gsparc.apps.maps.pictures import Layer, Legend
+from gsparc.apps.maps.layers import Layer, Legend
 from gsparc.prediction.predictor import Predictor
 
 CHANGE, DEVIATION = "change_db", "change_deviation_db"
@@ -43,9 +43,10 @@ def change_layers(field: FieldMap) -> Iterator[Layer]:
         return
     change, deviation = field.extra[CHANGE], field.extra[DEVIATION]
     most = max(float(np.nanmax(np.abs(change), initial=0.0)), LEAST)
-    doubt = np.abs(change) < SURE * deviation, f"within {SURE:g} deviations of no change"
+    why = f"within {SURE:g} deviations of no change"
+    doubt = np.abs(change) < SURE * deviation, "////", why
     yield Layer(
-        "change", change, Legend("change of the level [dB]", -most, most, "RdBu_r"), unsure=doubt
+        "change", change, Legend("change of the level [dB]", -most, most, "RdBu_r"), doubts=[doubt]
     )
     label = "deviation of the change [dB]"
     yield Layer("change_deviation", deviation, Legend.over(label, deviation, "cividis"))

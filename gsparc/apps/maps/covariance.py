@@ -8,13 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from gsparc.apps.maps.joint_errors import RegionErrors
 from gsparc.apps.maps.making import choose_stations
 from gsparc.apps.maps.promise import Promise
 from gsparc.prediction.levels import predict_levels
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import query_ends, to_local
 
-BETWEEN = (0.25, 4.0)  # what held-out blocks may multiply a variance with
+BETWEEN = (0.25, 1.0)  # what held-out blocks may multiply a measurement's scatter with
+LEAST_FIELD = 0.05  # of a tested squared error, that more rows can take away
 DRAWS = 200  # of levels, that tell how likely a station is the strongest
 # Before anything is measured: deviation, and noise relative to its square
 SHADOWING_DB, NOISE = 6.0, 0.1
@@ -32,7 +34,7 @@ class ErrorCovariance:
         noise: variance of one measurement.
         measured: (S,) the same of a measurement at each place, infinite where it would not list the
             station.
-        weight: (S,) what held-out blocks say that variances are to be multiplied with.
+        weight: (S,) what variances count, see `weigh_goal`.
     """
 
     covariance: np.ndarray
@@ -53,9 +55,7 @@ class ErrorCovariance:
         return explained / (np.maximum(self.covariance.diagonal(), 0) + self.measured)
 
     def variances(self) -> np.ndarray:
-        """Return variances of a measurement's error at each place (S,),
-        as held-out blocks scale it.
-        """
+        """Return variances of a measurement's error at each place (S,), weighed."""
         return self.weight * (np.maximum(self.covariance.diagonal(), 0) + self.noise)
 
 
@@ -70,9 +70,9 @@ def error_covariances(
 ) -> list[ErrorCovariance]:
     """Return error covariances at world places (S, 3) [m] of every station, by its process.
 
-    Held-out blocks of `promise` scale the variances, and what shall be known weighs them, see
-    `weigh_goal`. What is measured at a place lists those that are predicted strongest there, as
-    many as training rows have in the mean.
+    They are as large as held-out rows of `promise` say, and share what regions do; what shall be
+    known weighs them, see `weigh_goal`. What is measured at a place lists those that are predicted
+    strongest there, as many as training rows have in the mean.
 
     Raises:
         ValueError: the model has no process.
@@ -86,23 +86,47 @@ def error_covariances(
     listed = (level >= np.sort(level, 0)[-each]).T
     more = predictor.noise_by_others(places, [names.index(name) for name in all_names], listed).T
     levels, spreads = np.array([answers[name] for name in stations]).swapaxes(0, 1)
+    region = RegionErrors.from_promise(promise)
     for name, worth in zip(stations, weigh_goal(levels, spreads, goal, threshold_db), strict=True):
         number, asking = names.index(name), ask[name]
         covariance, noise = asking.covariance(**query_ends(asking.site, places, other_end))
-        weight = np.ones(len(places))
-        # Expected squared errors of held-out blocks over the process's variance
+        scatter = noise
         if promise is not None:
-            calibration = promise.calibration()
             far = promise.distance(to_local(asking.site, places, other_end), number)
-            inside = np.minimum(far, calibration.reach)  # beyond it, as at its edge
-            _, error = calibration.half_and_error(
-                answers[name][1], inside, np.full(len(far), number)
+            covariance, scatter = _as_tested(
+                covariance, noise, promise, region, places, number, far, answers[name][1]
             )
-            ratio = error**2 / (np.maximum(covariance.diagonal(), 0) + noise)
-            weight = np.clip(np.nan_to_num(ratio, nan=1.0), *BETWEEN)
-        measured = noise + more[all_names.index(name)]
-        covariances.append(ErrorCovariance(covariance, noise, measured, worth * weight))
+        # A place tells no more than its scatter allows, and less where it does not list the station
+        measured = scatter + more[all_names.index(name)]
+        covariances.append(ErrorCovariance(covariance, scatter, measured, worth))
     return covariances
+
+
+def _as_tested(
+    covariance: np.ndarray,
+    noise: float,
+    promise: Promise,
+    region: RegionErrors,
+    places: np.ndarray,
+    number: int,
+    far: np.ndarray,
+    spread_db: np.ndarray,
+) -> tuple[np.ndarray, float]:
+    """Covariance (S, S) of a station's level as large as held-out rows say, with what regions
+    share, and a measurement's scatter; `far` (S,) from what was measured [m].
+    """
+    calibration, station = promise.calibration(), np.full(len(far), number)
+    # Beyond its reach as at its edge
+    inside = np.minimum(far, calibration.reach)
+    error = calibration.half_and_error(spread_db, inside, station)[1]
+    stated = np.maximum(covariance.diagonal(), 1e-9)
+    total = np.where(np.isfinite(error), error**2, stated + noise)
+    # Near rows nothing but scatter is left: there tested errors say how large it is.
+    scatter = float(noise * np.clip(np.min(total / (stated + noise)), *BETWEEN))
+    field = np.sqrt(np.maximum(total - scatter, LEAST_FIELD * total))
+    alike = covariance / np.sqrt(np.outer(stated, stated))
+    alike = region.correlations(alike, places, station, inside)
+    return np.outer(field, field) * alike, scatter
 
 
 def weigh_goal(

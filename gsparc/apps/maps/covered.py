@@ -1,16 +1,17 @@
 """How surely a share of a map's squares is covered: near squares share their errors,
-and all share some.
+and regions that nobody walked some more.
 """
 
 from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.spatial.distance import cdist
 
 from gsparc.apps.maps.field_map import FieldMap
+from gsparc.apps.maps.joint_errors import RegionErrors, model_correlations
 from gsparc.apps.maps.promise import Promise
 from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.query import to_local
 from gsparc.processes.factor import Factor
 from gsparc.processes.few_rows import evenly_spaced
 from gsparc.processes.uncertainty import central_interval, standard_error
@@ -37,8 +38,8 @@ def draw_strongest(
     """Return squares (n,) of a thinned grid, and the strongest station's level there,
     drawn (n, DRAWS) [dB].
 
-    Errors of the strongest stations are drawn together by the model's own covariance, each as large
-    as held-out blocks say. See `covered_between`;
+    Errors of the strongest stations are drawn together, by the model's own covariance and what
+    regions share (`RegionErrors`), each as large as held-out rows say. See `covered_between`;
     without a promise only each square's own spread is right.
     """
     level, error = (
@@ -54,8 +55,16 @@ def draw_strongest(
     # The mean of all errors is known no better than the blocks tell it:
     # the correlations hold none of it.
     block_m, common = (1.0, 0.0) if promise is None else (promise.block_m, mean_error(promise) ** 2)
-    alike = _pair_correlation(predictor, places, field.number[station], block_m)
-    drawn = few[station, at][:, None] + draw_errors(np.outer(spread, spread) * alike + common)
+    number, region = field.number[station], RegionErrors.from_promise(promise)
+    alike = model_correlations(predictor, places, number, block_m)
+    if promise is not None:
+        far = promise.distances(to_local(predictor.site, places, None), number)
+        alike = region.correlations(alike, places, number, far)
+    errors = draw_errors(np.outer(spread, spread) * alike + common)
+    if region.quarters:  # few of them tell how large a region's error is
+        loose = np.random.default_rng(1).chisquare(region.quarters, DRAWS)
+        errors = errors * np.sqrt(region.quarters / loose)
+    drawn = few[station, at][:, None] + errors
     best = np.full((len(square), DRAWS), -np.inf)
     np.maximum.at(best, at, drawn)
     return square, best
@@ -82,24 +91,3 @@ def mean_error(promise: Promise) -> float:
     """Return the standard error of the mean error of measured rows, over held-out blocks [dB]."""
     heard = promise.evidence.subset(promise.evidence.heard)
     return standard_error(heard.level_db - heard.mean_db, heard.block)
-
-
-def shadowing(places: np.ndarray, block_m: float) -> np.ndarray:
-    """Return correlations (n, n) of errors at places (n, 3),
-    which decay over a block as shadowing does.
-    """
-    return np.exp(-cdist(places, places) / block_m)
-
-
-def _pair_correlation(
-    predictor: Predictor, places: np.ndarray, number: np.ndarray, block_m: float
-) -> np.ndarray:
-    """Correlations (n, n) of errors of stations (n,) at places (n, 3);
-    variances alone hold the noise.
-    """
-    if (joint := predictor.predict_joint(places[None], number)) is None:
-        # Of 32 simulated shares 24 lay in these intervals,
-        # 23 in those by each station's own process.
-        return np.where(number[:, None] == number, shadowing(places, block_m), 0.0)
-    variance = joint.covariance[0].diagonal()
-    return (joint.covariance[0] - np.diag(joint.noise)) / np.sqrt(np.outer(variance, variance))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -166,6 +166,25 @@ def read_shapes(
             "was trained in metres about an unknown origin, which degrees mean nothing to"
         )
     return shapely.union_all(shapely.make_valid(polygons)), list(lines)
+
+
+def read_outlines(settings: Mapping[str, Any], origin: Georeference | None) -> list[np.ndarray]:
+    """Return the lines (n, 2) [m] of all files that settings name, and the rims of their polygons:
+    what is drawn behind a map.
+    """
+    outlines = []
+    for key in ("area", "buildings", "walkable"):
+        if is_drawn(settings.get(key)):
+            area, lines = read_shapes(settings[key], key, origin, True)
+            rims = [rim for part in _polygons(area) for rim in (part.exterior, *part.interiors)]
+            outlines += [np.asarray(line.coords)[:, :2] for line in (*rims, *lines)]
+    return outlines
+
+
+def _polygons(area: Any) -> list[Any]:
+    from shapely import get_parts
+
+    return [part for part in get_parts(area) if part.geom_type == "Polygon"]
 
 
 def write_shapes(path: Path, shapes: list[tuple[dict[str, Any], Any]]) -> None:

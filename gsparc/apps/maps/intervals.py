@@ -16,7 +16,12 @@ from scipy.optimize import isotonic_regression
 from scipy.special import ndtr
 
 from gsparc.prediction.left_out import HeldOutLevels
-from gsparc.processes.uncertainty import conformal_level, coverage_and_width, weighted_quantiles
+from gsparc.processes.uncertainty import (
+    conformal_level,
+    coverage_and_width,
+    half_width,
+    weighted_quantiles,
+)
 
 LEAST_ROWS = 40  # held out, for any promise
 ROWS_OF_A_BIN, BLOCKS_OF_A_BIN = 150, 8
@@ -88,12 +93,15 @@ class IntervalScales:
         return np.where(np.isfinite(standard), chance, np.nan)
 
 
-def calibrate(evidence: HeldOutLevels, share: float = 0.9) -> IntervalScales:
+def calibrate(
+    evidence: HeldOutLevels, share: float = 0.9, quarters: HeldOutLevels | None = None
+) -> IntervalScales:
     """Learn the scales; their intervals get no narrower with distance.
 
     Args:
         evidence: of held-out rows.
         share: of measurements that intervals are to hold.
+        quarters: rows of whole quarters held out, for places farther from rows than `evidence` has.
 
     Raises:
         ValueError: too few rows.
@@ -131,7 +139,36 @@ def calibrate(evidence: HeldOutLevels, share: float = 0.9) -> IntervalScales:
     scaled = used.error / np.interp(used.distance, middle, rms)
     tail = np.quantile(scaled, TAIL) if heard.all() else None
     reach = float(np.quantile(used.distance, REACH))
-    return IntervalScales(share, middle, half, rms, tail, reach, station, least)
+    near = IntervalScales(share, middle, half, rms, tail, reach, station, least)
+    return near if quarters is None else _with_quarters(near, quarters)
+
+
+def _with_quarters(near: IntervalScales, quarters: HeldOutLevels) -> IntervalScales:
+    """Scales that go on where blocks end, by rows of quarters: as many of them tell, no more."""
+    station = np.append(near.station, 1.0)[np.minimum(quarters.station, len(near.station))]
+    far = replace(quarters, spread_db=np.maximum(quarters.spread_db, near.least) * station)
+    far = far.subset((far.distance > near.reach) & np.isfinite(far.error))
+    if far.heard.sum() < LEAST_ROWS:
+        return near
+    away = np.sort(far.distance)
+    parts = np.array_split(away, int(np.clip(len(far) // ROWS_OF_A_BIN, 1, MOST_BINS)))
+    first = np.unique([part[0] for part in parts])
+    which = np.searchsorted(first, far.distance, side="right")
+    bins = [far.subset(which == number) for number in range(1, len(first) + 1)]
+    middle = np.array([np.median(part.distance) for part in bins])
+    typical = np.array([np.median(part.spread_db) for part in bins])
+    rms = np.array([_half_and_rms(part, 0.5)[1] for part in bins]) * typical
+    # No smaller than where blocks end, as everywhere else.
+    least = near.rms[-1] * typical.min()
+    rms = np.maximum(isotonic_regression(rms, weights=[len(part) for part in bins]).x, least)
+    half = max(half_width(near.share, len(np.unique(far.block))), near.half[-1] / near.rms[-1])
+    return replace(
+        near,
+        distance=np.append(near.distance, middle),
+        rms=np.append(near.rms, rms / typical),
+        half=np.append(near.half, half * rms / typical),
+        reach=float(np.quantile(far.distance, REACH)),
+    )
 
 
 def _half_and_rms(part: HeldOutLevels, level: float) -> tuple[float, float]:

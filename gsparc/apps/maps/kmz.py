@@ -11,8 +11,9 @@ from zipfile import ZipFile
 import numpy as np
 from matplotlib.image import imsave
 
-from gsparc.apps.maps.field_map import FieldMap, raster_profile
-from gsparc.apps.maps.pictures import Layer
+from gsparc.apps.maps.field_map import FieldMap
+from gsparc.apps.maps.geotiff import raster_profile
+from gsparc.apps.maps.layers import Layer
 from gsparc.base.files import whole_file
 
 NAMESPACE = "http://www.opengis.net/kml/2.2"

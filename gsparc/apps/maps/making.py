@@ -8,14 +8,15 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from scipy.ndimage import maximum_filter
 
-from gsparc.apps.maps import field_map
+from gsparc.apps.maps import field_map, strongest
 from gsparc.apps.maps.area import Grid, lay_grid
 from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.intervals import IntervalScales
 from gsparc.apps.maps.promise import Promise, read_promise
-from gsparc.apps.maps.refining import sample_adaptively
+from gsparc.apps.maps.refining import FIRST, sample_adaptively
 from gsparc.apps.maps.scoring import Scoring
 from gsparc.base import limits
 from gsparc.base.errors import DataError
@@ -34,7 +35,9 @@ from gsparc.prediction.query import to_local
 from gsparc.processes.uncertainty import half_width
 
 MOST_DB = 1000.0  # of a level
-ALL_CELLS = 40_000  # of a map that are all asked about
+FEW_CELLS = 3_000  # of a map that are all asked about
+SLACK, ALIKE = 0.1, 0.1  # of the model's own deviation, and of a correlation: interpolated
+NEAR = 2  # cells around what was measured that are all asked about
 # What follows is cheap, but float64 arrays (T, n) of all cells of a city take gigabytes.
 BANDS = 1 << 16  # cells at a time of what follows from predictions
 
@@ -76,7 +79,7 @@ def predict_map(
         promise: evidence of held-out blocks, or what the checkpoint holds of it; None: intervals
             are the model's own deviations, and nothing is refused.
         share: of measurements that intervals are to hold.
-        tolerance_db: error of cells that are interpolated, in maps of more than `ALL_CELLS`; 0 asks
+        tolerance_db: error of cells that are interpolated, in maps of more than `FEW_CELLS`; 0 asks
             about every cell. Known places must be stored with the model.
         unit: of the map's levels, and of `threshold_db` and `noise_db`: dBm or dBW; None: as
             measured.
@@ -102,7 +105,7 @@ def predict_map(
     grid = lay_grid(site, area, height_m, step_m, plan, len(names), buildings, loss is not None)
     numbers = np.array([site.every_station.name.index(name) for name in names])
     about = station_facts(site, numbers)
-    load_of = field_map.read_loads(load, names, about["stations"])
+    load_of = strongest.read_loads(load, names, about["stations"])
     level = PowerUnit.from_name(unit, site.level_unit, levels=True)
     # Inside, all is in the unit of the measurements: settings are converted once.
     threshold_db -= level.raised_db
@@ -115,16 +118,24 @@ def predict_map(
     calibration = uncalibrated(share) if promise is None else promise.calibration(share)
     notes += _notes_of_threshold(threshold_db, promise, level)
     values: dict[str, Any] = field_map.empty_layers(len(names), grid.inside.shape)
-    inside, stride = np.flatnonzero(grid.inside), 1
-    if tolerance_db > 0 and len(inside) > ALL_CELLS and promise is not None:
-        # Cells asked about everywhere are no farther apart than what was measured.
-        stride = max(int(neighbour_distance(promise.known[:, -3:-1]) / grid.step / 2), 1)
+    inside = np.flatnonzero(grid.inside)
+    # Where nothing is said nothing is asked.
+    told = grid.inside
+    if promise is not None:
+        local = grid.places(np.arange(told.size)) - site.origin
+        told = told & promise.within_reach(local).reshape(told.shape)
+    sure = told
+    if promise is not None and tolerance_db > 0 and len(inside) > FEW_CELLS:
+        sure = told & _beside_rows(grid, promise, site)
     alike, computed = _fill_levels(
-        values, predictor, grid, other_end, names, numbers, stride, tolerance_db
+        values, predictor, grid, other_end, names, numbers, told, sure, tolerance_db
     )
-    if computed < len(names) * len(inside):
-        most = f"{computed} of {len(names) * len(inside)} levels were predicted"
-        notes.append(f"{most}, the others interpolated to about {tolerance_db:g} dB (tolerance_db)")
+    if computed < len(names) * told.sum():
+        most = f"{computed} of {len(names) * told.sum()} levels were predicted"
+        notes.append(
+            f"{most}, the others interpolated to about {tolerance_db:g} dB (tolerance_db) or a "
+            "tenth of their deviation"
+        )
     bands = about["bands"]
     carrier = np.unique(bands or ("",) * len(names), return_inverse=True)[1].reshape(-1)
     scoring = Scoring(
@@ -202,6 +213,18 @@ def _notes_of_threshold(
     return []
 
 
+def _beside_rows(grid: Grid, promise: Promise, site: Site) -> np.ndarray:
+    """Cells (ny, nx) bool near rows, unless cells are finer than these: what a row tells of is
+    narrower than a lattice."""
+    known = promise.known[:, -3:-1] + site.origin[:2]
+    place = ((known - [grid.x[0], grid.y[0]]) / grid.step).round().astype(int)
+    inside = ((place >= 0) & (place < [len(grid.x), len(grid.y)])).all(1)
+    sure = np.zeros_like(grid.inside)
+    if neighbour_distance(known) < 2 * FIRST * grid.step:
+        sure[place[inside, 1], place[inside, 0]] = True
+    return maximum_filter(sure, 2 * NEAR + 1)
+
+
 def _fill_levels(
     values: dict[str, np.ndarray],
     predictor: Predictor,
@@ -209,7 +232,8 @@ def _fill_levels(
     other_end: Sequence[float] | None,
     names: Sequence[str],
     numbers: np.ndarray,
-    stride: int,
+    told: np.ndarray,
+    sure: np.ndarray,
     tolerance_db: float,
 ) -> tuple[np.ndarray, int]:
     """Write levels and the model's own deviations to `values`.
@@ -224,7 +248,14 @@ def _fill_levels(
     for row in range(0, len(names), size):
         chosen = slice(row, row + size)
         ask = _asker(predictor, joint, grid, other_end, names[chosen], numbers[chosen])
-        parts, count = sample_adaptively(ask, grid.inside, stride, tolerance_db)
+
+        def allowed(values: np.ndarray) -> np.ndarray:
+            parts = values.reshape(len(values), -1, size)
+            error = np.full(parts.shape, ALIKE)
+            error[:, :2] = np.maximum(SLACK * parts[:, 1:2], tolerance_db)
+            return error.reshape(values.shape)
+
+        parts, count = sample_adaptively(ask, told, allowed, sure, 1 if sure is told else FIRST)
         parts = parts.reshape(-1, size, *grid.inside.shape)
         values["power_db"][chosen], values["expected_error_db"][chosen] = parts[:2]
         alike[chosen] = parts[2] if joint else 0.0

@@ -18,10 +18,10 @@ from gsparc.apps.maps.covered import (
     SHARE,
     draw_errors,
     draw_strongest,
-    shadowing,
     share_between,
 )
 from gsparc.apps.maps.geojson import draws_shapes
+from gsparc.apps.maps.joint_errors import shadowing
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.planning import coarse_grid, walkable_places
 from gsparc.apps.maps.promise import Promise

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from gsparc.apps.maps.area import Grid, lay_grid
 from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances, prior_covariances
@@ -160,8 +160,9 @@ def plan_measurements(
     wanted = np.arange(len(places)) < len(targets)
     before = mean_error(unknown)
     before_db = float(np.sqrt(np.mean(before[wanted] ** 2)))
+    too_near = find_neighbours(places[first:, :2], count)
     chosen, expected, stopped = choose_greedily(
-        unknown, first, wanted, count, least_gain_db, tour, before_db
+        unknown, first, wanted, count, least_gain_db, tour, before_db, too_near
     )
     order = np.array(
         [chosen.index(cell) for cell in (tour.walk[1:-1] if route else chosen)], np.int64
@@ -201,9 +202,9 @@ def coarse_grid(
     fine = lay_grid(None if predictor is None else predictor.site, area, height_m, None, plan)
     if area is None and plan is None and promise is not None and predictor is not None:
         local = fine.places(np.arange(fine.inside.size)) - predictor.site.origin
-        far = cKDTree(promise.known[:, -3:]).query(local)[0].reshape(fine.inside.shape)
         # No farther than a promise reaches: where nothing is said, measuring cannot be weighed.
-        fine = replace(fine, inside=fine.inside & (far <= promise.calibration().reach))
+        told = promise.within_reach(local).reshape(fine.inside.shape)
+        fine = replace(fine, inside=fine.inside & told)
     west, east, south, north = fine.extent
     share = fine.inside.mean()
     step = float(np.sqrt((east - west) * (north - south) * share / count))
@@ -258,11 +259,13 @@ def choose_greedily(
     least_gain_db: float,
     tour: Tour,
     error: float,
+    too_near: np.ndarray,
 ) -> tuple[list[int], list[float], str]:
     """Return chosen candidates, expected error after each, and why it stopped early.
 
     Candidates are the places from `first` on, by whose numbers they are in `tour`;
-    `error` is that before.
+    `error` is that before. Of two that are `too_near` (C, C) one alone is chosen, while others are
+    left.
     """
     free = np.ones(len(wanted) - first, bool)
     chosen: list[int] = []
@@ -273,6 +276,8 @@ def choose_greedily(
             [covariance.variance_reductions(wanted)[first:] for covariance in unknown], axis=0
         )
         possible = free & tour.reachable()[: len(free)]
+        apart = possible & ~too_near[chosen].any(axis=0)
+        possible = apart if apart.any() else possible
         if not possible.any():
             why = "no place is left" if not free.any() else "no other place fits in the walk"
             return chosen, expected, f"{why} after {len(chosen)} places"
@@ -293,6 +298,19 @@ def choose_greedily(
         tour.add(best)
         free[best] = False
     return chosen, expected, ""
+
+
+def find_neighbours(places: np.ndarray, count: int) -> np.ndarray:
+    """Return which of places (C, 2) are too near to be measured both, (C, C) bool: nearer than half
+    of what as many places, evenly spread, are apart.
+    """
+    distance, far = cdist(places, places), np.full(len(places), np.inf)
+    # The farthest from all before, again and again: as even as a design gets.
+    number = 0
+    for _ in range(max(min(count, len(places)) - 1, 1)):
+        far = np.minimum(far, distance[number])
+        number = int(far.argmax())
+    return distance < far.max() / 2
 
 
 def mean_error(unknown: list[ErrorCovariance]) -> np.ndarray:

@@ -8,14 +8,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from gsparc.apps.maps.field_map import (
+from gsparc.apps.maps.intervals import IntervalScales
+from gsparc.apps.maps.strongest import (
     best_server,
     count_overlap,
+    heard_chance,
     outage_probability,
     server_chance,
     sinr,
 )
-from gsparc.apps.maps.intervals import IntervalScales
 from gsparc.processes.uncertainty import half_width
 
 
@@ -86,6 +87,7 @@ class Scoring:
             "best_server": best,
             "sinr_db": sinr(power, self.load, self.noise_db, self.carrier),
             "server_chance": server_chance(power, error, self.floor, alike),
+            "heard_chance": heard_chance(power, error, self.floor),
             "outage": outage_probability(power, error, self.threshold_db, alike, below),
             "overlap": count_overlap(power, self.carrier),
         }

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsparc.apps.maps.floor_plan import FloorPlan
-from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.maps.layers import Legend
 from gsparc.apps.view.answer import SILENT_DB, Answer
 from gsparc.apps.view.scene import (
     EXTENT,

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.maps.layers import Legend
 from gsparc.apps.view.answer import Answer
 from gsparc.data.schema import Site
 from gsparc.physics.decibels import from_decibels, to_decibels

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from gsparc.apps.maps.area import Grid
-from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.maps.layers import Legend
 from gsparc.apps.view.scene import PlacedPicture
 from gsparc.prediction.levels import predict_levels
 from gsparc.prediction.predictor import Predictor

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.maps.layers import Legend
 from gsparc.apps.view.answer import SILENT_DB, Answer, azimuth_elevation
 from gsparc.apps.view.building import SURFACES
 from gsparc.apps.view.scene import Faces, Part

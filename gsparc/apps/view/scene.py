@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.maps.layers import Legend
 
 THICKNESS = 1.5  # of lines [pixels]
 STATION = (40, 40, 40)

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from gsparc.apps.maps.area import Grid, lay_grid
 from gsparc.apps.maps.floor_plan import FloorPlan
-from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.maps.layers import Legend
 from gsparc.apps.view.building import VALUES, Sphere, build_scene, start_place
 from gsparc.apps.view.plane import Plane, refine_plane
 from gsparc.apps.view.scene import EXTENT, DrawnScene, Points

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -42,9 +41,6 @@ CHANCE = 2.0  # times the correlation of noise, within these limits
 # Standard error of such a scatter of independent pairs, times the root of their number
 SPREAD = 1.17
 MORE = 0.1  # of correlation that a free delay must bring
-# What rows of one place differ by, at least, and over that of rows of different ones: noise of 10
-# dB and 0 dB below the signal leaves .1 and .5 of the power.
-UNLIKE, AS_FAR = 0.1, 0.7
 SCATTER_DB = {NEAR: 2.0, IN_LINE: 3.2}  # of levels between neighbours, more than fading makes
 
 
@@ -133,48 +129,6 @@ def estimate_coherence(data: Measurements) -> Coherence | None:
         scatter,
         unknown_factor,
     )
-
-
-def place_warnings(data: Measurements) -> list[str]:
-    """Warn of channels that are hardly more alike at one place than between places,
-    after a free phase.
-
-    Of one entry a row sizes are compared: a phase alone makes all others alike.
-    """
-    if not data.site.target.is_complex or data.uplink is not None:
-        return []
-    few = max(MOST_ENTRIES // (len(data.site.every_station) * data.target[0].size), 1)
-    rows = Snapshots.from_rows(data, np.arange(min(len(data), few)))
-    _, where = np.unique(rows.places, axis=0, return_inverse=True)
-    where, rng = where.reshape(-1), np.random.default_rng(0)
-    again = np.array([pair for _, ids in rows_by(where) for pair in pairwise(ids)])
-    if len(again) < FEWEST:
-        return []
-    again = again[evenly_spaced(len(again), MOST)]
-    apart = rng.integers(0, len(where), (10 * MOST, 2))
-    apart = apart[where[apart[:, 0]] != where[apart[:, 1]]][:MOST]
-    if not len(apart):
-        return []
-    within, between = (_unlike(rows, pairs).mean(0) for pairs in (again, apart))
-    best = int((within / np.maximum(between, UNLIKE)).argmin())
-    if within[best] < max(UNLIKE, AS_FAR * between[best]):
-        return []
-    text = f"rows at one place differ by {within[0]:.2f} of their power even after a free phase"
-    return [
-        f"{text}, rows at different places by {between[0]:.2f} ({len(again)} pairs): places "
-        "tell nothing"
-    ]
-
-
-def _unlike(rows: Snapshots, pairs: np.ndarray) -> np.ndarray:
-    """What a phase, and a phase and a delay, leave (P, 2) of the power of pairs (P, 2) of rows."""
-    a, b = (rows.values[pairs[:, side]] for side in (0, 1))
-    if a[0].size > 1:
-        turned = a * align_factors(a, b, rows.tones, "phase+delay")[:, None]
-        return 1 - np.abs(np.stack([_correlation(values, b)[0] for values in (a, turned)], 1))
-    size = np.abs(np.stack([a, b])).reshape(2, -1)
-    difference = (size[0] - size[1]) ** 2 / (size**2).sum(0).clip(1e-300)
-    return np.stack([difference, difference], 1)
 
 
 def set_unknown_factor(data: Measurements, align: str) -> Measurements:

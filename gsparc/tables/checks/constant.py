@@ -1,9 +1,8 @@
-"""What is constant over rows but for rounding: guard tones, dead antennas, dark pixels,
-stuck stations.
+"""What is constant over rows but for rounding: guard tones, dead antennas, stuck stations.
 
 Tones and antennas of channels are left out, as what a receiver fills in may be far stronger than
-what it measures, and would be most of every figure. Pixels are dark where no wave comes from; a
-station may be as it says: these are named alone.
+what it measures, and would be most of every figure. A station may be as it says: it is named
+alone.
 """
 
 from __future__ import annotations
@@ -25,7 +24,8 @@ def mark_constants(data: Measurements, notes: list[str]) -> Measurements:
     """Return channels with what is constant over rows marked as not measured;
     `notes` that name it are added.
 
-    Of spectra and powers it is named alone. Values are those of the file, before they are scaled.
+    Rows of spectra and powers that are all the same are named alone.
+    Values are those of the file, before they are scaled.
     """
     facts, shape = data.site.target, data.target.shape[1:]
     if len(np.unique(data.moving[: 20 * LEAST], axis=0)) < LEAST:
@@ -47,11 +47,7 @@ def mark_constants(data: Measurements, notes: list[str]) -> Measurements:
         notes += [Caution(f"all rows {who}are the same: are they measurements?")]
     alive = [entries for t, entries in constant.items() if t not in stuck]
     common = np.asarray(np.array(alive or [np.zeros(shape)]).all(axis=0))
-    if not common.any() or facts.is_level:
-        return data
-    if facts.is_image:
-        pixels = list_first([f"({row}, {column})" for row, column in np.argwhere(common)])
-        notes.append(f"{common.sum()} of {common.size} pixels are constant over all rows: {pixels}")
+    if not common.any() or not facts.is_complex:
         return data
     antennas = np.asarray(common.all(axis=1))
     tones = np.asarray(common[~antennas].all(axis=0))

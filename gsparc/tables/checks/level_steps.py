@@ -4,26 +4,28 @@ another antenna.
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.data.spacing import neighbour_distance
 from gsparc.processes.few_rows import evenly_spaced
-from gsparc.processes.level_field import NUGGETS, fit_level_field
+from gsparc.processes.level_field import fit_level_field
+from gsparc.tables.advice import MOST_ROWS, LevelsAtPlaces, is_better_parted
+from gsparc.tables.checks.link_levels import UNNAMED, LinkLevels
 
-MOST_BLOCKS = 1000  # of rows; the cost is their cube: 0.3 s
-LIKELIHOOD_BLOCKS = 300  # that choose the length of correlation
+MOST, LEAST = 600, 200  # rows of a station, of many stations; the cost is their cube
 MOST_STEPS = 3
+AROUND = MOST_ROWS // 2  # rows before and after a step that it is tried on
 LEAST_ROWS = 60
 SHORTEST = 1 / 20  # part of a station's rows between two steps
 LEAST_DB = 10.0  # smaller ones are common between campaigns, and cost a model little
-LEAST_SIGMAS = 6.0  # of the estimate; shadowing is not Gaussian, and every row is tried
-FAR_M = 1e9  # between devices, which share no place
 # Usual steps that rows of one place lie apart at most; of them before and after a step that tell
 SAME_PLACE, LEAST_PAIRS = 3.0, 5
+FAR_M = 1e9  # between devices, which share no place
+LEAST_SIGMAS = 6.0  # of the estimate; shadowing is not Gaussian, and every row is tried
 
 
 @dataclass(frozen=True)
@@ -41,13 +43,75 @@ class LevelStep:
     change_db: float
 
 
+def find_level_steps(levels: LinkLevels) -> list[tuple[int, LevelStep]]:
+    """Return stations and their steps, which name rows of `levels`,
+    where levels that are left out are predicted better with a station from the step on,
+    and one device sees the step at the same places.
+    """
+    steps = list[tuple[int, LevelStep]]()
+    most = int(np.clip(20 * MOST / max(len(levels.names), 1), LEAST, MOST))
+    for t, used in levels.heard() if levels.ordered else ():
+        position, level = levels.position[used], levels.level_db[used]
+        candidates = detect_level_steps(position, level, levels.station_position[t], most)
+        edges = [0, *(step.first for step in candidates), len(used)]
+        for step, start, end in zip(candidates, edges, edges[2:], strict=False):
+            near = np.arange(len(used))[max(step.first - AROUND, 0) : step.first + AROUND]
+            links = LevelsAtPlaces(position[near], np.zeros(len(near), np.int64), level[near])
+            device = None if levels.device is None else levels.device[used]
+            again = _seen_again(position, level, device, step, slice(start, end))
+            if again and is_better_parted(links, near >= step.first):
+                named = replace(step, last=int(used[step.last]), first=int(used[step.first]))
+                steps.append((t, named))
+    return steps
+
+
+def _seen_again(
+    position: np.ndarray,
+    level_db: np.ndarray,
+    device: np.ndarray | None,
+    step: LevelStep,
+    part: slice,
+) -> bool:
+    """Whether rows `part` of one device at one place before and after a step differ by as much."""
+    number = np.zeros(len(position)) if device is None else device
+    place = np.c_[position, FAR_M * number]
+    rows = np.arange(len(place))[part]
+    before, after = rows[rows < step.first], rows[rows >= step.first]
+    apart, nearest = cKDTree(place[before]).query(place[after])
+    change = level_db[after] - level_db[before[nearest]]
+    same = apart <= SAME_PLACE * neighbour_distance(place)
+    seen = float(np.median(change[same])) if same.sum() >= LEAST_PAIRS else 0.0
+    return bool(np.sign(step.change_db) * seen >= LEAST_DB / 2)
+
+
+def step_warnings(levels: LinkLevels, steps: Sequence[tuple[int, LevelStep]]) -> list[str]:
+    """Warn of stations whose level changes at a row, unexplained by places."""
+    names, rows, warnings = levels.names, levels.rows, []
+    for t in dict.fromkeys(t for t, _ in steps):
+        who = f"station {names[t]}" if len(names) > 1 else "the level"
+        station_steps = [step for station, step in steps if station == t]
+        change = " and ".join(
+            f"{'rises' if step.change_db > 0 else 'falls'} by {abs(step.change_db):.0f} dB between "
+            f"{rows[step.last]} and {rows[step.first]}"
+            for step in station_steps
+        )
+        first = ",".join(str(levels.file_row[step.first]) for step in station_steps)
+        setting = (
+            f"'dataset.level_steps={{{levels.keys[t]}:[{first}]}}' (rows from 0) makes it another"
+        )
+        setting = "" if names[t] == UNNAMED else f" {setting} station from there on"
+        warnings.append(
+            f"{who} {change}, which the places do not explain: another gain or antenna?{setting}"
+        )
+    return warnings
+
+
 def detect_level_steps(
     position: np.ndarray,
     level_db: np.ndarray,
     station_position: np.ndarray | None = None,
-    most_blocks: int = MOST_BLOCKS,
-    device: np.ndarray | None = None,
-) -> tuple[LevelStep, ...]:
+    most: int = MOST,
+) -> list[LevelStep]:
     """Find where the level of one station changes though the places do not explain it.
 
     The level is a line in the logarithm of the distance, plus a field
@@ -55,108 +119,55 @@ def detect_level_steps(
     generalised least-squares estimate and its variance follow from two cumulative sums of the
     inverse covariance; the largest is kept, and the search repeated with it, like binary
     segmentation (Scott and Knott, Biometrics 30, 1974).
-    Places seen before and after a step count most, as they should; one that the same device does
-    not see there is no step.
+    Places seen before and after a step count most, as they should.
 
     Args:
         position: (n, 2) or (n, 3) [m], in the order of measuring.
         level_db: (n,) [dB], NaN where there is none.
-        station_position: (2,) or (3,) [m]; None: the level is not tied to a distance.
-        most_blocks: rows are averaged to at most so many (median), against outliers and for speed.
-        device: (n,) labels of what measured; None: one.
+        station_position: (2,) or (3,) [m]; None, or NaN: the level is not tied to a distance.
+        most: rows that are looked at.
     """
     rows = np.flatnonzero(np.isfinite(level_db))
-    if len(rows) < LEAST_ROWS or not np.ptp(position[rows], axis=0).any():
-        return ()
-    blocks = _blocks(rows, most_blocks)
-    places = np.array([np.median(position[b], axis=0) for b in blocks])
-    level = np.array([np.median(level_db[b]) for b in blocks])
-    if not np.ptp(level):
-        return ()
-    mean: list[np.ndarray] = []
-    if station_position is not None:
+    rows = rows[evenly_spaced(len(rows), most)]
+    places, level, mean = position[rows], level_db[rows], list[np.ndarray]()
+    if len(rows) < LEAST_ROWS or not np.ptp(places, axis=0).any() or not np.ptp(level):
+        return []
+    if station_position is not None and np.isfinite(station_position).all():
         distance = np.linalg.norm(places - np.asarray(station_position)[: places.shape[1]], axis=1)
         mean.append(np.log10(np.maximum(distance, np.ptp(places, axis=0).max() / 300)))
-    some = evenly_spaced(len(level), LIKELIHOOD_BLOCKS)
-    # Medians of rows hold less noise than rows do.
-    of_some = places[some], level[some], np.zeros(len(some)), [column[some] for column in mean]
-    field = fit_level_field(*of_some, nuggets=NUGGETS[:-1])
-    precision, regressors = field.precision(places), np.column_stack([np.ones(len(level)), *mean])
-    steps = [
-        LevelStep(int(blocks[k - 1][-1]), int(blocks[k][0]), float(change))
-        for k, change in zip(*_search(precision, level, regressors), strict=True)
-        if abs(change) >= LEAST_DB
-    ]
-    steps.sort(key=lambda step: step.first)
-    edges = [0, *(step.first for step in steps), len(position)]
-    around = zip(steps, edges, edges[2:], strict=False)
-    place = (
-        position
-        if device is None
-        else np.c_[position, np.unique(device, return_inverse=True)[1] * FAR_M]
-    )
-    return tuple(
-        step for step, start, end in around if _seen_again(place, level_db, rows, step, start, end)
-    )
-
-
-def _seen_again(
-    place: np.ndarray, level_db: np.ndarray, rows: np.ndarray, step: LevelStep, start: int, end: int
-) -> bool:
-    """Whether rows at one place before and after a step, from `start` to `end`, differ by it."""
-    before, after = (
-        rows[(rows >= start) & (rows <= step.last)],
-        rows[(rows >= step.first) & (rows < end)],
-    )
-    apart, nearest = cKDTree(place[before]).query(place[after])
-    same = apart <= SAME_PLACE * neighbour_distance(place[rows])
-    change = level_db[after] - level_db[before[nearest]]
-    if same.sum() < LEAST_PAIRS:
-        return False
-    seen = float(np.median(change[same])) * np.sign(step.change_db)
-    return seen >= LEAST_DB
-
-
-def _blocks(rows: np.ndarray, most: int) -> list[np.ndarray]:
-    """Consecutive rows in at most about `most` groups, none across a gap."""
-    size = max(3, math.ceil(len(rows) / most))  # a median of three does not see a single wrong row
-    pieces = np.split(rows, np.flatnonzero(np.diff(rows) > 10 * size) + 1)
+    field = fit_level_field(places, level, np.zeros(len(level)), mean)
+    regressors = np.column_stack([np.ones(len(level)), *mean])
+    after, change = _search(field.precision(places), level, regressors)
     return [
-        block for piece in pieces for block in np.array_split(piece, math.ceil(len(piece) / size))
+        LevelStep(int(rows[k - 1]), int(rows[k]), float(by))
+        for k, by in sorted(zip(after, change, strict=True))
+        if abs(by) >= LEAST_DB
     ]
 
 
 def _search(
     precision: np.ndarray, level: np.ndarray, regressors: np.ndarray
 ) -> tuple[list[int], np.ndarray]:
-    """First blocks after steps of `LEAST_SIGMAS` and more,
+    """First rows after steps of `LEAST_SIGMAS` and more,
     and estimates [dB] of all of them together.
     """
-    count = len(level)
-    margin = max(3, int(SHORTEST * count))
-    after: list[int] = []
+    margin, after, change = max(3, int(SHORTEST * len(level))), list[int](), np.zeros(0)
     for _ in range(MOST_STEPS):
-        after.append(_best(precision, level, regressors, after, margin))
-        # The first was found without the others
-        for i in range(len(after)) if len(after) > 1 else ():
-            others = after[:i] + after[i + 1 :]
-            after[i] = _best(precision, level, regressors, others, margin)
-    while True:
-        design = np.column_stack([regressors, *(_step(count, k) for k in after)])
+        longer = [*after, _best(precision, level, regressors, after, margin)]
+        design = np.column_stack([regressors, *(_step(len(level), k) for k in longer)])
         covariance = np.linalg.pinv(design.T @ precision @ design)
-        change = (covariance @ (design.T @ (precision @ level)))[regressors.shape[1] :]
-        deviation = np.sqrt(np.diag(covariance)[regressors.shape[1] :].clip(1e-300))
-        # A step that is none takes from its neighbours: without it the others are estimated again.
-        sigmas = np.abs(change) / deviation
-        if not after or sigmas.min() >= LEAST_SIGMAS:
-            return after, change
-        after.pop(int(sigmas.argmin()))
+        estimate = covariance @ (design.T @ (precision @ level))
+        deviation = np.sqrt(np.diag(covariance).clip(1e-300))
+        if abs(estimate[-1]) < LEAST_SIGMAS * deviation[-1]:
+            break
+        after, change = longer, estimate[regressors.shape[1] :]
+    return after, change
 
 
 def _best(
     precision: np.ndarray, level: np.ndarray, mean: np.ndarray, steps: list[int], margin: int
 ) -> int:
-    """The block after the most significant step, besides `steps`."""
+    """The row after the most significant step, besides `steps`."""
     count = len(level)
     design = np.column_stack([mean, *(_step(count, k) for k in steps)])
     weighed = precision @ design

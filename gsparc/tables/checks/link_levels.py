@@ -13,10 +13,8 @@ from scipy.spatial.distance import cdist
 
 from gsparc.data.blocks import rows_by
 from gsparc.data.schema import Measurements
-from gsparc.data.selection import FROM_ROW
 from gsparc.physics.decibels import to_decibels
 from gsparc.processes.few_rows import evenly_spaced
-from gsparc.tables.links.strongest import ALONE
 
 # Moves of which that share lead to a place nearer than all but a tenth of the others are an order;
 # of a few places, to one of the nearest; changes of place that tell, and that are looked at
@@ -27,7 +25,7 @@ UNNAMED = "the station"  # a single one, of a file without stations
 
 @dataclass(frozen=True)
 class LinkLevels:
-    """One row for every measurement, and for every place and station without one.
+    """One row for every measurement.
 
     Attributes:
         position: (n, 3) of the moving end, in the world [m].
@@ -38,8 +36,6 @@ class LinkLevels:
         names: (T,) of the stations, for people.
         keys: (T,) as settings take them.
         station_position: (T, 3), in the world [m]; NaN where it is not known.
-        limited: stations with rows below a level of hearing that the file states, or that lists
-            leave out.
         device: (n,) int64, what measured a row; None where nothing tells.
     """
 
@@ -51,7 +47,6 @@ class LinkLevels:
     names: list[str]
     keys: list[str]
     station_position: np.ndarray
-    limited: frozenset[int] = frozenset()
     device: np.ndarray | None = None
 
     @cached_property
@@ -86,43 +81,13 @@ def link_levels(data: Measurements, file_row: np.ndarray | None = None) -> LinkL
     site = data.site
     if not site.maps_levels:
         return None
-    stations, station = site.every_station, data.stations_of()
-    place = np.arange(len(data)) if data.place is None else data.place
-    _, first, which = np.unique(place, return_index=True, return_inverse=True)
-    count = len(stations)
+    stations = site.every_station
     with np.errstate(divide="ignore"):
         level = to_decibels(data.powers()[:, 0])
-    link, called = which.reshape(-1) * count + station, data.row_names
-    side = data.censored_side()
-    rows = np.flatnonzero(side <= 0)
-    # Lists end at their weakest, of several levels: what piles up there is no receiver's noise.
-    floors = np.unique(np.stack([station, level], 1)[side > 0], axis=0)
-    floor_known = "sensitivity_db" in data.provenance or len(floors) > len(np.unique(floors[:, 0]))
-    limited = frozenset(floors[:, 0].astype(int).tolist() if floor_known else ())
-    absent = np.zeros(0, np.int64)
-    # What was not heard is known to be weak, or was said to be unknown, which `links.absent`
-    # judges; a file with a station for each place, as of serving cells, has no empty cells.
-    absence_stated = data.censored is not None or data.provenance.get("absent") == "unknown"
-    if not absence_stated and np.mean(np.bincount(np.unique(link) // count) == 1) < ALONE:
-        absent = np.setdiff1d(np.arange(len(first) * count), link)
-    parts = [name.split(FROM_ROW) for name in stations.name]
-    for t in [
-        t for t, (name, *_) in enumerate(parts) if sum(name == other for other, *_ in parts) > 1
-    ]:
-        # A part of a station is not absent before its first row or after its last.
-        at, visits = absent // count, which[station == t]
-        within = (at > visits.min(initial=len(first))) & (at < visits.max(initial=0))
-        absent = absent[(absent % count != t) | within]
-    order = np.argsort(np.concatenate([rows, first[absent // count]]), kind="stable")
-    of_row = np.concatenate([rows, first[absent // count]])[order]
-    of_link = np.concatenate([station[rows], absent % count])[order]
-    levels = np.concatenate([level[rows], np.full(len(absent), np.nan)])[order]
-    of_file = [called[i].partition(", station")[0] for i in of_row]
+    rows = np.flatnonzero(data.censored_side() <= 0)
+    of_file = [data.row_names[i].partition(", station")[0] for i in rows]
     names, keys = ([name or UNNAMED for name in names] for names in (stations.shown, stations.name))
-    number = of_row if file_row is None else file_row[of_row]
-    place = data.moving[of_row] + site.origin
-    positions = stations.position + site.origin
-    device = None if data.device is None else data.device[of_row]
-    return LinkLevels(
-        place, of_link, levels, of_file, number, names, keys, positions, limited, device
-    )
+    number = rows if file_row is None else file_row[rows]
+    place, positions = data.moving[rows] + site.origin, stations.position + site.origin
+    station, device = data.stations_of()[rows], None if data.device is None else data.device[rows]
+    return LinkLevels(place, station, level[rows], of_file, number, names, keys, positions, device)

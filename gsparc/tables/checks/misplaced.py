@@ -15,8 +15,7 @@ from gsparc.tables.checks.link_levels import LinkLevels
 # Places where a site was heard, that tell; those, and sites, looked at
 LEAST, MOST, SITES = 20, 100, 100
 CLEAR = math.log(1e12)  # ratio of likelihoods: shadowing is not Gaussian
-# The same of kilometres: few sites stand within a thousandth of the reach of 0, 0
-LIKELY = math.log(30)
+LIKELY = math.log(30)  # that a site's levels speak against a shift of all, at most
 FEW = 3  # sites at places of others: of two a hill may be the reason
 # A tenth of a site's levels lies about it, its beams ahead of it
 STRONG, SHARES = 10, (1, 0.75, 0.5)
@@ -24,8 +23,7 @@ SLOPES = -60.0, -10.0  # of levels over the logarithm of the distance [dB]
 
 
 def misplaced_warnings(levels: LinkLevels) -> list[str]:
-    """Warn of sites whose levels tell other places: each other's, shifted ones,
-    or their own in kilometres.
+    """Warn of sites whose levels tell other places: each other's, or shifted ones.
 
     Of the sectors of a site the strongest counts, so that no beam makes up for a distance.
     """
@@ -43,25 +41,17 @@ def misplaced_warnings(levels: LinkLevels) -> list[str]:
     shift = np.median(strong - where[[*heard]], axis=0) * [1, 1, 0] if heard else np.zeros(3)
     shifts = shift * np.array(SHARES)[:, None]
     gains, shifted = np.full((len(where),) * 2, -np.inf), np.zeros(len(SHARES))
-    names, kilometres = [levels.names[t] for t in first], list[str]()
+    names, warnings = [levels.names[t] for t in first], list[str]()
     for number, rows in heard.items():
         some = np.random.default_rng(0).permutation(rows)[:MOST]
-        places = np.vstack(
-            [where[number], where[number] * [1e3, 1e3, 1], where[number] + shifts, where[finite]]
-        )
+        places = np.vstack([where[number], where[number] + shifts, where[finite]])
         gain = _gains(levels.position[some], levels.level_db[some], places)
-        kilometres += [names[number]] * bool(gain[0] > LIKELY)
-        shifted += np.maximum(gain[1 : 1 + len(SHARES)], -LIKELY)
+        shifted += np.maximum(gain[: len(SHARES)], -LIKELY)
         # Each that is tried may fit by chance.
-        gains[number, finite] = gain[1 + len(SHARES) :] - math.log(len(where))
+        gains[number, finite] = gain[len(SHARES) :] - math.log(len(where))
     gains[np.diag_indices(len(where))] = 0
-    who = list_first(kilometres)
-    finding = (
-        f"levels of {who} fall with distance from a place a thousand times as far: is it "
-        "in kilometres?"
-    )
     stated, likely = linear_sum_assignment(gains, maximize=True)
-    warnings, moved = [finding] * bool(kilometres), np.flatnonzero(stated != likely)
+    moved = np.flatnonzero(stated != likely)
     exchanged = gains[stated, likely].sum()
     if shifted.max() > max(CLEAR, exchanged) and len(heard) >= FEW:
         x, y, _ = shifts[shifted.argmax()]

@@ -111,17 +111,9 @@ def add_unlisted(
         how += f", in lists shorter than {lists.length}: "
         how += "unknown, strong ones are lost there" if is_lossy else f"below {floor.min():.4g} dB"
     if absent not in ("auto", "weaker"):
-        does = "unlisted ones are predicted too high, and figures of listed rows do not show it"
-        if absent == "silent":
-            weakest = np.nanmin(lists.level[lists.full], 1)
-            does = f"what full lists leave out is below their weakest ({weakest.min():.4g} to "
-            does += (
-                f"{weakest.max():.4g} dB), not all below {np.nanmin(floor):.4g}: predictions "
-                "are too low"
-            )
-        check.notes.append(
-            Severe(f"{missing} with dataset.absent={absent}: {does}; leave absent out")
-        )
+        text = f"{missing} with dataset.absent={absent}: unlisted ones are predicted too "
+        text += "high, or too low (silent), and figures of listed rows do not show it"
+        check.notes.append(Severe(f"{text}; leave absent out"))
         return 0
     most, all_below = UNLISTED_EACH * len(heard), int(may.sum())
     of_list, station, below = lists.bound_unlisted(floor, most, may)

@@ -15,13 +15,13 @@ from gsparc.data.blocks import is_big
 from gsparc.data.schema import OTHER, Links
 from gsparc.data.selection import take_rows
 from gsparc.physics.decibels import to_decibels
+from gsparc.tables.array_checks import MOST_DB
 from gsparc.tables.checks.plausibility import APART_DB, find_marks, find_saturation
-from gsparc.tables.own_checks import MOST_DB, Checker
+from gsparc.tables.own_checks import Checker
 
 POWERS = ("rssi", "rssi_db")
 BESIDE, LEAST_MARKS = 6, 12  # rows around a mark; marks that tell
 WEAK_SHARE = 0.62  # of marks beside rows that are weaker than half of the station's: not heard
-FAR_BELOW_DB = 20.0  # the weakest power heard: a receiver that could hear less would have somewhere
 
 
 def _are_levels(value: Any) -> bool:
@@ -83,7 +83,7 @@ def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) 
         if floor is not None:
             # Of what is marked as not heard the weakest bounds it where no level is stated.
             floor = np.where(unheard & np.isnan(floor), heard.min(initial=np.inf), floor)
-            unknown |= _below_floor(check, values, floor, ~unknown & marked, unknown & marked)
+            unknown |= _below_floor(check, values, floor, ~unknown & marked)
             censored = unknown & marked & ~np.isnan(floor)
         elif unheard.any() and len(heard):
             floor, censored = np.full(len(values), heard.min()), unheard
@@ -146,24 +146,13 @@ def _stated_floor(check: Checker, measured: str, values: np.ndarray) -> np.ndarr
 
 
 def _below_floor(
-    check: Checker, values: np.ndarray, floor: np.ndarray, known: np.ndarray, silent: np.ndarray
+    check: Checker, values: np.ndarray, floor: np.ndarray, known: np.ndarray
 ) -> np.ndarray:
-    """Which of known values (S,) lie below a level of hearing (S,), (S,) bool;
-    one far below all is noted.
-    """
+    """Which of known values (S,) lie below a level of hearing (S,), (S,) bool."""
     below = known & (values < floor)
     if below.any():
         share = f"{below.sum()} of {known.sum()} levels lie below sensitivity_db"
         check.notes.append(Caution(f"{share}: taken as not heard; has it the unit of the levels?"))
-    highest = np.fmax.reduce(floor[silent | below], initial=-np.inf)
-    # Whole numbers know no infinity
-    weakest = values[known & ~below].astype(float).min(initial=np.inf)
-    if FAR_BELOW_DB < weakest - highest < np.inf:
-        check.notes.append(
-            f"sensitivity_db={highest:.4g} is {weakest - highest:.0f} dB below the weakest power "
-            "heard: "
-            "is it the receiver's? places where nothing was heard count as weaker still"
-        )
     return below
 
 

@@ -8,7 +8,7 @@ from towns import ORIGIN, town_model, town_on_earth
 
 import gsparc
 from gsparc.apps.maps import predict_map
-from gsparc.apps.maps.field_map import NO_CLASS, check_geotiff, write_classes, write_geotiff
+from gsparc.apps.maps.geotiff import NO_CLASS, check_geotiff, write_classes, write_geotiff
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.base.errors import DataError
 
@@ -36,7 +36,7 @@ def test_a_polygon_in_degrees_comes_back_as_the_same_cells(tmp_path):
     found = predict_map(predictor, tmp_path / "area.geojson", step_m=1.0)
     write_geotiff(tmp_path / "map.tif", found)
     with rasterio.open(tmp_path / "map.tif") as file:
-        assert file.descriptions[0] == "power_db" and file.count == 11
+        assert file.descriptions[0] == "power_db" and file.count == 12
         units = dict(zip(file.descriptions, file.units, strict=True))
         assert units["upper_db"] == found.unit and units["sinr_db"] == "dB" and not units["outage"]
         power = file.read(1)
@@ -106,7 +106,7 @@ def test_degrees_for_a_model_in_metres_were_a_speck_of_its_map(tmp_path):
 
 
 def test_asked_for_without_rasterio(monkeypatch):
-    monkeypatch.setattr("gsparc.apps.maps.field_map.find_spec", lambda name: None)
+    monkeypatch.setattr("gsparc.apps.maps.geotiff.find_spec", lambda name: None)
     with pytest.raises(DataError, match="needs rasterio"):
         check_geotiff(True)
     assert not check_geotiff(None) and not check_geotiff(False)

@@ -10,8 +10,8 @@ from matplotlib.image import imread
 from towns import town_on_earth
 
 from gsparc.apps.maps.kmz import NAMESPACE, write_kmz
+from gsparc.apps.maps.layers import list_layers
 from gsparc.apps.maps.making import predict_map
-from gsparc.apps.maps.pictures import list_layers
 
 
 def test_an_image_has_each_cells_colour_where_the_cell_lies(tmp_path):

@@ -16,18 +16,18 @@ from scipy.stats import norm
 from towns import MASTS, town_model
 
 import gsparc
-from gsparc.apps.maps import field_map, pictures, plan_measurements
-from gsparc.apps.maps.field_map import (
+from gsparc.apps.maps import layers, pictures, plan_measurements, plan_pictures, strongest
+from gsparc.apps.maps.layers import Layer, Legend, assign_colours, label_places, list_layers
+from gsparc.apps.maps.making import _hearing_floors, choose_stations, predict_map
+from gsparc.apps.maps.promise import Promise, map_notes
+from gsparc.apps.maps.refining import sample_adaptively
+from gsparc.apps.maps.strongest import (
     REFUSED,
     best_server,
     read_loads,
     server_chance,
     sinr,
 )
-from gsparc.apps.maps.making import _hearing_floors, choose_stations, predict_map
-from gsparc.apps.maps.pictures import Layer, Legend, assign_colours, label_places, list_layers
-from gsparc.apps.maps.promise import Promise, map_notes
-from gsparc.apps.maps.refining import sample_adaptively
 from gsparc.base.errors import DataError
 from gsparc.data.georeference import Georeference
 from gsparc.data.splits import Fold
@@ -168,7 +168,7 @@ def test_coverage_counted_the_named_station_alone():
     power, error, below = np.array([[-100.0], [-100.0]]), np.full((2, 1), 6.0), np.array([0.5])
 
     def found(*alike):
-        return field_map.outage_probability(power, error, -100.0, np.array(alike)[:, None], below)[
+        return strongest.outage_probability(power, error, -100.0, np.array(alike)[:, None], below)[
             0
         ]
 
@@ -228,8 +228,10 @@ def test_a_station_was_named_best_where_nothing_was_known_or_above_the_floor(pre
     assert (
         not quiet.unsure.any() and loud.unsure.all() and loud.summarise()["map/server_unsure"] == 1
     )
-    unsure = {layer.name: layer.unsure for layer in list_layers(loud)}
-    assert unsure["best_server"] is not None and unsure["power"] is None
+    doubts = {layer.name: layer.doubts for layer in list_layers(loud)}
+    (other, *_), (silent, *_) = doubts["best_server"]
+    # None is heard: that another cell led was said of all of it.
+    assert silent.all() and not other.any() and not doubts["power"]
 
 
 def test_the_floor_of_a_station_is_its_level_or_what_was_weakest():
@@ -283,12 +285,15 @@ def test_interpolated_cells_are_as_exact_as_asked_for():
 
     inside = np.ones((150, 200), bool)
     inside[100:, :60] = False
-    every, count = sample_adaptively(ask, inside, 1, 0.1)
-    few, asked = sample_adaptively(ask, inside, 4, 0.1)
-    assert count == inside.sum() and asked < 0.2 * count
+    none = np.zeros_like(inside)
+    every, count = sample_adaptively(ask, inside, lambda v: 0.1 + 0 * v, none, 1)
+    few, asked = sample_adaptively(ask, inside, lambda v: 0.1 + 0 * v, none)
+    assert count == inside.sum() and asked < 0.3 * count, asked / count
     assert np.array_equal(np.isnan(few), np.isnan(every)) and np.nanmax(np.abs(few - every)) < 0.1
-    exact, asked = sample_adaptively(ask, inside, 4, 1e-6)
+    exact, asked = sample_adaptively(ask, inside, lambda v: 1e-6 + 0 * v, none)
     assert asked > 0.9 * count and np.nanmax(np.abs(exact - every)) < 1e-4
+    sure, _ = sample_adaptively(ask, inside, lambda v: np.inf + 0 * v, inside)
+    assert np.array_equal(sure, every, equal_nan=True)
 
 
 @pytest.mark.slow
@@ -334,12 +339,13 @@ def test_a_noise_of_a_billion_decibels_overflowed(predictor):
 def drawn(monkeypatch):
     """Figures, which are not written."""
     figures: list[Figure] = []
-    monkeypatch.setattr(pictures, "save", lambda figure, path, dpi: figures.append(figure))
+    for module in (pictures, plan_pictures):
+        monkeypatch.setattr(module, "save", lambda figure, path, dpi: figures.append(figure))
     return figures
 
 
 def draw(field, name):
-    (layer,) = [one for one in pictures.list_layers(field) if one.name == name]
+    (layer,) = [one for one in layers.list_layers(field) if one.name == name]
     pictures.draw_layer(field, layer, "unused.png", "")
 
 
@@ -351,7 +357,7 @@ def test_axes_of_a_map_were_metres_from_an_origin_that_they_did_not_name(
         predictor, "site", replace(predictor.site, georeference=Georeference(47.2, 11.3))
     )
     draw(predict_map(predictor, step_m=4.0), "power")
-    pictures.draw_measurement_plan(
+    plan_pictures.draw_measurement_plan(
         plan_measurements(predictor, 2), "unused.png", None, predictor, None
     )
     said = [figure.axes[0].get_xlabel() for figure in drawn]
@@ -361,10 +367,10 @@ def test_axes_of_a_map_were_metres_from_an_origin_that_they_did_not_name(
 def test_a_legend_of_ten_cells_did_not_say_that_others_serve_less(drawn, predictor):
     field = predict_map(predictor, step_m=4.0)
     number = np.arange(field.grid.inside.size).reshape(field.grid.inside.shape) % 24
-    layer = pictures.Layer(
+    layer = layers.Layer(
         "best_server",
         1.0 * number,
-        pictures.Legend("", -0.5, 23.5),
+        layers.Legend("", -0.5, 23.5),
         tuple("abcdefghijklmnopqrstuvwx"),
     )
     pictures.draw_layer(field, layer, "unused.png", "")
@@ -375,10 +381,10 @@ def test_a_legend_of_ten_cells_did_not_say_that_others_serve_less(drawn, predict
 def test_a_legend_of_twelve_cells_left_two_out(drawn, predictor):
     field = predict_map(predictor, step_m=4.0)
     number = np.arange(field.grid.inside.size).reshape(field.grid.inside.shape) % 12
-    legend = pictures.Legend("", -0.5, 11.5)
+    legend = layers.Legend("", -0.5, 11.5)
     pictures.draw_layer(
         field,
-        pictures.Layer("best_server", 1.0 * number, legend, tuple("abcdefghijkl")),
+        layers.Layer("best_server", 1.0 * number, legend, tuple("abcdefghijkl")),
         "unused.png",
         "",
     )
@@ -386,9 +392,10 @@ def test_a_legend_of_twelve_cells_left_two_out(drawn, predictor):
     assert {*"abcdefghijkl"} <= {*words} and not any("more" in word for word in words)
 
 
-def test_the_curve_of_a_plan_was_a_flat_line(drawn, predictor):
-    """Its axis began at 0 dB."""
+def test_a_fall_of_a_tenth_of_a_decibel_looked_like_one_to_nothing(drawn, predictor):
+    """The curve of a plan began at its own least; its ends are written beside it."""
     plan = plan_measurements(predictor, 4)
-    pictures.draw_measurement_plan(plan, "unused.png", None, predictor, None)
-    low, high = drawn[0].axes[2].get_ylim()
-    assert high - low < 1.5 * (plan.before_db - plan.after_db)
+    plan_pictures.draw_measurement_plan(plan, "unused.png", None, predictor, None)
+    curve = drawn[0].axes[-1]
+    assert curve.get_ylim()[0] == 0 and curve.get_ylim()[1] > plan.before_db
+    assert f"{plan.after_db:.2f} dB" in [text.get_text() for text in curve.texts]

@@ -9,7 +9,7 @@ from towns import town_model
 
 import gsparc
 from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances, weigh_goal
-from gsparc.apps.maps.planning import plan_measurements
+from gsparc.apps.maps.planning import find_neighbours, plan_measurements
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import StreetGraph, Tour, Ways
 from gsparc.base.errors import DataError
@@ -75,6 +75,16 @@ def test_corridors_and_a_length(tmp_path, predictor):
         predictor, 10, walkable=tmp_path / "corridor.geojson", start=[5, 5], route_m=30
     )
     assert short.length_m <= 30 and len(short.places) >= 1
+
+
+def test_places_of_a_plan_were_two_lumps(predictor):
+    """35 m apart on a campus; they are no nearer than half of what even ones are."""
+    places = plan_measurements(predictor, 12, [-40, 0, 80, 60], route=False).places[:, :2]
+    apart = cKDTree(places).query(places, k=2)[0][:, 1]
+    assert apart.min() > 0.25 * np.sqrt(120 * 60 / 12)
+    corners = np.array([[0.0, 0], [1, 0], [10, 0], [11, 0]])
+    near = find_neighbours(corners, 2)
+    assert near[0].tolist() == [True, True, False, False]
 
 
 def test_places_lie_in_the_polygon_that_can_be_walked(tmp_path):

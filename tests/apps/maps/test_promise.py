@@ -45,7 +45,7 @@ def test_intervals_of_thirty_towns_hold_measurements_as_often_as_promised_and_fi
         (fold,) = make_split(data.moving, cut).folds
         method, context = GaussianProcess(), FitContext(seed=seed)
         method.fit(data, fold, context)
-        learned = Learned(method, GaussianProcess, data, fold, context)
+        learned = Learned(method, GaussianProcess(), data, fold, context)
         promise = gather_promise(learned, PromiseSettings(seed=seed))
         tried = held_out_levels(method, data, fold, fold.test)
         far, half = tried.distance, promise.calibration(SHARE).half_of(tried)
@@ -81,7 +81,7 @@ def test_a_map_of_sixty_rows_was_refused():
     method = GaussianProcess()
     method.fit(data, fold, context)
     promise = gather_promise(
-        Learned(method, GaussianProcess, data, fold, context), PromiseSettings()
+        Learned(method, GaussianProcess(), data, fold, context), PromiseSettings()
     )
     assert len(promise.evidence) >= 100 and cross_validate(promise.evidence, SHARE).share > 0.8
 

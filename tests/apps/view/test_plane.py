@@ -4,7 +4,7 @@ import numpy as np
 from campaigns import channels
 from towns import trained
 
-from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.maps.layers import Legend
 from gsparc.apps.view.answer import predict_answer
 from gsparc.apps.view.plane import plane_sheet, refine_plane, weakest_place
 from gsparc.apps.view.site_view import lay_power_plane

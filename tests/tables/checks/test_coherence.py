@@ -8,7 +8,7 @@ import packets
 import pytest
 
 from gsparc.base.limits import SettingError
-from gsparc.tables.checks.coherence import estimate_coherence, place_warnings, set_unknown_factor
+from gsparc.tables.checks.coherence import estimate_coherence, set_unknown_factor
 from gsparc.tables.own import interpret
 from gsparc.tables.raw import Raw
 
@@ -104,25 +104,3 @@ def test_a_gain_for_each_packet_was_told_from_fifteen_pairs_that_fade():
         15: "phase",
         300: "phase+gain",
     }
-
-
-@pytest.mark.parametrize("shape", [(1, 8), (4, 1), (1, 1)])
-@pytest.mark.parametrize("noise, told", [(0.1, False), (0.5, False), (30.0, True)])
-def test_rows_of_one_place_that_do_not_agree_were_good(shape, noise, told):
-    """21 places of Bluetooth packets, each row another channel: `check` said good."""
-    rng = np.random.default_rng(0)
-    where, place = rng.uniform(0, 6, (21, 3)), np.repeat(np.arange(21), 20)
-
-    def draw(count):
-        return rng.normal(size=(count, *shape)) + 1j * rng.normal(size=(count, *shape))
-
-    channel = (1 + 2 * rng.random((21, 1, 1))) * draw(21)
-    turn = np.exp(2j * np.pi * rng.random((len(place), 1, 1)))
-    given = {
-        "rx_position": where[place],
-        "tx_position": np.array([3.0, 3, 2]),
-        "csi": (channel[place] + noise * draw(len(place))) * turn,
-        "frequency_hz": 2.4e9 + 1e6 * np.arange(shape[1]),
-    }
-    found = place_warnings(interpret(Raw(given), "packets").data)
-    assert [text.startswith("rows at one place differ by ") for text in found] == [True] * told

@@ -2,11 +2,8 @@
 
 import numpy as np
 import pytest
-from releases import real
 
-from gsparc.tables.checks.link_levels import link_levels
-from gsparc.tables.checks.plausibility import find_floor_pile, floor_warnings
-from gsparc.tables.own import from_arrays
+from gsparc.tables.checks.plausibility import find_floor_pile
 
 
 def drive(seed: int, count: int = 300) -> np.ndarray:
@@ -46,56 +43,6 @@ def test_a_lowest_reading_of_few_rows_is_found():
     least, after = np.unique(levels)[:2]
     pile = find_floor_pile(levels)
     assert pile is not None and least < pile[0] == after and pile[1] == pytest.approx(0.1, abs=0.01)
-    place, posts = np.random.default_rng(0).uniform(0, 99, (600, 3)), np.eye(30, 3) * 50
-    arrays = {"rx_position": place, "station_position": posts, "station": np.arange(600) % 30}
-    data = from_arrays(arrays | {"rssi_db": levels}, {"absent": "unknown"})
-    (line,) = floor_warnings(link_levels(data))
-    assert line.startswith(
-        f"not heard? 10% of the levels below {said(after)} dB look like a receiver's noise or"
-    )
-
-
-def said(level: float) -> str:
-    """As warnings write a level: hundredths, upwards."""
-    return f"{np.ceil(100 * level) / 100:g}"
-
-
-def told(levels: np.ndarray, **more: object) -> list[str]:
-    """What is said of levels (n, T) of stations."""
-    place, posts = (
-        np.random.default_rng(0).uniform(0, 99, (len(levels), 3)),
-        50 * np.eye(levels.shape[1], 3),
-    )
-    arrays = {"rx_position": place, "station_position": posts, "rssi_db": levels}
-    return floor_warnings(link_levels(from_arrays(arrays | more)))
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_advice_on_a_floor_did_nothing_and_was_given_again(seed):
-    """Rounded to a tenth, `sensitivity_db=-121.2` lay below the lowest reading of -121.24 dB."""
-    levels = np.maximum(drive(seed), np.quantile(drive(seed), 0.5))[:, None]
-    (line,) = told(levels)
-    level = float(line.partition("; sensitivity_db=")[2].split()[0])
-    assert level > levels.min() and told(levels, sensitivity_db=np.array(level)) == []
-
-
-def test_a_stated_floor_was_called_too_low():
-    """Who followed the advice was told of the next station and of a higher level;
-    one not stated is named.
-    """
-    levels = np.stack([noisy(drive(seed), 0.8, seed) for seed in range(2)], 1)
-    low = np.quantile(levels, 0.1, axis=0)
-    assert len(told(levels)) == 1 and told(levels, sensitivity_db=np.array(low.max())) == []
-    (line,) = told(levels, sensitivity_db=np.array([np.nan, low[1]]))
-    assert "levels of station 0 below" in line
-
-
-def test_the_advice_on_a_floor_was_refused_for_files_of_arrays():
-    """`dataset.columns` goes with tables alone; marks named it, too."""
-    (line,) = told(noisy(drive(0), 0.8, 0)[:, None])
-    assert (
-        "; sensitivity_db=-110.49 in the file (of a table dataset.columns.sensitivity_db=-110.49"
-    ) in line
 
 
 def lists(seed: int) -> np.ndarray:
@@ -119,29 +66,3 @@ SOUND = {
 @pytest.mark.parametrize("kind", SOUND)
 def test_no_wolf_without_a_floor(kind):
     assert sum(find_floor_pile(SOUND[kind](seed)) is not None for seed in range(30)) <= 1
-
-
-def test_a_citys_noise_was_learned_as_signal_without_a_word():
-    """Of three stations 60 to 86 % of the levels are the receiver's noise;
-    a hall's sensors have none.
-    """
-
-    def said(name: str) -> list[str]:
-        with np.load(real(f"real/{name}.npz")) as stored:
-            place, post = (
-                np.c_[stored[k], np.zeros((len(stored[k]), 3 - stored[k].shape[1]))]
-                for k in ("mobile_position", "station_position")
-            )
-            arrays = {"tx_position": place, "station_position": post, "rssi_db": stored["rssi_db"]}
-            names = stored["station"] if "station" in stored else np.arange(len(post)).astype(str)
-            levels = link_levels(from_arrays(arrays | {"station_name": names}))
-            return floor_warnings(levels)
-
-    (line,) = said("powder-rss-462mhz")
-    for part in (
-        "not heard? 60% of the levels of station bookstore-nuc2-b210 below -90.63 dB, 86% of",
-        "68% of the levels of station ebc-nuc1-b210",
-        "sensitivity_db=-88.89, or",
-    ):
-        assert part in line
-    assert line.count("% of the levels") == 4 and said("ble-hall-1") == said("ble-hall-2") == []

@@ -13,6 +13,8 @@ FOOT = 0.3048
 WRONG = {
     "static_feet": lambda rows, still: (rows, still / FOOT),
     "moving_feet": lambda rows, still: (rows / FOOT, still),
+    "static_kilometres": lambda rows, still: (rows, still / [1e3, 1e3, 1]),
+    "moving_kilometres": lambda rows, still: (rows / [1e3, 1e3, 1], still),
     "heights_feet": lambda rows, still: (rows / [1, 1, FOOT], still),
     "exchange_xy": lambda rows, still: (rows[:, [1, 0, 2]], still),
 }

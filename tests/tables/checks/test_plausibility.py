@@ -10,7 +10,7 @@ from scipy.spatial.distance import cdist
 
 from gsparc.datasets.own import read_any
 from gsparc.tables.checks import plausibility
-from gsparc.tables.checks.level_steps import detect_level_steps
+from gsparc.tables.checks.level_steps import detect_level_steps, find_level_steps, step_warnings
 from gsparc.tables.checks.link_levels import LinkLevels, link_levels
 from gsparc.tables.checks.unit_warnings import unit_warnings
 from gsparc.tables.own import from_arrays
@@ -47,7 +47,7 @@ def as_links(position, level_db, names, station_position=None) -> LinkLevels:
 
 def warnings_of(levels: LinkLevels | None):
     assert levels is not None
-    return plausibility.sanity_warnings(levels, plausibility.find_level_steps(levels))
+    return plausibility.sanity_warnings(levels, find_level_steps(levels))
 
 
 def room(seed=0, count=100):
@@ -72,12 +72,12 @@ def measured_at(place):
 @pytest.mark.parametrize(
     "position, said",
     [
-        (lambda p: np.round(p * [600, 600, 1]), "whole numbers up to"),
-        (lambda p: p * [1, 1, 1000], "heights differ by"),
-        (lambda p: p / 1000, "if these are kilometres"),
+        (lambda p: np.round(p * [600, 600, 1]), "in millimetres, centimetres or feet?"),
+        (lambda p: p * [1, 1, 1000], "in millimetres, centimetres or feet?"),
+        (lambda p: p / 1000, "in kilometres?"),
         (
             lambda p: p * [300, 300, 1] + 30e3 * np.outer(np.arange(len(p)) % 2, [1, 0, 0]),
-            "reach over",
+            "places fill a box of",
         ),
         (lambda p: np.array([40.76, -111.8, 0]) + p / 1e3, "degrees? then give"),
         (lambda p: p, None),
@@ -115,8 +115,6 @@ def test_sound_degrees():
         (lambda v: 10 ** (v / 10), "or linear (give it as rssi"),
         (lambda v: -v + 40, "losses (store minus them; dataset.columns.rssi_db=HEAD*-1), per cent"),
         (lambda v: np.round((v + 100) / 2), "an index, or linear"),
-        (lambda v: np.where(np.arange(len(v)) == 3, 80, v), "1 levels above 60 dBm, up to 80"),
-        (lambda v: v * 0 - 3, "all levels are -3 dB"),
     ],
 )
 def test_levels(level, said):
@@ -169,31 +167,12 @@ def test_no_wolf_on_thirty_sound_walks():
 
 def test_steps_of_little_input():
     place, level, station = walk(0)
-    assert detect_level_steps(place[:50], level[:50], station) == ()
+    assert detect_level_steps(place[:50], level[:50], station) == []
     assert (
-        detect_level_steps(np.zeros((600, 2)), level) == ()
-        and detect_level_steps(place, level * 0) == ()
+        detect_level_steps(np.zeros((600, 2)), level) == []
+        and detect_level_steps(place, level * 0) == []
     )
-    assert detect_level_steps(place, np.full(600, np.nan)) == ()
-
-
-def test_outages_and_what_was_not_heard():
-    place, level, _ = walk(1)
-    level = np.stack([level, walk(2)[1], walk(5)[1]], axis=1)
-    level[100:160, 0] = np.nan  # off
-    level[:, 1][level[:, 1] < np.percentile(level[:, 1], 30)] = np.nan  # not heard
-    level[[7, 9, 200, 300, 555, 500], 2] = np.nan  # lost
-    found = plausibility.gap_warnings(as_links(place, level, ["a", "b", "c"]))
-    # Of silence nothing is advised: heeded where nobody listened, it costs more than it saves.
-    assert not any("silent" in line or "not heard?" in line for line in found)
-    off = (
-        "no level in the 60 rows from row 100 to row 159 of station a: off, not listed or not heard"
-    )
-    assert found[0].startswith(off)
-    assert "single levels missing of stations b, c: lost, not listed or not measured" in found[-1]
-    assert plausibility.gap_warnings(as_links(place[:4], np.full((4, 1), np.nan), ["a"])) == [
-        "no level in any row"
-    ]
+    assert detect_level_steps(place, np.full(600, np.nan)) == []
 
 
 def campus(stations=slice(None)) -> LinkLevels:
@@ -209,37 +188,15 @@ def campus(stations=slice(None)) -> LinkLevels:
 
 
 def test_a_real_station_that_lost_its_gain():
-    """One of four changes: 17 dB more from row 350 on, 19 dB less from row 1461 on,
+    """One of four changes: 17 dB more from row 350 on, 19 dB less from row 1462 on,
     after it was off.
     """
     some = campus(slice(5, 9))
-    found = plausibility.step_warnings(some, plausibility.find_level_steps(some))
-    # Two lines proposed [350] and [1461], of which the later setting replaces the first.
-    assert len(found) == 1 and "dataset.level_steps={ebc-nuc1-b210:[350,1461]}" in found[0]
-    assert "rises by 17 dB between row 349 and row 350 and falls" in found[0]
-    assert "falls by 19 dB between row 1161 and row 1461" in found[0]
-
-
-def test_real_outages_are_not_taken_for_silence():
-    found = plausibility.gap_warnings(campus())
-    assert sum("off, not listed or not heard" in line for line in found) == 8
-    assert any(
-        "the 811 rows from row 351 to row 1161 of stations bookstore" in line for line in found
-    )
-    assert any(
-        "the 1162 rows from row 0 to row 1161 of station cnode-ustar-dd-b210" in line
-        for line in found
-    )
-    assert not any("sensitivity_db" in line for line in found)
-
-
-def test_a_station_for_each_place_is_no_outage_of_the_others():
-    place, level, station = walk(0, 60)
-    links = {"rx_position": np.column_stack([place, np.ones(60)]), "station": np.arange(60) % 2}
-    posts = np.array([[*station, 5.0], [0.0, 0, 5]])
-    assert not warnings_of(
-        link_levels(from_arrays({**links, "station_position": posts, "rssi_db": level}))
-    )
+    found = step_warnings(some, find_level_steps(some))
+    # Two lines proposed [353] and [1462], of which the later setting replaces the first.
+    assert len(found) == 1 and "dataset.level_steps={ebc-nuc1-b210:[353,1462]}" in found[0]
+    assert "rises by 17 dB between row 345 and row 353 and falls" in found[0]
+    assert "falls by 19 dB between row 1155 and row 1462" in found[0]
 
 
 def test_the_setting_of_a_level_step_named_no_row_of_a_table(tmp_path):
@@ -256,16 +213,14 @@ def test_the_setting_of_a_level_step_named_no_row_of_a_table(tmp_path):
     (tmp_path / "posts.csv").write_text(posts)
     reading = read_any(tmp_path / "walk.csv", stations_file=tmp_path / "posts.csv")
     levels = link_levels(reading.data, reading.file_row)
-    steps = plausibility.find_level_steps(levels)
-    said = plausibility.step_warnings(levels, steps)[0]
+    steps = find_level_steps(levels)
+    said = step_warnings(levels, steps)[0]
     first = levels.file_row[steps[0][1].first]
     assert f"and line {first + 3}," in said and f"'dataset.level_steps={{A:[{first}]}}'" in said
-    # Once it is set, rows before and after the step were called outages of its parts.
     parted = read_any(
         tmp_path / "walk.csv", stations_file=tmp_path / "posts.csv", level_steps={"A": [int(first)]}
     )
     assert f"A from row {first}" in parted.data.site.stations.name
-    assert plausibility.gap_warnings(link_levels(parted.data)) == []
 
 
 def test_warnings_and_rows_had_other_names_of_a_cell_than_the_rest():
@@ -300,72 +255,21 @@ def test_no_verdict_depends_on_rows_that_are_in_no_order():
         order = rng.permutation(len(level))
         links = as_links(place[order], level[order, None], ["a"], np.full((1, 2), np.nan))
         back = [f"row {number}" for number in order]
-        warned = plausibility.sanity_warnings(
-            replace(links, rows=back), plausibility.find_level_steps(links)
-        )
+        warned = plausibility.sanity_warnings(replace(links, rows=back), find_level_steps(links))
         found.add(tuple(warned))
     assert len(found) == 1, found
     assert not any("in the" in line or "level_steps" in line for line in next(iter(found)))
 
 
-def test_levels_that_agree_but_for_one_are_named():
-    level = np.full(30, -70.0)
-    level[7] = -71
-    (said,) = plausibility.level_warnings(level)
-    assert said == "all levels but 1, -71 dB, are -70 dB: is it the column of levels?"
-    assert not plausibility.level_warnings(np.array([-70.0, -71, -70, -72, -73]))
-
-
-def test_a_station_copied_under_another_name_is_named():
-    place, level, _ = walk(0)
-    other = walk(1)[1]
-    for names, says in (
-        (["a", "b", "c"], "stations a, c hold the same levels at the same places"),
-        (["AP1", "b", "ap1"], "stations AP1, ap1 differ by capitals alone"),
-    ):
-        twins = as_links(place, np.stack([level, other, level], 1), names)
-        assert any(said.startswith(says) for said in plausibility.twin_warnings(twins))
-    assert not plausibility.twin_warnings(as_links(place, np.stack([level, other], 1), ["a", "b"]))
-
-
-def test_all_rows_of_a_station_at_one_place_are_named():
-    place, level, _ = walk(0)
-    levels = np.stack([level, np.full(len(level), np.nan)], 1)
-    still = np.flatnonzero((place == place[40]).all(1)).tolist() + list(range(41, 60))
-    place[still], levels[still, 1] = place[40], np.linspace(-90, -60, 20)
-    (said,) = plausibility.still_warnings(as_links(place, levels, ["a", "b"]))
-    assert said.startswith(
-        "all rows of station b are at one place, while levels change by up to 30 dB"
-    )
-
-
-@pytest.mark.parametrize("other", ["kilometres", "degrees"])
-def test_some_places_in_another_unit_are_named(other):
-    rng, half = np.random.default_rng(0), np.arange(80) % 2 == 0
-    place = rng.uniform(0, 2500, (80, 2))
-    mixed = place / 1e3 if other == "kilometres" else [11.5, 48.1] + place / 111e3
-    rows = np.c_[np.where(half[:, None], mixed, place), np.ones(80)]
-    found = unit_warnings(from_arrays({"rx_position": rows, "rssi_db": rng.normal(-80, 5, 80)}))
-    assert any("40 of 80 places lie within" in line and f"in {other}?" in line for line in found), (
-        found
-    )
-    whole = from_arrays(
-        {"rx_position": np.c_[place, np.ones(80)], "rssi_db": rng.normal(-80, 5, 80)}
-    )
-    assert not unit_warnings(whole)
-
-
-@pytest.mark.parametrize("axes", [[1e3, 1, 1], [1, 1e3, 1], [1e3, 1e3, 1]])
-@pytest.mark.parametrize("who", ["stations", "rows"])
-def test_places_of_stations_beside_rows_in_kilometres_are_named(axes, who):
+def test_rows_of_which_some_have_other_degrees_were_good():
+    """Half of the latitudes divided by ten: a box of 4,800 km, whose degrees nobody asked."""
     rng = np.random.default_rng(0)
-    rows, posts = (np.c_[rng.uniform(0, 2500, (n, 2)), np.ones(n)] for n in (80, 6))
-    files = {"rx_position": rows, "station_position": posts, "station": np.arange(80) % 6}
-    files["rssi_db"] = rng.normal(-80, 5, 80)
-    assert not unit_warnings(from_arrays(files))
-    key = {"stations": "station_position", "rows": "rx_position"}[who]
-    found = unit_warnings(from_arrays({**files, key: files[key] / axes}))
-    assert any(f"of {who} reach over" in line and "in kilometres?" in line for line in found), found
+    latitude, longitude = 48 + rng.uniform(0, 0.02, 80), 11 + rng.uniform(0, 0.02, 80)
+    arrays = {"longitude": longitude, "rssi_db": rng.normal(-80, 5, 80), "rx_height": np.array(1.5)}
+    assert not unit_warnings(from_arrays({**arrays, "latitude": latitude}))
+    half = np.where(np.arange(80) % 2, latitude, latitude / 10)
+    (said,) = unit_warnings(from_arrays({**arrays, "latitude": half}))
+    assert said.startswith("two groups of places ") and "km apart" in said
 
 
 @pytest.mark.parametrize(
@@ -380,35 +284,12 @@ def test_some_levels_in_another_unit_are_named(other, each):
     assert said.endswith("in two units?"), said
 
 
-@pytest.mark.parametrize("factor", [1e3, 1e-3])
-def test_carriers_that_no_link_has_are_named(factor):
-    place, level = room()
-    arrays = {"rx_position": place, "tx_position": np.zeros(3), "rssi_db": level}
-    assert not unit_warnings(from_arrays({**arrays, "carrier_hz": np.array(1.8e9)}))
-    (said,) = unit_warnings(from_arrays({**arrays, "carrier_hz": np.array(1.8e9 * factor)}))
-    assert said.startswith("carriers of ") and said.endswith("MHz: another unit?")
-
-
 @pytest.mark.parametrize("factor, says", [(1e-2, "differ by"), (3.28, "thermal noise of a hertz")])
 def test_all_levels_in_another_unit_were_good(factor, says):
     """-80 dBm as -.8, or as -262."""
-    place, level = room()
-    data = from_arrays(
-        {"rx_position": place, "tx_position": np.zeros(3), "rssi_db": (level - 40) * factor}
-    )
-    found = unit_warnings(data) + plausibility.level_warnings((level - 40) * factor)
+    level = room()[1]
+    found = plausibility.level_warnings((level - 40) * factor)
     assert any(says in line for line in found), found
-
-
-def test_rows_of_which_some_have_other_degrees_were_good():
-    """Half of the latitudes divided by ten: a box of 4,800 km, whose degrees nobody asked."""
-    rng = np.random.default_rng(0)
-    latitude, longitude = 48 + rng.uniform(0, 0.02, 80), 11 + rng.uniform(0, 0.02, 80)
-    arrays = {"longitude": longitude, "rssi_db": rng.normal(-80, 5, 80), "rx_height": np.array(1.5)}
-    assert not unit_warnings(from_arrays({**arrays, "latitude": latitude}))
-    half = np.where(np.arange(80) % 2, latitude, latitude / 10)
-    (said,) = unit_warnings(from_arrays({**arrays, "latitude": half}))
-    assert said.startswith("two groups of places ") and "km apart" in said
 
 
 @pytest.mark.parametrize("share", [0.5, 0.1])
@@ -431,15 +312,15 @@ def test_rows_of_which_half_follow_a_way_are_in_no_order():
     level[200:] += 20
     links = as_links(place[rows], level[rows, None], ["a"])
     assert as_links(place, level[:, None], ["a"]).ordered and not links.ordered
-    assert plausibility.find_level_steps(links) == []
+    assert find_level_steps(links) == []
 
 
 def test_a_step_is_claimed_from_places_that_one_device_saw_before_and_after():
     """Another phone in the second half, or another street, was a station that had changed."""
     place, level, station = walk(4, 400)
-    twice, again = np.tile(place, (2, 1)), np.r_[level, level + 20]
-    phone = np.repeat([0, 1], 400)
-    assert len(detect_level_steps(twice, again, station)) == 1
-    assert detect_level_steps(twice, again, station, device=phone) == ()
+    twice, again = np.tile(place, (2, 1)), np.r_[level, level + 20][:, None]
+    links = as_links(twice, again, ["a"], station[None])
+    assert len(find_level_steps(links)) == 1
+    assert find_level_steps(replace(links, device=np.repeat([0, 1], 400))) == []
     elsewhere = np.r_[place, place + np.array([1e3, 0])]
-    assert detect_level_steps(elsewhere, again) == ()
+    assert find_level_steps(as_links(elsewhere, again, ["a"], station[None])) == []

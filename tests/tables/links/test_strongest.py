@@ -1,7 +1,5 @@
 """Lists of the strongest: recognised, what they leave out, and levels of single rows."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from networks import network
@@ -9,8 +7,6 @@ from releases import release
 
 from gsparc.base.errors import DataError, Severe
 from gsparc.datasets.powder import read_powder
-from gsparc.tables.checks.link_levels import link_levels
-from gsparc.tables.checks.plausibility import floor_warnings, sanity_warnings
 from gsparc.tables.links.strongest import number_lists
 from gsparc.tables.own import from_arrays, interpret
 from gsparc.tables.raw import Raw
@@ -99,10 +95,6 @@ def test_check_advised_silent_beside_leave_absent_out(floor):
     reading = interpret(Raw(arrays, {"absent": "unknown"}), "drive")
     (said,) = [note for note in reading.notes if isinstance(note, Severe)]
     assert "with dataset.absent=unknown: " in said and said.endswith("; leave absent out")
-    levels = link_levels(reading.data)
-    assert not [
-        text for text in sanity_warnings(levels, []) if "absent" in text or "no level" in text
-    ]
 
 
 def test_silent_cells_of_a_wide_table_were_lost():
@@ -191,15 +183,6 @@ def test_noise_in_lists_of_the_strongest_was_refused():
     assert levels.min() > floor - 1e-3
 
 
-def test_the_weak_end_of_lists_was_called_a_receivers_noise():
-    """Whoever set the `sensitivity_db` that was advised lost a quarter of good levels."""
-    levels = link_levels(from_arrays(network(0).arrays(6)))
-    pile = np.r_[np.linspace(-118, -113, 60), np.linspace(-100, -80, 40)]
-    piled = replace(levels, station=np.zeros(len(pile), int), level_db=pile)
-    assert floor_warnings(replace(piled, limited=frozenset()))
-    assert not floor_warnings(piled)
-
-
 @pytest.mark.parametrize("absent", ["auto", "silent"])
 def test_silence_of_a_station_without_a_stated_level_was_lost(absent, recwarn):
     """Of an empty column the note said "below nan dB";
@@ -234,12 +217,9 @@ def test_silence_was_believed_of_lists_of_the_strongest():
     reading = interpret(Raw(arrays, {"absent": "silent"}), "drive")
     (severe,) = [note for note in reading.notes if isinstance(note, Severe)]
     assert severe.startswith(
-        "lists of the 6 strongest of 30 stations with dataset.absent=silent: what full "
+        "lists of the 6 strongest of 30 stations with dataset.absent=silent: unlisted "
     )
-    least = f"{arrays['rssi_db'].min():.4g}"
-    assert severe.endswith(
-        f" dB), not all below {least}: predictions are too low; leave absent out"
-    )
+    assert severe.endswith("; leave absent out")
     # All that is heard: no such lists
     heard = network(0).measured > np.quantile(network(0).measured, 0.6)
     level = np.where(heard, network(0).measured, np.nan)
@@ -381,8 +361,6 @@ def test_a_log_of_the_serving_cell_was_learned_as_if_the_others_were_unknown(sta
     moment = [place[tuple(at)] for at in (data.moving + data.site.origin).round(3)]
     wrong = one.measured[moment, data.station][silent] > level[silent] + 1e-3
     assert wrong.mean() < 0.02
-    said = sanity_warnings(link_levels(data), [])
-    assert not [text for text in said if "absent" in text]
     reading = interpret(Raw(arrays, {"absent": "silent"}), "drive")
     assert any(isinstance(note, Severe) and "leave absent out" in note for note in reading.notes)
 
@@ -401,5 +379,3 @@ def test_one_station_at_each_moment_is_not_always_the_one_that_serves():
         arrays = serving(one, station=chosen, rssi_db=one.measured[rows, chosen])
         reading = interpret(Raw(arrays), "drive")
         assert reading.data.censored is None and not [n for n in reading.notes if "strongest" in n]
-        said = sanity_warnings(link_levels(reading.data), [])
-        assert not [text for text in said if "absent" in text]

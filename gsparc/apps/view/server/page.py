@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import viser
 
-from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.maps.layers import Legend
 from gsparc.apps.view.answer import predict_answer
 from gsparc.apps.view.building import PATHS, SPHERE, draw_rays
 from gsparc.apps.view.panel import panel_image

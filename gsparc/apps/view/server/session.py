@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from gsparc.apps.maps.area import Grid
-from gsparc.apps.maps.pictures import Legend
+from gsparc.apps.maps.layers import Legend
 from gsparc.apps.view.answer import Answer, predict_answer
 from gsparc.apps.view.building import GAUSSIANS, PATHS, RAYS, SPHERE, VALUES, draw_rays
 from gsparc.apps.view.latest_job import LatestJobQueue

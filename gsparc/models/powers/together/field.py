@@ -58,6 +58,7 @@ from gsparc.training.stopwatch import Stopwatch
 
 MEMORY = 3e9  # bytes of all stations' factors
 PLACES = 2 * TRIED_EACH  # that the shared process is known at in the end
+TINY_DB2 = 1e-6  # least variance of a level [dB^2]
 UNHEARD_EACH = 1_000  # rows of each station, for what is said of others
 
 
@@ -232,20 +233,18 @@ class JointPowerField(ClosedForm):
                 (posterior, 1.0) if station in posterior.processes else (elsewhere, self.inflation)
             )
             mean[:, at], block = of.predict_joint(places[:, at], station)
-            covariance[:, at[:, None], at] = inflation * block
             kernel = self.own.prior(station).kernel
-            noise[at] = inflation * kernel.amplitude * kernel.noise
-            if (
-                self.links is not None
-            ):  # their covariances are as the station's own process has them
-                asked, is_heard = places[:, at], station in posterior.processes
-                level, variance = self.links.answer(asked.flatten(0, 1), is_heard)
-                mean[:, at], noise[at] = (
-                    level.unflatten(0, asked.shape[:2]),
-                    self.links.noise(is_heard),
-                )
-                scale = (variance.unflatten(0, asked.shape[:2]) / block.diagonal(0, 1, 2)).sqrt()
-                covariance[:, at[:, None], at] = scale[:, :, None] * block * scale[:, None]
+            noise[at], block = inflation * kernel.amplitude * kernel.noise, inflation * block
+            if self.links is not None:
+                # They have no covariances: places go together as in the station's own process.
+                signal = block - noise[at].diag()
+                is_heard, asked = station in posterior.processes, places[:, at].flatten(0, 1)
+                level, variance = self.links.answer(asked, is_heard)
+                mean[:, at], noise[at] = level.view(groups, -1), self.links.noise(is_heard)
+                left = (variance.view(groups, -1) - noise[at]).clamp_min(TINY_DB2)
+                scale = (left / signal.diagonal(0, 1, 2).clamp_min(TINY_DB2)).sqrt()
+                block = scale[:, :, None] * signal * scale[:, None] + noise[at].diag()
+            covariance[:, at[:, None], at] = block
         return JointLevels(mean, covariance, noise)
 
     def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:

@@ -1,0 +1,145 @@
+"""Columns that a setting names: a head, a sum, a pattern, numbers."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from gsparc.base.errors import suggest_name
+from gsparc.data.units import UNITS, Unit
+from gsparc.tables import heads
+from gsparc.tables.column import BY_ROW, JOINED, Column
+from gsparc.tables.heads import (
+    KINDS,
+    LISTS,
+    unit_of,
+    unit_suits,
+    words_of,
+)
+from gsparc.tables.roles import NONE
+from gsparc.tables.sheet import Sheet
+
+JOINT = ("station", "device")
+
+
+def columns_of_setting(sheet: Sheet, key: str, value: object) -> tuple[Column, ...]:
+    """Return the columns that a setting names; none, and noted, where there are no such ones."""
+    role, where = heads.OTHER_NAMES.get(key, key), f"dataset.columns.{key}={value}"
+    if role not in KINDS:
+        hint = suggest_name(key, [*KINDS, *heads.OTHER_NAMES], 0.4) or (
+            f"; known are {', '.join(KINDS)}"
+        )
+        return sheet.problems.add(where, f"no such quantity{hint}") or ()
+    text = str(value).strip()
+    if text.startswith(BY_ROW):  # before heads, whose words alone are compared
+        return (Column(role, text.removeprefix(BY_ROW)),)
+    if isinstance(value, Sequence) and not isinstance(value, str):  # of stations each
+        listed = [column for text in value for column in columns_of_setting(sheet, key, text)]
+        return tuple(replace(c, label=_label(c.head or "", role)) for c in listed)
+    head = _head(sheet, text)
+    if head is not None:
+        return (Column(role, unit=_unit(head, role), head=head),)
+    if text == NONE:
+        return ()
+    # After the head as it is: heads may hold a `*`, a `+` or a `-`.
+    if KINDS[role] != "text" and (column := _sum_of_columns(sheet, role, text)) is not None:
+        return (column,)
+    joined = [_head(sheet, part.strip()) for part in text.split("+")] if role in JOINT else []
+    if len(joined) > 1 and all(joined):
+        return tuple(Column(role, JOINED, head=part) for part in joined)
+    if role in heads.MANY and ("*" in text or "..." in text):
+        times = re.fullmatch(r"(.*[^*].*)\*([-+]?\d*\.?\d+)", text)
+        for pattern, factor in ((text, ""), times.groups() if times else ("", "")):
+            if named := _named_columns(sheet, role, pattern):
+                return tuple(_times(c, factor) for c in named) if factor else named
+        fault = "expected one * only" if text.count("*") > 1 else "no column is called so"
+        return sheet.problems.add(where, fault) or ()
+    # `FIRST:LAST` of frequencies, or one number for all rows;
+    # other text becomes NaN and no constant.
+    numbers = tuple(pd.to_numeric(np.array(text.split(":"), object), errors="coerce").tolist())
+    constant = all(map(math.isfinite, numbers)) and KINDS[role] != "text" and role not in heads.MANY
+    if constant and len(numbers) <= (2 if role == "frequency_hz" else 1):
+        return (Column(role, value=numbers),)
+    hint = suggest_name(text, sheet.heads, 0.4) or f"; there are {sheet.first_heads()}"
+    hint += f"; or say dataset.columns.{key}=null"
+    return sheet.problems.add(where, f"{sheet.source} has no such column{hint}") or ()
+
+
+def _named_columns(sheet: Sheet, role: str, text: str) -> tuple[Column, ...]:
+    """Columns that a pattern with one `*` names, or FIRST...LAST; what is left names stations."""
+    first, dots, last = (part.strip() for part in text.partition("..."))
+    if dots and {first, last} <= {*sheet.heads}:
+        begin, end = sheet.heads.index(first), sheet.heads.index(last)
+        listed = sheet.heads[begin : end + 1]
+        return tuple(Column(role, _label(h, role), _unit(h, role), head=h) for h in listed)
+    matches = heads.match_pattern(text, sheet.heads)
+    labels = {head: unit_of(part)[0].strip() for head, part in matches.items()}
+    before, _, after = text.partition("*")
+    # `MAC1` is a name, `RSSI_1` a level of the station 1.
+    whole = role in heads.LEVELS and not LISTS["level"] & {*words_of(before + " " + after)}
+    labels = {h: h if whole and label.isdigit() else label for h, label in labels.items()}
+    return tuple(Column(role, label, _unit(h, role), head=h) for h, label in labels.items())
+
+
+def _label(head: str, role: str) -> str:
+    station = role in heads.LEVELS
+    return heads.station_in_head(head) or head if station else heads.parse_head(head).label
+
+
+def _sum_of_columns(sheet: Sheet, role: str, text: str) -> Column | None:
+    """A column times a factor, as in `pathloss*-1`, with others and numbers: `asu*2-113`,
+    `rssi-tx_power`.
+    """
+    for cut in [len(text), *(sign.start() for sign in re.finditer(r"[-+]", text))]:
+        times = re.fullmatch(r"(.+)\*([-+]?\d*\.?\d+)", text[:cut].strip())
+        head = _head(sheet, times[1].strip() if times else text[:cut].strip()) if cut else None
+        if head is None:
+            continue
+        column, rest = Column(role, unit=_unit(head, role), head=head), text[cut + 1 :].strip()
+        column = _times(column, times[2]) if times else column
+        if cut == len(text):
+            return column
+        if re.fullmatch(r"\d*\.?\d+", rest):
+            return replace(column, plus=(Column(role, value=(float(text[cut] + rest),)),))
+        more = _sum_of_columns(sheet, role, rest)
+        if more is not None:
+            first = replace(more, plus=())
+            first = _times(first, "-1") if text[cut] == "-" else first
+            return replace(column, plus=(first, *more.plus))
+    return None
+
+
+def _times(column: Column, factor: str) -> Column:
+    """The same times a number, or, where it already is, times -1."""
+    unit = column.unit or Unit("", KINDS[column.role])
+    multiplier = f"-{unit.times}" if unit.times else factor
+    return replace(column, unit=replace(unit, times=multiplier, factor=unit.factor * float(factor)))
+
+
+def _head(sheet: Sheet, text: str) -> str | None:
+    """The column called `text`, else the only one called so but for case, spaces and unit."""
+    if text in sheet.heads:
+        return text
+    words = words_of(text)
+    # Case, spaces and a unit in brackets are layout; where two heads differ in them alone,
+    # none is meant.
+    alike = [h for h in sheet.heads if words and words in (words_of(h), words_of(unit_of(h)[0]))]
+    return alike[0] if len(alike) == 1 else None
+
+
+def _unit(head: str, role: str) -> Unit | None:
+    unit, words = unit_of(head)[1], words_of(head)
+    if (
+        unit is None
+        and len(words) > 1
+        and words[-1] in UNITS
+        and unit_suits(role, UNITS[words[-1]])
+    ):
+        return UNITS[words[-1]]
+    # A level that is the amplitude of a channel
+    return UNITS["db"] if unit is None and role == "csi_amp" and LISTS["level"] & {*words} else unit
