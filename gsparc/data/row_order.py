@@ -21,7 +21,7 @@ from gsparc.data.splits import Fold
 BITS = 20  # of a coordinate, of three; of both ends half as many
 REVISITED = 0.5  # of a device's places: where more hold different levels, rows are visits
 PACKETS = 8  # different levels of a fix, from which on equal ones count as often as they are
-MARKED_DB = 20.0  # from the mean of a fix, that no level of it is away
+APART_DB = 5.0  # from the mean of a fix, that no level of it is away
 
 
 def hash_rows(*arrays: np.ndarray | None) -> np.ndarray:
@@ -94,8 +94,9 @@ def merge_fixes(
         differ = np.bincount(of[once])
         copies = np.where(differ[of[once]] < PACKETS, 1, copies)
         mean = np.bincount(of[once], copies * level[once]) / np.bincount(of[once], copies)
-        # Beyond that a mark of what was not heard stands among levels.
-        whole = np.bincount(of[once], np.abs(level[once] - mean[of[once]]) > MARKED_DB) == 0
+        # Beyond that a fix stood still on a way, or a mark of silence stands among levels.
+        middle = (np.bincount(of[once], level[once]) / differ)[of[once]]
+        whole = np.bincount(of[once], np.abs(level[once] - middle) > APART_DB) == 0
         if (differ > 1).mean() <= REVISITED:
             result[rows[first[whole]]] = mean[whole]
             over[rows] = (turned[0] > 0) | (whole[of] & (np.arange(len(rows)) != first[of]))
