@@ -66,7 +66,9 @@ def task(call: CommandCall) -> Result:
     """Map, draw and write."""
     run_dir, config, floor = call.folder, call.config, read_plan_settings(call.given)
     run = open_run(config.ckpt, call.given["dataset"])
-    predictor = run.predictor
+    predictor, other = run.predictor, call.given["other_end"]
+    if anywhere := other is not None and predictor.site.stations is not None:
+        predictor, other = predictor.stand_at(other), None
     how = PromiseSettings(**call.given["promise"])
     query = {
         "area": call.given["area"],
@@ -76,7 +78,7 @@ def task(call: CommandCall) -> Result:
         "stations": stations_of(call.given["stations"]),
         "load": call.given["load"],
         "noise_db": config.noise_db,
-        "other_end": call.given["other_end"],
+        "other_end": other,
         "plan": floor,
         "share": how.share,
         "tolerance_db": float(config.tolerance_db),
@@ -89,7 +91,7 @@ def task(call: CommandCall) -> Result:
     wanted = _pictures(call, first)
     # Refused before evidence is gathered, which takes minutes.
     tiff = check_geotiff(config.geotiff)
-    promise = read_or_gather(run, call.given, renew=config.renew)
+    promise = None if anywhere else read_or_gather(run, call.given, renew=config.renew)
     field = add_changes(predict_map(predictor, promise=promise, **query), predictor)
     coverage = None if promise is None else cross_validate(promise.evidence, how.share)
     ends = None if promise is None else covered_between(field, predictor, promise)

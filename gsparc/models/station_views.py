@@ -38,6 +38,14 @@ class OneStationView(View):
         return self.inner.predict(self.of_station(query))
 
 
+class AnywhereView(View):
+    """A method that knows all stations, asked about whoever stands where a query says."""
+
+    def predict(self, query: Query) -> Prediction:
+        """See `Method.predict`."""
+        return self.inner.predict(replace(query, station=None))
+
+
 class AllStationsView(OneStationView):
     """A method that knows all stations of powers, asked about each of them at every place."""
 

@@ -6,12 +6,14 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
+from hashlib import sha256
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.base.errors import DataError
 from gsparc.data.schema import Site
 from gsparc.data.station_names import find_station
 from gsparc.data.target import Kind
@@ -20,11 +22,12 @@ from gsparc.models.abilities import AddsCarriers, HasGaussians
 from gsparc.models.device_offsets import find_device
 from gsparc.models.method import MEAN_DEVICE, Method, Prediction, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
+from gsparc.models.station_views import AnywhereView
 from gsparc.physics.row_factors import describe_factor
 from gsparc.prediction.confidence import ConfidenceMixin, Trusted
 from gsparc.prediction.gradients import predict_with_gradients
 from gsparc.prediction.jointly import JointMixin
-from gsparc.prediction.query import DegreesMixin, Queries, match_input
+from gsparc.prediction.query import DegreesMixin, Queries, match_input, read_place
 from gsparc.prediction.timing import Call
 from gsparc.prediction.updating import UpdateMixin, read_versions
 
@@ -165,6 +168,30 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         view = self._view(method, whole, station_site(self.site, number), self._unit)
         view.queries = Queries(view.site, None if isinstance(self.method, PerStation) else number)
         view._own_station = number
+        return view
+
+    def stand_at(self, place: Any) -> Predictor:
+        """Return the same model asked about an end that stands anywhere, where it was at several.
+
+        Args:
+            place: (3,) of that end, world [m].
+
+        Raises:
+            DataError: it stood at one place, or moved, when this was measured.
+        """
+        if self.site.stations is None:
+            raise DataError("other_end: there is one place, or the query says it; leave it out")
+        still = read_place("other_end", place)
+        words = ", ".join(f"{coordinate:g}" for coordinate in still)
+        site = replace(
+            self.site,
+            name=f"{self.site.name} from ({words})",
+            stations=None,
+            static_position=still - self.site.origin,
+            sha256=sha256(f"{self.site.sha256} {words}".encode()).hexdigest(),
+        )
+        view = self._view(AnywhereView(self.method), None, site, self._unit)
+        view.queries, view.extra = Queries(site), {}  # what was tested is of stations
         return view
 
     def select_carrier(self, frequency_hz: float) -> Predictor:

@@ -271,8 +271,8 @@ def query_ends(
     """Return world places [m] of the ends that a predictor needs,
     the moving one at `places` (n, 3).
 
-    `other_end` (3,) is the transmitter's place where both moved, or anywhere where it was at
-    several; `station` (3,) that of one never heard.
+    `other_end` (3,) is the transmitter's place where both moved, `station` (3,)
+    that of one never heard.
 
     Raises:
         DataError: both ends moved and nobody says where the other is, or it stood still and
@@ -280,10 +280,9 @@ def query_ends(
     """
     moving, other = site.moving_end, site.still_end
     if not site.paired:
-        if other_end is not None and site.stations is None:
+        if other_end is not None:
             raise DataError(f"other_end: the {other} stood still; leave it out")
-        at = station if other_end is None else read_place("other_end", other_end)
-        return {moving: places} | ({} if at is None else {other: at})
+        return {moving: places} | ({} if station is None else {other: station})
     if other_end is None:
         raise DataError(
             "other_end: both ends moved; say where the transmitter stands, other_end=[x,y,z]"

@@ -9,6 +9,7 @@ import torch
 from closed import fitted_to, read_back
 from releases import real
 
+from gsparc.base.errors import DataError
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
@@ -137,3 +138,16 @@ def test_a_table_of_both_ends_was_answered_for_the_known_transmitters(tmp_path, 
     answers = pd.read_csv(tmp_path / "out.csv")
     assert facts["predict/predictions"] == len(answers) == 20
     assert np.allclose(answers.rssi_db, predictor.rssi(**ends)[:, 0], atol=1e-4)
+
+
+def test_an_end_may_stand_anywhere():
+    data, rows = robots(), fold().test[:20]
+    method = wrap_per_station(Gsparc(), data).create_for(data)
+    method.fit(data, fold(), FitContext())
+    predictor, place = Predictor(method, data.site), np.array([-2.0, 2.0, 0.3])
+    receivers = data.moving[rows] + data.site.origin
+    alone = predictor.stand_at(place)
+    assert np.allclose(alone.rssi(rx=receivers), predictor.rssi(tx=place, rx=receivers), atol=1e-4)
+    assert not alone.site.several and "from (-2, 2, 0.3)" in alone.site.name
+    with pytest.raises(DataError, match="there is one place"):
+        alone.stand_at(place)
