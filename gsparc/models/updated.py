@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.ends import NOBODY, Ends
 from gsparc.data.query import Query
 from gsparc.data.schema import Site
 from gsparc.models.abilities import HasProcess
@@ -160,10 +161,10 @@ class Updated(View):
     def _level_now(self, query: Query, before: Level) -> Level:
         mean, doubt = before.mean.clone(), before.doubt.clone()
         rows = self.changes.stations
-        places, number = query.places(self.fitted_site), query.station
-        if self.own is not None or number is None:
-            number = torch.full((len(query),), self.own or 0)
-        for station in number.unique().tolist():
+        places = query.places(self.fitted_site)
+        number = Ends.from_query(self.fitted_site, query).station
+        number = number if self.own is None else torch.full((len(query),), self.own)
+        for station in number[number != NOBODY].unique().tolist():
             at = (number == station).nonzero()[:, 0]
             if len(later := rows.get(station, LaterRows.empty())) or self.changes.belief.common:
                 mean[at], doubt[at] = correct(

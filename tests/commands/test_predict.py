@@ -369,7 +369,7 @@ def test_where_the_answers_go(town, tmp_path):
     with np.load(tmp_path / "b.npz") as stored:
         assert stored["station"].tolist() == NAMES.tolist() and stored["rssi_db"].shape == (3,)
     refused(
-        r"expected a table \(csv, parquet",
+        r"no rx_position or tx_position",
         predict_file,
         town,
         tmp_path / "b.npz",

@@ -151,8 +151,18 @@ VIEWS = {"select_station": ["b"], "ask_station": [1], "select_device": ["q"], "i
 def test_every_view_of_a_predictor_is_looked_at():
     methods = inspect.getmembers(Predictor, inspect.isfunction)
     views = {name for name, one in methods if one.__annotations__.get("return") == "Predictor"}
-    # Levels of other carriers: no model has them
-    assert views - {"_view", "select_carrier"} == {*VIEWS}
+    # Levels of other carriers: no model has them; later rows are of stations, not of new places
+    assert views - {"_view", "select_carrier", "stand_at"} == {*VIEWS}
+
+
+def test_later_rows_of_the_first_station_were_those_of_whoever_stood_elsewhere(stations):
+    fitted, heard, at = stations
+    model, here = fitted.in_levels(None), fitted.site.every_station.position + fitted.site.origin
+    model.update(rx=at, rssi=heard(at) - 6, unit="dBm")
+    asked = at[:4] + np.array([0, 2, 0])
+    for number, name in enumerate("abc"):
+        known = model.select_station(name).rssi(rx=asked)
+        assert np.allclose(model.rssi(tx=here[number], rx=asked), known, atol=1e-4)
 
 
 @pytest.mark.parametrize("name", VIEWS)

@@ -121,13 +121,13 @@ def test_visits_of_a_place_are_snapshots_of_their_own():
     """The second row of a station there is of the second snapshot,
     whichever order stations come in.
     """
-    place = np.repeat([[0.0, 0, 1], [5, 5, 1], [9, 0, 1]], [4, 2, 2], axis=0)
-    station, level = np.array([0, 1, 1, 0, 0, 1, 0, 1]), -50.0 - np.arange(8)
+    place = np.repeat([[0.0, 0, 1], [5, 5, 1], [9, 0, 1]], [4, 4, 2], axis=0)
+    station, level = np.array([0, 1, 1, 0, 0, 1, 0, 1, 0, 1]), -50.0 - np.arange(10)
     ends = {"station_position": np.array([[0.0, 9, 5], [9, 9, 5]]), "station": station}
     data = from_arrays({"rx_position": place, "rssi_db": level, **ends})
-    values = group_snapshots(data, np.arange(8)).values.reshape(-1, 2)
+    values = group_snapshots(data, np.arange(10)).values.reshape(-1, 2)
     heard = (values - values.max() - 50).round().int().tolist()
-    assert sorted(heard) == sorted([[-50, -51], [-53, -52], [-54, -55], [-56, -57]])
+    assert sorted(heard) == sorted([[-50, -51], [-53, -52], [-54, -55], [-56, -57], [-58, -59]])
 
 
 @pytest.mark.parametrize(
