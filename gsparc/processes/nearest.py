@@ -30,6 +30,7 @@ from gsparc.processes.few_rows import covering_rows
 from gsparc.processes.fit_kernel import LOOKS, SETTLED, fit_kernel
 from gsparc.processes.kernel import Kernel, distances
 from gsparc.processes.neighbourhood import (
+    FEWEST,
     NEIGHBOURS,
     Neighbourhood,
     nearest_distance,
@@ -41,7 +42,6 @@ COVER, FEW = 2_000, 500  # rows that weigh the mean law, where it is to stay, an
 ENTRIES = 1_000_000  # of systems and values that are solved with at a time: memory
 LOOKED_AT = 1_200  # places whose density given their neighbours chooses the settings
 LOOKED_BY = 16  # their neighbours (M. L. Stein et al., J. R. Stat. Soc. B 66 (2004): few will do)
-SPARSEST = 60  # places of a set, whose neighbours lie so far apart that they show long lengths
 SHORTER = (0.3, 0.03)  # lengths that a search starts from beside the longest, of that
 JITTER = 1e-8  # of the amplitude, only so that a system of places millimetres apart can be solved
 EXCESS = 20.0  # nats, of an amplitude e times the variance of the values
@@ -342,7 +342,11 @@ def nearest_density(
 
 
 def choose_kernel_by_nearest(
-    prior: Prior, values: PlaceValues, seed: int, looked_at: np.ndarray | None = None
+    prior: Prior,
+    values: PlaceValues,
+    seed: int,
+    looked_at: np.ndarray | None = None,
+    sparsest: int = FEWEST,
 ) -> tuple[Kernel, str]:
     """Choose the kernel most likely by rows that cover the site, and say on what it was chosen.
 
@@ -354,6 +358,7 @@ def choose_kernel_by_nearest(
         values: where something was heard.
         seed: of what is drawn.
         looked_at: (T, 1 + k) rows, each before those that it is given; None: its nearest ones.
+        sparsest: places of a set at least: neighbours in it show long lengths.
     """
     count, start = len(values.places), prior.kernel
     if count <= NEIGHBOURS:
@@ -364,7 +369,7 @@ def choose_kernel_by_nearest(
         prior, values.places, rest, start.noise / values.count, seed, FEW
     )
     rest = rest - prior.columns(places) @ about
-    level = Neighbourhood.from_places(values.places, seed, SPARSEST).level
+    level = Neighbourhood.from_places(values.places, seed, sparsest).level
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]
     parts = [] if looked_at is None else [looked_at]
     for members in sets if looked_at is None else ():

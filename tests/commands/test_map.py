@@ -244,3 +244,24 @@ def test_a_map_and_its_model_are_judged_by_later_rows_alike(model, tmp_path):
     assert {*parts["map"].index} == {"east", "west"}
     assert np.allclose(parts["map"], parts["model"][parts["map"].index], atol=0.4)
     assert_refused(run("evaluate", f"ckpt={file}", folder=tmp_path / "no"), "dataset.file=FILE")
+
+
+def test_a_map_of_an_end_that_stands_anywhere(model, tmp_path):
+    """Of twenty places and more; one model a station says what it lacks."""
+    rng = np.random.default_rng(0)
+    ends = np.c_[rng.uniform(0, 20, (24, 2)), np.ones(24)]
+    station = np.repeat(np.arange(24), 20)
+    places = np.c_[rng.uniform(0, 20, (480, 2)), np.ones(480)]
+    away = np.linalg.norm(places - ends[station], axis=1)
+    level = -40 - 20 * np.log10(away + 0.1) + 4 * np.sin(ends[station, 0]) + rng.normal(0, 1, 480)
+    arrays = {"station_position": ends, "station": station, "rssi_db": level}
+    file = tmp_path / "links.npz"
+    np.savez(file, rx_position=places, **arrays)
+    links = trained(file, "gsparc", "split=none")
+    how = "step_m=2", "geotiff=false", "threshold_db=-60"
+    done = run("map", f"ckpt={links}", "other_end=[10,10,1]", *how, folder=tmp_path / "map")
+    assert done.status == 0 and (tmp_path / "map" / "outage.png").exists(), done
+    facts = json.loads((tmp_path / "map" / "summary.json").read_text())
+    assert facts["map/stations"] == 1 and facts["promise/calibrated"] == 0
+    refused = run("map", f"ckpt={model}", "other_end=[10,10,1]", *how, folder=tmp_path / "no")
+    assert_refused(refused, "no station stands")

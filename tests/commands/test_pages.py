@@ -20,6 +20,7 @@ COMPOSED = {  # by `tests/test_docs.py` alone, for another reason each
     "model=calibrated_raytracer": "needs the ray tracer (tests/peers)",
     "undo=1": "of a model that was updated (tests/commands/test_update.py)",
     "search=optuna": "a search of many trainings",
+    "other_end=[-2,2,.3]": "needs twenty places of an end (tests/commands/test_map.py)",
     "experiment=results/wsr": "needs logs of both ends (tests/datasets/test_wsr.py)",
 }
 

@@ -42,6 +42,7 @@ FREE, FREE_FROM = 1.0, 100  # belief in free numbers, and rows that tell them
 PLACE_NEEDS = 8  # rows that were heard, for a place that is sought
 LEARNED_ON = 500  # rows: numbers, and shares
 NEAREST_FROM = 1_000  # rows, from which on shape and numbers follow from the nearest ones
+SPARSEST = 60  # places of a set that shows long lengths
 JUDGED_ON = 1_000  # places, that shares are learned on where the nearest rows tell of each
 WALKED = 15  # looks at silent rows, from numbers that rows that were heard have
 ASKED = 200  # places, whose error is foreseen
@@ -288,7 +289,7 @@ def _by_nearest(
         alike = [(share, member) for share, member in weighed if member.trend is trend]
         member = max(alike, key=lambda pair: pair[0])[1]
         if member.kernel.is_isotropic:
-            kernel, how = choose_kernel_by_nearest(member.prior, values, seed)
+            kernel, how = choose_kernel_by_nearest(member.prior, values, seed, sparsest=SPARSEST)
             member = replace(member, kernel=kernel, notes=(*member.notes, f"then {how}"))
         result.append((sum(share for share, _ in alike), member))
         answers = condition_on_nearest(member.prior, values, seed).left_out(some).mean
