@@ -28,13 +28,20 @@ from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.method import Prediction
 from gsparc.models.powers.prior_map import NetworkMaps, describe_use
 from gsparc.models.powers.together.learning import (
+    ERRORS,
     TRIED_EACH,
     StationPriors,
     learn_own_settings,
     learn_shared_terms,
     learn_station_priors,
 )
-from gsparc.models.powers.together.links import LinkPriors, Links, both_ends_move, learn_links
+from gsparc.models.powers.together.links import (
+    LinkPriors,
+    Links,
+    both_ends_move,
+    errors_of_heard,
+    learn_links,
+)
 from gsparc.models.powers.together.network import find_sectors, learn_network, relabel_by_site
 from gsparc.models.powers.together.terms import (
     SharedTerms,
@@ -53,6 +60,7 @@ from gsparc.processes.sectors import NO_AZIMUTH, ROUND, Sectors
 from gsparc.processes.shared import SharedTermsPosterior
 from gsparc.processes.stored import from_plain, to_plain
 from gsparc.processes.trend import TINY_M
+from gsparc.processes.uncertainty import mean_and_error
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.stopwatch import Stopwatch
 
@@ -116,7 +124,7 @@ class JointPowerField(ClosedForm):
             self.own, remarks = learn_station_priors(used, self.seed)
             if self.shared and both_ends_move(data, rows):
                 remarks.append(self._share_terms(used, by_links=True))
-            if self.link_priors is not None:
+            if self.link_priors is not None and self._links_tell_heard(used, self.link_priors):
                 return (*notes, *remarks)
             self.own, more = learn_own_settings(used, self.own, self.seed)
             remarks += more
@@ -147,6 +155,20 @@ class JointPowerField(ClosedForm):
     def _law_alone(self, rows: StationRows) -> SharedTerms:
         return SharedTerms.from_rows(rows, self.own.never.known_trend, 1.0, 0, self.seed)
 
+    def _links_tell_heard(self, rows: StationRows, priors: LinkPriors) -> bool:
+        """Whether links tell of stations that were heard better than the stations' own processes,
+        at rows left out; else they are for others alone.
+        """
+        few = rows.thin_rows(TRIED_EACH, self.seed)
+        own = self.own.condition(few, self.heard, self.seed)
+        order = np.concatenate([np.flatnonzero(few.station == n) for n in own.processes])
+        missed = np.concatenate([own.left_out(n).residual.numpy() for n in own.processes])
+        errors, station = errors_of_heard(few, priors, self.seed)[order], few.station[order]
+        gain, unsure = mean_and_error(missed**2 - errors**2, station)
+        if gain <= ERRORS * unsure:
+            self.link_priors = replace(priors, heard=None)
+        return gain > ERRORS * unsure
+
     def _share_terms(self, rows: StationRows, by_links: bool = False) -> str:
         """Set what stations share, and links where these are better; what must be said."""
         self.heard = self.unheard = self._law_alone(rows)
@@ -171,8 +193,8 @@ class JointPowerField(ClosedForm):
         """See `ClosedForm`; silent rows say that powers are below a level."""
         own_rows = rows_of_stations(data, rows, self.places)
         own_rows = own_rows if self.network is None else relabel_by_site(own_rows, self.network)
-        if self.link_priors is not None:
-            self.links = self.link_priors.condition(own_rows, self.seed)
+        links = self.link_priors
+        self.links = None if links is None else links.condition(own_rows.measured_rows, self.seed)
         used = own_rows.thin_rows(rows_per_station(len(own_rows.stations)), self.seed)
         self.posterior, self._reach = self.own.condition(used, self.heard, self.seed), None
         elsewhere = self.posterior
@@ -201,8 +223,9 @@ class JointPowerField(ClosedForm):
         heard = torch.isin(number, torch.tensor([*posterior.processes]))
         exact = query.tx.dtype == torch.float64
         for of, inflation, chosen in ((posterior, 1.0, heard), (elsewhere, self.inflation, ~heard)):
-            if chosen.any() and self.links is not None:
-                mean[chosen], spread[chosen] = self.links.answer(places[chosen], of is posterior)
+            links = self.links
+            if chosen.any() and links is not None and links.of_station(of is posterior) is not None:
+                mean[chosen], spread[chosen] = links.answer(places[chosen], of is posterior)
                 share[chosen] = spread[chosen] / self.whole
             elif chosen.any():
                 mean[chosen], variance = of.answer(places[chosen], number[chosen], exact)
@@ -235,12 +258,12 @@ class JointPowerField(ClosedForm):
             mean[:, at], block = of.predict_joint(places[:, at], station)
             kernel = self.own.prior(station).kernel
             noise[at], block = inflation * kernel.amplitude * kernel.noise, inflation * block
-            if self.links is not None:
+            links, is_heard = self.links, station in posterior.processes
+            if links is not None and links.of_station(is_heard) is not None:
                 # They have no covariances: places go together as in the station's own process.
-                signal = block - noise[at].diag()
-                is_heard, asked = station in posterior.processes, places[:, at].flatten(0, 1)
-                level, variance = self.links.answer(asked, is_heard)
-                mean[:, at], noise[at] = level.view(groups, -1), self.links.noise(is_heard)
+                signal, asked = block - noise[at].diag(), places[:, at].flatten(0, 1)
+                level, variance = links.answer(asked, is_heard)
+                mean[:, at], noise[at] = level.view(groups, -1), links.noise(is_heard)
                 left = (variance.view(groups, -1) - noise[at]).clamp_min(TINY_DB2)
                 scale = (left / signal.diagonal(0, 1, 2).clamp_min(TINY_DB2)).sqrt()
                 block = scale[:, :, None] * signal * scale[:, None] + noise[at].diag()
@@ -254,7 +277,7 @@ class JointPowerField(ClosedForm):
             ValueError: before `condition`.
         """
         posterior, _ = self._require_posteriors()
-        if self.links is not None:
+        if self.links is not None and self.links.heard is not None:
             return self.links.left_out(rows)
         means, spreads, known = [], [], []
         for number, process in posterior.processes.items():

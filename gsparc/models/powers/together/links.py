@@ -52,19 +52,23 @@ class LinkPriors(Stored):
 
     Attributes:
         law: of the site.
-        heard: kernel of what is left, of links of stations that were heard, at `scaled` places.
+        heard: kernel of what is left, of links of stations that were heard, at `scaled` places;
+            None: their own processes tell them.
         unheard: of links of all others.
     """
 
     law: Trend
-    heard: Kernel
+    heard: Kernel | None
     unheard: Kernel
 
     def condition(self, rows: StationRows, seed: int) -> Links:
         """Return what rows that were heard say."""
-        values = link_values(rows, self.law)
-        kernels = self.heard, self.unheard
-        heard, unheard = (condition_on_nearest(Prior(k), values, seed) for k in kernels)
+        values, kernels = link_values(rows, self.law), (self.heard, self.unheard)
+        heard, unheard = (
+            None if kernel is None else condition_on_nearest(Prior(kernel), values, seed)
+            for kernel in kernels
+        )
+        assert unheard is not None
         return Links(self.law, heard, unheard, torch.from_numpy(rows.index))
 
 
@@ -79,13 +83,18 @@ class Links(Stored):
     """
 
     law: Trend
-    heard: Nearest
+    heard: Nearest | None
     unheard: Nearest
     index: Tensor
 
+    def of_station(self, heard: bool) -> Nearest | None:
+        """Return what tells of a station; None: its own process does."""
+        return self.heard if heard else self.unheard
+
     def answer(self, places: Tensor, heard: bool) -> MeanVariance:
         """Return mean [dB] and variance [dB^2] (B,) of a measurement at places (B, 6) [m]."""
-        process = self.heard if heard else self.unheard
+        process = self.of_station(heard)
+        assert process is not None
         mean, variance = process.answer(scaled(places))
         return MeanVariance(
             self.law.mean(places) + mean[:, 0], process.prior.kernel.amplitude * variance
@@ -93,11 +102,14 @@ class Links(Stored):
 
     def noise(self, heard: bool) -> float:
         """Variance of a measurement's noise [dB^2]."""
-        kernel = (self.heard if heard else self.unheard).prior.kernel
+        process = self.of_station(heard)
+        assert process is not None
+        kernel = process.prior.kernel
         return kernel.amplitude * kernel.noise
 
     def left_out(self, rows: np.ndarray | None) -> LeftOutRows:
         """Return the rows, or those of `rows` (m,) that it knows, each without itself; linear."""
+        assert self.heard is not None
         every = np.arange(len(self.index))
         some = every if rows is None else np.flatnonzero(np.isin(self.index.numpy(), rows))
         mean, variance = self.heard.left_out(torch.from_numpy(some))
@@ -151,6 +163,13 @@ def learn_links(
         f"{NEIGHBOURS} links whose ends are nearest, which answer{'' if used else ' nothing'}"
     )
     return LinkPriors(law, heard, unheard) if used else None, remark
+
+
+def errors_of_heard(rows: StationRows, priors: LinkPriors, seed: int) -> np.ndarray:
+    """Return errors (n,) [dB] of rows that were heard, each predicted from all others."""
+    heard, values = priors.condition(rows, seed).heard, link_values(rows, priors.law).values
+    assert heard is not None
+    return (heard.left_out().mean - values)[:, 0].numpy()
 
 
 def link_values(rows: StationRows, law: Trend) -> PlaceValues:

@@ -151,3 +151,34 @@ def test_an_end_may_stand_anywhere():
     assert not alone.site.several and "from (-2, 2, 0.3)" in alone.site.name
     with pytest.raises(DataError, match="there is one place"):
         alone.stand_at(place)
+
+
+def test_known_stations_of_many_gains_were_told_by_their_neighbours():
+    """Gains differ by 5 dB: another draw's 3.64 dB became 4.15, as stations left out alone chose."""
+    rng = np.random.default_rng(2)
+    places = np.c_[rng.uniform(0, 300, (24, 2)), np.full(24, 8.0)]
+    station = np.repeat(np.arange(24), 60)
+    at = np.c_[rng.uniform(0, 300, (len(station), 2)), np.full(len(station), 1.5)]
+    waves, phase = rng.normal(size=(24, 2, 200)) / 30, rng.uniform(0, 2 * np.pi, (24, 200))
+    shadow = np.cos(np.einsum("nd,ndk->nk", at[:, :2], waves[station]) + phase[station]).sum(1)
+    away = np.linalg.norm(at - places[station], axis=1)
+    level = 5 * rng.normal(size=24)[station] - 30 * np.log10(away) + 0.6 * shadow
+    arrays = {"rx_position": at, "station_position": places, "station": station}
+    data = from_arrays({**arrays, "rssi_db": level + rng.normal(0, 1.5, len(level))}, {"name": "x"})
+    order = rng.permutation(len(data))
+    known, asked = np.sort(order[288:]), order[:288]
+    method, _ = fitted_to(JointPowerField(), data, known)
+    mean, links = method.predict(data.batch(asked)).mean, method.links
+    assert links is not None and links.heard is None
+    method.links = None
+    own = method.predict(data.batch(asked)).mean
+    assert torch.allclose(mean, own)
+
+
+def test_links_of_an_earlier_fit_stayed():
+    data, some = robots(), fold().train
+    method, _ = fitted_to(JointPowerField(), data, some)
+    few = some[np.isin(data.stations_of(some), np.unique(data.stations_of(some))[:5])]
+    assert method.links is not None
+    method.fit(data, Fold(few, few[:0], few[:0]), FitContext())
+    assert method.links is None
