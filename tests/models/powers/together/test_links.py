@@ -154,7 +154,7 @@ def test_an_end_may_stand_anywhere():
 
 
 def test_known_stations_of_many_gains_were_told_by_their_neighbours():
-    """Gains differ by 5 dB: another draw's 3.64 dB became 4.15, as stations left out alone chose."""
+    """Another draw's 3.64 dB became 4.15: stations left out chose for known ones, too."""
     rng = np.random.default_rng(2)
     places = np.c_[rng.uniform(0, 300, (24, 2)), np.full(24, 8.0)]
     station = np.repeat(np.arange(24), 60)
