@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 ARROWS = {
     "base": "",
     "ops": "",
-    "processes": "ops",
+    "processes": "base ops",
     "physics": "ops",
     "data": "base ops physics processes",
     "tables": "base data ops physics processes",

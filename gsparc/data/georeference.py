@@ -10,8 +10,8 @@ from pyproj import Proj
 
 from gsparc.base.errors import DataError
 
-# Of an origin's degrees: 11 m, so that the same campaign with a few rows more keeps its origin
-DIGITS = 4
+# Of an origin's degrees: 1.1 km, so that the same campaign with a few rows more keeps its origin
+DIGITS = 2
 # Latitude and longitude [deg]; both customs of longitude are taken: -180 to 180, and 0 to 360.
 ON_EARTH = ((-90, 90), (-180, 360))
 
@@ -38,7 +38,7 @@ class Georeference:
 
     @classmethod
     def from_coordinates(cls, latitude: np.ndarray, longitude: np.ndarray) -> Self:
-        """Place the origin of (n,) [deg] at their median, rounded to 1e-4 degrees.
+        """Place the origin of (n,) [deg] at the median of different ones, rounded to 1e-2 degrees.
 
         Raises:
             DataError: no places, or a value is not in range.
@@ -49,6 +49,7 @@ class Georeference:
         if not latitude.size:
             raise DataError("origin: no places")
         _refuse_invalid(latitude, longitude, "origin: ")
+        latitude, longitude = np.unique([latitude, longitude], axis=1)
         # Relative to one of them: 179.9 and -179.9 are neighbours, their median is not 0.
         turned = np.median((longitude - longitude[0] + 180) % 360 - 180) + longitude[0]
         east = (round(float(turned), DIGITS) + 180) % 360 - 180

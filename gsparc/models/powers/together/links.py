@@ -22,7 +22,7 @@ from gsparc.models.powers.together.learning import ERRORS, LeftOutStations
 from gsparc.models.powers.together.terms import StationRows
 from gsparc.models.target_rows import linear_moments
 from gsparc.processes.averages import MeanVariance
-from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.few_rows import draw_places
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import (
     LOOKED_AT,
@@ -143,7 +143,7 @@ def learn_links(
         missed: what terms that stations share miss of some rows.
         seed: of rows that are looked at.
     """
-    law, looked_at = start.known_trend, draw_rows(len(rows.index), LOOKED_AT, seed)
+    law, looked_at = start.known_trend, draw_places(rows.places, LOOKED_AT, seed)
     values, kernel = link_values(rows, law), Prior(start.kernel)
     others = np.c_[looked_at, links_of_others(rows, values.places, looked_at, LOOKED_BY)]
     heard, unheard = (

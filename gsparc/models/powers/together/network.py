@@ -25,7 +25,7 @@ from gsparc.models.powers.together.terms import StationRows, places_and_notes, r
 from gsparc.processes.censored import PseudoValues
 from gsparc.processes.density import NegativeLogEvidence
 from gsparc.processes.factor import Factor
-from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.few_rows import draw_places
 from gsparc.processes.fit_kernel import SETTLED, minimise
 from gsparc.processes.kernel import Kernel, WhiteNoise, distances
 from gsparc.processes.places import first_end, horizontal, other_end
@@ -172,7 +172,7 @@ def _fit_azimuths(
     rows: StationRows, network: Sectors, names: tuple[str, ...], seed: int
 ) -> tuple[Sectors, Tensor, float, list[str]]:
     """What `_fit_rough` returns, with azimuths that rows do not contradict, and notes on these."""
-    few = _without_foreign(rows.subset(draw_rows(len(rows.index), ROUGH_ON, seed)))
+    few = _without_foreign(rows.subset(draw_places(rows.places, ROUGH_ON, seed)))
     law = replace(fit_law(few, None), level=0.0, exponent=0.0)
     loud = few.heard_rows
     decades = law.decades(torch.from_numpy(loud.places))

@@ -15,11 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.base.hashes import shuffle_rows
 from gsparc.data.schema import Measurements
 from gsparc.models.baselines.distance_law import locate_still_end, say_estimated
 from gsparc.models.target_rows import power_rows
 from gsparc.processes.factor import Factor
-from gsparc.processes.few_rows import draw_rows, first_rows, shuffle_groups
+from gsparc.processes.few_rows import draw_places, first_rows, shuffle_groups
 from gsparc.processes.kernel import distances, matern32
 from gsparc.processes.nearest import JITTER
 from gsparc.processes.places import NO_PLACES, first_end
@@ -65,7 +66,7 @@ class StationRows(PowerRows):
         Rows where something was heard come first where there are too many, up to half of them.
         """
         # One order of places: stations that share places keep the same ones.
-        order = shuffle_groups(self._place_numbers, seed)
+        order = shuffle_rows(seed, first_end(self.places))
         return self.subset(first_rows(order, per_station, self.station, self.silent))
 
     def select_complete_places(self) -> Self:
@@ -150,7 +151,7 @@ class SharedTerms(Columns):
     def set_inducing(self, rows: StationRows, limit: int, seed: int) -> SharedTerms:
         """Return the same with g known at so many places of rows, drawn evenly."""
         ends = np.unique(first_end(rows.places), axis=0)
-        return replace(self, inducing=torch.from_numpy(ends[draw_rows(len(ends), limit, seed)]))
+        return replace(self, inducing=torch.from_numpy(ends[draw_places(ends, limit, seed)]))
 
     def columns(self, places: Tensor) -> Tensor:
         """Return (n, P) [units] at places of both ends (n, 6) [m], or of sectors (n, 7)."""
