@@ -2,7 +2,6 @@
 and the same as in memory.
 """
 
-import hashlib
 import multiprocessing
 import pickle
 import zipfile
@@ -14,7 +13,6 @@ from opened import say
 from releases import write_release
 
 from gsparc.data import blocks
-from gsparc.data.assemble import content_hash
 from gsparc.data.schema import Measurements, Site
 from gsparc.datasets.own import read_any
 from gsparc.datasets.rfid import load_rfid
@@ -90,29 +88,6 @@ def test_measurements_stay_on_disk_and_are_the_same(tmp_path, small, monkeypatch
     )
     rows = np.array([7, 3, 3, 19])
     assert np.array_equal(there.batch(rows).target, here.batch(rows).target)
-
-
-@pytest.mark.parametrize(
-    ("make", "name", "index", "value", "says"),
-    [
-        (arrays, "csi", (31, 2, 5), np.nan, "csi.*row 31.*not finite"),
-        (lambda: spectra(np.float32), "spectrum", (13, 2, 5), -1, "spectrum.*row 13.*at least 0"),
-    ],
-)
-def test_a_bad_entry_is_named_there_too(tmp_path, small, refused, make, name, index, value, says):
-    values = make()
-    values[name][index] = value
-    unchunked(tmp_path / "own.h5", values)
-    refused(says, load_own, tmp_path / "own.h5")
-
-
-def test_the_hash_is_that_of_all_bytes_as_it_was(small):
-    named = {"scale": np.array(2.0), "csi": arrays(200)["csi"][:, ::2], "none": None}
-    digest = hashlib.sha256()
-    for name in ("csi", "scale"):
-        whole = np.ascontiguousarray(named[name])
-        digest.update(f"{name} {whole.dtype.str} {whole.shape};".encode() + whole.tobytes())
-    assert content_hash(named) == digest.hexdigest()
 
 
 def test_a_folder_of_pictures_stays_on_disk_and_so_do_rows_to_learn_from(

@@ -1,7 +1,5 @@
 """Degrees and metres: known lengths of the ellipsoid, and back again to a millimetre."""
 
-import pickle
-
 import numpy as np
 import pytest
 
@@ -41,14 +39,6 @@ def test_the_antimeridian_and_the_poles_are_places():
         Georeference(10, 1).from_degrees(10, -0.5),
         atol=1e-6,
     )
-
-
-def test_the_origin_is_the_rounded_median():
-    origin = Georeference.from_coordinates(
-        [40.76521977, 40.7, 40.8], [-111.83475621, -111.0, -112.0]
-    )
-    assert origin == Georeference(40.7652, -111.8348)
-    assert pickle.loads(pickle.dumps(origin)) == origin
 
 
 @pytest.mark.parametrize(

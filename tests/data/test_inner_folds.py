@@ -65,38 +65,11 @@ def test_they_are_of_training_rows_alone_and_a_pure_function(name):
     )
 
 
-@pytest.mark.parametrize("side", [SIDE, None])
-def test_blocks_are_the_same_squares_of_floor(side):
-    """Where none was said they are a tenth of the site, inside as outside."""
-    positions = floor()
-    outer, inner = both("blocks", positions, share=0.15, side_m=side)
-    low = positions[:, :2] - positions[:, :2].min(axis=0)
-    width = side or np.ptp(low, axis=0).max() / 10 * (1 + 2e-6)
-    square = np.unique(np.floor(low / width), axis=0, return_inverse=True)[1].reshape(-1)
-    for fold in (outer, *inner.folds):
-        assert not np.isin(square[fold.test], square[np.union1d(fold.train, fold.val)]).any()
-    tested = np.concatenate([fold.test for fold in inner.folds])
-    shared = 1 - len(np.unique(tested)) / len(tested)
-    assert shared < 0.15  # draws that overlap little are taken
-    units = inner.unit[tested]
-    assert len(np.unique(units)) == len(np.unique(square[tested]))
-
-
 def test_squares_are_made_smaller_where_two_are_left():
     positions = floor() * [1, 0.3, 1]
     _, inner = both("blocks", positions, side_m=0.34)
     assert inner.name == "blocks" and len(inner.folds) == 3
     assert all(len(fold.val) and len(fold.test) for fold in inner.folds)
-
-
-def test_thinned_rows_are_not_thinned_again():
-    positions = floor()
-    outer, inner = both("random", positions, train_count=100, spacing_m=0.01)
-    known = len(outer.train) + len(outer.val)
-    assert known == 100
-    assert all(len(fold.train) + len(fold.val) == 80 for fold in inner.folds)
-    outer, inner = both("sparse", positions)
-    assert all(len(f.train) + len(f.val) == 0.8 * 180 for f in inner.folds)
 
 
 @pytest.mark.parametrize("together", [0, 2])
@@ -147,12 +120,6 @@ def test_a_files_own_rows_say_how_they_were_cut(name):
     assert inner.name == name
     gap = apart(positions, Fold(outer.train, outer.train[:0], outer.val))
     assert np.mean([apart(positions, fold) for fold in inner.folds]) == pytest.approx(gap, rel=0.5)
-
-
-def test_a_file_without_validation_rows_is_cut_at_random():
-    rows, none = np.arange(60), np.zeros(0, np.int64)
-    inner = inner_folds(floor(60), Fold(rows, none, none), FileSettings(path="split.json"), 3, 0)
-    assert inner.name == "random"
 
 
 def test_too_few_places_are_refused():

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from campaigns import channels, powers, spectra
-from releases import release
 
 from gsparc.commands.check import main as check
 from gsparc.data.outliers import find_outliers, find_strong_outliers, too_far
@@ -143,9 +142,3 @@ def test_a_robot_that_waits_makes_no_outliers():
     assert not too_far(places).any()
     places[99] = [300, 5, 1]
     assert np.flatnonzero(too_far(places)).tolist() == [99]
-
-
-def test_passing_a_station_is_no_outlier():
-    """Three of the city's twelve stations had their nearest rows named, 40 dB above the median."""
-    for column in arrays_of(release("real/powder-rss-462mhz.npz"))["rssi_db"].T:
-        assert not find_strong_outliers(10 ** (column[np.isfinite(column)] / 20)).any()

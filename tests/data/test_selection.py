@@ -5,13 +5,12 @@ which settings cannot be.
 import numpy as np
 import pytest
 from measured import ble_arrays, techtile_arrays
-from releases import release
 
 from gsparc.data import selection
 from gsparc.data.schema import Measurements
 from gsparc.data.selection import Selection
 from gsparc.tables.own import Reading, interpret
-from gsparc.tables.raw import Raw, read_raw
+from gsparc.tables.raw import Raw
 
 
 def part(raw: Raw, **settings) -> Reading:
@@ -229,26 +228,6 @@ CANNOT = {
 def test_what_cannot_be_is_one_line(refused, case):
     make, settings, says = CANNOT[case]
     refused(says, lambda: part(make(), **settings))
-
-
-def test_one_name_needs_no_brackets():
-    assert Selection(stations="A05").stations == ("A05",) and Selection(runs=3).runs == (3,)
-    assert Selection(level_steps={"b": 5, 3: [6, 7]}).level_steps == {"b": (5,), "3": (6, 7)}
-
-
-def test_the_faulty_rows_of_the_measured_plane():
-    path = release("real/techtile-power-reci-rf-1.npz")
-    raw = read_raw(path)
-    read = part(raw, min_rssi_db=-75, max_rows=5000)
-    weak, rows = (raw.arrays["rssi_db"] < -75).sum(), len(raw.arrays["rssi_db"])
-    assert f"dataset.min_rssi_db=-75: {weak} of {rows} rows left out" in read.notes and weak > 0
-    assert level(read.data).min() > -75 and len(read.data) == 5000
-    # Fewer rows reach as far as all do, in centimetres.
-    for end in (np.min, np.max):
-        whole, some = (
-            end(one[:, :2], axis=0) for one in (raw.arrays["rx_position"], read.data.rx_position)
-        )
-        assert np.abs(whole - some - read.data.site.origin[:2]).max() < 0.03
 
 
 @pytest.mark.parametrize("jitter", [0.01, 0.3])
