@@ -7,14 +7,11 @@ import warnings
 import zipfile
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from releases import SPOILT
 
 from gsparc.base.errors import DataError
-from gsparc.datasets.load import load
-from gsparc.datasets.newrf import read_newrf
 from gsparc.datasets.own import read_any
 from gsparc.datasets.rfid import load_rfid
 from gsparc.tables.own import from_arrays, load_own, write_own
@@ -280,30 +277,6 @@ def test_a_file_that_cannot_be_opened_is_a_line(tmp_path, csi_arrays, refused, m
     refused(r"a\.npz: cannot be read .*Permission denied", load_own, tmp_path / "a.npz")
 
 
-def test_hdf5_name_that_is_no_text_is_refused_or_ignored(tmp_path, csi_arrays):
-    path = tmp_path / "name.h5"
-    write_own(path, csi_arrays)
-    with h5py.File(path, "a") as file:
-        file[b"\xff\xfe\xfd"] = np.ones(3)
-        del file.attrs["content_sha256"]
-    assert len(load_own(path)) == 12
-
-
-@pytest.mark.parametrize("name", ["tx_pos", "rx_pos", "csi", "frequency_hz"])
-def test_newrf_without(tmp_path, csi_arrays, refused, name):
-    arrays = {
-        "tx_pos": np.zeros(3),
-        "rx_pos": csi_arrays["rx_position"],
-        "csi": csi_arrays["csi"][:, 0, 0],
-        "frequency_hz": np.array(2.4e9),
-    }
-    (tmp_path / "room.npz").write_bytes(_archive(arrays))
-    assert len(load({"name": "newrf", "file": str(tmp_path / "room.npz")})) == 12
-    del arrays[name]
-    (tmp_path / "room.npz").write_bytes(_archive(arrays))
-    refused(rf"room\.npz, {name}: missing", read_newrf, tmp_path / "room.npz")
-
-
 @pytest.mark.parametrize(
     "text,says",
     [
@@ -324,22 +297,6 @@ def test_attributes_that_are_none(tmp_path, csi_arrays, refused, text, says):
     np.savez(tmp_path / "own.npz", attributes=np.array(text), **csi_arrays)
     said = str(refused(says, load_own, tmp_path / "own.npz"))
     assert "own.npz, " in said and "set_int_max_str_digits" not in said
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize(
-    ("dtype", "unit"),
-    [(np.complex128, unit) for unit in (1e-310, 1e-200, 1e200, 1e300)]
-    + [(np.complex64, unit) for unit in (1e-42, 1e-38, 1e38)],
-)
-def test_channels_in_units_at_the_edge_of_numbers(csi_arrays, dtype, unit):
-    """Units of 1e-310 were refused row by row;
-    dividing in complex64 by 1e-42 gave NaN or a digit or two.
-    """
-    plain = from_arrays(csi_arrays)
-    tiny = from_arrays({**csi_arrays, "csi": (csi_arrays["csi"] * unit).astype(dtype)})
-    tolerance = 2e-3 if unit == 1e-42 else 1e-5
-    assert np.abs(tiny.target - plain.target).max() < tolerance * np.abs(plain.target).max()
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

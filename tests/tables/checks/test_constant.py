@@ -111,21 +111,6 @@ def test_another_file_has_the_tones_that_were_learned(other):
     np.testing.assert_allclose(value, arrays["csi"][:, ~DEAD][:, :, ~NULLS][:, mask], rtol=1e-4)
 
 
-def test_stuck_stations_are_named_and_kept():
-    rng = np.random.default_rng(0)
-    at = rng.uniform(0, 5, (ROWS, 3))
-    levels = -60 - 5 * rng.random((ROWS, 3))
-    levels[:, 2] = -62.5
-    posts = {
-        "station_position": rng.uniform(0, 5, (3, 3)),
-        "station_name": np.array(["a", "b", "stuck"]),
-    }
-    reading = interpret(Raw({"rx_position": at, "rssi_db": levels} | posts), "levels")
-    (note,) = [note for note in reading.notes if isinstance(note, Caution)]
-    assert note == "all rows of station stuck are the same: are they measurements?"
-    assert len(reading.data) == 3 * ROWS
-
-
 def test_check_named_no_null_tone_of_a_card():
     text = said(real("strangers3/nexmon_nulls.npz"))
     assert "tones 0 to 3, tone 32, tones 61 to 63 (of 1 x 64, from 0) are constant" in text

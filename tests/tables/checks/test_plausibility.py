@@ -105,10 +105,6 @@ def test_degrees(latitude, longitude, said):
     assert len(found) == 1 and said in found[0], found
 
 
-def test_sound_degrees():
-    assert plausibility.degree_warnings(np.array([40.7, -33.9]), np.array([-111.8, 151.2])) == []
-
-
 @pytest.mark.parametrize(
     "level, said",
     [
@@ -245,22 +241,6 @@ def test_warnings_and_rows_had_other_names_of_a_cell_than_the_rest():
     assert data.row_names[:2] == ["row 0, station W03-2 (150)", "row 0, station W03-3 (212)"]
 
 
-def test_no_verdict_depends_on_rows_that_are_in_no_order():
-    """Rows shuffled told of a step, an outage and wild rows, by chance."""
-    rng, place, level, _ = np.random.default_rng(0), *walk(2)
-    level[level < np.percentile(level, 30)] = np.nan
-    level[[50, 300]] = -20.0
-    found = set[tuple[str, ...]]()
-    for _ in range(3):
-        order = rng.permutation(len(level))
-        links = as_links(place[order], level[order, None], ["a"], np.full((1, 2), np.nan))
-        back = [f"row {number}" for number in order]
-        warned = plausibility.sanity_warnings(replace(links, rows=back), find_level_steps(links))
-        found.add(tuple(warned))
-    assert len(found) == 1, found
-    assert not any("in the" in line or "level_steps" in line for line in next(iter(found)))
-
-
 def test_rows_of_which_some_have_other_degrees_were_good():
     """Half of the latitudes divided by ten: a box of 4,800 km, whose degrees nobody asked."""
     rng = np.random.default_rng(0)
@@ -270,18 +250,6 @@ def test_rows_of_which_some_have_other_degrees_were_good():
     half = np.where(np.arange(80) % 2, latitude, latitude / 10)
     (said,) = unit_warnings(from_arrays({**arrays, "latitude": half}))
     assert said.startswith("two groups of places ") and "km apart" in said
-
-
-@pytest.mark.parametrize(
-    "other", [lambda v: v / 1e3, lambda v: v / 10, lambda v: 10 ** (v / 10), lambda v: v - 30]
-)
-@pytest.mark.parametrize("each", [2, 10])
-def test_some_levels_in_another_unit_are_named(other, each):
-    place, level, _ = walk(0)
-    assert not plausibility.two_unit_warnings(as_links(place, level[:, None], ["a"]))
-    level[::each] = other(level[::each])
-    (said,) = plausibility.two_unit_warnings(as_links(place, level[:, None], ["a"]))
-    assert said.endswith("in two units?"), said
 
 
 @pytest.mark.parametrize("factor, says", [(1e-2, "differ by"), (3.28, "thermal noise of a hertz")])
