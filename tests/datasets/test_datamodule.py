@@ -38,11 +38,6 @@ def test_order_is_pinned():
     assert rows_of_step(0, 3, 4, np.arange(8)).tolist() == [0, 4, 2, 5]
 
 
-def test_empty_pool_is_refused(data):
-    with pytest.raises(ValueError, match="training rows"):
-        StepLoader(data, np.array([], dtype=np.int64), 4, seed=0)
-
-
 class _Recorder(pl.LightningModule):
     def __init__(self, stop_after=None):
         super().__init__()
