@@ -115,14 +115,6 @@ def test_silent_rows_counted_nowhere(drawn):
     assert squares[1] < squares[0] and found[0] < 0.9 * found[1]
 
 
-def test_no_variance_no_figures(drawn):
-    data, mean_db = drawn
-    scores = scored(data, mean_db, 6.0)
-    assert (
-        power_intervals(Scores(**{**vars(scores), "variance": np.full(COUNT, np.nan)}), data) == {}
-    )
-
-
 def test_levels_of_lists_are_none_of_a_station(drawn):
     """The last list's level was taken for the sensitivity of a station."""
     data, _ = drawn

@@ -1,6 +1,5 @@
 """What a run leaves behind."""
 
-import csv
 import json
 import os
 import re
@@ -22,7 +21,6 @@ from gsparc.evaluation.summary import (
     remarks,
     results_table,
     run_git,
-    write_samples,
     write_summary,
 )
 
@@ -51,15 +49,6 @@ def test_what_is_not_finite_or_flat_is_refused_by_name(tmp_path, bad):
     write_summary(path, {"test/ssim": 0.5})
     refused("test/psnr_db", write_summary, path, {"test/ssim": 0.6, "test/psnr_db": bad})
     assert json.loads(path.read_text()) == {"test/ssim": 0.5}
-
-
-def test_samples_become_rows(tmp_path):
-    write_samples(
-        tmp_path / "s.csv", {"row": np.arange(2), "name": ["a", "b,c"], "ssim": [0.5, np.nan]}
-    )
-    rows = list(csv.reader((tmp_path / "s.csv").open(newline="")))
-    assert rows == [["row", "name", "ssim"], ["0", "a", "0.5"], ["1", "b,c", ""]]
-    refused("same length", write_samples, tmp_path / "s.csv", {"a": [1], "b": [1, 2]})
 
 
 def test_table_shows_no_accuracy_without_its_time():
