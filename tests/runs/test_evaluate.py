@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
 from refusals import refused
 
 from gsparc.base.files import write_samples
@@ -15,7 +14,6 @@ from gsparc.models.baselines.mean import Mean
 from gsparc.prediction.timing import ClockSettings
 from gsparc.runs.baselines import baselines_for, fit_baseline
 from gsparc.runs.evaluate import evaluate
-from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 QUICK = ClockSettings(rounds=3, least=2, warmup=1)
@@ -170,24 +168,6 @@ def test_baselines_have_not_seen_the_rows_they_are_scored_on(campaign, folds, na
     assert fit_baseline(name, data, split, "val").methods[0].count_components() == 27
 
 
-def test_wrong_counts_are_refused(campaign, folds, tmp_path):
-    data, split = campaign("spectrum", 40), folds(40, 2)
-    methods, seconds = fit_all(Mean, data, split)
-    refused(
-        "1 methods for the 2 folds", evaluate, methods[0], seconds[:1], data, split, clock=QUICK
-    )
-    refused(
-        "1 training times for 2 methods", evaluate, methods, seconds[0], data, split, clock=QUICK
-    )
-
-
-def test_a_poisoned_prediction_is_not_scored(campaign, folds, tmp_path):
-    data, split = campaign("spectrum", 40), folds(40)
-    (method,), _ = fit_all(Mean, data, split)
-    method.value[:, 3] = torch.nan
-    refused("NaN or Inf", evaluate, method, None, data, split, clock=QUICK)
-
-
 def test_a_method_of_seconds_a_query_is_not_timed_in_batches(campaign, folds, monkeypatch):
     """Ray marching took ten minutes to be timed in batches of 64."""
     monkeypatch.setattr("gsparc.runs.evaluate.SLOWEST_BATCH_MS", 0.0)
@@ -211,19 +191,3 @@ def test_a_row_that_decides_sums_is_named_beside_a_median(campaign, folds, tmp_p
         f"row {row} alone makes 100.0% of the error or power"
     )
     write_summary(tmp_path / "summary.json", facts)
-
-
-def test_rows_of_links_whose_both_ends_moved_name_both_places(folds, tmp_path):
-    """Training ended with an error after it: six coordinates of a link were taken for three."""
-    ends = np.random.default_rng(0).uniform(0, 10, (2, 40, 3))
-    power = -40 - 20 * np.log10(np.linalg.norm(ends[0] - ends[1], axis=1))
-    data = from_arrays(
-        {"tx_position": ends[0], "rx_position": ends[1], "rssi_db": power, "carrier_hz": 1e9}
-    )
-    found = evaluated(InverseDistance, data, folds(40), baselines=()).columns
-    for end, names in zip(
-        ends, (("tx_x_m", "tx_y_m", "tx_z_m"), ("x_m", "y_m", "z_m")), strict=True
-    ):
-        np.testing.assert_allclose(
-            np.column_stack([found[n] for n in names]), end[found["row"]], atol=1e-6
-        )

@@ -17,7 +17,7 @@ from gsparc.commands.train import train
 from gsparc.evaluation.results import read_run
 from gsparc.models import checkpoint
 from gsparc.runs import run_lock
-from gsparc.runs.ledger import LEFT, set_earlier_aside
+from gsparc.runs.ledger import LEFT
 from gsparc.runs.open_runs import open_run
 from gsparc.runs.run_lock import LOCK, RunLock, hold_folder, locked, release_folders
 
@@ -162,15 +162,6 @@ def test_what_a_run_goes_on_from_is_not_set_aside(tmp_path):
         "summary.json.earlier",
         "split.json",
     }
-
-
-def test_a_split_alone_was_called_results(tmp_path, caplog):
-    caplog.set_level("INFO")
-    (tmp_path / "split.json").write_text("{}")
-    set_earlier_aside(tmp_path)
-    assert caplog.messages == [
-        f"{tmp_path}: files of an earlier run there were renamed to NAME.earlier"
-    ]
 
 
 def test_half_written_files_of_killed_runs_stayed_for_ever(tmp_path):

@@ -48,19 +48,6 @@ def test_a_whole_table_comes_before_further_efforts_and_seeds():
     assert "rfid/random/waves/1/1" in names(kind="csi")
 
 
-def test_every_room_has_its_first_table_before_any_has_a_second():
-    rooms = [problem("a"), problem("b")]
-    found = [str(cell) for _, cell in plan_cells(rooms, METHODS, [1], [0, 1])]
-    assert found == [
-        "a/random/gp/any/any",
-        "b/random/gp/any/any",
-        "a/random/fast/1/0",
-        "b/random/fast/1/0",
-        "a/random/fast/1/1",
-        "b/random/fast/1/1",
-    ]
-
-
 def test_a_draw_of_a_split_is_the_seed_of_every_method():
     draws = [problem("a", "blocks", draw=n) for n in range(2)]
     found = [(p.draw, str(cell)) for p, cell in plan_cells(draws, METHODS, [1], [5, 6])]
@@ -106,17 +93,6 @@ def test_methods_take_part_where_they_are_said_to_and_tell_what_they_read():
         ("rfid", "walls"),
         ("rfid", "directions"),
     ]
-
-
-@pytest.mark.slow
-def test_every_method_of_the_default_comparison_composes():
-    config = OmegaConf.to_container(compose(config="compare"), resolve=True)
-    for contender in read_entries("methods", Contender, config["methods"]).values():
-        assert compose(*contender.overrides(0.3)).model
-    assert config["ours"] in config["methods"]
-    for split in read_entries("splits", SplitChoice, config["splits"]).values():
-        assert set(split.datasets) <= set(config["datasets"])
-        assert compose("dataset=newrf", "dataset.file=x", *split.overrides).split.name
 
 
 def test_one_model_of_a_network_was_fitted_under_four_names():
