@@ -219,22 +219,6 @@ def test_seconds_of_stations_were_said_to_be_unused(town):
     assert not wrap_per_station(method_class("idw")(), town).takes_effort
 
 
-def test_models_of_stations_left_folders_in_the_current_one(town, fold, tmp_path):
-    """A search keeps what it finds in `run_dir`;
-    without one that of station 0 became ./station0.
-    """
-    folders = []
-
-    class Writes(method_class("mean")):
-        def fit(self, data, fold, context):
-            folders.append(context.run_dir)
-            return super().fit(data, fold, context)
-
-    for context in (FitContext(), FitContext(tmp_path)):
-        wrap_per_station(Writes(), town).fit(town, fold, context)
-    assert set(folders[: len(POSTS)]) == {Path()} and tmp_path / "station0" in folders
-
-
 @pytest.mark.slow
 def test_stations_that_are_fitted_elsewhere_are_the_same_bits(town, fold, tmp_path, elsewhere):
     torch.set_num_threads(1)

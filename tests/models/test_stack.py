@@ -56,16 +56,6 @@ def test_rows_of_one_unit_do_not_make_a_mixture():
     assert sorted(weights_of([noisy(0.3, 1), noisy(0.31, 2)], TARGET, 0 * EACH)) == [0, 1]
 
 
-def test_complex_predictions_are_weighed_as_they_are_summed():
-    turned = torch.complex(noisy(0.3, 1), noisy(0.3, 2))
-    other = torch.complex(noisy(0.3, 3), noisy(0.3, 4))
-    target = torch.complex(TARGET, TARGET)
-    found = weights_of([turned, other], target, EACH)
-    both = found[0] * turned + found[1] * other
-    told = [explained_variance(one, target, False) for one in (both, turned, other)]
-    assert told[0] > max(told[1:])
-
-
 def test_silent_targets_still_give_weights():
     assert sum(
         weights_of([noisy(0.1, 1), noisy(0.2, 2)], torch.zeros_like(TARGET), EACH)

@@ -198,24 +198,6 @@ def test_calls_have_one_of_few_sizes():
         assert all(count <= size and size in (1, 3, 8, 23, 67, 200) for count, size in parts)
 
 
-def test_other_places_compile_nothing(places):
-    """Each receiver's coordinates were constants of a kernel of its own, a fifth of the time of
-    tracing, and so were the number of receivers of a call and that of rays."""
-    import drjit as dr
-
-    room = RayTracer(conference_room(), TRANSMITTER, 2.44e9, QUICK)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        room.trace(places[:20], PLAIN)
-        dr.kernel_history()
-        room.trace(places[20:50], PLAIN)
-        compiled = [kernel for kernel in dr.kernel_history() if not kernel.get("cache_hit", True)]
-        room.with_samples(1777).trace(places[:50], PLAIN)
-        anew = [kernel for kernel in dr.kernel_history() if not kernel.get("cache_hit", True)]
-    assert len(compiled) < 10  # of what follows the number of paths
-    # Of rays
-    assert all(kernel["operation_count"] < 1000 for kernel in anew if kernel["size"] == 1777)
-
-
 def test_polarisation_edges_and_scattering_are_recorded(room, places):
     paths = room.trace(places[:10], Effects(depth=2))
     assert paths.gain.shape[1] == 2 and np.abs(paths.gain[:, 1]).max() > 0

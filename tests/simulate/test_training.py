@@ -56,18 +56,6 @@ def test_fewer_effects_are_tested_on_the_full_simulation(kind, box, tmp_path):
         with_true_targets(alone, replace(whole, release_split=None), "dataset.truth=x")
 
 
-def test_outages_are_the_truth_s(box):
-    whole = load({"name": "sionna", "file": str(box), "target": "rssi"})
-    test = whole.release_split[1]
-    deaf = np.zeros(len(whole), bool)
-    deaf[[test[0], whole.release_split[0][0]]] = True
-    fewer = replace(whole, censored=deaf, mask=~deaf[:, None])
-    mixed = with_true_targets(fewer, whole, "dataset.truth=x")
-    assert not mixed.censored[test].any() and mixed.mask[test].all() and mixed.censored.sum() == 1
-    back = with_true_targets(whole, fewer, "dataset.truth=x")
-    assert back.censored.sum() == 1 and back.censored[test[0]] and not back.mask[test[0]].any()
-
-
 @pytest.mark.parametrize("kind", ROAD)
 def test_simulated_dataset_is_trained_like_any_other(kind, box, tmp_path):
     settings = [
