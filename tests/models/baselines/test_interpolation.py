@@ -1,7 +1,6 @@
 """The simple baselines, what all of them share, and kriging from the nearest of many places."""
 
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -46,15 +45,6 @@ def test_idw_weighs_by_inverse_squared_distance(campaign, folds, tmp_path):
     )
     with pytest.raises(ValueError, match="neighbours"):
         InverseDistance(neighbours=0)
-
-
-def test_mean_is_the_mean(campaign, folds, tmp_path):
-    data, fold = campaign("spectrum", 30), folds(30).folds[0]
-    rows = np.concatenate([fold.train, fold.val])
-    batch = data.batch(fold.test)
-    found = fitted("mean", data, fold, tmp_path).predict(batch).mean
-    assert torch.allclose(found[0], data.targets(rows).mean(0), atol=1e-6)
-    assert torch.equal(found[0], found[-1])
 
 
 @pytest.mark.parametrize("name", ["mean", "nearest", "idw", "gp"])
@@ -106,15 +96,6 @@ def test_kriging_of_many_rows_asked_for_all_memory(tmp_path, monkeypatch):
         ]
     )
     assert (error + 40 + torch.from_numpy(places[70:, 0]).float()).abs().max() < 1.5
-
-
-def test_runs_were_taken_as_one_without_a_word(campaign, folds, tmp_path):
-    data = campaign("csi")
-    fold = folds(len(data)).folds[0]
-    several = replace(data, run=np.arange(len(data)) % 2)
-    said = [InverseDistance().fit(d, fold, FitContext(tmp_path)).notes for d in (several, data)]
-    assert any("channels of 2 runs" in note for note in said[0])
-    assert not any("runs" in note for note in said[1])
 
 
 def field(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

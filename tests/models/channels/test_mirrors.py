@@ -17,7 +17,6 @@ from gsparc.models.channels.columns import group_channels
 from gsparc.models.channels.evidence import compress_groups, normalise_power
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
-from gsparc.models.channels.mirrors import find_mirrors
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.probe import Probe, likelihood_gains
 from gsparc.models.channels.terms import Direct, Images, Isotropic, Noise
@@ -92,17 +91,6 @@ def test_a_probe_gains_what_the_likelihood_rises():
             torch.testing.assert_close(gain, rise, rtol=1e-4, atol=1e-3)
         covariance = covariance + level * waves[0][:, None] * waves[0].conj()[None]
         probe = probe.add_wave(waves[0], level)
-
-
-@pytest.mark.slow
-def test_a_wall_at_any_azimuth_is_found_by_ends_of_unknown_phases():
-    data = _data(*_site([WALL], ends=4, count=50, side=0.7, turned=2.0))
-    groups, prior = _bare(data)
-    parts = compress_groups(groups, prior)
-    planes = find_mirrors(parts, parts, prior, WAVELENGTH, 1)
-    plane = planes[0].numpy() * np.sign(planes[0, 0].item())
-    assert np.arccos(plane[:3] @ WALL[:3]) < 0.05
-    assert plane[3] + plane[:3] @ data.site.origin == pytest.approx(WALL[3], abs=0.05)
 
 
 def test_no_wall_is_kept_where_there_is_none():

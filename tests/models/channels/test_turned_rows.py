@@ -12,7 +12,6 @@ from gsparc.data.splits import Fold, SplitSettings
 from gsparc.models.aligned_rows import align_phases
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.turned_rows import FullPowerGP, TurnedNeighbours
-from gsparc.models.closed_form import method_from_state, method_state
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import factors_to_measured
 from gsparc.physics.row_factors import align_factors
@@ -66,25 +65,6 @@ def test_neighbours_are_told_whatever_phases_their_rows_have():
     turned = said.mean * factors_to_measured(said.mean, data, test)
     squared = (turned - torch.from_numpy(data.target[test])).abs().square().flatten(1).mean(1)
     assert 0.3 < float(squared.mean() / said.variance.mean()) < 3
-
-
-@pytest.mark.parametrize("tones", [1, 16])
-def test_rows_of_unknown_tones_are_turned_by_their_phase(tones):
-    data, test = line(), np.arange(0, 60, 7)
-    one = replace(
-        data, target=data.target[..., :tones], site=replace(data.site, subcarriers_hz=None)
-    )
-    method = fit(TurnedNeighbours(), one, np.setdiff1d(np.arange(60), test), test)
-    assert method.predict(one.batch(test)).mean.shape == (len(test), 1, tones)
-
-
-def test_a_stored_method_answers_the_same(tmp_path):
-    data, test = line(), np.arange(0, 60, 7)
-    method = fit(TurnedNeighbours(), data, np.setdiff1d(np.arange(60), test), test)
-    again = method_from_state(data.site, method_state(method))
-    for part in ("mean", "variance", "unknown"):
-        one, two = (getattr(each.predict(data.batch(test)), part) for each in (method, again))
-        torch.testing.assert_close(one, two)
 
 
 def test_the_mean_keeps_its_phase_and_gains_power_where_little_is_known():

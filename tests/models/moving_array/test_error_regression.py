@@ -45,14 +45,6 @@ def test_the_error_of_each_half_is_predicted(half_bad):
     )
 
 
-def test_a_feature_correlated_with_the_error_is_used():
-    rng = np.random.default_rng(1)
-    places, observed = rng.uniform(0, 10, (300, 3)), features(300)
-    model = fit(places, 0.1 * np.exp(2 * observed[:, 1]), observed)
-    said = said_of(model, places, rng.uniform(2, 8, (100, 3)), features(100, 2))
-    assert np.corrcoef(np.log(said), features(100, 2)[:, 1])[0, 1] > 0.95
-
-
 def test_the_error_grows_far_away_to_that_of_an_image_drawn_at_random(half_bad):
     """Near rows it is the relative one."""
     away = np.array([[10.0, 4, 1.3], [13.0, 4, 1.3], [1e4, 4, 1.3]])
