@@ -3,8 +3,6 @@ and nothing is done twice.
 """
 
 import json
-import subprocess
-import sys
 from collections import defaultdict
 from pathlib import Path
 
@@ -60,32 +58,3 @@ def test_a_killed_job_is_gone_on_with_and_nothing_is_done_twice(tmp_path, monkey
         if any(stage.is_relative_to(record.parent) for record in before):
             assert len(steps) == STEPS  # done in the first command, and then not again
         assert len(steps) - STEPS <= EVERY  # of one cut short, those after its last checkpoint
-
-
-@pytest.mark.slow
-@pytest.mark.rare
-def test_jobs_on_ray_return_what_jobs_here_do_and_are_not_done_again(tmp_path):
-    pytest.importorskip("ray", reason="ray is not installed")
-    spectra(tmp_path / "own.npz")
-    settings = (
-        "dataset=own",
-        f"dataset.file='{tmp_path / 'own.npz'}'",
-        "model=mean,nearest",
-        "threads=1",
-    )
-    found = []
-    for launcher, folder in (("basic", "here"), ("ray", "there"), ("basic", "there")):
-        where = (f"hydra.sweep.dir={tmp_path / folder}", f"hydra/launcher={launcher}")
-        given = ["-m", *settings, "baselines=[]", "logger=none", *where]
-        if launcher == "basic":
-            assert knock(main, "train.py", given).status == 0
-        else:
-            command = [sys.executable, "train.py", *given]
-            done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-            assert done.returncode == 0, done.stderr
-        jobs = sorted((tmp_path / folder).glob("*/job.json"))
-        began = [json.loads(file.read_text())["began"] for file in jobs]
-        facts = [json.loads(file.with_name("summary.json").read_text()) for file in jobs]
-        found.append(([(one["model/name"], one["test/psnr_db"]) for one in facts], began))
-    here, there, again = found
-    assert len(here[0]) == 2 and here[0] == there[0] and there == again
