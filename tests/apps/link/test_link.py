@@ -23,7 +23,6 @@ from gsparc.apps.link.study import (
     beam_loss_db,
     find_crossing,
     rate_facts,
-    send_blocks,
 )
 from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
@@ -165,24 +164,6 @@ def test_export_on_any_grid(trained) -> None:
     assert np.abs(found.delay_s).max() < 1 / 312.5e3
     with pytest.raises(ValueError, match=r"expected \(B, 64, 26\)"):
         predictor.csi(uplink=heard[:, :8])
-
-
-def test_a_coarse_look_may_be_all_there_is() -> None:
-    """coarse = fine once asked for a second part of no blocks."""
-
-    class Half:
-        def run(self, band, level, order, batch):
-            assert len(order)
-            failed = np.arange(len(order)) % 2 == 0
-            own = {"ebno_db": level, "position": order, "failed": failed, "wrong": failed * 0.1}
-            return pd.concat(
-                [pd.DataFrame(own | {"receiver": name}) for name in ("perfect", "predicted")]
-            )
-
-    nothing = Band(*[torch.zeros(5, 1)] * 3)
-    for fine, blocks in ((8, 8), (20, 20)):
-        found = send_blocks(Half(), nothing, [1.0], (8, fine, 4))
-        assert len(found) == 2 * blocks
 
 
 @needs_sionna

@@ -16,24 +16,6 @@ def gaussians(cells, middles, width=0.2):
     return PlacePosterior(cells, density - np.log((np.exp(density) * cells.volume).sum()))
 
 
-def test_cells_cover_the_plane_that_was_walked():
-    cells = cover_box(PLACES, 400, False)
-    assert (
-        300 < len(cells) < 600
-        and (cells.edge[:, 2] == 0).all()
-        and (cells.centre[:, 2] == 1.5).all()
-    )
-    assert cells.volume.sum() == pytest.approx(np.ptp(PLACES[:, :2], axis=0).prod())
-
-
-def test_halves_fill_the_whole():
-    cells = cover_box(PLACES, 50, False)
-    finer = cells.halve()
-    assert len(finer) == 4 * len(cells) and finer.volume.sum() == pytest.approx(cells.volume.sum())
-    one = cells.subset(np.array([3])).halve()
-    assert np.abs(one.centre - cells.centre[3]).max(0) == pytest.approx(cells.edge[3] / 4)
-
-
 def test_cells_near_trained_places():
     walked = PLACES[PLACES[:, 0] < 1.0]
     both = np.concatenate([walked, [[4.0, 2.0, 1.5]]])
