@@ -32,15 +32,6 @@ def test_every_gaussian_has_a_network_of_its_own(hidden):
         assert torch.allclose(many.logits(where)[:, i], want, atol=1e-6)
 
 
-@pytest.mark.parametrize("precision", [torch.bfloat16, torch.float16], ids=str)
-def test_networks_keep_their_precision_under_autocast(precision):
-    many, encoded = emission(), torch.rand(3, 15)
-    with torch.autocast("cpu", dtype=precision):
-        assert torch.equal(many._networks(encoded), many._networks(encoded).float())
-        half = many._networks(encoded)
-    assert torch.allclose(half, many._networks(encoded), rtol=1e-5)
-
-
 def test_activations():
     where, apart = torch.rand(2, 3), torch.full((2, 5), 3.0)
     plain = emission(activation="linear")

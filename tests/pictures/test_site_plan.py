@@ -106,54 +106,6 @@ def test_rows_that_are_wrong_are_marked(figures):
     assert figure.axes[0].get_aspect() == 1
 
 
-def test_stations_that_jump_have_a_panel(figures):
-    rng = np.random.default_rng(0)
-    place = rng.uniform(0, 100, (200, 3)) * [1, 1, 0]
-    # Two tours of the site, each in an order of places: of rows in none no step is told.
-    for tour in (place[:120], place[120:]):
-        tour[:] = tour[np.lexsort((tour[:, 1], tour[:, 0] // 20))]
-    posts = np.array([[0.0, 0, 9], [100, 0, 9], [0, 100, 9]])
-    level = -30 * np.log10(np.linalg.norm(place[:, None] - posts, axis=-1)) + rng.normal(
-        0, 1, (200, 3)
-    )
-    level[120:, 1] += 20
-    names = np.array(["a", "b", "c"])
-    data = from_arrays(
-        {"tx_position": place, "station_position": posts, "station_name": names, "rssi_db": level}
-    )
-    figure, said = shown(data, figures)
-    panels = [axis for axis in figure.axes if axis.get_title()]
-    assert [axis.get_title() for axis in panels] == ["b: steps that the places do not explain"]
-    assert "dB from row 119 to row 120" in said and "its level jumps" in said
-    assert "3 stations (receivers)" in said
-
-
-def test_the_origin_of_degrees_is_said(figures):
-    rng = np.random.default_rng(0)
-    arrays = {
-        "latitude": -33 - rng.uniform(0, 0.01, 30),
-        "longitude": 151 + rng.uniform(0, 0.01, 30),
-    }
-    data = from_arrays({**arrays, "rx_height": np.array(1.5), "rssi_db": rng.uniform(-90, -60, 30)})
-    origin = data.site.georeference
-    said = shown(data, figures)[1]
-    assert f"metres east of {origin.longitude:g}° E" in said
-    assert f"metres north of {-origin.latitude:g}° S" in said
-
-
-def test_other_kinds_are_drawn_too(campaign, figures):
-    assert "spectra" in shown(campaign("spectrum"), figures)[1]
-    ends = {
-        "rx_position": scattered(),
-        "tx_position": scattered()[::-1],
-        "frequency_hz": np.array(1e9),
-    }
-    said = shown(from_arrays({**ends, "csi": np.exp(1j * np.arange(80))}), figures)[1]
-    assert "transmitter" in said and "receiver" in said and "mean channel power [dB]" in said
-    line = {"rx_position": np.arange(30.0)[:, None] * [1, 0, 0], "rssi_db": np.arange(30.0)}
-    assert "30 powers at 30 places" in shown(from_arrays(line), figures)[1]
-
-
 STATION = np.array([101.0, 204.0, 2.0])
 HALF = np.sqrt(0.5)
 # Two walls, and a floor

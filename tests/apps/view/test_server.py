@@ -150,47 +150,6 @@ def test_the_plane_is_of_the_transmitter_that_was_dragged(visit, tmp_path):
     assert "m from the other end" in session.answer_text.content
 
 
-def test_a_station_that_is_being_made_keeps_nobody_waiting(visit, power_view, monkeypatch):
-    """Pictures of a station were made on the event loop: all clients stood still for seconds."""
-    session = visit(power_view)
-    settle(session)
-    make, go = SiteView._make, threading.Event()
-    monkeypatch.setattr(SiteView, "_make", lambda view, name: go.wait(20) and make(view, name))
-    choosing = threading.Thread(target=session._station_changed, args=("east",))
-    choosing.start()
-    drag(session, "rx", [20.0, 30.0, 1.5])
-    settle(session)
-    assert session.station == "west" and "receiver at 20.00, 30.00" in session.answer_text.content
-    assert "being prepared" in session.title.content and not go.is_set()
-    go.set()
-    choosing.join()
-    settle(session)
-    assert session.station == "east" and session.title.content.endswith("east**")
-
-
-def test_another_station_is_another_answer_and_the_weakest_cell_can_be_visited(visit, power_view):
-    session = visit(power_view)
-    settle(session)
-    first = session.answer_text.content
-    session._station_changed("east")
-    settle(session)
-    assert session.answer_text.content != first and "east" in session.title.content
-    session._go("next weak place")
-    settle(session)
-    level = session.plane.level_db
-    said = float(re.match(r"\*\*(-?[\d.]+)", session.answer_text.content)[1])
-    assert said == pytest.approx(np.nanmin(level), abs=0.1)
-    here = session.places["rx"]
-    session._go("next weak place")
-    settle(session)
-    # It stayed where it was, however often one asked
-    assert np.linalg.norm(session.places["rx"] - here) > 5
-    session.laid.value = False
-    session.want_plane()
-    settle(session)
-    assert "plane" not in session.nodes and session.power is None
-
-
 def test_of_two_clients_one_vanishes_and_the_other_is_answered(power_view):
     server = PageServer(power_view, port=0)
     try:

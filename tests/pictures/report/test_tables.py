@@ -241,16 +241,3 @@ def test_settings_were_told_apart_without_a_word_on_the_seed_that_they_share(run
     for seeds in (1, 2):
         runs = sweep_of(run_dir, tmp_path / str(seeds), [(29.0, 28.7)] * seeds)
         assert (said in tables.table_of_leads(runs).markdown()) == (seeds == 1)
-
-
-def test_a_method_without_chance_had_differences_without_error(run_dir, tmp_path):
-    """Three seeds of a closed form are one fit:
-    its difference is known as well as its test rows tell it.
-    """
-    runs = sweep_of(run_dir, tmp_path, [(29.0, 28.7)] * 3)
-    for row in own_rows(runs).itertuples():
-        change = np.repeat([0.1, 0.0], 12)  # on half of the rows
-        samples = row.run.samples
-        samples["psnr_db"] = samples["psnr_db"] + (change if "on" in row.setting else -change)
-    (lead,) = tables.table_of_leads(runs).rows
-    assert lead[3] == "24 test rows" and lead[2].error == pytest.approx(0.1 / 23**0.5)
