@@ -160,22 +160,6 @@ def test_children_lie_as_their_parent_does():
     assert torch.allclose(spread, torch.tensor([0.1, 2.0, 0.1]), rtol=0.03)
 
 
-def test_a_cap_that_leaves_no_room_was_not_said(model, caplog):
-    """The ablations started at their cap, and never densified."""
-    densify = with_gradient(
-        Densify(grad_threshold=0.5, size_share=1.0, max_gaussians=10, interval=1, start=0), [2, 7]
-    )
-    module = at(model, 600, 1000)
-    trainer = SimpleNamespace(
-        optimizers=[optimizer_for(model, OptimizerSettings())], loggers=[], logger=None
-    )
-    densify.on_train_batch_start(trainer, module)
-    with_gradient(densify, [2])
-    densify.on_train_batch_start(trainer, module)
-    said = [line for line in caplog.messages if "no room" in line]
-    assert said == ["no room for more Gaussians since step 600: callbacks.densify.max_gaussians=10"]
-
-
 def test_large_ones_go_by_size_and_by_radius_from_a_step_on(model):
     with torch.no_grad():
         model.gaussians.log_scales[3] = 3.0

@@ -38,14 +38,3 @@ def test_now_and_then_and_at_the_end(campaign, folds, tmp_path, step, drawn):
     run, module = stage(data, folds(len(data)).folds[0], tmp_path, step)
     Pictures(every=10, count=2).on_train_batch_end(run, module)
     assert (tmp_path / "pictures" / f"step_{step:06d}.png").exists() == drawn
-
-
-@pytest.mark.parametrize(("kind", "validation"), [("spectrum", 0), ("csi", None)])
-def test_neither_training_rows_nor_channels_are_drawn(campaign, folds, tmp_path, kind, validation):
-    data = campaign(kind)
-    fold = folds(len(data)).folds[0]
-    run, module = stage(
-        data, type(fold)(fold.train, fold.val[:validation], fold.test), tmp_path, 25
-    )
-    Pictures(every=5, count=200).on_train_batch_end(run, module)
-    assert not list(tmp_path.iterdir())

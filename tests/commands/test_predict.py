@@ -7,17 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from campaigns import compose
 from doors import knock
-from drives import city_drive, write_table
+from drives import write_table
 from refusals import refused_as
 
 import gsparc
 from gsparc.apps.maps.promise import Promise
 from gsparc.base.errors import DataError
-from gsparc.commands.check import main as check
 from gsparc.commands.listing import COMMANDS
-from gsparc.commands.train import train
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.per_station import wrap_per_station
@@ -97,39 +94,6 @@ def answered(model, folder, heads, rows, **how):
     return read(
         predict_file(model, write_table(folder / f"{count}.csv", heads, rows), **how)["out"]
     )
-
-
-@pytest.mark.slow
-def test_a_drive_test_from_its_file_to_predictions_in_degrees(tmp_path):
-    """Three commands; held-out places of the measured city are predicted better
-    than by the mean.
-    """
-    drive = city_drive(tmp_path)
-    assert check([str(drive.rows), "--stations-file", str(drive.sites)]) == 0
-    settings = [f"dataset.file={drive.rows}", f"dataset.stations_file={drive.sites}", "threads=1"]
-    train(
-        compose("dataset=own", *settings, "model=gp", "baselines=[]", "logger=none"),
-        tmp_path / "run",
-    )
-    ours = [
-        f"ckpt={tmp_path / 'run' / 'model.ckpt'}",
-        f"places={drive.places}",
-        f"hydra.run.dir={tmp_path}",
-    ]
-    done = knock(COMMANDS["predict"].run, "predict", ours)
-    assert done.status == 0 and (tmp_path / "summary.json").exists(), done
-    assert any("60 places, 2 stations" in line for line in done.out), done
-    found = read(tmp_path / "places.predicted.csv")
-    given = read(drive.places)
-    # Every digit
-    assert [row["Latitude"] for row in found[::2]] == [row["Latitude"] for row in given]
-    level, spread = (column(found, name).reshape(-1, 2) for name in ("rssi_db", "rssi_db_std"))
-    error = np.sqrt(np.mean((level - drive.level_db) ** 2, axis=0))
-    naive = np.sqrt(np.mean((drive.learned_db.mean(axis=0) - drive.level_db) ** 2, axis=0))
-    assert (error < 0.9 * naive).all() and np.sqrt(np.mean(error**2)) < 0.65 * np.sqrt(
-        np.mean(naive**2)
-    )
-    assert np.mean(np.abs(level - drive.level_db) < 2 * spread) > 0.8
 
 
 def test_a_station_was_not_found_by_its_name_in_the_list_of_cells(town, tmp_path, monkeypatch):

@@ -74,24 +74,6 @@ def test_a_baseline_that_does_not_serve_the_data_ended_the_trade_off(swept):
     assert beside == {"mean"}  # laws of distance are of powers
 
 
-def test_the_front_is_kept_with_the_model_which_stays_what_it_was(swept, field):
-    _, _, ckpt, _ = swept
-    before, after = checkpoint.read(field.checkpoints[0]), checkpoint.read(ckpt)
-    points, measured = operating_point.stored_points(after.extra)
-    assert (
-        points
-        and "receiver" in measured
-        and operating_point.stored_points(before.extra) == ([], {})
-    )
-    assert after.config == before.config and set(after.extra) == {
-        *before.extra,
-        operating_point.KEY,
-    }
-    place = field.data.site.origin + 0.1
-    same = [gsparc.load(path).spectrum(tx=place) for path in (field.checkpoints[0], ckpt)]
-    assert np.array_equal(*same)
-
-
 def test_a_budget_picks_the_most_accurate_that_fits(swept, monkeypatch):
     _, _, ckpt, _ = swept
     points, _ = operating_point.stored_points(checkpoint.read(ckpt).extra)

@@ -5,10 +5,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gsparc.base.errors import DataError
-from gsparc.data.inner_folds import NOT_TESTED, cut_folds, inner_folds
-from gsparc.data.splits import FileSettings, Fold, SplitSettings, make_split
-from gsparc.models.per_station import UNHEARD, station_site
-from gsparc.tables.own import from_arrays
+from gsparc.data.inner_folds import NOT_TESTED, inner_folds
+from gsparc.data.splits import Fold, SplitSettings, make_split
 
 KINDS = ("random", "grouped", "corner", "blocks", "sparse")
 SIDE = 0.2
@@ -92,34 +90,6 @@ def test_of_two_stations_each_is_left_out_and_of_one_rows_are():
     assert [set(station[f.test]) for f in inner.folds] == [{3}, {5}]
     alone = inner_folds(positions, Fold(rows[:20], none, none), settings, 3, 0, station=station)
     assert alone.name == "random" and len(alone.folds) == 3
-
-
-def test_of_stations_learned_together_squares_are_those_of_what_moves():
-    walk = floor(90) * [20, 20, 1]
-    posts = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])
-    far = np.linalg.norm(walk[:, None] - posts, axis=-1)
-    data = from_arrays(
-        {"rx_position": walk, "station_position": posts, "rssi_db": -20 * np.log10(far)}
-    )
-    settings = SplitSettings("blocks", side_m=5.0)
-    outer = make_split(data.moving, settings, place=data.place, station=data.station).folds[0]
-    together = data.subset(np.arange(len(data)), station_site(data.site, UNHEARD))
-    assert together.moving.shape[1] == 6
-    inner, plain = (cut_folds(d, outer, settings, 3, 0) for d in (together, data))
-    assert inner.name == "blocks"
-    assert all(
-        np.array_equal(a.test, b.test) for a, b in zip(inner.folds, plain.folds, strict=True)
-    )
-
-
-@pytest.mark.parametrize("name", ["random", "blocks"])
-def test_a_files_own_rows_say_how_they_were_cut(name):
-    positions = floor(1200)
-    outer = make_split(positions, settings_of(name)).folds[0]
-    inner = inner_folds(positions, outer, FileSettings(path="split.json"), 3, 0)
-    assert inner.name == name
-    gap = apart(positions, Fold(outer.train, outer.train[:0], outer.val))
-    assert np.mean([apart(positions, fold) for fold in inner.folds]) == pytest.approx(gap, rel=0.5)
 
 
 def test_too_few_places_are_refused():

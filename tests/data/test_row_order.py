@@ -7,7 +7,6 @@ from layouts import KINDS, rows_of
 from gsparc.data.row_order import merge_fixes, order_rows
 from gsparc.data.splits import Fold
 from gsparc.datasets.describe import describe
-from gsparc.models.channels.columns import group_channels
 from gsparc.tables.heads import KINDS as TABLE_KINDS
 from gsparc.tables.own import from_arrays, interpret
 from gsparc.tables.raw import Raw
@@ -154,19 +153,3 @@ def test_rows_of_a_table_shuffled_with_any_columns_are_one_order(write, options,
             assert np.array_equal(getattr(first, name), getattr(other, name)), name
         stations_of_other = np.array(other.site.every_station.name)[other.stations_of()]
         assert np.array_equal(names[first.stations_of()], stations_of_other)
-
-
-def test_errors_that_drift_are_seen_in_the_order_of_the_file():
-    """Rows along a curve hid the drift of 42 antennas: an error of .340 where .326 was."""
-    order = np.random.default_rng(1).permutation(60)
-    data = measurements(rows_of("stations' channels"), order)
-    ordered, _ = order_rows(data, Fold(np.arange(60), NONE, NONE))
-    again, _ = order_rows(ordered, Fold(np.arange(60), NONE, NONE))
-    for one in (ordered, again):
-        groups = group_channels(one, np.arange(len(one)), True)
-        assert len(groups) == 3
-        for group in groups:
-            np.testing.assert_array_equal(
-                group.places[np.argsort(group.order)],
-                data.moving[data.station == group.slot.station],
-            )

@@ -104,15 +104,6 @@ def test_carriers_of_as_many_rows_as_stations_were_taken_by_station():
     assert stations.carrier_hz.tolist() == [1e9, 2e9, 4e9]
 
 
-def test_runs_are_rows():
-    read = part(channels(), runs=["EXP006"])
-    assert set(read.data.run) == {0} and len(read.data.site.stations) == 3
-    assert left_out(read) == ["dataset.runs=EXP006: 24 of 36 rows left out"]
-    numbered = Raw({**channels().arrays, "run": np.repeat([5, 6], [8, 4])})
-    counts = [len(np.unique(part(numbered, runs=[run]).data.place)) for run in (5, "6")]
-    assert counts == [8, 4]
-
-
 def test_low_powers_are_left_out():
     read = part(plain(), min_rssi_db=-50)
     assert level(read.data).min() == pytest.approx(-50, abs=1e-4) and len(read.data) == 11
@@ -228,22 +219,3 @@ CANNOT = {
 def test_what_cannot_be_is_one_line(refused, case):
     make, settings, says = CANNOT[case]
     refused(says, lambda: part(make(), **settings))
-
-
-@pytest.mark.parametrize("jitter", [0.01, 0.3])
-def test_a_packet_logged_twice_beside_its_place_counted_as_two(jitter):
-    """The stated deviation was a hundredth of the true one: the noise was told by copies."""
-    rng = np.random.default_rng(0)
-    place = np.c_[rng.uniform(0, 3000, (300, 2)), np.full(300, 1.5)]
-    level = rng.normal(-80, 6, 300).round(2)
-    arrays = {
-        "rx_position": np.r_[place, place + np.array([jitter, 0, 0])],
-        "tx_position": np.zeros((600, 3)),
-        "rssi_db": np.r_[level, level],
-    }
-    reading = part(Raw(arrays))
-    assert len(reading.data) == 300
-    assert any("copies of other rows" in note for note in reading.notes)
-    # Another level at nearly the same place is a measurement.
-    arrays["rssi_db"][300:] += rng.normal(0, 2, 300)
-    assert len(part(Raw(arrays)).data) == 600

@@ -7,7 +7,6 @@ from releases import real
 
 from gsparc.base.errors import DataError
 from gsparc.data.inner_folds import inner_folds
-from gsparc.data.spacing import group_visits
 from gsparc.data.split_files import read_split, write_split
 from gsparc.data.splits import SplitSettings, hash_indices, make_split
 from gsparc.datasets.load import load, split_for
@@ -290,14 +289,6 @@ def test_places_visited_again_within_a_hundredth_of_the_step_were_split_apart(
     assert (
         f"{60 * visits} rows are of 61 places: those within a hundredth of the usual step"
     ) in caplog.text
-
-
-def test_rows_a_tenth_of_a_step_apart_are_places_of_their_own():
-    walk = np.cumsum(np.random.default_rng(0).uniform(0.1, 2, (500, 3)) * [1, 1, 0], axis=0)
-    assert group_visits(walk) is None
-    # Six antennas at every place
-    arrays = walk[::10, None] + np.linspace(0, 0.6, 6)[:, None] * [1, 0, 0]
-    assert group_visits(arrays.reshape(-1, 3)) is None
 
 
 @pytest.mark.parametrize("side_m", [None, 0.3, 0.5])

@@ -82,11 +82,3 @@ def test_absent_release_is_loud(caplog) -> None:
     data = load({"name": "argos", "root": None, "stand_in": stand_in})
     assert "SIMULATED" in caplog.text and data.site.stand_in == "argos"
     assert data.moving.shape == (120, 3) and np.ptp(data.moving) > 0
-
-
-def test_true_positions_are_asked_for_as_yaml_reads_them() -> None:
-    """`dataset.positions=true` arrives as a boolean."""
-    stand_in = {"root": str(folder().parent), "count": 120, "seed": 1}
-    data = load({"name": "argos_sim", "stand_in": stand_in, "positions": True})
-    where = np.load(folder() / "positions.npy")
-    assert np.allclose(data.moving + data.site.origin, where)

@@ -49,16 +49,6 @@ def test_techtile_release(tmp_path, kind):
     assert np.allclose(held["csi"][held["mask"]], expected[held["mask"]], atol=1e-6)
 
 
-def test_techtile_antennas_lie_elsewhere_or_in_the_file(tmp_path, refused):
-    path = write_release(tmp_path)
-    table = (tmp_path / "techtile_antenna_locations.yml").rename(tmp_path / "ceiling.yml")
-    assert np.array_equal(read_techtile(path, table).arrays["station_position"], ANTENNAS)
-    refused("name the file with dataset.antennas", read_techtile, path)
-    variables = {**release_variables(), "rx_antenna_position": (("hostname", "xyz"), ANTENNAS)}
-    path = write_release(tmp_path, variables=variables, antennas=False)
-    assert np.array_equal(read_techtile(path).arrays["station_position"], ANTENNAS)
-
-
 TECHTILE = {
     "missing": (
         {"csi_imag": None, "rover_z": None},
@@ -126,16 +116,6 @@ def test_damaged_netcdf(tmp_path, refused, kind):
         path.write_bytes(content)
         refused("csi.nc: ", read_raw, path)
     refused("no such file", read_raw, tmp_path / "other.nc")
-
-
-def test_powder_stations_without_a_place_are_left_out(tmp_path):
-    raw = read_powder(
-        write_walk(tmp_path, table="{'ebc-nuc1-b210': (40.7677, -111.83816), 'bus-6186': None}")
-    )
-    assert raw.arrays["station_name"].tolist() == ["ebc-nuc1-b210"] and raw.arrays[
-        "rssi_db"
-    ].shape == (20, 1)
-    assert "madsen-nuc2-b210" in raw.notes[0]
 
 
 def test_noise_of_powder_receivers_could_not_be_told_from_levels(tmp_path, refused):

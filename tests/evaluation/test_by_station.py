@@ -137,17 +137,6 @@ def test_the_worst_stations_had_other_names_than_warnings_and_a_bias_of_no_meani
     assert [row[0] for row in listed.texts()[1]] == ["W03-2 (150)", "212"] and not listed.note
 
 
-def test_a_constant_of_each_station_is_what_is_left_out(drive):
-    """The figure is that of errors less the mean of their station."""
-    error = np.random.default_rng(0).normal(size=len(drive)) + 7.0 * drive.station
-    scores = scored(drive, np.ones(len(drive)), error)
-    means = np.array([error[drive.station == t].mean() for t in range(3)])
-    assert rmse_after_constants(scores, drive.station) == pytest.approx(
-        np.sqrt(np.mean((error - means[drive.station]) ** 2))
-    )
-    assert rmse_after_constants(scored(drive, error, error * np.nan), drive.station) is None
-
-
 def scored(data, prediction, error=None):
     rows = np.arange(len(data))
     target = data.target[:, 0].astype(float)

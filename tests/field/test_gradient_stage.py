@@ -108,16 +108,6 @@ def test_a_checkpoint_with_every_step_done_still_ends_in_a_model(whole, tmp_path
     assert ledger.seconds > 0.0
 
 
-@pytest.mark.parametrize(
-    ("step", "advice", "left"), [(7, "go on with", 5), (0, "there is no checkpoint yet", None)]
-)
-def test_a_second_interrupt_does_not_wait(tmp_path, step, advice, left):
-    with pytest.raises(KeyboardInterrupt, match=advice):
-        run(tmp_path, Interrupt(step, times=2))
-    last = tmp_path / "run" / "last.ckpt"
-    assert left is None or checkpoint.read(last).extra["trainer"]["global_step"] == left
-
-
 class Watching(L.Callback):
     """Remembers the loss of every step and what a validation is told of it."""
 

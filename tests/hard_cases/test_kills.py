@@ -13,7 +13,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from crashes import assert_same, killed, last_checkpoint, moments, run, simulation, training
+from crashes import assert_same, killed, last_checkpoint, moments, run, training
 
 from gsparc.models import checkpoint
 
@@ -74,39 +74,3 @@ def test_training_killed_again_and_again(undisturbed, tmp_path, chain):
     code, _ = run(training, str(folder), [*settings, *last_checkpoint(folder)])
     assert code == 0, (folder / "error.txt").read_text()
     assert_same(whole, folder)
-
-
-@pytest.fixture(scope="module")
-def simulated(tmp_path_factory):
-    """A simulation nobody disturbed, and its length."""
-    out = tmp_path_factory.mktemp("kills") / "box.h5"
-    code, seconds = run(simulation, str(out), ROWS)
-    assert code == 0
-    return out, seconds
-
-
-@CHAINS
-def test_simulation_killed_again_and_again(simulated, tmp_path, chain):
-    whole, seconds = simulated
-    for folder, share in sooner(tmp_path):
-        out = folder / "box.h5"
-        kills = 0
-        for moment in moments(5 if chain else 3, share * seconds, seed=100 + chain):
-            if out.exists() or not killed(simulation, str(out), ROWS, after_s=moment):
-                break  # once the file is there another run is refused
-            kills += 1
-            assert_whole(folder)
-        if kills:
-            break
-    assert kills, "every run had ended before it was killed"
-    # Killed when the file was whole: its parts are whole, too, or on their way out
-    if out.exists():
-        left = folder / "box.h5.parts"
-        assert not left.exists() or (left / "plan.json").exists()
-    else:
-        code, _ = run(simulation, str(out), ROWS)
-        assert code == 0, out.with_suffix(".txt").read_text()
-        assert not (folder / "box.h5.parts").exists()
-    with h5py.File(whole) as one, h5py.File(out) as two:
-        assert set(one) == set(two)
-        assert all(np.array_equal(one[name][()], two[name][()]) for name in one)

@@ -67,20 +67,6 @@ def training(folder: str, overrides: list[str], most_bytes: int = 0) -> None:
     os._exit(0)
 
 
-def simulation(out: str, rows: int, most_bytes: int = 0) -> None:
-    """`gsparc simulate` of a box room in many small shards."""
-    from gsparc.evaluation.console import error_in_one_line
-    from gsparc.simulate.campaign import simulate
-
-    with Limited(most_bytes):
-        try:
-            simulate(small_campaign(rows), Path(out))
-        except Exception as error:
-            Path(out).with_suffix(".txt").write_text(error_in_one_line(error))
-            os._exit(1)
-    os._exit(0)
-
-
 def small_campaign(rows: int):
     """`rows` receivers in a box, four to a shard; spectra of 18 x 36."""
     from gsparc.simulate.effects import Effects

@@ -120,20 +120,6 @@ def test_the_process_says_what_it_did_with_silent_rows():
     assert f"gp: {silent.sum()} rows where nothing was heard are below their level" in notes
 
 
-def test_baselines_take_saturated_rows_as_measured_and_say_so():
-    data, _, silent = town(60)
-    rows, above = np.arange(60), replace(data, censored=-silent.astype(np.int8))
-    fold = Fold(rows, rows[:0], rows[:5])
-    notes = (
-        build({"_target_": "gsparc.models.baselines.mean.Mean"})
-        .fit(above, fold, FitContext())
-        .notes
-    )
-    assert notes == (
-        f"mean: {silent.sum()} rows in saturation are learned from as if measured at that level",
-    )
-
-
 @pytest.mark.parametrize(
     "model", ["gsparc.models.baselines.idw.InverseDistance", "gsparc.models.baselines.mean.Mean"]
 )

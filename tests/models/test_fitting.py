@@ -116,12 +116,3 @@ def test_a_third_of_the_log_was_numbers_of_stations_fitted_in_a_second(
     caplog.set_level("INFO", "gsparc")
     fitted(town, tmp_path)
     assert not [one for one in caplog.messages if "station 1 of 3" in one]
-
-
-@pytest.mark.parametrize(
-    ("given", "found"), [("run", "run"), ("run/fold1", "run"), ("run/fold1/refit/last.ckpt", "run")]
-)
-def test_the_folder_of_a_run_is_told_from_what_is_in_it(tmp_path, given, found):
-    (tmp_path / "run" / "fold1" / "refit").mkdir(parents=True)
-    (tmp_path / "run" / "fold1" / "refit" / "last.ckpt").touch()
-    assert fitting.run_folder(tmp_path / given, fitting.FOLDS) == tmp_path / found

@@ -126,28 +126,6 @@ def test_far_from_all_data_nothing_is_known(name):
     assert ((near >= 0) & (near <= 1)).all() and (away < 0.01).all() and near.mean() > 0.2
 
 
-@pytest.mark.parametrize("name", KINDS)
-def test_facts_say_where_it_started_and_what_that_cost(name):
-    fitted = default(name)
-    facts = fitted.method.facts()
-    assert {*facts} == {
-        "model/init",
-        "model/steps",
-        "model/variance_explained",
-        "model/num_gaussians",
-        "time/init_s",
-        "model/made",
-        "model/class",
-        "model/choices",
-        "model/steps_taken",
-    }
-    assert facts["model/init"] and facts["model/init"] != "auto"
-    assert facts["model/num_gaussians"] == fitted.method.count_components()
-    assert facts["model/steps"] >= 0 and 0 < facts["time/init_s"] <= fitted.report.seconds
-    share = facts["model/variance_explained"]
-    assert share is None or share <= 1
-
-
 def test_a_search_that_could_gain_too_little_ends(monkeypatch, caplog):
     monkeypatch.setattr(race, "LEAST_GAIN", math.inf)
     monkeypatch.setattr(race, "STALLED", -math.inf)

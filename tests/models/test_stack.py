@@ -10,7 +10,6 @@ from gsparc.models.stack import (
     best_weights,
     error_products,
     explained_variance,
-    mixture_errors,
     weigh,
 )
 
@@ -184,13 +183,6 @@ def test_weights_are_the_best_of_a_grid():
         for b in np.linspace(0, 1 - a, 41)
     ]
     assert least <= min(float(w @ gram @ w) for w in grid) + 1e-9
-
-
-def test_a_mixture_is_taken_where_it_pays():
-    errors = drawn([1.0, 1.05])
-    weights = weigh(gram_of(errors), np.arange(400), "square")
-    assert weights == pytest.approx([0.5, 0.5], abs=0.1)
-    assert mixture_errors(weights, gram_of(errors)).mean() < 0.7 * (errors[:, 0] ** 2).mean()
 
 
 @pytest.mark.parametrize("deviations,common", [([1.0, 5.0], 0.0), ([0.1, 0.1], 1.0)])

@@ -152,23 +152,6 @@ def test_gaussians_mapped_over_a_plan_got_past_the_refusal(backend):
         refused(r"vmap over Gaussians or poses is not possible: give P poses", vmap(made), several)
 
 
-def test_second_derivatives_by_either_road():
-    model = field()
-
-    def power(backend):
-        return lambda opacities: image(backend)(*model[:3], opacities, model[4]).square().sum()
-
-    leaf = model[3].clone().requires_grad_()
-    (slope,) = torch.autograd.grad(power("reference")(leaf), leaf, create_graph=True)
-    rows = [torch.autograd.grad(part, leaf, retain_graph=True)[0] for part in slope]
-    assert torch.allclose(hessian(power("cpu"))(model[3]), torch.stack(rows), rtol=1e-8, atol=1e-9)
-    (slope,) = torch.autograd.grad(power("cpu")(leaf), leaf, create_graph=True)
-    with pytest.raises(
-        RuntimeError, match=r"kernels have no second derivatives: take backend='reference'"
-    ):
-        torch.autograd.grad(slope.sum(), leaf)
-
-
 @pytest.mark.parametrize("projection", ["tangent", "equirect"])
 def test_the_hessian_in_means_was_off_by_five_percent(projection):
     """The frame of `tangent` was orthonormal to first order only."""

@@ -86,26 +86,6 @@ def test_levels_in_dbm_were_drawn_as_db(figures):
     }
 
 
-def test_rows_that_are_wrong_are_marked(figures):
-    place = scattered()
-    place[17] = [5000, 300, 1]
-    level = -20 * np.log10(np.linalg.norm(place - [3, 3, 5], axis=1))
-    level[40] = -150
-    data = from_arrays(
-        {"rx_position": place, "tx_position": np.array([3.0, 3, 5]), "rssi_db": level}
-    )
-    found = find_spots(data, link_levels(data))
-    assert np.flatnonzero(found.far).tolist() == [17] and found.suspicious[40]
-    figure, said = shown(data, figures)
-    assert (
-        "row 17 at (5000, 300)" in said
-        and "row 40" in said
-        and ("suspicious level (1 place)") in said
-    )
-    assert figure.axes[0].get_xlim()[1] < 40  # the map is of the others
-    assert figure.axes[0].get_aspect() == 1
-
-
 STATION = np.array([101.0, 204.0, 2.0])
 HALF = np.sqrt(0.5)
 # Two walls, and a floor

@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from refusals import refused
 
 from gsparc.base.files import write_samples
 from gsparc.evaluation.scores import score_methods
@@ -89,17 +88,6 @@ def test_samples_had_the_nmse_of_baselines_and_none_of_the_method(campaign, fold
     np.testing.assert_array_equal(found.columns["nmse"], found.columns["baseline/idw/nmse"])
 
 
-def test_the_evaluated_baseline_equals_its_own_row(campaign, folds, tmp_path):
-    data, split = campaign("spectrum", 40), folds(40)
-    facts = evaluated(InverseDistance, data, split).facts
-    for figure in ("ssim", "ssim_gauss", "psnr_db", "skill"):
-        assert facts[f"test/{figure}"] == facts[f"baseline/idw/{figure}"]
-    assert facts["baseline/nearest/skill"] == 0
-    assert facts["test/skill"] == pytest.approx(
-        1 - facts["test/mse"] / facts["baseline/nearest/mse"]
-    )
-
-
 def test_a_method_that_is_a_baseline_too_was_fitted_twice(campaign, folds, monkeypatch):
     """`model=gp` was fitted again as its own baseline, for a second row of equal figures."""
     data, split = campaign("rssi", 40), folds(40)
@@ -145,18 +133,6 @@ def test_folds_are_pooled(campaign, folds, monkeypatch):
     assert facts["model/steps_taken"] == 2, "the mean, not the first fold's"
     assert facts["split/folds"] == 5 and facts["test/samples"] == 45
     assert facts["time/train_total_s"] == pytest.approx(5 * facts["time/train_s"])
-
-
-def test_the_prefix_names_the_subset(campaign, folds, tmp_path):
-    data, split = campaign("spectrum", 40), folds(40)
-    methods, _ = fit_all(Mean, data, split)
-    facts = evaluate(
-        methods, None, data, split, eval_on="train", baselines=("nearest",), clock=QUICK
-    ).facts
-    assert facts["train/samples"] == len(split.folds[0].train) and "test/ssim" not in facts
-    # The nearest training row is the row itself: its error is no bar.
-    assert facts["train/skill"] is None and facts["time/train_s"] is None
-    refused("eval_on='tset'", evaluate, methods, None, data, split, eval_on="tset", clock=QUICK)
 
 
 @pytest.mark.parametrize("name", ["nearest", "gp"])

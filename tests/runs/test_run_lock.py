@@ -134,13 +134,6 @@ def test_a_failed_run_left_its_split_beside_the_summary_of_the_one_before(tmp_pa
     refused("of different runs; give the folds of one", open_run, models, {})
 
 
-def test_a_command_that_is_refused_leaves_no_summary_of_the_one_before(tmp_path):
-    (tmp_path / "summary.json").write_text("{}")
-    given = ["ckpt=none.ckpt", f"hydra.run.dir={tmp_path}"]
-    assert_refused(knock(COMMANDS["evaluate"].run, "evaluate", given), "no such checkpoint")
-    assert not (tmp_path / "summary.json").exists() and (tmp_path / "summary.json.earlier").exists()
-
-
 @pytest.mark.parametrize(("goes_on", "kept"), [(None, False), ("run", True)])
 def test_a_new_run_went_on_in_the_log_of_the_one_before(goes_on, kept, tmp_path, monkeypatch):
     (tmp_path / "train.log").write_text("of the first run")

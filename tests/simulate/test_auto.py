@@ -1,6 +1,5 @@
 """`effects=auto`: requirements, what each effect contributes, and which are kept."""
 
-import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +8,7 @@ from refusals import refused
 
 from gsparc.simulate import auto
 from gsparc.simulate.attribution import Deliverable, SurveyProbe
-from gsparc.simulate.auto import AutoSettings, Choice
+from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, Effects
 from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.spectrum import SpectrumSettings
@@ -145,26 +144,6 @@ def test_few_failures_prove_the_quantile(probes, quantile, confidence, most):
     if probes > 60:  # fewer prove nothing, even without a failure
         outside = np.random.default_rng(0).random((20_000, probes)) < 1 - quantile
         assert (outside.sum(1) <= most).mean() < 1 - confidence + 0.01
-
-
-def test_fewer_rays_are_taken_where_probes_stay_within_tolerance():
-    """By powers of another trace: of 3 of 128 outside."""
-    choice = replace(decided("coverage +-1 dB"), effects=FULL)
-
-    def tried(outside):
-        probe = probe_of(heard(128))
-        gain = probe.paths.gain * 1.05
-        gain[: outside * len(RECORD)] *= 2
-        thinned = replace(probe.paths, gain=gain)
-        return auto.choose_rays(choice, AutoSettings(full=FULL), probe, thinned, 300)
-
-    taken = tried(3)
-    row = taken.table[-1]
-    assert taken.samples == 300 and not row.kept and row.effect == "rays > 300"
-    assert row.error == pytest.approx(20 * np.log10(1.05), rel=1e-4)
-    for without in (tried(4), auto.keep_all_rays(taken)):
-        assert without.samples is None and without.table[-1].kept
-    assert Choice.from_dict(dataclasses.asdict(taken)) == taken
 
 
 def test_spectra_are_judged_against_the_nearest_receiver():

@@ -15,7 +15,6 @@ from gsparc.commands.check import main as check
 from gsparc.data import blocks
 from gsparc.data.schema import LIGHT
 from gsparc.datasets.load import load
-from gsparc.datasets.sionna import _in_decibels
 from gsparc.pictures.simulated import draw_floor_plan
 from gsparc.simulate import campaign as campaigns
 from gsparc.simulate import deciding
@@ -138,22 +137,6 @@ def test_file_is_read_as_powers(tmp_path):
     np.testing.assert_allclose(powers[~heard], power[heard].min(), rtol=1e-4)
 
 
-def test_outlier_does_not_set_the_sensitivity():
-    """In a town one path was 66 dB below the next:
-    43 places without any counted as weaker still.
-    """
-    rng = np.random.default_rng(0)
-    power = 10 ** (rng.uniform(-140, -80, 400) / 10)
-    weakest = np.sort(power)[1]
-    power[power.argmin()] = 10**-21.0
-    power[power.argsort()[-2:]] = 0
-    found = _in_decibels(power)
-    np.testing.assert_allclose(found["sensitivity_db"], 10 * np.log10(weakest))
-    assert np.isnan(found["rssi_db"]).sum() == 3
-    # Nothing missing: every power is one
-    assert "sensitivity_db" not in _in_decibels(power[power > 0])
-
-
 def test_noise_has_the_stated_power_and_is_the_same_put_together_on_disk(tmp_path, monkeypatch):
     simulate(plan(), tmp_path / "clean.h5")
     disturbed = plan(effects=replace(MIRROR, noise_snr_db=20.0))
@@ -260,22 +243,6 @@ def test_auto_decides_verifies_and_is_drawn(tmp_path):
     assert choice_table(choice).row_count == len(choice.table)
     draw_floor_plan(outcome, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 10_000
-
-
-def test_probes_are_rows_of_the_file(tmp_path, monkeypatch):
-    """No row is traced twice."""
-    real, traced = ShoeboxEngine.trace, []
-
-    def counts(self, receivers, effects, seed=None):
-        traced.append((len(receivers), effects.depth))
-        return real(self, receivers, effects, seed)
-
-    monkeypatch.setattr(ShoeboxEngine, "trace", counts)
-    first = simulate(plan(effects=FEW_PROBES), tmp_path / "first.h5")
-    assert sum(count for count, _ in traced) == 60 and first.effects.depth < 4
-    simulate(plan(effects=first.effects), tmp_path / "same.h5")
-    # What probes kept of their full trace is what a run with the choice finds.
-    assert_same(tmp_path / "first.h5", tmp_path / "same.h5")
 
 
 class Rays(ShoeboxEngine):

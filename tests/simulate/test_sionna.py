@@ -9,8 +9,6 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-import torch
-from refusals import refused
 
 from gsparc.datasets.load import load
 from gsparc.simulate import llvm, raytracer
@@ -69,33 +67,6 @@ def places():
         stands_clear_of(conference_room()),
         seed=0,
     )
-
-
-def test_one_thread_is_deterministic():
-    """Of several threads the faster one's candidate stays:
-    a hundredth of receivers differed by rounding.
-    """
-    where = draw_places(
-        800,
-        np.array(CONFERENCE.area_m),
-        CONFERENCE.height_m,
-        stands_clear_of(conference_room()),
-        seed=0,
-    )
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(1)
-        few = Sampling(samples=1_000, batch=400)
-        one, two = (
-            RayTracer(conference_room(), TRANSMITTER, 2.44e9, few).trace(
-                where, replace(PLAIN, depth=3)
-            )
-            for _ in range(2)
-        )
-    finally:
-        torch.set_num_threads(before)
-    for name in ("delay", "direction", "gain"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
 def test_line_of_sight_is_friis(room, places):
@@ -255,25 +226,6 @@ def test_town_with_sectors_in_degrees(tmp_path):
     assert read.site.georeference == outcome.survey.georeference
     latitude, longitude = read.site.georeference.to_degrees(places[:, :2])
     assert np.ptp(latitude) < 0.003 and abs(np.median(longitude) + 30) < 0.001
-
-
-def test_scene_file_of_the_user(tmp_path):
-    import sionna.rt as rt
-
-    own = replace(
-        CONFERENCE,
-        builder=None,
-        xml=str(rt.scene.floor_wall),
-        area_m=((-3, -3), (3, 3)),
-        transmitter_m=(-2.0, 0.0, 3.0),
-        num_receivers=20,
-    )
-    survey = build_survey(own, QUICK)
-    engine, receivers = survey.engine, survey.places
-    assert engine.trace(receivers, PLAIN).received_power().min() > 0
-    refused("no such file", build_survey, replace(own, xml=str(tmp_path / "none.xml")), QUICK)
-    (tmp_path / "bad.xml").write_text("<scene version='2.1.0'><oops/></scene>")
-    refused("cannot read it", build_survey, replace(own, xml=str(tmp_path / "bad.xml")), QUICK)
 
 
 def test_auto_in_the_conference_room(tmp_path):

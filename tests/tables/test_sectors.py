@@ -277,24 +277,3 @@ def test_the_unit_of_a_cell_that_a_warning_advises_is_read(tmp_path):
     assert not change(tmp_path, "Tx Power [W]", lambda v: "43 dBm")
     (said,) = change(tmp_path, "Tx Power [dBm]", lambda v: "20 parsecs", every=False)
     assert "'20 parsecs' in line 5: no station_power_db; unknown" in said
-
-
-@pytest.mark.parametrize(
-    ("head", "values", "unit"),
-    [
-        ("Azimuth", np.radians, "rad"),
-        ("HBW", np.radians, "rad"),
-        ("Tx Power", lambda v: 20, "W"),
-        ("Antenna Height", lambda v: -25, ""),
-    ],
-)
-def test_a_column_in_another_unit_was_believed(tmp_path, head, values, unit):
-    said, *_ = change(tmp_path, head, values)
-    assert re.search(f"{head}' holds .* in another unit.*{unit}", said), said
-    assert not unit or not change(tmp_path, f"{head} [{unit}]", values)
-
-
-def test_powers_of_0_beside_others_are_unknown(tmp_path):
-    site, notes = read_list(tmp_path, **{"Tx Power [dBm]": [0, 43, 46]})
-    power = site.stations.sector[:, 4]
-    assert set(power[np.isfinite(power)]) == {43, 46} and "station_power_db, 0 unknown" in notes

@@ -6,18 +6,15 @@ import pytest
 from doors import said
 from scipy.io import savemat
 from strangers import (
-    ALONG,
     CASES,
     DEAF,
     EAST,
-    FLOOR,
     LEVELS,
     NORTH,
     ONE_CELL,
     PLACES,
     RNG,
     ROWS,
-    STUCK,
     ZONES,
     long,
     table,
@@ -78,18 +75,6 @@ def test_saturated_levels_were_learned_and_scored_as_measured(write):
         above = LEVELS[:, 0] >= least
         assert (data.censored == np.where(above, -1, 0)).all() and (data.mask[:, 0] == ~above).all()
     np.testing.assert_allclose(level, np.minimum(LEVELS[:, 0], -76), atol=1e-3)
-
-
-def test_the_log_of_a_run_left_out_what_check_warns_of(write, caplog):
-    path = write(long("phone", FLOOR, level=ALONG, places=STUCK))
-    Own(path).load()
-    warned = [
-        line.removeprefix("warning").strip()
-        for line in said(path).splitlines()
-        if line.startswith("warning")
-    ]
-    logged = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert len(warned) > 1 and all(any(text in line for line in logged) for text in warned), warned
 
 
 def channels() -> dict[str, np.ndarray]:

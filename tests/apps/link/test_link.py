@@ -18,7 +18,6 @@ from gsparc.apps.link.adaptation import Adaptation, Band, Rates
 from gsparc.apps.link.channels import true_channels
 from gsparc.apps.link.pusch import Pusch, frequency_correlation
 from gsparc.apps.link.study import (
-    beam_facts,
     beam_gain,
     beam_loss_db,
     find_crossing,
@@ -95,23 +94,6 @@ def test_beams_gain_the_number_of_antennas_and_lose_what_is_wrong() -> None:
     noise = draw(200, 16, 4)
     # Half of the beam's power is of no use: |h + e|^2 = 2 |h|^2.
     assert abs(float(beam_loss_db(true, true + noise).mean()) - 3.0) < 0.3
-
-
-def test_beams_without_a_prediction_or_without_a_channel_have_figures() -> None:
-    """A prediction of exactly 0, or one silent test channel, ended the command:
-    -inf is no figure.
-    """
-    true = drawn()(4, 2, 3)
-    silent = true.clone()
-    silent[1] = 0
-    nothing = beam_facts(true, torch.zeros_like(true), np.ones(4, bool))
-    assert nothing["beams/2/loss_db"] == pytest.approx(100) == nothing["beams/2/loss_db_mean"]
-    some = beam_facts(silent, silent, np.array([False, True, False, False]))
-    assert some["beams/silent"] == 1 and some["beams/2/loss_db_max"] == pytest.approx(0, abs=1e-5)
-    assert some["beams/2/loss_db_accepted"] is None
-    assert beam_facts(0 * true, true, np.ones(4, bool)) == {"beams/positions": 4, "beams/silent": 4}
-    for facts in (nothing, some):
-        assert all(value is None or np.isfinite(value) for value in facts.values())
 
 
 def test_where_nothing_can_be_carried_nothing_falls_short() -> None:

@@ -41,19 +41,6 @@ def test_peak_is_between_middles_of_cells():
     assert found.peak()[2] == 1.5
 
 
-@pytest.mark.slow
-def test_errors_of_recorded_places_widen_an_area():
-    cells = cover_box(PLACES, 8_000, False)
-    sharp = gaussians(cells, [[2.0, 1.0]])
-    wide = PlacePosterior(cells, sharp.sharp, 0.3)
-    area = cells.volume[densest_cells(wide.log_density, cells.volume, 0.9)].sum()
-    assert area == pytest.approx(-2 * np.pi * (0.2**2 + 0.3**2) * np.log(0.1), rel=0.03)
-    place = np.array([2.3, 1.1, 1.5])
-    assert wide.log_density_at(place) == pytest.approx(
-        wide.log_density[cells.index_of(place)], abs=0.05
-    )
-
-
 def test_area_of_a_known_density_holds_its_share():
     found = gaussians(cover_box(PLACES, 20_000, False), [[2.0, 1.0]])
     area = found.cells.volume[densest_cells(found.log_density, found.cells.volume, 0.9)].sum()

@@ -106,25 +106,6 @@ def test_spoilt_grids(said, how):
     refused(said, lay_grid, None, **{"area": [0, 0, 4, 4], "height_m": 1.5, "step_m": 0.5, **how})
 
 
-@pytest.mark.parametrize(
-    "said, content",
-    [
-        ("empty polygon", '{"type": "Polygon", "coordinates": [[[0, 0], [1, 1], [2, 2], [0, 0]]]}'),
-        ("no polygon|corners", '{"type": "Polygon", "coordinates": []}'),
-        ("not readable", '{"type": "Polygon", "coordinates": [[[0, 0], ["a", 1], [2, 2]]]}'),
-        ("NaN", '{"type": "Polygon", "coordinates": [[[0, 0], [NaN, 1], [2, 2]]]}'),
-        ("no polygon", '{"type": "LineString", "coordinates": [[0, 0], [1, 1]]}'),
-        ("no polygon", '{"type": "FeatureCollection", "features": []}'),
-        ("not readable", "not json"),
-        ("not readable", "[1, 2]"),
-    ],
-)
-def test_spoilt_polygons(tmp_path, said, content):
-    path = tmp_path / "a.geojson"
-    path.write_text(content)
-    refused(said, lay_grid, None, str(path), 1.5, 0.5)
-
-
 def test_a_plan_of_too_many_pixels_was_said_to_be_no_image(tmp_path):
     with (tmp_path / "p.png").open("wb") as file:
         file.write(b"\x89PNG\r\n\x1a\n")

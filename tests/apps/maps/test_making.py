@@ -16,7 +16,7 @@ from towns import MASTS, town_model
 import gsparc
 from gsparc.apps.maps import layers, pictures, plan_measurements, plan_pictures, strongest
 from gsparc.apps.maps.layers import Layer, Legend, assign_colours, label_places, list_layers
-from gsparc.apps.maps.making import _hearing_floors, predict_map
+from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.promise import Promise, map_notes
 from gsparc.apps.maps.refining import sample_adaptively
 from gsparc.apps.maps.strongest import (
@@ -203,16 +203,6 @@ def test_a_station_was_named_best_where_nothing_was_known_or_above_the_floor(pre
     (other, *_), (silent, *_) = doubts["best_server"]
     # None is heard: that another cell led was said of all of it.
     assert silent.all() and not other.any() and not doubts["power"]
-
-
-def test_the_floor_of_a_station_is_its_level_or_what_was_weakest():
-    level, row = np.append(np.linspace(-100, -50, 101), [-90.0, -70.0]), np.arange(103)
-    evidence = HeldOutLevels(
-        level, level, np.ones(103), np.zeros(103), row, (row > 100) * 1, row > 100
-    )
-    promise = Promise(evidence, np.zeros((1, 3)), np.zeros(1, np.int64), 1.0)
-    assert _hearing_floors(promise, [0, 1], None) == pytest.approx([-99.5, -90])
-    assert _hearing_floors(None, [0, 1], -95.0).tolist() == [-95, -95]
 
 
 def test_a_threshold_below_all_that_was_measured_was_said_to_be_met_everywhere(predictor):

@@ -10,10 +10,6 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from towns import trained
-
-from gsparc.apps.view.site_view import SiteView, lay_power_plane
-from gsparc.apps.view.viewed import open_model
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'gsparc[viewer]'")
 
@@ -128,26 +124,6 @@ def test_a_spectrum_follows_on_the_sphere_and_in_the_panel(visit, spectrum_view)
     assert "emi" in session.legend.content
     session._show_part("gaussians", False)
     assert not session.nodes["gaussians"].visible and "emi" not in session.legend.content
-
-
-def test_the_plane_is_of_the_transmitter_that_was_dragged(visit, tmp_path):
-    """Where both ends moved the plane stayed that of the transmitter's first place."""
-    rng = np.random.default_rng(0)
-    ends = rng.uniform(0, 10, (2, 60, 3))
-    power = -40 - 20 * np.log10(np.linalg.norm(ends[0] - ends[1], axis=1))
-    file = tmp_path / "both.npz"
-    np.savez(file, tx_position=ends[0], rx_position=ends[1], rssi_db=power, carrier_hz=1e9)
-    viewed = open_model(trained(file, "idw"))
-    session = visit(SiteView(viewed, grid=lay_power_plane(viewed, {"step_m": 2.0})))
-    settle(session)
-    before = session.plane.level_db
-    drag(session, "rx", [1.0, 1.0, 1.0])
-    settle(session)
-    assert session.plane.level_db is before
-    drag(session, "tx", [9.0, 9.0, 9.0])
-    settle(session)
-    assert np.abs(session.plane.level_db - before).max() > 1
-    assert "m from the other end" in session.answer_text.content
 
 
 def test_of_two_clients_one_vanishes_and_the_other_is_answered(power_view):

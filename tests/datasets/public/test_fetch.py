@@ -2,7 +2,6 @@
 
 import contextlib
 import csv
-import gzip
 import os
 import threading
 import time
@@ -235,17 +234,6 @@ def test_a_byte_now_and_then_never_ended(mirror, monkeypatch, tmp_path, refused)
     monkeypatch.setattr(fetching, "PATIENCE", 2)
     offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, drips))
     refused("the server sends too little in the time", fetch, "room", timeout_s=0.1, retries=0)
-
-
-def test_what_is_packed_on_the_wire_is_not_unpacked(mirror, monkeypatch, tmp_path, refused):
-    def packed(request, content):
-        body = gzip.compress(bytes(10**7))
-        begin(request, Content_Encoding="gzip", Content_Length=len(body))
-        with contextlib.suppress(OSError):
-            request.wfile.write(body)
-
-    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, packed))
-    refused("not the 3,000 bytes", fetch, "room", retries=0)
 
 
 def test_who_waits_for_another_fetch_is_told(mirror, monkeypatch, tmp_path, caplog):

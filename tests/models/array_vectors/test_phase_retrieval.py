@@ -5,7 +5,6 @@ each solved once.
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 from known_arrays import array_site, spectra
 from releases import release
@@ -70,14 +69,6 @@ def test_restarts_are_counted_and_no_clock_ends_them(known_campaign, monkeypatch
         starts.clear()
         recover_vectors(broken.site, broken.target[rows], broken.tx[rows], max_restarts=most)
         assert (96 in starts) == (most >= 96) and 384 not in starts
-
-
-@pytest.mark.parametrize("rows", [2, 3, 5])
-def test_very_few_spectra_and_a_zero_vector_of_a_zero_spectrum(known_campaign, rows):
-    data, _ = known_campaign
-    images = np.concatenate([data.target[: rows - 1], np.zeros_like(data.target[:1])])
-    found = recover_vectors(data.site, images, data.tx[:rows])
-    assert np.isfinite(found.vectors).all() and np.abs(found.vectors[-1]).max() < 1e-2
 
 
 def test_seconds_of_vectors_that_another_fit_had_solved_were_not_counted(

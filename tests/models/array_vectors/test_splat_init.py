@@ -73,18 +73,6 @@ def test_the_field_is_the_posterior_of_the_vectors(trained, process):
     )
 
 
-def test_all_is_unknown_far_away_and_little_at_data(trained):
-    method, data, fold = trained
-    tx, rx = _ends(data, fold.train)
-    far = method.predict(Query(tx[:10] + torch.tensor([9.0, -8.0, 3.0]), rx))
-    background = method.fitted_model().response.background
-    torch.testing.assert_close(far.mean, background.expand(10, -1, -1), atol=1e-5, rtol=0)
-    assert (far.confidence == 0).all() and (far.variance == far.variance[0]).all()
-    near = method.predict(Query(tx, rx))
-    assert near.confidence.min() > 0.5 and near.variance.max() < 0.5 * far.variance[0]
-    assert (method.fitted_model().unknown_shares(tx, rx) < 0.05).all()
-
-
 @pytest.mark.slow
 def test_a_number_of_gaussians_that_changes_nothing_was_swept_without_a_word(
     known_campaign, tmp_path

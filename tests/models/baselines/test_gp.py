@@ -14,26 +14,7 @@ from gsparc.data.target import TARGETS
 from gsparc.datasets.load import load, split_for
 from gsparc.evaluation.scores import score_methods
 from gsparc.models.baselines.gp import GaussianProcess, principal_components
-from gsparc.processes.density import left_out_density
-from gsparc.processes.fit_kernel import choose_left_out_kernel
-from gsparc.processes.kernel import Kernel
 from gsparc.training.context import FitContext
-
-
-def test_chosen_kernel_is_a_minimum(campaign):
-    data = campaign("spectrum", 40)
-    scores = torch.from_numpy(principal_components(data.target, data.site.target, 512).scores)
-    kernel = choose_left_out_kernel(data.moving, scores.numpy(), 288, 1)
-    places = torch.from_numpy(data.moving)
-    at = {
-        step: left_out_density(
-            [(Kernel.from_length(kernel.length * step, kernel.noise).gram(places), scores)],
-            288,
-            False,
-        )[0]
-        for step in (0.8, 1.0, 1.25)
-    }
-    assert at[1.0] == min(at.values())
 
 
 @pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])

@@ -11,7 +11,6 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines import kriging
 from gsparc.models.baselines.idw import InverseDistance
-from gsparc.models.baselines.kriging import Kriging, Variogram
 from gsparc.models.registry import method_class
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
@@ -96,38 +95,6 @@ def test_kriging_of_many_rows_asked_for_all_memory(tmp_path, monkeypatch):
         ]
     )
     assert (error + 40 + torch.from_numpy(places[70:, 0]).float()).abs().max() < 1.5
-
-
-def field(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places, powers [dB] of a smooth field with noise, and queries among them."""
-    rng = np.random.default_rng(0)
-    places = np.concatenate([rng.uniform(0, 30, (count, 2)), np.ones((count, 1))], 1)
-    level = 6 * np.sin(places[:, 0] / 3) + 4 * np.cos(places[:, 1] / 4)
-    return (
-        places,
-        (level + rng.normal(0, 0.5, count)).astype(np.float32)[:, None],
-        places[:40] + 0.1,
-    )
-
-
-def krige(
-    places: np.ndarray, decibels: np.ndarray, queries: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    method = Kriging()
-    method.positions, method.values, method.channels = places, decibels, None
-    method.variogram = Variogram(0.25, 25.0, 5.0)
-    method._factor_system()
-    place, weights, variance = method._weights(queries)
-    return (weights * decibels[place, 0]).sum(1), variance
-
-
-def test_nearest_places_screen_the_others(monkeypatch):
-    places, decibels, queries = field(600)
-    whole, spread = krige(places, decibels, queries)
-    monkeypatch.setattr(kriging, "WHOLE", 100)
-    near, wider = krige(places, decibels, queries)
-    assert np.abs(near - whole).max() < 0.15 and np.sqrt(np.mean((near - whole) ** 2)) < 0.05
-    assert (wider >= spread - 1e-9).all() and np.abs(wider / spread - 1).max() < 0.05
 
 
 def test_two_places_have_no_variogram():

@@ -1,7 +1,5 @@
 """The process of powers: its likelihood's slopes, its choices, and what it does with many rows."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -68,19 +66,6 @@ def test_the_mean_is_chosen_by_likelihood_and_by_name():
         assert said in fit(GaussianProcess(mean=about), data, 50)[1][0]
     with pytest.raises(ValueError, match="mean='flat': one of auto, constant, distance is needed"):
         GaussianProcess(mean="flat")
-
-
-def test_beyond_the_measured_places_the_law_goes_on():
-    data = town(300)
-    near = np.argsort(
-        np.linalg.norm(data.moving - data.site.static_position, axis=1), kind="stable"
-    )
-    data = replace(data, rx_position=data.rx_position[near], target=data.target[near])
-    errors = [
-        error_db(m, fit(m, data, 150)[0])
-        for m in (GaussianProcess(), GaussianProcess(mean="constant"))
-    ]
-    assert errors[0] < 0.8 * errors[1], errors
 
 
 def test_intervals_cover_what_they_promise():

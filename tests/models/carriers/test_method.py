@@ -15,7 +15,6 @@ from refusals import refused
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.carriers import method
 from gsparc.models.carriers.alone import CarriersAlone
 from gsparc.models.carriers.array import carriers_obstacle
 from gsparc.models.carriers.geometry import STEP, find_paths, ways
@@ -149,20 +148,6 @@ def test_an_array_that_carriers_see_differently_is_not_one(room):
     )
     assert carriers_obstacle(plain.site) == "carriers see through different arrays"
     refused("carriers: carriers see through different arrays", fit, CarrierField(), plain, LAST)
-
-
-def test_more_rows_than_a_process_takes_were_refused(room, monkeypatch):
-    """Over 4,000 rows `model=gsparc` ended in an error;
-    whole places all over the site are learned from.
-    """
-    monkeypatch.setattr(method, "MOST_ROWS", 60)
-    monkeypatch.setattr(method, "CHOSEN_ON", 30)
-    field, none = CarrierField(), np.zeros(0, np.int64)
-    report = field.fit(room, Fold(np.arange(100), none, np.arange(100, 150)), FitContext(Path()))
-    learned = len(field.rows)
-    assert 30 <= learned <= 60 and learned % CARRIERS == 0
-    assert f"{learned} of 100 rows are learned from" in report.notes[-1]
-    assert torch.isfinite(field.predict(room.batch(np.arange(100, 150))).mean).all()
 
 
 @pytest.mark.slow

@@ -36,20 +36,6 @@ def pillar():
     return data, fold, sources, fitted(data, fold)[0]
 
 
-def test_rows_left_out_were_told_by_other_sources_than_answer():
-    """Each group was triangulated anew: three fits more, whose errors were not those of this."""
-    data, fold, _ = directed(100)
-    method, _ = fitted(data, fold)
-    places, kernel = method.posterior.positions.points, method.posterior.kernel
-    part = np.sort(fold.learned())[::2]
-    method.condition(data, part)
-    assert method.posterior.positions.points is places and method.posterior.kernel is kernel
-    assert set(method.left_out().rows.tolist()) == set(part.tolist())
-    assert error(method, data, fold.test) < 0.1
-    method.condition(data, np.sort(np.r_[part, fold.test[:1]]))
-    assert method.posterior.positions.points is not places, "rays that nobody looked at"
-
-
 def test_few_receivers_are_enough_with_directions():
     data, _, sources = directed(60)
     rows = np.arange(60)
@@ -82,15 +68,6 @@ def test_a_search_starts_from_sources_where_rays_meet():
     context, init = FitContext(beside={"rays": method}), InitSettings()
     assert torch.equal(CANDIDATES["sources"](init, True, context).start[0], found[0])
     assert CANDIDATES["sources"](init, True, FitContext()).start is None
-
-
-def test_occlusion_by_a_pillar_is_learned(pillar):
-    data, fold, sources, method = pillar
-    assert bool((method.posterior.visibility.seen == 0).any())
-    rays = sources[None] - data.rx_position[:, None]  # to all sources, whoever hides
-    rays = list((rays / np.linalg.norm(rays, axis=-1, keepdims=True)).astype(np.float32))
-    blind, _ = fitted(replace(data, directions=rays), fold)
-    assert error(method, data, fold.test) < 0.5 * error(blind, data, fold.test)
 
 
 def test_rows_left_out_are_predicted_as_by_a_fit_without_the_receiver():

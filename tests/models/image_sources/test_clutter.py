@@ -18,7 +18,6 @@ from gsparc.models.image_sources.clutter.boxes import find_occluding_box
 from gsparc.models.image_sources.clutter.finite_mirrors import find_small_mirrors
 from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, UnexplainedRows
 from gsparc.models.image_sources.gp_likelihood import GainPosterior
-from gsparc.models.image_sources.known.method import ReflectionPhasePrior
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, SourceScene
 from gsparc.physics.mirror_planes import all_sequences
@@ -188,15 +187,3 @@ def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
         finite_mirrors._count_cells(room, plane_tangents(WALLS[0]), cells[0][1])
     )
     assert 3 * count < 1.1 * finite_mirrors.MOST_CELLS, "a plane and one wall: three sequences"
-
-
-def test_walls_of_equal_phase_shift_give_a_phase_prior():
-    scene = _scene(Clutter.empty())
-    phase = torch.tensor([0.3, *[0.3 + np.pi] * 6]) + 0.1 * torch.tensor([0.0, 1, -1, 1, -1, 1, -1])
-    phase_prior = ReflectionPhasePrior.from_scene(phased(scene, phase))
-    assert phase_prior.turn == pytest.approx(np.pi)
-    assert phase_prior.concentration > 3
-    expected = phase_prior.expected_phases(phase[0], ((0, 1),))
-    assert torch.cos(expected - 0.3).item() == pytest.approx(1.0, abs=1e-5)
-    scattered = phased(scene, torch.arange(7.0) * 2.1)
-    assert ReflectionPhasePrior.from_scene(scattered).concentration < phase_prior.concentration

@@ -17,7 +17,6 @@ from gsparc import load
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.rows import rows_of_measurements
 from gsparc.models.mixture.methods import ImageSources
 from gsparc.prediction.predictor import Predictor
 from gsparc.tables.own import from_arrays
@@ -116,21 +115,6 @@ def test_two_searches_at_the_noise_floor_are_enough(tmp_path):
     assert "of 8 searches (two agree up to noise, which is enough)" in report.notes[0]
     # both threads may have started one more when the second ended
     assert 2 <= len(method.members) <= 2 + torch.get_num_threads()
-
-
-@pytest.mark.slow
-def test_tones_not_measured_are_predicted_by_delay(tmp_path):
-    frequency = 2.4e9 + np.arange(16) * 2e6
-    _, data, fold = shoebox(100, size=(3.0, 2.5, 2.2), max_order=1, frequency_hz=frequency)
-    mask = np.zeros(data.target.shape, bool)
-    mask[..., ::4] = True
-    known = replace(data, mask=mask)
-    assert set(rows_of_measurements(known, fold.train, 1000, 0).frequency.tolist()) <= set(
-        frequency[::4]
-    )
-    method, _ = fitted(known, fold, tmp_path, clutter=False)
-    prediction = _predicted(method, data, fold.test).mean.numpy()
-    assert nmse(prediction[..., 1::4], data.targets(fold.test).numpy()[..., 1::4]) < 0.02
 
 
 def test_spectra_and_zero_channels_are_refused_in_one_line(tmp_path):

@@ -83,15 +83,3 @@ def test_a_variance_needs_the_nearest_rows_only():
         and (near < 1.5 * exact).all()
         and near.mean() < 1.1 * exact.mean()
     )
-
-
-def test_a_column_that_never_changed_is_not_extrapolated():
-    """Rows that were all alike in something; a query unlike them once got an error of nothing."""
-    rng = np.random.default_rng(2)
-    places, observed = rng.uniform(0, 10, (50, 3)), features(50)
-    constant, other = observed.copy(), observed.copy()
-    constant[:, 0], other[:, 0] = 0.0, np.log(0.2)
-    model = fit(places, rng.lognormal(-2, 0.3, 50), constant)
-    np.testing.assert_allclose(
-        said_of(model, places, places, other), said_of(model, places, places, constant)
-    )

@@ -20,7 +20,6 @@ from gsparc.field.gaussians import FieldSettings
 from gsparc.models import reduced
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean
-from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, Prediction
 from gsparc.models.splat.array import ArrayField
 from gsparc.training.context import FitContext
@@ -107,18 +106,6 @@ def test_fewer_places_say_what_all_of_them_said(through_array):
     assert error[0] < 1e-5 < error[1] < error[2]
     unsure = [float(case.answer(way, case.fold.train).confidence.mean()) for way in ways]
     assert unsure[0] > unsure[1] > unsure[2]
-
-
-def test_a_process_of_sources_spares_searches_and_its_variance(tmp_path):
-    data = load({"name": "own", "file": str(channels(tmp_path / "own.npz", rows=60, shape="S"))})
-    case = Case.fit(
-        ImageSourceGP(searches=2, search_rows=40, max_sources=4, clutter=False), data, 3
-    )
-    silent = case.less(confidence=False)
-    assert case.away(silent) < 1e-9 and case.answer(silent).variance is None
-    one = case.less(searches=1)
-    assert len(one.members) == 1 and case.answer(one).variance is not None
-    assert float(one.weights.sum()) == pytest.approx(1)
 
 
 def test_a_gaussian_process_spares_components_pixels_and_its_variance(process):

@@ -81,16 +81,3 @@ def test_holes_of_masked_spectra_are_filled_not_learned(smooth):
     assert error(model, smooth, ROWS) < 0.2 * spread(smooth)
     naive = started(dataclasses.replace(smooth, target=holes))
     assert error(naive, smooth, ROWS) > 2 * error(model, smooth, ROWS)
-
-
-def test_rows_without_their_neighbours_are_as_a_fit_without_them(smooth):
-    """The kernel stays: what is left out is the rows alone."""
-    model, left = starting(smooth)
-    assert left is not None and len(left.centres) == len(ROWS)
-    errors = ((left.predicted - left.images[left.centres]) ** 2).mean(-1)
-    nearest = np.nanmean(errors[0])
-    shown = error(model, smooth, ROWS)
-    assert (
-        shown < nearest < spread(smooth)
-    )  # harder than rows it has seen, easier than knowing the mean alone
-    assert nearest <= np.nanmean(errors[1:])

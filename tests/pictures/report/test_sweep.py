@@ -41,16 +41,6 @@ def test_a_failure_is_said_once_and_kept_and_the_sweep_goes_on(tmp_path, caplog)
     assert "second line" in caplog.text  # in the job's own log
 
 
-def test_a_single_run_and_a_good_job_are_left_alone(tmp_path):
-    single = failed(ValueError("x"))
-    SweepReport().on_job_end(of_job(tmp_path, RunMode.RUN), single)
-    assert single.status == JobStatus.FAILED
-    good = JobReturn()
-    good.return_value, good.status = 1.0, JobStatus.COMPLETED
-    SweepReport().on_job_end(of_job(tmp_path), good)
-    assert good.return_value == 1.0 and not list(tmp_path.iterdir())
-
-
 def of_sweep(folder: Path):
     return OmegaConf.create({"hydra": {"sweep": {"dir": str(folder)}}})
 

@@ -20,19 +20,6 @@ def cells(table, row: int) -> dict:
     return dict(zip([c.name for c in table.columns], table.rows[row], strict=True))
 
 
-def test_runs_are_found_in_a_sweep_and_named_by_what_differs(three):
-    rows = own_rows(frame(three[0].parent))
-    assert [run.folder.name for run in rows.run] == ["a0", "a1", "b0"] and list(rows.seed) == [
-        0,
-        1,
-        0,
-    ]
-    settings = ["gsparc emission.hidden=8"] * 2 + ["gsparc emission.hidden=64"]
-    assert list(own_rows(short_settings(rows)).setting) == settings
-    assert {*own_rows(short_settings(rows[:2])).setting} == {"gsparc"}
-    assert list(tables.groups_of(rows)) == settings[1:]
-
-
 @pytest.mark.parametrize(
     ("folder", "text", "message"),
     [

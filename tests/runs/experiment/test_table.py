@@ -213,18 +213,6 @@ def test_the_csv_file_had_other_signs_than_the_console():
     )
 
 
-def test_errors_are_in_units_of_the_best_plain_method_of_the_same_draws():
-    """An average over fewer draws, and a method that is not plain, are no measure."""
-    draws = [("gp", 4.0, 6.0), ("kriging", 1.0), ("gsparc", 3.0, 5.0), ("gsrf", 2.0, 2.0)]
-    cells = [row for draw in draws for row in drawn(*draw, kind="rssi")]
-    rows = averages(cells).set_index("method")
-    assert rows.error["gsparc"] == 4.0 and rows.ratio["gsparc"] == pytest.approx(0.8)
-    spectra = averages([filled("gp", 20.0), filled("gsparc", 26.0, 0, 1.0)]).set_index("method")
-    assert spectra.error["gp"] == pytest.approx(0.1)
-    assert spectra.ratio.to_dict() == pytest.approx({"gp": 1.0, "gsparc": 10**-0.3})
-    assert averages([filled("gsrf", 20.0, 0, 1.0)]).ratio.isna().all()
-
-
 def test_what_methods_were_given_besides_places_was_not_said():
     newrf = filled("newrf", 29.0, 0, 1.0, given="directions")
     assert "given more than places: newrf: directions" in said_of([*FOUND[:1], newrf])

@@ -12,7 +12,6 @@ from releases import real
 from gsparc.base.errors import Caution
 from gsparc.data.splits import Fold, Split
 from gsparc.models.registry import method_class
-from gsparc.prediction.fit import fit
 from gsparc.runs.align_site import align_to_site
 from gsparc.runs.evaluate import evaluate
 from gsparc.tables.own import from_arrays, interpret
@@ -76,21 +75,6 @@ def test_null_tones_were_most_of_every_figure(name, junk):
     found, right = figures(name, reading.data), figures(name, from_arrays(kept(arrays)))
     both = [one for one in ("test/nmse", "test/snr_db", "test/reduced_chi2") if one in right]
     assert [found[one] for one in both] == pytest.approx([right[one] for one in both], rel=1e-4)
-
-
-def test_channels_are_answered_in_the_shape_of_the_file():
-    arrays = spoilt(30)
-    predictor = fit(
-        arrays["rx_position"],
-        model="nearest",
-        **{k: arrays[k] for k in ("csi", "frequency_hz")},
-        tx=arrays["tx_position"],
-    )
-    told = predictor.csi(rx=arrays["rx_position"])
-    assert told.shape == arrays["csi"].shape
-    assert (np.isnan(told) == (NULLS | DEAD[:, None])).all()
-    here = ~np.isnan(told[0])
-    np.testing.assert_allclose(told[:, here], arrays["csi"][:, here], rtol=1e-5)
 
 
 @pytest.mark.parametrize("other", ["few rows", "other nulls"])

@@ -281,14 +281,3 @@ def test_rows_of_which_half_follow_a_way_are_in_no_order():
     links = as_links(place[rows], level[rows, None], ["a"])
     assert as_links(place, level[:, None], ["a"]).ordered and not links.ordered
     assert find_level_steps(links) == []
-
-
-def test_a_step_is_claimed_from_places_that_one_device_saw_before_and_after():
-    """Another phone in the second half, or another street, was a station that had changed."""
-    place, level, station = walk(4, 400)
-    twice, again = np.tile(place, (2, 1)), np.r_[level, level + 20][:, None]
-    links = as_links(twice, again, ["a"], station[None])
-    assert len(find_level_steps(links)) == 1
-    assert find_level_steps(replace(links, device=np.repeat([0, 1], 400))) == []
-    elsewhere = np.r_[place, place + np.array([1e3, 0])]
-    assert find_level_steps(as_links(elsewhere, again, ["a"], station[None])) == []

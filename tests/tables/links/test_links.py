@@ -112,12 +112,6 @@ def test_levels_below_the_sensitivity_were_refused():
     )
 
 
-def test_the_files_own_split_names_rows_of_the_file():
-    data = read(town(split_train=np.arange(8), split_test=np.array([8, 9]))).data
-    np.testing.assert_array_equal(np.unique(data.place[data.release_split[1]]), [8, 9])
-    assert data.subset(np.arange(6)).release_split is None  # its rows are numbered otherwise
-
-
 def test_carriers_that_could_be_of_rows_or_stations_were_taken_without_a_word():
     three = town(
         **{k: v[:3] for k, v in town().items() if isinstance(v, np.ndarray) and len(v) == PLACES}
@@ -369,24 +363,6 @@ def test_arrays_and_attributes_of_another_form_were_tracebacks(case):
     with pytest.raises(DataError) as caught:
         interpret(Raw(arrays, attributes), "town.npz")
     assert any(re.search(says, line) for line in caught.value.problems), caught.value.problems
-
-
-@pytest.mark.parametrize("count", [1, 2, 5])
-@pytest.mark.parametrize("stations", [1, 12])
-def test_a_level_of_0_far_above_all_others_was_the_strongest(count, stations):
-    """One 0 among -42 to -100 was a station next door; three were below the weakest."""
-    rng = np.random.default_rng(0)
-    level = np.round(rng.uniform(-100, -42, 240))
-    level[rng.choice(240, count, replace=False)] = 0
-    arrays = {"rx_position": rng.uniform(0, 50, (240, 3)), "rssi_db": level}
-    if stations > 1:
-        posts = rng.uniform(0, 50, (stations, 3))
-        arrays |= {"station": np.arange(240) % stations, "station_position": posts}
-    reading = interpret(Raw(arrays), "file")
-    assert len(reading.data) == 240 - count
-    assert 10 * np.log10(reading.data.target.max() * reading.data.site.target_scale) < -41
-    (said,) = [note for note in reading.notes if "exactly 0" in note]
-    assert "no value, left out; dataset.not_heard=[0]" in said and reading.data.censored is None
 
 
 def test_a_carrier_per_row_was_refused_without_a_list_of_stations():

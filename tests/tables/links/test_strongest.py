@@ -328,19 +328,3 @@ def test_a_log_of_the_serving_cell_was_learned_as_if_the_others_were_unknown(sta
     assert wrong.mean() < 0.02
     reading = interpret(Raw(arrays, {"absent": "silent"}), "drive")
     assert any(isinstance(note, Severe) and "leave absent out" in note for note in reading.notes)
-
-
-def test_one_station_at_each_moment_is_not_always_the_one_that_serves():
-    """Cells asked one after the other, or where somebody chose to,
-    tell nothing of those that were not.
-    """
-    one, rng = network(2), np.random.default_rng(0)
-    rows = np.arange(len(one.moment))
-    by_turns, second = rows % 30, np.argsort(-one.measured, 1)[rows, rng.integers(0, 5, len(rows))]
-    east = np.where(
-        one.moment[:, 0] > np.median(one.moment[:, 0]), *one.measured.mean(0).argsort()[[0, -1]]
-    )
-    for chosen in (by_turns, second, east):
-        arrays = serving(one, station=chosen, rssi_db=one.measured[rows, chosen])
-        reading = interpret(Raw(arrays), "drive")
-        assert reading.data.censored is None and not [n for n in reading.notes if "strongest" in n]
