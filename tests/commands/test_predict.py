@@ -447,19 +447,9 @@ def test_predict_answered_where_maps_refuse_and_its_deviations_held_79_of_90(tmp
     asked = [f"ckpt={tmp_path}/model.ckpt", f"places={file}", "overwrite=true"]
     done = knock(COMMANDS["predict"].run, "predict", [*asked, f"hydra.run.dir={tmp_path}/run"])
     after = read(file.with_name("asked.predicted.csv"))
-    far = np.array([float(row["y"]) > 100 for row in after])
-    assert [int(row["refused"]) for row in after] == far.astype(int).tolist()
+    far = column(after, "y") > 100
+    assert column(after, "refused").tolist() == far.tolist()
     assert column(after, "rssi_db") == pytest.approx(column(before, "rssi_db"))
-    # Of refused ones the model's own.
-    own = [
-        (a["rssi_db_std"], b["rssi_db_std"])
-        for a, b, one in zip(after, before, far, strict=True)
-        if one
-    ]
-    assert all(float(a) == pytest.approx(float(b)) for a, b in own)
-    near = [row for row, one in zip(after, far, strict=True) if not one]
-    own = [row for row, one in zip(before, far, strict=True) if not one]
-    assert (column(near, "rssi_db_std") / column(own, "rssi_db_std")).mean() == pytest.approx(
-        2, rel=0.2
-    )
+    wider = column(after, "rssi_db_std") / column(before, "rssi_db_std")
+    assert wider[far] == pytest.approx(1) and wider[~far].mean() == pytest.approx(2, rel=0.2)
     assert any("3 of 9 predictions are refused" in line for line in (*done.out, *done.err)), done

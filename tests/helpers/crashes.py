@@ -49,7 +49,7 @@ VARYING = ("time/", "machine/", "memory/", "git", "run_id")
 TIMED = ("train_s", "render_ms", "ratio_to_copy")
 
 
-def training(folder: str, overrides: list[str], most_bytes: int = 0) -> None:
+def training(folder: str, overrides: list[str]) -> None:
     """`train.py` with these overrides into `folder`; errors are one line in `error.txt`."""
     import torch
     from campaigns import compose
@@ -58,7 +58,7 @@ def training(folder: str, overrides: list[str], most_bytes: int = 0) -> None:
     from gsparc.evaluation.console import error_in_one_line
 
     torch.set_num_threads(1)
-    with Limited(most_bytes), mock.patch(DRAWING):
+    with mock.patch(DRAWING):
         try:
             train(compose(*overrides), Path(folder))
         except Exception as error:

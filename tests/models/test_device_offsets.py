@@ -12,7 +12,6 @@ import torch
 import gsparc
 from gsparc.data.splits import Fold
 from gsparc.models.device_offsets import take_off_devices, without_devices
-from gsparc.models.method import Prediction
 from gsparc.prediction.answers import predict_file
 from gsparc.tables.own import from_arrays
 
@@ -136,12 +135,3 @@ def test_a_device_that_differs_at_one_carrier_has_an_offset_there():
     level -= half - np.where(phone == "left", -1, 1)
     levels = take_off_devices(from_arrays({**rows, "rssi_db": level}), every).site.device_levels
     assert np.ptp(levels[:, 1, 0]) < 0.15 and levels[0, 1, 0] == pytest.approx(1, abs=0.25)
-    asked = Prediction(torch.ones(2, 1), torch.zeros(2))
-    site = from_arrays({**rows, "rssi_db": level + half}).site
-    told = take_off_devices(from_arrays({**rows, "rssi_db": level + half}), every).site
-    named = torch.tensor([1, 1]), torch.tensor([0, 2])
-    ratio = asked.of_devices(told, *named).mean[:, 0].log10().diff() * 10
-    assert float(ratio[0]) == pytest.approx(
-        float(told.device_levels[2, 1, 0] - told.device_levels[0, 1, 0]), abs=1e-4
-    )
-    assert asked.of_devices(site, *named) is asked

@@ -15,7 +15,6 @@ from omegaconf import OmegaConf
 
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.results import read_summary
 from gsparc.evaluation.summary import write_summary
 from gsparc.runs import ledger
 from gsparc.runs.inputs import read_inputs
@@ -198,25 +197,6 @@ def plugin(tmp_path, monkeypatch):
     yield folder
     for name in ("lone_plugin", "lone_helper"):
         sys.modules.pop(name, None)
-
-
-@pytest.mark.parametrize(
-    ("file", "counts"),
-    [
-        ("lone_helper.py", True),
-        ("README.md", False),
-        ("lone_other.py", False),  # a new program beside it that nobody imports
-    ],
-)
-def test_a_plugin_s_helper_was_edited_and_it_counted_as_done(tmp_path, plugin, file, counts):
-    """Two jobs were done already, 2.93 dB where over 20 is right."""
-    run_once(tmp_path, state(), ends(tmp_path, 1))
-    (plugin / file).write_text("VALUE = 2\n")
-    changed = [str(plugin / file)] if counts else []
-    assert state().changes(read_summary(tmp_path / "job.json")) == changed
-    assert (read_finished(tmp_path, state()) is None) == counts
-    assert read_finished(tmp_path, state(), reuse=True) == {"value": 1}
-    assert run_once(tmp_path, state(), ends(tmp_path, 2)) == {"value": 2 if counts else 1}
 
 
 def test_a_new_program_in_the_clone_threw_finished_sweeps_away(tmp_path, plugin):

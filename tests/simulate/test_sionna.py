@@ -2,17 +2,14 @@
 where Sionna is not installed (`make sionna`).
 """
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 
 from gsparc.datasets.load import load
 from gsparc.simulate import llvm, raytracer
-from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import BITS, Effects
 from gsparc.simulate.raytracer import RayTracer, Sampling
@@ -226,24 +223,3 @@ def test_town_with_sectors_in_degrees(tmp_path):
     assert read.site.georeference == outcome.survey.georeference
     latitude, longitude = read.site.georeference.to_degrees(places[:, :2])
     assert np.ptp(latitude) < 0.003 and abs(np.median(longitude) + 30) < 0.001
-
-
-def test_auto_in_the_conference_room(tmp_path):
-    asked = AutoSettings(probes=16, held_back=16, full=Effects(depth=2))
-    plan = CampaignSettings(CONFERENCE, asked, sampling=QUICK, check=8, shard=20)
-    outcome = simulate(plan, tmp_path / "room.h5")
-    assert outcome.decision is not None and outcome.decision.choice.verdict is not None
-    assert outcome.effects.line_of_sight and outcome.effects.specular
-    assert outcome.convergence is not None and 0 < outcome.convergence.nmse < 0.5
-    with h5py.File(tmp_path / "room.h5") as file:
-        table = json.loads(file.attrs["auto"])["table"]
-        assert {row["effect"] for row in table} >= {
-            "diffuse",
-            "refraction",
-            "depth > 1",
-            "polarisation",
-        }
-        assert all(row["failures"] >= 0 for row in table)
-        assert "itu-glass" in json.loads(file.attrs["materials"])
-    spectra = load({"name": "sionna", "file": str(tmp_path / "room.h5")})
-    assert spectra.site.convergence_error == pytest.approx(outcome.convergence.spectrum_nmse)

@@ -2,7 +2,6 @@
 and of use to one that was never heard.
 """
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -99,17 +98,6 @@ def test_no_wall_is_kept_where_there_is_none():
         ChannelField(ChannelSettings(mirrors=2, directions=False)), data, np.arange(len(data))
     )
     assert field.prior.find_term(Images) is None and not len(field.objects().planes)
-
-
-def test_a_plane_between_an_end_and_the_places_mirrors_nothing():
-    plane = torch.tensor([[1.0, 0.0, 0.0, 0.5], [0.0, 1.0, 0.0, 3.0]], dtype=torch.float64)
-    (group, *_), prior = _bare(_data(*_site([WALL], ends=1)))
-    frame, slot = (
-        replace(prior.frame, middle=torch.zeros(3).double()),
-        replace(group.slot, end=plane[0, :3]),
-    )
-    waves = Images.from_planes(frame, plane).waves(replace(group, slot=slot))
-    assert waves.abs().sum(1).bool().tolist() == [False, True]
 
 
 @pytest.mark.slow

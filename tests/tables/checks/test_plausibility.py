@@ -143,19 +143,6 @@ def test_a_wild_row_is_named():
     assert len(found) == 1 and found[0].startswith("row 123: up to") and "row 124" not in found[0]
 
 
-def test_two_steps_are_found():
-    """Walked thrice, another gain the second time."""
-    place, level, station = walk(4, 400)
-    rng = np.random.default_rng(0)
-    thrice = np.concatenate([level + rng.normal(0, 2, 400) for _ in range(3)])
-    thrice[400:800] += 14
-    steps = detect_level_steps(np.tile(place, (3, 1)), thrice, station)
-    assert [abs(s.first - at) <= 3 for s, at in zip(steps, (400, 800), strict=True)] == [True, True]
-    assert steps[0].change_db == pytest.approx(14, abs=1) and steps[1].change_db == pytest.approx(
-        -14, abs=1
-    )
-
-
 def test_no_wolf_on_thirty_sound_walks():
     alarms = sum(bool(detect_level_steps(*walk(seed, 400))) for seed in range(30))
     assert alarms == 0
