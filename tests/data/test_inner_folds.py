@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 
 from gsparc.base.errors import DataError
 from gsparc.data.inner_folds import NOT_TESTED, inner_folds
-from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.data.splits import FileSettings, Fold, SplitSettings, make_split
 
 KINDS = ("random", "grouped", "corner", "blocks", "sparse")
 SIDE = 0.2
@@ -90,6 +90,16 @@ def test_of_two_stations_each_is_left_out_and_of_one_rows_are():
     assert [set(station[f.test]) for f in inner.folds] == [{3}, {5}]
     alone = inner_folds(positions, Fold(rows[:20], none, none), settings, 3, 0, station=station)
     assert alone.name == "random" and len(alone.folds) == 3
+
+
+@pytest.mark.parametrize("name", ["random", "blocks"])
+def test_a_files_own_rows_say_how_they_were_cut(name):
+    positions = floor(1200)
+    outer = make_split(positions, settings_of(name)).folds[0]
+    inner = inner_folds(positions, outer, FileSettings(path="split.json"), 3, 0)
+    assert inner.name == name
+    gap = apart(positions, Fold(outer.train, outer.train[:0], outer.val))
+    assert np.mean([apart(positions, fold) for fold in inner.folds]) == pytest.approx(gap, rel=0.5)
 
 
 def test_too_few_places_are_refused():

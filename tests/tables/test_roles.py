@@ -96,6 +96,16 @@ def test_ranks_were_taken_for_stations(write, heads):
     assert data.site.stations.name == ("a", "b", "c") or set(data.site.stations.name) == set("abc")
 
 
+def test_ranks_beside_names_of_another_word_are_asked(write):
+    path = write(table("x,y,who1,rssi1,who2,rssi2", *PLACES.T, *RANKS))
+    with pytest.raises(DataError, match=r"rssi_db=rssi\* dataset.columns.station=who\*"):
+        Own(path).load()
+    lists = {"station": "who*", "rssi_db": "rssi*"}
+    assert set(read_any(path, columns=lists).data.site.stations.name) == set("abc")
+    wide = read_any(path, columns={"rssi_db": ["rssi1", "rssi2"]}).data
+    assert wide.site.stations.name == ("1", "2")
+
+
 @pytest.mark.parametrize("way", ["RSSI A...RSSI C*-1", ["RSSI A*-1", "RSSI B*-1", "RSSI C*-1"]])
 def test_one_answer_takes_all_columns_of_a_block(write, way):
     content = table("x,y,RSSI A,RSSI B,RSSI C", *PLACES.T, *-LEVELS.T)

@@ -20,6 +20,7 @@ from gsparc.training.tracking import (
     PartLogger,
     log_picture,
     log_table,
+    tensorboard_logger,
     wandb_logger,
 )
 
@@ -53,6 +54,21 @@ def test_weights_and_biases_gets_files_and_tables(file):
         ("predictions", [str(file)], 7),
         ("results", ["method", "dB"], [["gp", "3.1"]]),
     ]
+
+
+def test_tensorboard_gets_pixels_and_markdown(file, tmp_path):
+    pytest.importorskip("tensorboard", reason="TensorBoard is not installed: the extra tensorboard")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    logger = tensorboard_logger(str(tmp_path))
+    log_picture([logger], "predictions", file, 7)
+    log_table([logger], "results", ["method", "dB"], [["gp", "3.1"]])
+    logger.finalize("success")
+    found = EventAccumulator(str(tmp_path / "tensorboard")).Reload()
+    (image,) = found.Images("predictions")
+    assert (image.step, image.height, image.width) == (7, 4, 6)
+    (text,) = found.Tensors("results/text_summary")
+    assert b"| gp | 3.1 |" in text.tensor_proto.string_val[0]
 
 
 def test_other_loggers_are_left_alone(file):

@@ -1,6 +1,5 @@
 """Public data from a local server: what comes, what is refused in one line, and what is kept."""
 
-import contextlib
 import csv
 import os
 import threading
@@ -220,20 +219,6 @@ def test_the_list_tells_size_licence_and_source(capsys):
     assert (
         "github.com/wenchaozheng/WRF-GSplus at e564f31844"
     ) in listed and "no licence stated" in listed
-
-
-def test_a_byte_now_and_then_never_ended(mirror, monkeypatch, tmp_path, refused):
-    def drips(request, content):
-        begin(request, Content_Length=len(content))
-        with contextlib.suppress(OSError):
-            for one in content:
-                request.wfile.write(bytes([one]))
-                if mirror.stop.wait(0.02):
-                    return
-
-    monkeypatch.setattr(fetching, "PATIENCE", 2)
-    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, drips))
-    refused("the server sends too little in the time", fetch, "room", timeout_s=0.1, retries=0)
 
 
 def test_who_waits_for_another_fetch_is_told(mirror, monkeypatch, tmp_path, caplog):
