@@ -155,13 +155,13 @@ def test_the_folder_of_one_run_was_ignored_in_a_sweep(tmp_path, monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("way", [(), ("-m", "seed=0,1")], ids=["a run", "a sweep"])
 def test_the_objective_is_for_searches_alone(tmp_path, way):
-    """One power heard of sixty: everything was written, then `error: objective=test/rmse_db`,
-    exit 1.
+    """One channel of sixty is not silent: everything was written, then
+    `error: objective=test/nmse`, exit 1.
     """
-    where, heard = np.random.default_rng(0).uniform(0, 20, (60, 3)), np.full(60, np.nan)
-    heard[7] = -60.0
-    powers = {"rssi_db": heard, "sensitivity_db": -90.0}
-    np.savez(tmp_path / "own.npz", rx_position=where, tx_position=np.zeros(3), **powers)
+    where, heard = np.random.default_rng(0).uniform(0, 20, (60, 3)), np.zeros(60, complex)
+    heard[7] = 1.0
+    ends = {"rx_position": where, "tx_position": np.zeros(3), "frequency_hz": 1e9}
+    np.savez(tmp_path / "own.npz", csi=heard, **ends)
     folder = [f"hydra.run.dir={tmp_path / 'run'}", f"hydra.sweep.dir={tmp_path / 'run'}"]
     given = ["dataset=own", f"dataset.file={tmp_path / 'own.npz'}", "model=mean", "baselines=[]"]
     answer = knock(
@@ -172,7 +172,7 @@ def test_the_objective_is_for_searches_alone(tmp_path, way):
     )
     written = list((tmp_path / "run").glob("*/summary.json" if way else "summary.json"))
     assert len(written) == (2 if way else 1)
-    assert all(json.loads(file.read_text())["test/rmse_db"] is None for file in written)
+    assert all(json.loads(file.read_text())["test/nmse"] is None for file in written)
     assert not way or (tmp_path / "run" / "sweep.png").exists()  # of no figure at all: no logarithm
 
 
