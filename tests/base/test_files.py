@@ -31,15 +31,6 @@ def test_a_folder_appears_when_it_is_whole(tmp_path):
     assert [file.name for file in path.iterdir()] == ["one"] and list(tmp_path.iterdir()) == [path]
 
 
-def test_of_two_makers_of_a_folder_the_first_wins(tmp_path):
-    path = tmp_path / "stand-in"
-    with whole_folder(path) as partial:
-        (partial / "one").write_text("mine")
-        path.mkdir()
-        (path / "one").write_text("theirs")
-    assert (path / "one").read_text() == "theirs" and list(tmp_path.iterdir()) == [path]
-
-
 BOMBS = {
     "billion": "a: &a [1, 1, 1, 1, 1, 1, 1, 1, 1, 1]\n"
     + "".join(

@@ -47,11 +47,3 @@ def test_who_writes_again_and_again_lets_others_in(tmp_path):
         for _ in range(3):
             with hold_file(file, 2):
                 time.sleep(0.05)
-
-
-def test_a_failed_block_frees_the_file_and_its_error_is_its_own(tmp_path):
-    file = tmp_path / "a.ckpt"
-    with pytest.raises(TimeoutError, match="of the block"), hold_file(file, 0):
-        raise TimeoutError("of the block")
-    with hold_file(file, 0):
-        pass

@@ -160,37 +160,6 @@ def test_children_lie_as_their_parent_does():
     assert torch.allclose(spread, torch.tensor([0.1, 2.0, 0.1]), rtol=0.03)
 
 
-def test_an_edit_is_said_and_given_to_the_trackers(model, caplog):
-    caplog.set_level("INFO")
-    seen = []
-    tracker = SimpleNamespace(log_metrics=lambda figures, step: seen.append((figures, step)))
-    optimizer = optimizer_for(model, OptimizerSettings())
-    trainer, module = (
-        SimpleNamespace(optimizers=[optimizer], loggers=[tracker]),
-        at(model, 200, 400),
-    )
-    densify = with_gradient(Densify(0.25, 0.75, 0.125, grad_threshold=0.5, size_share=1.0), [2, 7])
-    densify.on_train_batch_start(trainer, module)
-    assert seen == [({"densify/removed": 0, "densify/added": 2}, 200)]
-    assert "step 200: 0 Gaussians removed or split, 2 added: 10 -> 12" in caplog.text
-
-
-def test_a_cap_that_leaves_no_room_was_not_said(model, caplog):
-    """The ablations started at their cap, and never densified."""
-    densify = with_gradient(
-        Densify(grad_threshold=0.5, size_share=1.0, max_gaussians=10, interval=1, start=0), [2, 7]
-    )
-    module = at(model, 600, 1000)
-    trainer = SimpleNamespace(
-        optimizers=[optimizer_for(model, OptimizerSettings())], loggers=[], logger=None
-    )
-    densify.on_train_batch_start(trainer, module)
-    with_gradient(densify, [2])
-    densify.on_train_batch_start(trainer, module)
-    said = [line for line in caplog.messages if "no room" in line]
-    assert said == ["no room for more Gaussians since step 600: callbacks.densify.max_gaussians=10"]
-
-
 def test_large_ones_go_by_size_and_by_radius_from_a_step_on(model):
     with torch.no_grad():
         model.gaussians.log_scales[3] = 3.0

@@ -92,19 +92,3 @@ def test_the_curve_of_a_resumed_run_ends_with_its_checkpoint(clock, module):
     again.load_state_dict(state)
     again.on_train_start(run, module)
     assert [row["step"] for row in curve.read_curve(module.run_dir)] == ["7"]
-
-
-def test_a_resumed_run_keeps_counting_and_an_exception_stops_the_watch(clock):
-    bill = CostLedger()
-    run = trainer()
-    run.global_step = 0
-    bill.on_train_start(run, SimpleNamespace())
-    clock.value += 4
-    again = CostLedger()
-    again.load_state_dict(bill.state_dict())
-    again.on_train_start(run, SimpleNamespace())
-    clock.value += 1
-    assert again.elapsed() == 5
-    again.on_exception(trainer(), SimpleNamespace(), RuntimeError())
-    clock.value += 4
-    assert again.elapsed() == 5

@@ -1,4 +1,3 @@
-import re
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
@@ -39,37 +38,9 @@ def test_one_line_of_80_columns_says_how_far_and_how_good(screen):
     assert "…" not in line
 
 
-def test_the_second_stage_was_called_a_refit(screen):
-    bar, (trainer, module) = StepProgress(), run()
-    trainer.callback_metrics = {"train/task_loss": 0.0123}  # no rows are left to validate on
-    bar.on_train_start(trainer, SimpleNamespace(count=500, run_dir=Path("run/refit"), pace=None))
-    bar.on_train_batch_end(trainer, module)
-    bar.on_train_end(trainer, module)
-    line = screen.export_text().strip().splitlines()[-1]
-    assert "again, on all rows 400/400" in line and "500 Gaussians" in line and "…" not in line
-
-
 def test_an_exception_gives_the_terminal_back(screen):
     bar, (trainer, module) = StepProgress(), run(3)
     bar.on_train_start(trainer, module)
     bar.on_exception(trainer, module, RuntimeError())
     bar.on_train_batch_end(trainer, module)  # nothing left to draw on
     assert bar._bar is None
-
-
-def test_minutes_were_promised_before_a_field_grew(screen, monkeypatch):
-    """5 minutes were said after 50 steps of 1,000 Gaussians,
-    15 it took with the 4,000 they grew to.
-    """
-    clock = iter([0.0, 50 * 0.1, 50 * 0.1 + 950 * 0.5, 1e4, 2e4])
-    monkeypatch.setattr(progress.time, "perf_counter", lambda: next(clock))
-    bar, (trainer, module) = StepProgress(), run()
-    trainer.max_steps = 4004
-    bar.on_train_start(trainer, module)
-    for trainer.global_step in (1, 51, 1001):
-        bar.on_train_batch_end(trainer, module)
-    bar.on_train_end(trainer, module)
-    said = re.findall(
-        r"4,004 steps, (\d+) ms each here: about (\d+) min to go", screen.export_text()
-    )
-    assert said == [("100", "7"), ("500", "25")]

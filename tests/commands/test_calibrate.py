@@ -120,30 +120,7 @@ def test_promise_holds_over_two_hundred_calibration_sets(how) -> None:
     assert facts["realised"] < 0.2
 
 
-def test_parts_are_disjoint_and_cells_stay_whole() -> None:
-    evidence = _evidence()
-    parts = split_choose_calibrate_test(evidence, True, np.random.default_rng(0))
-    assert len(np.unique(np.concatenate(parts))) == sum(map(len, parts)) == len(evidence)
-    cell = np.floor((evidence.position[:, :2] - evidence.position[:, :2].min(0)) / (2 / 6) * 0.9999)
-    names = [set(map(tuple, cell[part])) for part in parts]
-    # Only where the cells above differ by rounding at their edges
-    assert len(names[1] & names[2]) < 8
-
-
 MUTE = Trial("learned", "random", np.full(3, np.nan), np.zeros(3), 0.1)
-
-
-def test_nobody_accepted_is_no_promise_kept() -> None:
-    """A draw that accepts nobody says nothing: it is counted by itself, not among the kept."""
-    facts = Trial(
-        "learned", "random", np.array([np.nan, 0.05, 0.2]), np.array([0.0, 0.5, 0.5]), 0.1
-    ).summarise()
-    assert facts["silent"] == 1 / 3 and facts["broken"] == 0.5 and facts["broken_of_all"] == 1 / 3
-    assert facts["broken_low"] < 0.5 < facts["broken_high"]
-    facts = MUTE.summarise()
-    assert (
-        facts["broken"] is facts["broken_low"] is facts["realised"] is None and facts["silent"] == 1
-    )
 
 
 def test_a_picture_of_nobody_accepted(tmp_path) -> None:

@@ -101,16 +101,6 @@ def test_a_place_without_a_fix_is_left_out_and_named(tmp_path):
     assert len(write_own(tmp_path / "b.npz", {**arrays, **at_sea})) == 50
 
 
-def test_receivers_in_one_plane_are_noted(tmp_path, arrays):
-    arrays["csi"] = arrays.pop("spectrum")[:, 0, 0] + 1j
-    arrays["frequency_hz"] = np.array(2.4e9)
-    write_own(tmp_path / "a.npz", arrays)
-    assert "about a plane" not in _said(tmp_path / "a.npz")[1]
-    arrays["tx_position"][:, 2] = 1.5
-    write_own(tmp_path / "flat.npz", arrays)
-    assert "about a plane" in _said(tmp_path / "flat.npz")[1]
-
-
 def test_path_that_is_not_utf8(tmp_path):
     good, text = _said(tmp_path / "\udcff.npz")
     assert not good and "no such file" in text
@@ -134,20 +124,6 @@ def test_exit_status(tmp_path, arrays, capsys):
     assert main([str(tmp_path / "a.npz"), str(tmp_path / "absent.npz")]) == 1
     assert main([str(tmp_path)]) == 1
     assert "a folder without gateway_info.yml" in capsys.readouterr().out
-
-
-def test_a_map_only_where_it_is_asked_for(tmp_path, arrays, capsys):
-    write_own(tmp_path / "a.npz", arrays)
-    assert main([str(tmp_path / "a.npz")]) == 0
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.npz"]
-    assert main([str(tmp_path / "a.npz"), "--draw", str(tmp_path / "maps" / "a.png")]) == 0
-    assert (tmp_path / "maps" / "a.png").read_bytes().startswith(b"\x89PNG")
-    assert main([str(tmp_path / "a.npz"), "--draw", str(tmp_path / "a.npz" / "b.png")]) == 1
-    assert "b.png: cannot be written" in capsys.readouterr().out
-    for wrong in (["a.npz", "b.npz", "--draw", "c.png"], ["a.npz", "--draw", "c.pdf"]):
-        with pytest.raises(SystemExit):
-            main(wrong)
-        assert "--draw takes the name of a PNG file" in capsys.readouterr().err
 
 
 def test_draw_none_was_refused_without_the_option_that_draws_none(capsys):

@@ -2,10 +2,7 @@
 
 import json
 import re
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 from campaigns import spectra
@@ -15,7 +12,6 @@ from pages import compare_files
 from gsparc.commands.listing import COMMANDS
 from gsparc.runs.run_lock import locked
 
-ROOT = Path(__file__).parents[2]
 FILLED = re.compile(r"own/\S+: \S+ \S+ after ")  # a line of each cell
 
 
@@ -80,40 +76,3 @@ def test_cells_are_filled_once_and_reported_again(tmp_path):
     assert "3 cells, 2 already done" in compare(tmp_path, only, "latency=false")[1]
     spectra(tmp_path / "own.npz", rows=44)
     assert "3 cells, 0 already done" in compare(tmp_path, only, "latency=false", "train=false")[1]
-
-
-PLAIN = "only=[own/random/nearest/*,own/random/gp/*]", "latency=false"
-
-
-def figures(folder) -> list[dict]:
-    facts = [
-        json.loads(file.read_text()) for file in sorted((folder / "cells").rglob("summary.json"))
-    ]
-    return [{key: value for key, value in one.items() if key.startswith("test/")} for one in facts]
-
-
-@pytest.fixture(scope="module")
-def filled_here(tmp_path_factory) -> list[dict]:
-    """Figures of two cells that this process filled."""
-    folder = tmp_path_factory.mktemp("here")
-    spectra(folder / "own.npz")
-    status, said = compare(folder, *PLAIN)
-    assert status == 0 and len(FILLED.findall(said)) == 2, said
-    return figures(folder)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", ["joblib", pytest.param("ray", marks=pytest.mark.rare)])
-def test_cells_filled_elsewhere_are_the_same(filled_here, tmp_path, engine):
-    pytest.importorskip(engine, reason=f"{engine} is not installed")
-    spectra(tmp_path / "own.npz")
-    command = [
-        sys.executable,
-        "-m",
-        "gsparc",
-        "compare",
-        *words(tmp_path, *PLAIN, f"engine={engine}"),
-    ]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0 and len(FILLED.findall(done.stdout)) == 2, done.stderr
-    assert figures(tmp_path) == filled_here and min(map(len, filled_here)) > 1

@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 import towns
-from campaigns import compose, powers, spectra
+from campaigns import compose, powers
 from PIL import Image
 
 from gsparc.apps.locate import locator
@@ -59,18 +59,6 @@ def test_places_areas_and_pictures_are_written(trained, tmp_path):
     assert facts["time/locate_ms_p50"] > 0 and 0 <= facts["locate/coverage"] <= 1
     assert (tmp_path / "posteriors.png").stat().st_size > 10_000
     assert "locate" in checkpoint.read(trained).extra
-
-
-@pytest.mark.slow
-def test_a_file_without_places_is_located_too(trained, tmp_path):
-    file = tmp_path / "other.npz"
-    with np.load(spectra(tmp_path / "all.npz", rows=80)) as stored:
-        true = stored["tx_position"][:3]
-        np.savez(file, spectrum=stored["spectrum"][:3], rx_position=stored["rx_position"])
-    _, rows = located(tmp_path / "run", f"ckpt={trained}", f"data='{file}'", "calibrate=0")
-    assert len(rows) == 3 and set(rows[0]) == UNPLACED
-    found = np.stack([column(rows, axis) for axis in "xyz"], 1)
-    assert np.median(np.linalg.norm(found - true, axis=1)) < 0.3
 
 
 @pytest.mark.slow
@@ -336,19 +324,6 @@ def test_what_was_heard_beyond_the_trained_places_was_located_at_their_edge_unsa
     assert f"{len(found)} true places lie outside" in said
     facts, found = located(tmp_path / "own", f"ckpt={ckpt}", "calibrate=0")
     assert facts["locate/beyond"] <= 0.2 * len(found)
-
-
-@pytest.mark.slow
-def test_nobody_is_located_in_a_wall(trained, tmp_path):
-    plan = np.full((40, 100, 3), 255, np.uint8)
-    plan[:, 50:] = 0  # the right half of the room
-    Image.fromarray(plan).save(tmp_path / "plan.png")
-    low, high = (site := checkpoint.read(trained).site).moving_box[:, :2] + site.origin[:2]
-    points = f"plan_points=[[0,40,{low[0]},{low[1]}],[100,40,{high[0]},{low[1]}]]"
-    given = f"ckpt={trained}", "calibrate=0", "rows=5", f"plan='{tmp_path}/plan.png'", points
-    _, rows = located(tmp_path / "run", *given)
-    wall = 0.5 * (low + high)[0] + 0.3
-    assert (column(rows, "x") <= wall).all() and (column(rows, "x_true") > wall).any()
 
 
 def test_a_method_without_variance_is_refused_in_one_line(tmp_path):

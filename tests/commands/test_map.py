@@ -3,12 +3,9 @@ errors in one line.
 """
 
 import json
-import os
 import shutil
-import signal
 from dataclasses import replace
 from pathlib import Path
-from threading import Timer
 
 import numpy as np
 import pandas as pd
@@ -17,8 +14,6 @@ from doors import assert_refused, knock
 from PIL import Image
 from towns import town_file, town_model, trained
 
-import gsparc
-from gsparc.apps.maps import predict_map
 from gsparc.apps.maps.placing import place_station
 from gsparc.commands.listing import COMMANDS
 
@@ -69,15 +64,6 @@ def test_every_layer_and_a_table(mapped):
         assert found["power_db"].shape == (2, 30, 40) and told.mean() > 0.8
         assert (found["lower_db"] < found["upper_db"])[told].all()
         assert np.isnan(found["lower_db"][~told]).all()
-
-
-def test_the_promise_stays_with_the_model(mapped, model):
-    found = predict_map(gsparc.load(model), step_m=5.0)
-    assert found.calibrated and np.isfinite(found.power_db).any()
-    far = predict_map(gsparc.load(model), [0, 0, 200, 60], step_m=5.0)
-    assert np.isnan(far.power_db[:, :, -1]).all() and far.refused[:, -1].all()
-    near, edge = far.expected_error_db[0, 5, 5], np.nanmax(far.expected_error_db[0])
-    assert edge > near
 
 
 def test_a_plan_from_the_model(mapped, model, tmp_path):
@@ -207,24 +193,6 @@ def test_a_station_among_others_of_no_known_place_was_no_number_of_metres_away(t
     how = ("count=4", "threshold_db=-75", "promised=false", "station_height_m=8")
     done = run("place", f"ckpt={path}", *how, folder=tmp_path / "to")
     assert done.status == 0 and not any("from the next" in line for line in done.out), done
-
-
-@pytest.mark.slow
-def test_an_interrupt_leaves_no_half_written_file(model, tmp_path, monkeypatch):
-    began = []
-
-    def interrupt():
-        began.append(True)
-        os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(
-        "gsparc.commands.map.read_or_gather", lambda *_, **__: Timer(0.3, interrupt).start()
-    )
-    answer = run("map", f"ckpt={model}", "step_m=0.03", folder=tmp_path)
-    assert answer.status == 130 and began, answer
-    assert not [
-        file for file in tmp_path.iterdir() if file.suffix in (".npz", ".png", ".html", ".partial")
-    ]
 
 
 def test_a_map_and_its_model_are_judged_by_later_rows_alike(model, tmp_path):

@@ -24,8 +24,6 @@ from gsparc.models.fitting import Origin
 from gsparc.models.loading import load_module
 from gsparc.training.context import FitContext
 
-ROOT = Path(__file__).parents[2]
-
 
 @pytest.mark.parametrize(
     ("change", "message"),
@@ -131,20 +129,6 @@ def test_settings_of_the_schedule_may_change_and_are_named(spectra_file, halfway
     last = halfway.checkpoints[0].with_name("last.ckpt")
     train(short(spectra_file, "trainer.max_steps=25", f"ckpt_path={last}"), tmp_path)
     assert re.search(r"which had trainer\.max_steps=\d+ \(here 25\)", caplog.text)
-
-
-def test_processor_seconds_of_the_run_that_was_interrupted_count(spectra_file, halfway, tmp_path):
-    """Of a resumed run those alone were told that were spent after its interrupt."""
-    content = torch.load(halfway.checkpoints[0].with_name("last.ckpt"), weights_only=True)
-    content["extra"]["spent_cpu_s"] = 500.0
-    content["extra"]["trainer"]["callbacks"]["ReportSteps"]["cpu_seconds"] = 70.0
-    del content["sha256"]
-    torch.save(content, tmp_path / "last.ckpt")
-    facts, made = train(
-        short(spectra_file, f"ckpt_path={tmp_path / 'last.ckpt'}"), tmp_path / "run"
-    )
-    assert 570.0 < facts["time/train_cpu_s"] < 600.0
-    assert checkpoint.read(made.checkpoints[0]).extra["train_cpu_s"] == facts["time/train_cpu_s"]
 
 
 def test_training_starts_from_given_weights_on_rows_of_another_campaign(

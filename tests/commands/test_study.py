@@ -3,13 +3,12 @@
 import json
 
 import pytest
-from campaigns import compose, powers, spectra
+from campaigns import spectra
 from doors import knock
 from hydra import compose as compose_with_hydra
 from hydra import initialize_config_module
 
 from gsparc.commands.listing import COMMANDS
-from gsparc.commands.train import train
 from gsparc.evaluation.results import read_columns
 from gsparc.models.registry import build, fill_defaults
 from gsparc.models.terms import EffectSettings
@@ -53,20 +52,3 @@ def test_variants_join_the_models_settings_where_they_are_interpolations():
     assert all(isinstance(switch, EffectSettings) for switch in switches.values())
     assert (switches["plain"].image, switches["plain"].phase) == (True, False)
     assert (switches["all"].image, switches["plain"].visibility) == ("auto", "auto")
-
-
-def test_errors_cost_an_interpolator_and_not_the_mean(tmp_path):
-    """A baseline learns from, and is asked about, the same disturbed rows as the model."""
-    file, rmse = powers(tmp_path / "own.npz"), {}
-    given = ("dataset=own", f"dataset.file={file}", "model=gp", "baselines=[mean,gp]")
-    for key in ("keep=1", "queries_m=0.5", "train_m=0.5", "keep=0.2"):
-        config = compose(*given, "logger=none", "threads=1", f"disturb.{key}")
-        facts, _ = train(config, tmp_path / key, in_full=False)
-        names = ("test", "baseline/gp", "baseline/mean")
-        rmse[key] = [facts[f"{name}/rmse_db"] for name in names]
-        rows = facts["split/train"] + facts["split/val"]
-        assert rows == (13 if key == "keep=0.2" else 64)  # that a model learned from
-    assert all(own == beside for own, beside, _ in rmse.values())
-    clean, *disturbed = rmse.values()
-    assert all(own > clean[0] + 0.3 for own, _, _ in disturbed)
-    assert all(mean == clean[2] for _, _, mean in disturbed[:2])

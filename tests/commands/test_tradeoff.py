@@ -1,25 +1,21 @@
 """`gsparc tradeoff`: a table, a picture, points kept; and loading within a budget."""
 
 import csv
-import dataclasses
 import json
 import shutil
 
 import numpy as np
 import pytest
-import torch
 from campaigns import compose, runs_in
 from refusals import refused
 from towns import town_file, town_model, trained
 
 import gsparc
 from gsparc.commands.tradeoff import task
-from gsparc.evaluation.scores import score_methods
 from gsparc.models import checkpoint
 from gsparc.models.baselines.distance_law import DistanceLaw
 from gsparc.prediction import operating_point
-from gsparc.prediction.timing import ClockSettings, time_interleaved
-from gsparc.runs.experiment.tradeoff import closeness_db, why_irreducible
+from gsparc.runs.experiment.tradeoff import why_irreducible
 from gsparc.training import tracking
 
 
@@ -54,14 +50,6 @@ def swept(field, tmp_path_factory):
         return facts, folder, ckpt, said
 
 
-@pytest.mark.slow
-def test_dashboards_get_the_points_that_nothing_beats(swept):
-    facts, _, _, said = swept
-    ((loggers, name, heads, rows),) = said
-    assert (loggers, name, heads[:2]) == (1, "operating points", ["not beaten", "ms p50"])
-    assert len(rows) == facts["tradeoff/front"] and {len(row) for row in rows} == {len(heads)}
-
-
 def test_it_leaves_a_table_a_picture_and_a_summary(swept):
     facts, folder, *_ = swept
     with (folder / "tradeoff.csv").open() as file:
@@ -86,41 +74,6 @@ def test_a_baseline_that_does_not_serve_the_data_ended_the_trade_off(swept):
     assert beside == {"mean"}  # laws of distance are of powers
 
 
-def test_the_front_is_kept_with_the_model_which_stays_what_it_was(swept, field):
-    _, _, ckpt, _ = swept
-    before, after = checkpoint.read(field.checkpoints[0]), checkpoint.read(ckpt)
-    points, measured = operating_point.stored_points(after.extra)
-    assert (
-        points
-        and "receiver" in measured
-        and operating_point.stored_points(before.extra) == ([], {})
-    )
-    assert after.config == before.config and set(after.extra) == {
-        *before.extra,
-        operating_point.KEY,
-    }
-    place = field.data.site.origin + 0.1
-    same = [gsparc.load(path).spectrum(tx=place) for path in (field.checkpoints[0], ckpt)]
-    assert np.array_equal(*same)
-
-
-def test_what_is_kept_is_decided_without_a_measurement(swept, field):
-    _, folder, *_ = swept
-    with (folder / "tradeoff.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["kept_with_model"] == "1"]
-    close = [float(row["closeness_db"]) for row in rows]
-    # The last is as near as the full model itself
-    assert close == sorted(close) and close[-1] == 100.0
-    data = field.data
-    blind = dataclasses.replace(data, target=np.zeros_like(data.target))
-    told = [], []
-    for means, seen in zip(told, (blind, data), strict=True):
-        score_methods(field.methods[:1], seen, field.split, means=means)
-    answers, again = map(torch.cat, told)
-    assert torch.equal(answers, again) and closeness_db(answers, answers) == 100.0
-    assert closeness_db(1.1 * answers, answers) == pytest.approx(20.0, abs=1e-3)
-
-
 def test_a_budget_picks_the_most_accurate_that_fits(swept, monkeypatch):
     _, _, ckpt, _ = swept
     points, _ = operating_point.stored_points(checkpoint.read(ckpt).extra)
@@ -137,21 +90,6 @@ def test_a_budget_picks_the_most_accurate_that_fits(swept, monkeypatch):
         ckpt,
         budget_ms=0.5,
     )
-
-
-def test_a_budget_is_met_here_and_confidence_is_still_given(swept):
-    _, _, ckpt, _ = swept
-    threads = torch.get_num_threads()
-    predictor = gsparc.load(ckpt, budget_ms=1000)
-    place = predictor.site.origin + 0.1
-    assert (
-        predictor.spectrum(tx=place).shape == (16, 32) and 0 <= predictor.confidence(tx=place) <= 1
-    )
-    times = time_interleaved(
-        {0: lambda n: predictor.spectrum(tx=place)}, ClockSettings(rounds=5), {0: 1}
-    )
-    assert np.median(times[0]) <= 1000
-    torch.set_num_threads(threads)
 
 
 def test_a_model_never_swept_says_what_to_do(field):

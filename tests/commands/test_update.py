@@ -78,15 +78,6 @@ def test_a_file_that_is_told_twice_is_taken_once_unless_it_is_said(before, tmp_p
     assert len(gsparc.load(out).rows) == 80
 
 
-def test_rows_of_another_site_are_refused(before, tmp_path):
-    places, file = PLACES[:5] + np.array([2e6, 0, 0]), tmp_path / "far.npz"
-    np.savez(
-        file, rx_position=places, tx_position=np.array([9.0, 9.0, 2.6]), rssi_db=levels(places, 0)
-    )
-    answer, _ = update(tmp_path / "run", f"ckpt={before}", f"data={file}")
-    assert answer.status != 0 and "km from all rows" in " ".join(answer.err)
-
-
 def test_changes_are_listed_where_they_are(before, tmp_path):
     new, out = room_file(tmp_path / "new.npz", 200, change=-12.0), tmp_path / "after.ckpt"
     update(tmp_path / "run", f"ckpt={before}", f"data={new}", f"out={out}")
@@ -104,24 +95,6 @@ def test_neither_rows_nor_steps_back_and_no_version(before, tmp_path):
     ):
         answer, _ = update(tmp_path, f"ckpt={before}", *words)
         assert answer.status != 0 and said in " ".join(answer.err + answer.out)
-
-
-def test_a_model_of_channels_was_refused_for_the_name_of_its_new_rows(tmp_path):
-    """A folder was `no file; expected a table`; `update(csi=...)` had an unexpected keyword."""
-    csi = np.exp(1j * np.arange(20))
-    waves = gsparc.fit(
-        rx=PLACES[:20],
-        tx=[9.0, 9.0, 2.6],
-        csi=csi,
-        frequency_hz=1e9,
-        model="mean",
-        save=tmp_path / "a.ckpt",
-    )
-    answer, _ = update(tmp_path, f"ckpt={tmp_path / 'a.ckpt'}", f"data={tmp_path}")
-    said = "models of channels cannot be updated: train again on all rows"
-    assert answer.status != 0 and said in " ".join(answer.err + answer.out)
-    with pytest.raises(ValueError, match=said):
-        waves.update(rx=PLACES[:20], csi=csi)
 
 
 def test_a_model_of_powers_takes_no_spectra(before):

@@ -2,7 +2,6 @@
 and the same as in memory.
 """
 
-import hashlib
 import multiprocessing
 import pickle
 import zipfile
@@ -11,14 +10,10 @@ import h5py
 import numpy as np
 import pytest
 from opened import say
-from releases import write_release
 
 from gsparc.data import blocks
-from gsparc.data.assemble import content_hash
 from gsparc.data.schema import Measurements, Site
 from gsparc.datasets.own import read_any
-from gsparc.datasets.rfid import load_rfid
-from gsparc.models.target_rows import training_targets
 from gsparc.tables import array_sizes
 from gsparc.tables.checks.constant import leave_out_unmeasured, mark_constants
 from gsparc.tables.own import load_own, write_own
@@ -90,47 +85,6 @@ def test_measurements_stay_on_disk_and_are_the_same(tmp_path, small, monkeypatch
     )
     rows = np.array([7, 3, 3, 19])
     assert np.array_equal(there.batch(rows).target, here.batch(rows).target)
-
-
-@pytest.mark.parametrize(
-    ("make", "name", "index", "value", "says"),
-    [
-        (arrays, "csi", (31, 2, 5), np.nan, "csi.*row 31.*not finite"),
-        (lambda: spectra(np.float32), "spectrum", (13, 2, 5), -1, "spectrum.*row 13.*at least 0"),
-    ],
-)
-def test_a_bad_entry_is_named_there_too(tmp_path, small, refused, make, name, index, value, says):
-    values = make()
-    values[name][index] = value
-    unchunked(tmp_path / "own.h5", values)
-    refused(says, load_own, tmp_path / "own.h5")
-
-
-def test_the_hash_is_that_of_all_bytes_as_it_was(small):
-    named = {"scale": np.array(2.0), "csi": arrays(200)["csi"][:, ::2], "none": None}
-    digest = hashlib.sha256()
-    for name in ("csi", "scale"):
-        whole = np.ascontiguousarray(named[name])
-        digest.update(f"{name} {whole.dtype.str} {whole.shape};".encode() + whole.tobytes())
-    assert content_hash(named) == digest.hexdigest()
-
-
-def test_a_folder_of_pictures_stays_on_disk_and_so_do_rows_to_learn_from(
-    tmp_path, small, monkeypatch
-):
-    """50,000 pictures were 1.6 GB in memory,
-    and as much again for each method that copied its rows.
-    """
-    root = write_release(tmp_path / "release")
-    there = load_rfid(root)
-    with monkeypatch.context() as patch:
-        patch.setattr(blocks, "BIG", 2**28)
-        here = load_rfid(root)
-    assert isinstance(there.target, np.memmap) and not isinstance(here.target, np.memmap)
-    assert np.array_equal(there.target, here.target) and there.site.sha256 == here.site.sha256
-    rows = np.array([5, 0, 3])
-    learned = training_targets(there, rows)
-    assert isinstance(learned, np.memmap) and np.array_equal(learned, here.target[rows])
 
 
 def test_a_process_that_is_started_opens_the_file_itself(tmp_path):

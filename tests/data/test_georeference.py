@@ -1,7 +1,5 @@
 """Degrees and metres: known lengths of the ellipsoid, and back again to a millimetre."""
 
-import pickle
-
 import numpy as np
 import pytest
 
@@ -51,7 +49,6 @@ def test_the_origin_is_the_rounded_median():
     # Rows that were logged twice moved it, and with it every draw of rows.
     again = [*[40.76521977] * 2, 40.7, *[40.8] * 9], [*[-111.83475621] * 2, -111.0, *[-112.0] * 9]
     assert Georeference.from_coordinates(*again) == origin
-    assert pickle.loads(pickle.dumps(origin)) == origin
 
 
 @pytest.mark.parametrize(

@@ -5,10 +5,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from gsparc.base.errors import DataError
-from gsparc.data.inner_folds import NOT_TESTED, cut_folds, inner_folds
+from gsparc.data.inner_folds import NOT_TESTED, inner_folds
 from gsparc.data.splits import FileSettings, Fold, SplitSettings, make_split
-from gsparc.models.per_station import UNHEARD, station_site
-from gsparc.tables.own import from_arrays
 
 KINDS = ("random", "grouped", "corner", "blocks", "sparse")
 SIDE = 0.2
@@ -65,38 +63,11 @@ def test_they_are_of_training_rows_alone_and_a_pure_function(name):
     )
 
 
-@pytest.mark.parametrize("side", [SIDE, None])
-def test_blocks_are_the_same_squares_of_floor(side):
-    """Where none was said they are a tenth of the site, inside as outside."""
-    positions = floor()
-    outer, inner = both("blocks", positions, share=0.15, side_m=side)
-    low = positions[:, :2] - positions[:, :2].min(axis=0)
-    width = side or np.ptp(low, axis=0).max() / 10 * (1 + 2e-6)
-    square = np.unique(np.floor(low / width), axis=0, return_inverse=True)[1].reshape(-1)
-    for fold in (outer, *inner.folds):
-        assert not np.isin(square[fold.test], square[np.union1d(fold.train, fold.val)]).any()
-    tested = np.concatenate([fold.test for fold in inner.folds])
-    shared = 1 - len(np.unique(tested)) / len(tested)
-    assert shared < 0.15  # draws that overlap little are taken
-    units = inner.unit[tested]
-    assert len(np.unique(units)) == len(np.unique(square[tested]))
-
-
 def test_squares_are_made_smaller_where_two_are_left():
     positions = floor() * [1, 0.3, 1]
     _, inner = both("blocks", positions, side_m=0.34)
     assert inner.name == "blocks" and len(inner.folds) == 3
     assert all(len(fold.val) and len(fold.test) for fold in inner.folds)
-
-
-def test_thinned_rows_are_not_thinned_again():
-    positions = floor()
-    outer, inner = both("random", positions, train_count=100, spacing_m=0.01)
-    known = len(outer.train) + len(outer.val)
-    assert known == 100
-    assert all(len(fold.train) + len(fold.val) == 80 for fold in inner.folds)
-    outer, inner = both("sparse", positions)
-    assert all(len(f.train) + len(f.val) == 0.8 * 180 for f in inner.folds)
 
 
 @pytest.mark.parametrize("together", [0, 2])
@@ -121,24 +92,6 @@ def test_of_two_stations_each_is_left_out_and_of_one_rows_are():
     assert alone.name == "random" and len(alone.folds) == 3
 
 
-def test_of_stations_learned_together_squares_are_those_of_what_moves():
-    walk = floor(90) * [20, 20, 1]
-    posts = np.array([[0.0, 0, 5], [20, 0, 5], [0, 20, 5]])
-    far = np.linalg.norm(walk[:, None] - posts, axis=-1)
-    data = from_arrays(
-        {"rx_position": walk, "station_position": posts, "rssi_db": -20 * np.log10(far)}
-    )
-    settings = SplitSettings("blocks", side_m=5.0)
-    outer = make_split(data.moving, settings, place=data.place, station=data.station).folds[0]
-    together = data.subset(np.arange(len(data)), station_site(data.site, UNHEARD))
-    assert together.moving.shape[1] == 6
-    inner, plain = (cut_folds(d, outer, settings, 3, 0) for d in (together, data))
-    assert inner.name == "blocks"
-    assert all(
-        np.array_equal(a.test, b.test) for a, b in zip(inner.folds, plain.folds, strict=True)
-    )
-
-
 @pytest.mark.parametrize("name", ["random", "blocks"])
 def test_a_files_own_rows_say_how_they_were_cut(name):
     positions = floor(1200)
@@ -147,12 +100,6 @@ def test_a_files_own_rows_say_how_they_were_cut(name):
     assert inner.name == name
     gap = apart(positions, Fold(outer.train, outer.train[:0], outer.val))
     assert np.mean([apart(positions, fold) for fold in inner.folds]) == pytest.approx(gap, rel=0.5)
-
-
-def test_a_file_without_validation_rows_is_cut_at_random():
-    rows, none = np.arange(60), np.zeros(0, np.int64)
-    inner = inner_folds(floor(60), Fold(rows, none, none), FileSettings(path="split.json"), 3, 0)
-    assert inner.name == "random"
 
 
 def test_too_few_places_are_refused():

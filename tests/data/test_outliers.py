@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from campaigns import channels, powers, spectra
-from releases import release
 
 from gsparc.commands.check import main as check
 from gsparc.data.outliers import find_outliers, find_strong_outliers, too_far
@@ -134,18 +133,3 @@ def test_rows_with_signal_are_no_outliers_among_rows_without(others):
     heard = np.linspace(-95, -50, 40)
     assert not find_strong_outliers(10 ** (np.concatenate([others, heard]) / 20)).any()
     assert find_strong_outliers(10 ** (np.append(heard, 20.0) / 20)).sum() == 1
-
-
-def test_a_robot_that_waits_makes_no_outliers():
-    """With most rows at one place the median distance is 0, and everything else was far."""
-    places = np.random.default_rng(0).uniform(0, [10, 10, 2], (100, 3))
-    places[:60] = 5.0
-    assert not too_far(places).any()
-    places[99] = [300, 5, 1]
-    assert np.flatnonzero(too_far(places)).tolist() == [99]
-
-
-def test_passing_a_station_is_no_outlier():
-    """Three of the city's twelve stations had their nearest rows named, 40 dB above the median."""
-    for column in arrays_of(release("real/powder-rss-462mhz.npz"))["rssi_db"].T:
-        assert not find_strong_outliers(10 ** (column[np.isfinite(column)] / 20)).any()

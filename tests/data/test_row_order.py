@@ -1,17 +1,12 @@
 """Copies of rows count once, and what draws rows does not ask for their order in the file."""
 
-import logging
-
 import numpy as np
 import pytest
-from layouts import KINDS, POSTS, rows_of
+from layouts import KINDS, rows_of
 
-import gsparc
 from gsparc.data.row_order import merge_fixes, order_rows
 from gsparc.data.splits import Fold
 from gsparc.datasets.describe import describe
-from gsparc.models import device_offsets
-from gsparc.models.channels.columns import group_channels
 from gsparc.tables.heads import KINDS as TABLE_KINDS
 from gsparc.tables.own import from_arrays, interpret
 from gsparc.tables.raw import Raw
@@ -81,18 +76,6 @@ def test_equal_whole_decibels_of_visits_are_measurements():
     assert not over.any() and np.array_equal(levels, rows[2])
     twice = np.tile(np.arange(200), 2)
     assert merge_fixes(*(part[twice] for part in rows))[1].sum() == 200
-
-
-def test_one_phone_that_copies_its_rows_does_not_decide_for_another():
-    """A share of the file's places decided: of one file 7,440 rows were left out, of another with
-    the same layout none.
-    """
-    link, fix, level, device = visits()
-    copied = np.repeat(np.arange(0, 200, 10), 30)
-    copied = [part[copied] for part in (link + 20, fix + 20, level, device + 1)]
-    parts = zip(visits(), copied, strict=True)
-    _, over = merge_fixes(*(np.concatenate(part) for part in parts))
-    assert not over[:200].any() and over[200:].sum() == 20 * 29
 
 
 @pytest.mark.parametrize("copies", [1, 2, 5])
@@ -170,57 +153,3 @@ def test_rows_of_a_table_shuffled_with_any_columns_are_one_order(write, options,
             assert np.array_equal(getattr(first, name), getattr(other, name)), name
         stations_of_other = np.array(other.site.every_station.name)[other.stations_of()]
         assert np.array_equal(names[first.stations_of()], stations_of_other)
-
-
-def test_answers_of_devices_at_visits_of_places_did_not_stay_the_same_when_shuffled(monkeypatch):
-    """They moved by .1 dB: other rows told the offsets of devices."""
-    monkeypatch.setattr(device_offsets, "MOST_ROWS", 100)
-    rng = np.random.default_rng(1)
-    place = np.c_[rng.uniform(0, 100, (60, 2)), np.full(60, 1.5)].repeat(9, axis=0)
-    station, device = np.tile([0, 1, 2], 180), np.tile(np.repeat([0, 1, 2], 3), 60)
-    level = -40 - 30 * np.log10(np.linalg.norm(place - POSTS[station], axis=1)) + 4 * device
-    level = (level + rng.normal(0, 1, 540)).round(1)
-    kept = np.flatnonzero(rng.random(540) > 0.15)
-    rows = {"rx": place, "rssi": level, "station": station, "device": np.array(list("abc"))[device]}
-    answers = []
-    for order in (kept, rng.permutation(kept)):
-        model = gsparc.fit(
-            **{k: v[order] for k, v in rows.items()}, station_position=POSTS, model="gp"
-        )
-        answers.append(model.rssi(rx=place[::9]))
-    assert np.abs(answers[0] - answers[1]).max() < 1e-3
-
-
-def test_a_drive_reversed_is_answered_alike(caplog):
-    """Rows that validate were drawn by number."""
-    caplog.set_level(logging.ERROR)
-    arrays = rows_of("channels")
-    asked = arrays["rx_position"][:9] + 0.1
-    answers = [
-        gsparc.fit(
-            rx=arrays["rx_position"][order],
-            tx=POSTS[0],
-            csi=arrays["csi"][order],
-            frequency_hz=arrays["_frequency_hz"],
-            model="complex_gp",
-            align="none",
-        ).csi(rx=asked)
-        for order in (np.arange(60), np.arange(60)[::-1])
-    ]
-    assert np.abs(answers[0] - answers[1]).max() < 1e-6 * np.abs(answers[0]).std()
-
-
-def test_errors_that_drift_are_seen_in_the_order_of_the_file():
-    """Rows along a curve hid the drift of 42 antennas: an error of .340 where .326 was."""
-    order = np.random.default_rng(1).permutation(60)
-    data = measurements(rows_of("stations' channels"), order)
-    ordered, _ = order_rows(data, Fold(np.arange(60), NONE, NONE))
-    again, _ = order_rows(ordered, Fold(np.arange(60), NONE, NONE))
-    for one in (ordered, again):
-        groups = group_channels(one, np.arange(len(one)), True)
-        assert len(groups) == 3
-        for group in groups:
-            np.testing.assert_array_equal(
-                group.places[np.argsort(group.order)],
-                data.moving[data.station == group.slot.station],
-            )

@@ -5,13 +5,12 @@ which settings cannot be.
 import numpy as np
 import pytest
 from measured import ble_arrays, techtile_arrays
-from releases import release
 
 from gsparc.data import selection
 from gsparc.data.schema import Measurements
 from gsparc.data.selection import Selection
 from gsparc.tables.own import Reading, interpret
-from gsparc.tables.raw import Raw, read_raw
+from gsparc.tables.raw import Raw
 
 
 def part(raw: Raw, **settings) -> Reading:
@@ -103,15 +102,6 @@ def test_carriers_of_as_many_rows_as_stations_were_taken_by_station():
     of_rows = {"station": np.array([0, 0, 1, 2]), "carrier_hz": 1e9 * (1 + np.arange(4.0))}
     stations = part(Raw({**long().arrays, **first, **of_rows}), stations=[0, 2]).data.site.stations
     assert stations.carrier_hz.tolist() == [1e9, 2e9, 4e9]
-
-
-def test_runs_are_rows():
-    read = part(channels(), runs=["EXP006"])
-    assert set(read.data.run) == {0} and len(read.data.site.stations) == 3
-    assert left_out(read) == ["dataset.runs=EXP006: 24 of 36 rows left out"]
-    numbered = Raw({**channels().arrays, "run": np.repeat([5, 6], [8, 4])})
-    counts = [len(np.unique(part(numbered, runs=[run]).data.place)) for run in (5, "6")]
-    assert counts == [8, 4]
 
 
 def test_low_powers_are_left_out():
@@ -229,42 +219,3 @@ CANNOT = {
 def test_what_cannot_be_is_one_line(refused, case):
     make, settings, says = CANNOT[case]
     refused(says, lambda: part(make(), **settings))
-
-
-def test_one_name_needs_no_brackets():
-    assert Selection(stations="A05").stations == ("A05",) and Selection(runs=3).runs == (3,)
-    assert Selection(level_steps={"b": 5, 3: [6, 7]}).level_steps == {"b": (5,), "3": (6, 7)}
-
-
-def test_the_faulty_rows_of_the_measured_plane():
-    path = release("real/techtile-power-reci-rf-1.npz")
-    raw = read_raw(path)
-    read = part(raw, min_rssi_db=-75, max_rows=5000)
-    weak, rows = (raw.arrays["rssi_db"] < -75).sum(), len(raw.arrays["rssi_db"])
-    assert f"dataset.min_rssi_db=-75: {weak} of {rows} rows left out" in read.notes and weak > 0
-    assert level(read.data).min() > -75 and len(read.data) == 5000
-    # Fewer rows reach as far as all do, in centimetres.
-    for end in (np.min, np.max):
-        whole, some = (
-            end(one[:, :2], axis=0) for one in (raw.arrays["rx_position"], read.data.rx_position)
-        )
-        assert np.abs(whole - some - read.data.site.origin[:2]).max() < 0.03
-
-
-@pytest.mark.parametrize("jitter", [0.01, 0.3])
-def test_a_packet_logged_twice_beside_its_place_counted_as_two(jitter):
-    """The stated deviation was a hundredth of the true one: the noise was told by copies."""
-    rng = np.random.default_rng(0)
-    place = np.c_[rng.uniform(0, 3000, (300, 2)), np.full(300, 1.5)]
-    level = rng.normal(-80, 6, 300).round(2)
-    arrays = {
-        "rx_position": np.r_[place, place + np.array([jitter, 0, 0])],
-        "tx_position": np.zeros((600, 3)),
-        "rssi_db": np.r_[level, level],
-    }
-    reading = part(Raw(arrays))
-    assert len(reading.data) == 300
-    assert any("copies of other rows" in note for note in reading.notes)
-    # Another level at nearly the same place is a measurement.
-    arrays["rssi_db"][300:] += rng.normal(0, 2, 300)
-    assert len(part(Raw(arrays)).data) == 600

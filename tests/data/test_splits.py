@@ -1,5 +1,4 @@
 import json
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +7,6 @@ from releases import real
 
 from gsparc.base.errors import DataError
 from gsparc.data.inner_folds import inner_folds
-from gsparc.data.spacing import group_visits, path_order
 from gsparc.data.split_files import read_split, write_split
 from gsparc.data.splits import SplitSettings, hash_indices, make_split
 from gsparc.datasets.load import load, split_for
@@ -71,17 +69,6 @@ def test_grouped_keeps_whole_stretches_apart():
         # Validation is one stretch: no training row lies between its ends along the path.
         between = (fold.train > fold.val[0]) & (fold.train < fold.val[-1])
         assert not between.any()
-
-
-def test_grouped_orders_scattered_rows_into_slabs():
-    positions = np.random.default_rng(0).uniform([0, 0, 0], [9, 3, 2], (300, 3))
-    np.testing.assert_array_equal(path_order(positions), np.argsort(positions[:, 0]))
-    np.testing.assert_array_equal(path_order(_walk()), np.arange(400))
-    shuffled = _walk()[np.random.default_rng(1).permutation(400)]
-    assert (path_order(shuffled) != np.arange(400)).any()
-    folds = make_split(positions, SplitSettings("grouped")).folds
-    spans = sorted((positions[f.test, 0].min(), positions[f.test, 0].max()) for f in folds)
-    assert all(a[1] <= b[0] for a, b in pairwise(spans))
 
 
 @pytest.mark.parametrize("corner", ["--", "-+", "+-", "++"])
@@ -159,16 +146,6 @@ def test_impossible_splits_are_refused(refused):
     refused("too few for 5 folds", make_split, _walk(8), SplitSettings("grouped"))
     refused("fold 0 has 0 training", make_split, _walk(40), SplitSettings("grouped", buffer_m=10.0))
     refused("too few to hold some out", make_split, _walk(), SplitSettings("blocks", side_m=5000))
-
-
-def test_split_for_reads_the_config_group(rfid_folder, tmp_path, refused):
-    data = load_rfid(rfid_folder)
-    split = split_for({"name": "random", "seed": 0}, data)
-    assert split.folds[0].test.tolist() == [1, 4]
-    write_split(tmp_path / "s.json", split, len(data), data.site.sha256)
-    again = split_for({"name": "file", "path": str(tmp_path / "s.json")}, data)
-    assert again.sha256 == split.sha256 and again.name == "random"
-    refused(r"split\.sed: no such setting", split_for, {"name": "random", "sed": 0}, data)
 
 
 def test_an_index_file_takes_no_setting_without_a_word(rfid_folder, tmp_path, refused):
@@ -259,15 +236,6 @@ def test_whole_runs_are_held_out(refused):
     refused("have one run; take split=random", make_split, positions, SplitSettings("runs"))
 
 
-@pytest.mark.parametrize("text", ["[" * 50_000, '{"folds": [{"train": [' + "1" * 5000 + "]}]}"])
-def test_a_split_of_brackets_or_of_too_many_digits_is_refused_in_a_line(tmp_path, text):
-    file = tmp_path / "split.json"
-    file.write_text(text)
-    with pytest.raises(DataError, match=r"split\.json: not a split file") as error:
-        read_split(file, 4)
-    assert len(str(error.value)) < 300 and "sys." not in str(error.value)
-
-
 PLACES = np.repeat(np.random.default_rng(0).uniform(0, 9, (30, 3)), 10, axis=0)
 POST = np.array([0.0, 0, 5])
 
@@ -321,14 +289,6 @@ def test_places_visited_again_within_a_hundredth_of_the_step_were_split_apart(
     assert (
         f"{60 * visits} rows are of 61 places: those within a hundredth of the usual step"
     ) in caplog.text
-
-
-def test_rows_a_tenth_of_a_step_apart_are_places_of_their_own():
-    walk = np.cumsum(np.random.default_rng(0).uniform(0.1, 2, (500, 3)) * [1, 1, 0], axis=0)
-    assert group_visits(walk) is None
-    # Six antennas at every place
-    arrays = walk[::10, None] + np.linspace(0, 0.6, 6)[:, None] * [1, 0, 0]
-    assert group_visits(arrays.reshape(-1, 3)) is None
 
 
 @pytest.mark.parametrize("side_m", [None, 0.3, 0.5])

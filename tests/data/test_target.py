@@ -16,12 +16,6 @@ def stored(kind: str) -> np.ndarray:
     return (values * np.exp(6j * values)).astype(np.complex64) if kind == "csi" else values
 
 
-def test_there_is_one_of_each_kind():
-    assert {kind: (one.kind, one.axes) for kind, one in TARGETS.items()} == {
-        kind: (kind, len(shape) + 1) for kind, shape in SHAPES.items()
-    }
-
-
 @pytest.mark.parametrize("kind", SHAPES)
 def test_real_numbers_of_targets_are_targets_again(kind):
     target, values = TARGETS[kind], stored(kind)
@@ -30,11 +24,6 @@ def test_real_numbers_of_targets_are_targets_again(kind):
     again = target.to_targets(torch.from_numpy(rows), SHAPES[kind])
     assert again.is_complex() == target.is_complex
     np.testing.assert_allclose(again.numpy(), values, rtol=1e-5)
-
-
-def test_bytes_of_images_are_shares_of_255():
-    pixels = TARGETS["spectrum"].to_real(np.array([[0, 51, 255]], np.uint8))
-    np.testing.assert_array_equal(pixels, np.array([[0, 0.2, 1]], np.float32))
 
 
 @pytest.mark.parametrize("kind", SHAPES)
@@ -53,12 +42,6 @@ def test_an_error_of_a_power_is_one_of_decibels_to_first_order():
     power = torch.tensor([[2.0]])
     spread = TARGETS["rssi"].moments_in_error_unit(power, torch.tensor([0.01]))[1]
     assert float(spread) == pytest.approx((RELATIVE_DB * 0.1 / 2) ** 2)
-
-
-@pytest.mark.parametrize(("kind", "power"), [("spectrum", 0.25), ("csi", 0.25), ("rssi", 0.5)])
-def test_powers_are_linear_already_and_amplitudes_are_squared(kind, power):
-    assert float(TARGETS[kind].power(np.array(-0.5 if kind != "rssi" else 0.5))) == power
-    assert float(TARGETS[kind].power(torch.tensor(0.5))) == power
 
 
 def test_powers_that_are_weighed_in_decibels_were_averaged_as_such():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.base.errors import DataError
 from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.tables.own import from_arrays
 
@@ -80,9 +79,3 @@ def test_powers_in_watts_had_levels_in_db(name, about, level, unit):
     assert (data.site.level_unit, own.name) == (level, unit)
     given = np.arange(1.0, 5) * (1e9 if unit == "nW" else 1)
     assert np.allclose(own.values(data.targets(np.arange(4)))[:, 0], given)
-
-
-def test_a_unit_that_is_none_is_refused_at_load():
-    with pytest.raises(DataError, match="unit=dBi: of powers in dB expected dBm, dBW, linear"):
-        from_arrays({**PLACES, "rssi_db": np.arange(4.0)}, {"unit": "dBi"})
-    assert from_arrays({**PLACES, "csi": np.ones(4, complex), "frequency_hz": 1e9}, {"unit": "dBi"})

@@ -26,13 +26,6 @@ def test_reads_the_release_s_two_files(tmp_path) -> None:
     assert np.allclose(np.diff(data.site.subcarriers_hz), 312.5e3)
 
 
-def test_stand_in_is_named_and_has_all_antennas() -> None:
-    data = city("all")
-    assert data.site.name == "argos-sim" and data.site.stand_in == "argos"
-    assert data.target.shape[1:] == (64, 26) and data.noise_variance is not None
-    assert np.array_equal(city(3).target[:, 0], data.target[:, 3])
-
-
 def test_aligning_takes_phase_and_timing_and_nothing_else() -> None:
     csi = np.load(folder() / "csidata.npy")[:10].astype(np.complex128)
     tones = np.array(TONES, dtype=float)
@@ -89,20 +82,3 @@ def test_absent_release_is_loud(caplog) -> None:
     data = load({"name": "argos", "root": None, "stand_in": stand_in})
     assert "SIMULATED" in caplog.text and data.site.stand_in == "argos"
     assert data.moving.shape == (120, 3) and np.ptp(data.moving) > 0
-
-
-def test_true_positions_are_asked_for_as_yaml_reads_them() -> None:
-    """`dataset.positions=true` arrives as a boolean."""
-    stand_in = {"root": str(folder().parent), "count": 120, "seed": 1}
-    data = load({"name": "argos_sim", "stand_in": stand_in, "positions": True})
-    where = np.load(folder() / "positions.npy")
-    assert np.allclose(data.moving + data.site.origin, where)
-
-
-def test_one_tone_of_the_downlink_is_chosen(tmp_path) -> None:
-    every = load_argos(_copy(tmp_path))
-    one = load_argos(tmp_path / "argos", tone=3)
-    assert one.target.shape[2] == 1 and np.array_equal(one.target[..., 0], every.target[..., 3])
-    assert one.site.subcarriers_hz.tolist() == [every.site.subcarriers_hz[3]]
-    with pytest.raises(ValueError, match=r"dataset\.tone=26"):
-        load_argos(tmp_path / "argos", tone=26)

@@ -49,38 +49,6 @@ def test_techtile_release(tmp_path, kind):
     assert np.allclose(held["csi"][held["mask"]], expected[held["mask"]], atol=1e-6)
 
 
-@EVERY_KIND
-def test_techtile_release_of_one_experiment(tmp_path, kind):
-    variables = {
-        name: (dimensions[1:], values[0])
-        if dimensions[0] == "experiment_id"
-        else (dimensions, values)
-        for name, (dimensions, values) in release_variables().items()
-    }
-    del variables["experiment_id"]
-    held = read_techtile(write_release(tmp_path, kind, variables)).arrays
-    assert held["csi"].shape == (CYCLES, 3) and set(held["run"]) == {"csi"}
-
-
-def test_techtile_release_without_flags(tmp_path):
-    variables = {n: v for n, v in release_variables().items() if not n.endswith("_available")}
-    masks = [
-        read_techtile(write_release(tmp_path, "netcdf3", v)).arrays["mask"]
-        for v in (None, variables)
-    ]
-    assert np.array_equal(*masks)
-
-
-def test_techtile_antennas_lie_elsewhere_or_in_the_file(tmp_path, refused):
-    path = write_release(tmp_path)
-    table = (tmp_path / "techtile_antenna_locations.yml").rename(tmp_path / "ceiling.yml")
-    assert np.array_equal(read_techtile(path, table).arrays["station_position"], ANTENNAS)
-    refused("name the file with dataset.antennas", read_techtile, path)
-    variables = {**release_variables(), "rx_antenna_position": (("hostname", "xyz"), ANTENNAS)}
-    path = write_release(tmp_path, variables=variables, antennas=False)
-    assert np.array_equal(read_techtile(path).arrays["station_position"], ANTENNAS)
-
-
 TECHTILE = {
     "missing": (
         {"csi_imag": None, "rover_z": None},
@@ -148,24 +116,6 @@ def test_damaged_netcdf(tmp_path, refused, kind):
         path.write_bytes(content)
         refused("csi.nc: ", read_raw, path)
     refused("no such file", read_raw, tmp_path / "other.nc")
-
-
-def test_values_that_were_never_written_are_none(tmp_path):
-    variables = release_variables()
-    variables["rover_x"][1][0, 2] = 9.969209968386869e36
-    raw = read_techtile(write_release(tmp_path, variables=variables))
-    assert raw.notes[0].startswith("2 of 15 cycles")
-    assert np.isfinite(raw.arrays["tx_position"]).all()
-
-
-def test_powder_stations_without_a_place_are_left_out(tmp_path):
-    raw = read_powder(
-        write_walk(tmp_path, table="{'ebc-nuc1-b210': (40.7677, -111.83816), 'bus-6186': None}")
-    )
-    assert raw.arrays["station_name"].tolist() == ["ebc-nuc1-b210"] and raw.arrays[
-        "rssi_db"
-    ].shape == (20, 1)
-    assert "madsen-nuc2-b210" in raw.notes[0]
 
 
 def test_noise_of_powder_receivers_could_not_be_told_from_levels(tmp_path, refused):
@@ -237,13 +187,6 @@ def test_spoilt_powder_tables(tmp_path, refused, case):
         read_powder,
         write_walk(tmp_path, lambda t: t.replace(*change) if change else "", table),
     )
-
-
-def test_absent_powder_files(tmp_path, refused):
-    path = write_walk(tmp_path)
-    (tmp_path / "location_coordinates.json").unlink()
-    refused("name the file with dataset.station_table", read_powder, path)
-    refused("no such file", read_powder, tmp_path / "other.csv")
 
 
 EVERY = pytest.mark.parametrize("name", MAKERS)

@@ -38,11 +38,6 @@ def test_order_is_pinned():
     assert rows_of_step(0, 3, 4, np.arange(8)).tolist() == [0, 4, 2, 5]
 
 
-def test_empty_pool_is_refused(data):
-    with pytest.raises(ValueError, match="training rows"):
-        StepLoader(data, np.array([], dtype=np.int64), 4, seed=0)
-
-
 class _Recorder(pl.LightningModule):
     def __init__(self, stop_after=None):
         super().__init__()
@@ -188,14 +183,3 @@ def test_shares_of_a_step_add_up_to_one(data, batch, devices):
         counted = sum(len(part) for part in parts if part.share)
         assert all(part.share in (0, pytest.approx(len(part) / counted)) for part in parts)
         assert parts[-1].to("cpu").share == parts[-1].share
-
-
-def test_several_devices_take_the_steps_of_one(data):
-    one = [b.index.tolist() for b in StepLoader(data, FOLD.train, 4, seed=0)]
-    two = [
-        [b.index.tolist() for b in StepLoader(data, FOLD.train, 4, 0, rank=r, devices=2)]
-        for r in (0, 1)
-    ]
-    assert len(two[0]) == len(two[1]) == len(one)
-    for whole, *parts in zip(one, *two, strict=True):
-        assert parts[0] == whole[0::2] and set(parts[0] + parts[1]) == set(whole)

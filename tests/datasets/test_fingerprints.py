@@ -112,12 +112,3 @@ def test_columns_are_those_of_another_campaign(refused):
     np.testing.assert_array_equal(rows.level[:, [2, 0]], invented().level[:5][:, [0, 2]])
     assert np.isnan(rows.level[:, 1]).all() and rows.level.dtype == np.float32
     refused("no access point of", rows.select_access_points, np.array(["y"]))
-
-
-def test_unknown_places_are_read_where_allowed(tmp_path, refused):
-    file, table = written(tmp_path / "a.npz", position=None), tmp_path / "a.csv"
-    table.write_text("WAP001,FLOOR\n-60,2\n100,0\n")
-    for path in (file, table):
-        assert np.isnan(read_fingerprints(path, placed=False).position).all()
-        refused(r"position: missing|no column LONGITUDE", read_fingerprints, path)
-    assert np.isfinite(read_fingerprints(written(tmp_path / "b.npz"), placed=False).position).all()

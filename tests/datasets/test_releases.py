@@ -15,7 +15,6 @@ from gsparc.datasets.ble import read_ble
 from gsparc.datasets.load import load
 from gsparc.datasets.newrf import read_newrf
 from gsparc.datasets.own import read_any
-from gsparc.datasets.powder import read_powder
 from gsparc.datasets.rfid import load_rfid
 from gsparc.datasets.techtile_power import read_techtile_power
 
@@ -52,17 +51,6 @@ def frame(rows: int = 8, **changed):
     heads = pandas.Index(list(columns), dtype=object)
     return pandas.DataFrame({name: pandas.Series(columns[name]) for name in heads}).set_axis(
         heads, axis=1
-    )
-
-
-def test_newrf_rows_with_a_missing_value_are_left_out(tmp_path):
-    table = frame()
-    table.at[3, "CSI"] = np.nan
-    table.to_pickle(tmp_path / "room.pkl")
-    arrays = read_newrf(tmp_path / "room.pkl").arrays
-    assert len(arrays["csi"]) == 7 and arrays["path_offsets"][-1] == 28 == len(arrays["path_gain"])
-    assert (
-        arrays["csi"][3] == np.complex64(table["CSI"][4][0]) and arrays["frequency_hz"] == 2.412e9
     )
 
 
@@ -176,13 +164,6 @@ def hall(root: Path) -> Path:
     return root
 
 
-def test_ble_sets_and_what_was_not_heard(tmp_path):
-    first, second = (read_ble(hall(tmp_path / str(n)), hall=n).arrays for n in (1, 2))
-    assert first["tx_position"].tolist() == [[9.5, -2, 1.85], [10.5, 2, 1.85]]
-    assert np.isnan(first["rssi_db"]).tolist() == [[False, False], [False, True]]
-    assert (second["rssi_db"] == -63).all() and np.nanmax(first["rssi_db"]) == -62
-
-
 BLE = {
     "no sensors": ("cnf/tetam.dev", None, "tetam.dev: missing; expected a first line Dongles:"),
     "other devices": (
@@ -223,23 +204,6 @@ def test_spoilt_ble_folders(tmp_path, refused, case):
         file.write_text(text)
     refused(says, read_ble, tmp_path / "hall")
     refused("no \\*.mbd files", read_ble, hall(tmp_path / "other"), 3)
-
-
-def test_powder_table_is_what_was_converted_from_it():
-    released = read_powder(real("releases/powder/single_tx.csv")).arrays
-    converted = read_powder(real("real/powder-rss-462mhz.npz")).arrays
-    shared = [converted["station_name"].tolist().index(name) for name in released["station_name"]]
-    assert len(shared) == 12
-    # Every eighth row of the release.
-    assert np.array_equal(released["latitude"], converted["latitude"][::8])
-    same = np.isclose(
-        released["rssi_db"], converted["rssi_db"][::8][:, shared], atol=1e-4, equal_nan=True
-    )
-    assert same.all()
-    for axis in ("latitude", "longitude"):
-        assert np.allclose(
-            released[f"station_{axis}"], converted[f"station_{axis}"][shared], atol=1e-7
-        )
 
 
 class PositionerValue:

@@ -32,20 +32,6 @@ def test_tiny_folder(rfid_folder):
     )
 
 
-def test_gateway_is_chosen_by_name(rfid_folder):
-    second = load_rfid(rfid_folder, gateway="gateway2")
-    np.testing.assert_array_equal(second.rx_rotation[0], np.eye(3))
-    np.testing.assert_allclose(second.rx_position[0] + second.site.origin, [0, 0, 2])
-    assert second.site.sha256 != load_rfid(rfid_folder).site.sha256
-
-
-def test_windows_line_ends_and_byte_order_mark(rfid_folder):
-    for name in ("tx_pos.csv", "train_index.txt"):
-        path = rfid_folder / name
-        path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes().replace(b"\n", b"\r\n"))
-    assert load_rfid(rfid_folder).release_split[0].tolist() == [0, 2, 3, 5]
-
-
 def _pixel_under_tag(data, shift=0):
     elevation, azimuth = boresight_degrees(data)
     row = np.round(elevation).astype(int).clip(0, 89)

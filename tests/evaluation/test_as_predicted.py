@@ -10,16 +10,15 @@ import pytest
 
 from gsparc.data.schema import LIGHT
 from gsparc.data.splits import Fold, Split
-from gsparc.datasets.own import read_any
 from gsparc.models import checkpoint, fitting
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.prediction.answers import predict_file
-from gsparc.prediction.hearing import Hearing, read_hearing
+from gsparc.prediction.hearing import Hearing
 from gsparc.prediction.operating_point import load
 from gsparc.runs.align_site import align_to_site
 from gsparc.runs.evaluate import evaluate
-from gsparc.tables.own import from_arrays, write_own
+from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 PLACES, STATIONS, FLOOR_DB = 60, 4, -72.0
@@ -170,24 +169,3 @@ def test_channels_are_scored_as_they_are_answered(tmp_path, several, runs, nulls
         told = told * overlap / abs(overlap)
     nmse = (np.abs(told - truth) ** 2).sum() / (np.abs(truth) ** 2).sum()
     assert found.facts["test/nmse"] == pytest.approx(nmse, rel=1e-5)
-
-
-def test_a_models_file_answers_as_the_data_beside_it(tmp_path):
-    """What a model learned of silence is in its file: figures hold where its data are gone."""
-    path = tmp_path / "lists.npz"
-    write_own(path, powers("rssi_db", 2, False, False, False))
-    data = read_any(path).data
-    test = data.place % 3 == 0
-    fold = Fold(np.flatnonzero(~test), NONE, np.flatnonzero(test))
-    method = fitted("gp", data, fold, tmp_path)
-    stored = checkpoint.read(tmp_path / "model.ckpt")
-    hearing, split = read_hearing(stored.extra), Split("own", (fold,))
-    own = Hearing.from_learned(data, fold.learned())
-    np.testing.assert_array_equal(hearing.lists.level, own.lists.level)
-    facts = [
-        evaluate(method, 1.0, data, split, baselines=[], timed=False, hearing=one).facts[
-            "test/rmse_db"
-        ]
-        for one in (None, [hearing])
-    ]
-    assert facts[0] == facts[1]

@@ -35,9 +35,3 @@ def test_intervals_hold_all_parts_at_once():
     assert len(records) > 40
     assert all(row["bias_low_db"] < 0 < row["bias_high_db"] for row in records)
     assert "surely off" not in " ".join(describe_parts(records, 0.9))
-
-
-def test_no_rows_are_no_fault():
-    nothing = np.zeros(0)
-    empty = Drive(nothing, nothing, np.zeros((0, 2)), nothing, np.zeros(0, int), ["a"])
-    assert empty.judge() == [] and describe_parts([], 0.9)

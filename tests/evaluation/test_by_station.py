@@ -12,15 +12,13 @@ import torch
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.by_station import (
     best_server,
-    describe_never_listed,
     describe_new,
     newly_listed,
     rmse_after_constants,
-    unlisted_stations,
     worst_stations,
 )
 from gsparc.evaluation.metric_formats import BEST_SERVER, OF_LISTS, WITHOUT_OFF
-from gsparc.evaluation.scores import Scores, score_methods
+from gsparc.evaluation.scores import Scores
 from gsparc.evaluation.summary import remarks, results_table
 from gsparc.models.method import Method, Prediction
 from gsparc.prediction.timing import ClockSettings
@@ -139,17 +137,6 @@ def test_the_worst_stations_had_other_names_than_warnings_and_a_bias_of_no_meani
     assert [row[0] for row in listed.texts()[1]] == ["W03-2 (150)", "212"] and not listed.note
 
 
-def test_a_constant_of_each_station_is_what_is_left_out(drive):
-    """The figure is that of errors less the mean of their station."""
-    error = np.random.default_rng(0).normal(size=len(drive)) + 7.0 * drive.station
-    scores = scored(drive, np.ones(len(drive)), error)
-    means = np.array([error[drive.station == t].mean() for t in range(3)])
-    assert rmse_after_constants(scores, drive.station) == pytest.approx(
-        np.sqrt(np.mean((error - means[drive.station]) ** 2))
-    )
-    assert rmse_after_constants(scored(drive, error, error * np.nan), drive.station) is None
-
-
 def scored(data, prediction, error=None):
     rows = np.arange(len(data))
     target = data.target[:, 0].astype(float)
@@ -177,15 +164,6 @@ def test_the_strongest_is_told_where_it_is_and_equal_answers_tell_nothing(drive)
         ]
     )
     assert best_server(scored(twice, strongest), twice) == {"best_server": 1.0}
-
-
-def test_a_silent_station_that_is_predicted_strongest_is_wrong(drive):
-    """Rows below a level count as weaker than all that was heard there."""
-    truth, silent = drive.target[:, 0].astype(float), drive.station == 2
-    quiet = replace(drive, censored=silent.astype(np.int8))
-    assert best_server(scored(quiet, truth), quiet) == {"best_server": 1.0}
-    loud = np.where(silent & (quiet.place < PLACES // 2), 2 * truth.max(), truth)
-    assert best_server(scored(quiet, loud), quiet) == {"best_server": 0.5}
 
 
 def test_a_saturated_station_was_never_the_strongest():
@@ -314,32 +292,6 @@ def test_a_station_that_is_new_is_told_from_one_that_was_out_of_reach():
     assert len(unsure) and (unsure.chance == 1).all()
     assert "new, or out of its reach before; chance 1e+00" in describe_new(near, later)
     assert newly_listed(first, later).empty and describe_new(first, later) is None
-
-
-@pytest.mark.parametrize("off", [(), (3,)])
-def test_a_station_that_was_off_went_unseen(off):
-    """The strongest was told at 92 % of the moments, where a dead cell was named at 30 %."""
-    learned = lists_along(0)
-    judged = lists_along(1, off)
-    rows, none = np.arange(len(judged)), np.zeros(0, int)
-    whole = Split("whole", (Fold(none, none, rows),))
-    taught = Split("all", (Fold(np.arange(len(learned)), none, none),))
-    method = TrueLaw(learned.site)
-    scores = score_methods(
-        [method], align_to_site(judged, learned.site), whole, learned=(learned, taught)
-    )
-    found = unlisted_stations(scores, judged)
-    assert found.index.tolist() == list(off)
-    said = describe_never_listed(scores, judged)
-    assert (said is None) == (not off) and (not off or judged.site.stations.name[3] in said)
-    heard = np.flatnonzero(judged.censored_side(rows) == 0)
-    links = pd.DataFrame(
-        {"place": judged.place, "station": judged.station, "level": judged.target[:, 0]}
-    )
-    strongest = links.loc[links.iloc[heard].groupby("place")["level"].idxmax()]
-    told = law_db(judged.moving[strongest.index] + judged.site.origin).argmax(1)
-    share = float((strongest.station == told).mean())
-    assert best_server(scores, judged) == {"best_server": pytest.approx(share)}
 
 
 def test_figures_of_a_drive_counted_cells_that_were_off():

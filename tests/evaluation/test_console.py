@@ -2,12 +2,9 @@
 
 import io
 import logging
-from logging.config import dictConfig
 
 import pytest
 from hydra import compose, initialize_config_module
-from hydra.core.global_hydra import GlobalHydra
-from omegaconf import OmegaConf
 
 from gsparc.base.errors import Severe
 from gsparc.datasets.own import Own
@@ -113,22 +110,6 @@ def test_twelve_stations_wrote_two_hundred_lines(monkeypatch, caplog):
     assert last_warnings("train.log") == ["22 more warnings in train.log"]
 
 
-def test_a_run_of_ninety_kinds_of_warnings_shows_ten_lines(monkeypatch):
-    """98 were repeated of one file; those that change the answer stood anywhere."""
-    screen = ConsoleHandler([], io.StringIO())
-    monkeypatch.setattr(logging.getLogger(), "handlers", [screen])
-    log = logging.getLogger("gsparc.datasets.campaign")
-    log.warning("%s: %s", "a.npz", Severe("conjugate=true mends it"))
-    for letter in "abcdefghijklmnopqrstuvwxyz":
-        log.warning("%s: %s", "a.npz", f"{letter * 3} of {letter * 9} is odd")
-    log.error("the disk is full")
-    lines = screen.stream.getvalue().splitlines()
-    assert lines[0].endswith("conjugate=true mends it") and lines[-1] == "error: the disk is full"
-    again, more = last_warnings("train.log")
-    assert "conjugate=true" in again and more.startswith("18 more warnings")
-    assert len(lines[:-1]) + len([again]) == 10
-
-
 def test_what_a_run_warned_of_is_not_said_by_who_asks_its_model(tmp_path, monkeypatch):
     monkeypatch.setattr(ConsoleHandler, "before", set())
     (tmp_path / "train.log").write_text(
@@ -161,24 +142,3 @@ def test_jobs_of_a_sweep_said_again_how_columns_are_read(monkeypatch):
         record = logging.LogRecord("gsparc.datasets.campaign", logging.INFO, "", 0, text, (), None)
         said.append(ConsoleHandler([], io.StringIO()).filter(record))
     assert said == [True, False, True]
-
-
-def test_the_file_of_a_log_has_every_line_of_which_the_console_shows_some(tmp_path, capsys):
-    GlobalHydra.instance().clear()
-    given = ["hydra.job.name=train", f"hydra.runtime.output_dir={tmp_path}"]
-    with initialize_config_module("gsparc.conf", version_base="1.3"):
-        node = compose("report", overrides=given, return_hydra_config=True).hydra
-    before, level = logging.getLogger().handlers, logging.getLogger().level
-    try:
-        dictConfig(OmegaConf.to_container(node.job_logging, resolve=True))
-        logging.getLogger("gsparc.models.splat").info("a note")
-        logging.getLogger("gsparc.evaluation").info("a line")
-    finally:
-        logging.getLogger().handlers = before
-        logging.getLogger().setLevel(level)
-    assert capsys.readouterr().out == "a line\n"
-    text = (tmp_path / "train.log").read_text()
-    assert (
-        "[gsparc.models.splat][INFO] - a note" in text
-        and ("[gsparc.evaluation][INFO] - a line") in text
-    )

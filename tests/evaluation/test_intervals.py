@@ -61,16 +61,6 @@ def test_a_true_law_is_calibrated(drawn):
     assert found["reduced_chi2"] == pytest.approx(1, abs=0.05) and found["heard_above_db"] > 2.5
 
 
-def test_too_sure_and_too_unsure_are_told_apart(drawn):
-    data, mean_db = drawn
-    sure, right, unsure = (
-        power_intervals(scored(data, mean_db, s), data) for s in (1.0, 6.0, 30.0)
-    )
-    assert sure["interval/coverage_90"] < 0.4 < 0.99 < unsure["interval/coverage_90"]
-    assert right["outage/brier"] < min(sure["outage/brier"], unsure["outage/brier"])
-    assert right["reduced_chi2"] < 1.1 < 10 < sure["reduced_chi2"]
-
-
 def test_whether_std_is_right_was_in_no_table():
     """Deviations half as large as the errors, or twice, read the same in every table."""
     rng = np.random.default_rng(0)
@@ -113,14 +103,6 @@ def test_silent_rows_counted_nowhere(drawn):
     # silent_samples was 0 where they count.
     assert rmse_with_silent(both[0], data)["silent_samples"] == (~heard).sum() > 0
     assert squares[1] < squares[0] and found[0] < 0.9 * found[1]
-
-
-def test_no_variance_no_figures(drawn):
-    data, mean_db = drawn
-    scores = scored(data, mean_db, 6.0)
-    assert (
-        power_intervals(Scores(**{**vars(scores), "variance": np.full(COUNT, np.nan)}), data) == {}
-    )
 
 
 def test_levels_of_lists_are_none_of_a_station(drawn):

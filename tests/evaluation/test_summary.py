@@ -1,6 +1,5 @@
 """What a run leaves behind."""
 
-import csv
 import json
 import os
 import re
@@ -22,25 +21,8 @@ from gsparc.evaluation.summary import (
     remarks,
     results_table,
     run_git,
-    write_samples,
     write_summary,
 )
-
-
-def test_numbers_strings_and_null(tmp_path):
-    facts = {
-        "b": np.float32(0.5),
-        "a": 3,
-        "c": None,
-        "d": "text",
-        "e": torch.tensor(2.0),
-        "f": True,
-    }
-    write_summary(tmp_path / "run" / "summary.json", facts)
-    text = (tmp_path / "run" / "summary.json").read_text()
-    assert json.loads(text) == {"a": 3, "b": 0.5, "c": None, "d": "text", "e": 2.0, "f": 1}
-    assert '"f": 1' in text and [p.name for p in (tmp_path / "run").iterdir()] == ["summary.json"]
-
 
 INFINITE = [float("nan"), float("inf"), np.float32("nan"), torch.tensor(-torch.inf)]
 
@@ -51,15 +33,6 @@ def test_what_is_not_finite_or_flat_is_refused_by_name(tmp_path, bad):
     write_summary(path, {"test/ssim": 0.5})
     refused("test/psnr_db", write_summary, path, {"test/ssim": 0.6, "test/psnr_db": bad})
     assert json.loads(path.read_text()) == {"test/ssim": 0.5}
-
-
-def test_samples_become_rows(tmp_path):
-    write_samples(
-        tmp_path / "s.csv", {"row": np.arange(2), "name": ["a", "b,c"], "ssim": [0.5, np.nan]}
-    )
-    rows = list(csv.reader((tmp_path / "s.csv").open(newline="")))
-    assert rows == [["row", "name", "ssim"], ["0", "a", "0.5"], ["1", "b,c", ""]]
-    refused("same length", write_samples, tmp_path / "s.csv", {"a": [1], "b": [1, 2]})
 
 
 def test_table_shows_no_accuracy_without_its_time():

@@ -9,9 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from campaigns import compose, spectra
-from hydra import initialize_config_module
 from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.errors import MissingConfigException
 from invented import invent
@@ -26,9 +24,7 @@ from gsparc.data.splits import Fold
 from gsparc.datasets.load import datamodule
 from gsparc.evaluation.console import error_in_one_line
 from gsparc.models.registry import build, method_class
-from gsparc.runs.experiment.cells import load_every_problem
 from gsparc.runs.experiment.contenders import unlisted_contenders
-from gsparc.runs.settings import to_dict
 from gsparc.training.context import FitContext
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -90,21 +86,6 @@ def test_a_method_and_a_dataset_of_another_package(installed, tmp_path):
     assert {*unlisted_contenders()} == {"nearest_k", "other_carriers", "direct_beam", "ridge"}
     again, *_ = evaluate_files([objects.checkpoints[0]])
     assert again.facts["test/rmse_db"] == facts["test/rmse_db"]
-
-
-@pytest.mark.parametrize("words", [["dataset=corridor"], ["dataset=corridor", "count=40"]])
-def test_a_plugins_dataset_without_a_path_was_left_out_of_a_comparison(installed, words):
-    """`+datasets.corridor.dataset=corridor`, as the page has it:
-    `no dataset has a path` was the answer.
-    """
-    installed(EXAMPLES / "own-method")
-    more = ["splits.random.datasets=[corridor]", "only=['corridor/random/*']"]
-    config = compose(*(f"+datasets.corridor.{word}" for word in words), *more, config="compare")
-    GlobalHydra.instance().clear()
-    with initialize_config_module("gsparc.conf", version_base="1.3"):
-        (problem,) = load_every_problem(to_dict(config))
-    assert (problem.dataset, problem.split) == ("corridor", "random")
-    assert len(words) == 1 or len(problem.data) == 40
 
 
 def test_a_plugin_was_no_nearest_name(installed):

@@ -23,18 +23,6 @@ def test_the_best_confidence_is_alpha_over_loss():
     assert weighted_loss(torch.tensor(0.5), g, 0.3).argmin() == 0
 
 
-def test_the_range_comes_from_calibration_and_is_not_moved_by_queries():
-    sure = confidence()
-    calibration = torch.rand(50, 3)
-    sure.store_range(calibration)
-    own = sure.normalised_confidence(calibration)
-    assert own.min() == 0 and own.max() == 1
-    before = (sure.low.clone(), sure.high.clone())
-    anywhere = sure.normalised_confidence(100 * torch.randn(500, 3))
-    assert ((anywhere >= 0) & (anywhere <= 1)).all()
-    assert (sure.low, sure.high) == before
-
-
 def test_one_calibration_position_gives_a_range():
     sure = confidence()
     sure.store_range(torch.zeros(1, 3))

@@ -12,9 +12,6 @@ from states import same
 
 from gsparc.field.distributed import (
     SummedGradients,
-    first_process_value,
-    process_count,
-    sum_gradients,
 )
 
 
@@ -30,14 +27,6 @@ def test_strategies_that_share_batches_are_known_by_name():
         is SummedGradients.from_strategy(object())
         is None
     )
-
-
-def test_alone_nothing_is_changed():
-    one, none = torch.zeros(3, requires_grad=True), torch.zeros(2, requires_grad=True)
-    one.grad = torch.tensor([1.0, 2.0, 3.0])
-    sum_gradients([one, none])
-    assert one.grad.tolist() == [1, 2, 3] and none.grad is None
-    assert first_process_value(0.5, None) == 0.5 and process_count() == 1
 
 
 @pytest.mark.slow

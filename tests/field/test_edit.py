@@ -50,17 +50,6 @@ def test_one_edit_moves_everything_together():
     assert held == {id(p) for p in root.parameters()} and len(optimizer.state) == len(held)
 
 
-def test_an_edit_before_the_first_step_has_no_moments_to_move():
-    root = Root()
-    optimizer = torch.optim.Adam([{"params": [p]} for p in root.parameters()])
-    edit.apply_edit(
-        Edit(torch.zeros(6, dtype=torch.bool), torch.tensor([0])), root, root.gaussians, optimizer
-    )
-    assert len(root.gaussians) == 1 and root.gaussians.ids.tolist() == [6]
-    held = {id(group["params"][0]) for group in optimizer.param_groups}
-    assert held == {id(p) for p in root.parameters()}
-
-
 def test_resize_makes_room_for_a_state_dict():
     larger, smaller = Root(9), Root(4)
     smaller.shared = torch.nn.Parameter(torch.zeros(9, 3))

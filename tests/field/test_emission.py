@@ -32,28 +32,6 @@ def test_every_gaussian_has_a_network_of_its_own(hidden):
         assert torch.allclose(many.logits(where)[:, i], want, atol=1e-6)
 
 
-@pytest.mark.parametrize("precision", [torch.bfloat16, torch.float16], ids=str)
-def test_networks_keep_their_precision_under_autocast(precision):
-    many, encoded = emission(), torch.rand(3, 15)
-    with torch.autocast("cpu", dtype=precision):
-        assert torch.equal(many._networks(encoded), many._networks(encoded).float())
-        half = many._networks(encoded)
-    assert torch.allclose(half, many._networks(encoded), rtol=1e-5)
-
-
-def test_activations():
-    where, apart = torch.rand(2, 3), torch.full((2, 5), 3.0)
-    plain = emission(activation="linear")
-    logits = plain.logits(where)
-    assert torch.equal(plain(where, apart), logits)
-    assert torch.equal(
-        emission(activation="softplus")(where, apart), torch.nn.functional.softplus(logits)
-    )
-    assert torch.equal(emission(activation="sigmoid")(where, apart), torch.sigmoid(logits))
-    shifted = emission(activation="sigmoid", log_distance=True)(where, apart)
-    assert torch.allclose(shifted, torch.sigmoid(logits - apart.log()[..., None]))
-
-
 @pytest.mark.parametrize("activation", ["softplus", "linear"])
 def test_the_logarithm_of_distance_lives_under_a_sigmoid_only(activation):
     with pytest.raises(ValueError, match="log_distance=true needs activation=sigmoid"):

@@ -8,18 +8,6 @@ RECEIVER = torch.tensor([3.0, 0.0, 1.0])
 TURN = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])  # boresight along x
 
 
-def test_uniform_fills_the_enlarged_box():
-    torch.manual_seed(0)
-    field = create_field(
-        FieldSettings(count=2000, placement="uniform", margin=0.5), BOX, None, None
-    )
-    low, high = field.means.min(0).values, field.means.max(0).values
-    assert (low >= BOX[0] - 0.5).all() and (high <= BOX[1] + 0.5).all()
-    assert torch.allclose(low, BOX[0] - 0.5, atol=0.05) and torch.allclose(
-        high, BOX[1] + 0.5, atol=0.05
-    )
-
-
 def test_sphere_surrounds_the_receiver_above_its_horizon():
     field = create_field(
         FieldSettings(count=500, placement="sphere", near=1, far=6), BOX, RECEIVER, TURN

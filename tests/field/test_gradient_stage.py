@@ -1,7 +1,5 @@
 import signal
-from datetime import timedelta
 from functools import partial
-from types import SimpleNamespace
 
 import lightning.pytorch as L
 import pytest
@@ -10,10 +8,8 @@ from campaigns import spectra
 from contexts import trained
 
 from gsparc.callbacks import CostLedger, Densify
-from gsparc.field.gradient_stage import SPENT, SPENT_CPU, TAKEN, read_trainer_result
 from gsparc.models import checkpoint
 from gsparc.training import curve
-from gsparc.training.stopwatch import Stopwatch
 
 
 class Interrupt(L.Callback):
@@ -102,14 +98,6 @@ def test_a_run_that_went_on_did_not_say_so_nor_from_where(tmp_path, caplog):
     assert f"gradient steps: going on after step 8 of 20, as {last} left them" in caplog.text
 
 
-@pytest.mark.parametrize(("taken", "notes"), [(6, 0), (5, 1)])
-def test_six_of_six_steps_were_called_ended_by_their_time(taken, notes):
-    timer = L.callbacks.Timer(duration=timedelta(seconds=0))
-    figures = {SPENT: 1.0, SPENT_CPU: 1.0, TAKEN: float(taken)}
-    trainer = SimpleNamespace(callbacks=[timer], callback_metrics=figures, max_steps=6)
-    assert len(read_trainer_result(trainer, Stopwatch()).notes) == notes
-
-
 def test_a_checkpoint_with_every_step_done_still_ends_in_a_model(whole, tmp_path):
     """Killed between the last checkpoint and the model's file:
     Lightning then skips training and its end.
@@ -118,16 +106,6 @@ def test_a_checkpoint_with_every_step_done_still_ends_in_a_model(whole, tmp_path
     resumed = run(tmp_path, ledger, resume=whole[1] / "run" / "last.ckpt")
     assert all(torch.equal(value, resumed[key]) for key, value in whole[0].items())
     assert ledger.seconds > 0.0
-
-
-@pytest.mark.parametrize(
-    ("step", "advice", "left"), [(7, "go on with", 5), (0, "there is no checkpoint yet", None)]
-)
-def test_a_second_interrupt_does_not_wait(tmp_path, step, advice, left):
-    with pytest.raises(KeyboardInterrupt, match=advice):
-        run(tmp_path, Interrupt(step, times=2))
-    last = tmp_path / "run" / "last.ckpt"
-    assert left is None or checkpoint.read(last).extra["trainer"]["global_step"] == left
 
 
 class Watching(L.Callback):

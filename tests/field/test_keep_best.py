@@ -11,11 +11,9 @@ from campaigns import brief, compose, spectra
 from contexts import loaded, short
 from lightning.pytorch.callbacks import EarlyStopping
 
-from gsparc.callbacks import CostLedger
 from gsparc.field.gradient_stage import LOOKS
 from gsparc.field.keep_best import PATIENCE, _is_surely_less
 from gsparc.models.registry import build
-from gsparc.training import curve
 from gsparc.training.context import FitContext
 
 COLD = ("init=sphere", "model.keep_best=true", "model.refit=false")
@@ -103,12 +101,3 @@ def test_a_look_is_kept_where_its_rows_are_better_by_two_standard_errors(errors,
     """One row of four that gains nothing but noise chose steps that cost the others."""
     start = torch.ones(4, dtype=torch.float64)
     assert _is_surely_less(torch.tensor(errors, dtype=torch.float64), start) == kept
-
-
-def test_the_start_is_the_first_point_of_the_curve_and_the_result_the_last(measured, tmp_path):
-    fitted(measured, tmp_path, "init=images", steps=20, callbacks=lambda: [CostLedger()])
-    rows = curve.read_curve(tmp_path)
-    assert [row["step"] for row in rows] == ["0", "5", "10", "15", "20", "20"]
-    assert rows[0]["what"] == "init=images, closed form" and rows[-1]["what"].startswith("final, ")
-    errors = [float(row["val/psnr_db"]) for row in rows[:-1]]
-    assert min(errors) > errors[0] - 0.1 and rows[-1]["error"] == ""

@@ -54,14 +54,6 @@ def test_every_subcarrier_of_the_factored_band(tones):
     )
 
 
-def test_uneven_tones_are_not_factored():
-    frequency = torch.tensor([1.0, 1.01, 1.03, 1.07, 1.08, 1.11, 1.2], dtype=torch.float64) * 2.4e9
-    distance = torch.tensor([123.456], dtype=torch.float64)
-    torch.testing.assert_close(
-        wave_over_band(distance, frequency), point_wave(distance[:, None], frequency)
-    )
-
-
 def test_band_backward_equals_tone_by_tone():
     frequency = torch.linspace(2.4e9, 2.5e9, 32, dtype=torch.float64)
     slopes = []

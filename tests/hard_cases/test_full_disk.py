@@ -8,7 +8,7 @@ files, which fails like a full disk does: in the middle of writing.
 from pathlib import Path
 
 import pytest
-from crashes import Limited, run, simulation
+from crashes import Limited
 
 from gsparc.models import checkpoint
 from gsparc.models.checkpoint import CheckpointError
@@ -38,17 +38,3 @@ def test_a_checkpoint_that_does_not_fit_leaves_the_one_before(fitted, tmp_path):
     ):
         checkpoint.save(path, fitted)
     assert "\n" not in str(e.value) and path.read_bytes() == before and left(tmp_path) == names
-
-
-@pytest.mark.slow
-def test_simulation_keeps_its_finished_shards(tmp_path):
-    whole, out = tmp_path / "whole.h5", tmp_path / "box.h5"
-    assert run(simulation, str(whole), 20)[0] == 0
-    code, _ = run(simulation, str(out), 20, int(0.9 * whole.stat().st_size))
-    said = out.with_suffix(".txt").read_text()
-    assert (
-        code == 1 and ("box.h5: cannot be written (File too large)") in said and "\n" not in said
-    ), said
-    assert left(tmp_path) == ["box.h5.parts", "box.txt", "whole.h5"]
-    assert len(list((tmp_path / "box.h5.parts").glob("shard_*.npz"))) == 5
-    assert run(simulation, str(out), 20)[0] == 0 and out.read_bytes()

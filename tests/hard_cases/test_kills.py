@@ -1,4 +1,4 @@
-"""Kills: SIGKILL at random moments of training and of simulation.
+"""Kills: SIGKILL at random moments of training; tests/simulate/test_campaign.py cuts simulations.
 
 Remedy: every file appears by renaming (gsparc/models/checkpoint.py, gsparc/simulate/shards.py); all
 that a run needs to go on is in its last checkpoint, or in its finished shards. Shown: after any
@@ -10,14 +10,11 @@ import json
 import zipfile
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
-from crashes import assert_same, killed, last_checkpoint, moments, run, simulation, training
+from crashes import assert_same, killed, last_checkpoint, moments, run, training
 
 from gsparc.models import checkpoint
-
-ROWS = 60
 
 
 def assert_whole(folder: Path) -> None:
@@ -31,9 +28,6 @@ def assert_whole(folder: Path) -> None:
             json.loads(path.read_text())
         elif path.suffix == ".npz":
             assert zipfile.is_zipfile(path) and np.load(path).files
-        elif path.suffix == ".h5":
-            with h5py.File(path) as file:
-                assert len(file["rx_position"]) == ROWS
 
 
 def sooner(folder: Path):
@@ -74,39 +68,3 @@ def test_training_killed_again_and_again(undisturbed, tmp_path, chain):
     code, _ = run(training, str(folder), [*settings, *last_checkpoint(folder)])
     assert code == 0, (folder / "error.txt").read_text()
     assert_same(whole, folder)
-
-
-@pytest.fixture(scope="module")
-def simulated(tmp_path_factory):
-    """A simulation nobody disturbed, and its length."""
-    out = tmp_path_factory.mktemp("kills") / "box.h5"
-    code, seconds = run(simulation, str(out), ROWS)
-    assert code == 0
-    return out, seconds
-
-
-@CHAINS
-def test_simulation_killed_again_and_again(simulated, tmp_path, chain):
-    whole, seconds = simulated
-    for folder, share in sooner(tmp_path):
-        out = folder / "box.h5"
-        kills = 0
-        for moment in moments(5 if chain else 3, share * seconds, seed=100 + chain):
-            if out.exists() or not killed(simulation, str(out), ROWS, after_s=moment):
-                break  # once the file is there another run is refused
-            kills += 1
-            assert_whole(folder)
-        if kills:
-            break
-    assert kills, "every run had ended before it was killed"
-    # Killed when the file was whole: its parts are whole, too, or on their way out
-    if out.exists():
-        left = folder / "box.h5.parts"
-        assert not left.exists() or (left / "plan.json").exists()
-    else:
-        code, _ = run(simulation, str(out), ROWS)
-        assert code == 0, out.with_suffix(".txt").read_text()
-        assert not (folder / "box.h5.parts").exists()
-    with h5py.File(whole) as one, h5py.File(out) as two:
-        assert set(one) == set(two)
-        assert all(np.array_equal(one[name][()], two[name][()]) for name in one)

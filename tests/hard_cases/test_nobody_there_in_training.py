@@ -5,12 +5,9 @@ would prune every Gaussian ends with the floor; a run whose Gaussians are all be
 and one that starts without any, finish with finite figures.
 """
 
-import lightning.pytorch as L
 import numpy as np
 import pytest
-import torch
 from campaigns import brief, channels, compose, powers, spectra
-from contexts import trained
 
 from gsparc.commands.train import train
 
@@ -44,19 +41,3 @@ def test_no_gaussians_at_all(tmp_path, maker):
         return
     assert facts["model/num_gaussians"] == 0
     assert facts["test/nmse"] == pytest.approx(1.0)  # silence
-
-
-def test_nobody_is_seen(tmp_path):
-    """All Gaussians below a receiver that looks up."""
-
-    class Sink(L.Callback):
-        def on_train_start(self, trainer, module):
-            with torch.no_grad():
-                module.model.gaussians.means[:, 2] = -50.0
-                module.model.gaussians.log_scales.fill_(-3.0)
-
-    file = spectra(tmp_path / "own.npz")
-    method, data = trained(file, tmp_path, 10, "init=sphere", callbacks=lambda: [Sink()])
-    batch = data.batch(np.arange(4))
-    assert (method.predict(batch).mean == 0).all()
-    assert all(p.isfinite().all() for p in method.fitted_model().parameters())

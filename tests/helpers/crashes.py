@@ -49,7 +49,7 @@ VARYING = ("time/", "machine/", "memory/", "git", "run_id")
 TIMED = ("train_s", "render_ms", "ratio_to_copy")
 
 
-def training(folder: str, overrides: list[str], most_bytes: int = 0) -> None:
+def training(folder: str, overrides: list[str]) -> None:
     """`train.py` with these overrides into `folder`; errors are one line in `error.txt`."""
     import torch
     from campaigns import compose
@@ -58,25 +58,11 @@ def training(folder: str, overrides: list[str], most_bytes: int = 0) -> None:
     from gsparc.evaluation.console import error_in_one_line
 
     torch.set_num_threads(1)
-    with Limited(most_bytes), mock.patch(DRAWING):
+    with mock.patch(DRAWING):
         try:
             train(compose(*overrides), Path(folder))
         except Exception as error:
             Path(folder, "error.txt").write_text(error_in_one_line(error))
-            os._exit(1)
-    os._exit(0)
-
-
-def simulation(out: str, rows: int, most_bytes: int = 0) -> None:
-    """`gsparc simulate` of a box room in many small shards."""
-    from gsparc.evaluation.console import error_in_one_line
-    from gsparc.simulate.campaign import simulate
-
-    with Limited(most_bytes):
-        try:
-            simulate(small_campaign(rows), Path(out))
-        except Exception as error:
-            Path(out).with_suffix(".txt").write_text(error_in_one_line(error))
             os._exit(1)
     os._exit(0)
 

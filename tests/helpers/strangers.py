@@ -45,11 +45,6 @@ ZONES = PLACES + np.where(np.arange(ROWS)[:, None] < 80, [700_000, 5e6], [300_00
 WAY = np.c_[np.linspace(0, 60, ROWS), np.full(ROWS, 9.0)]
 ALONG = np.round(-30 - 70 * np.log10(1 + 0.3 * WAY[:, 0]), 1)
 STUCK = np.where((np.arange(ROWS)[:, None] > 60) & (np.arange(ROWS)[:, None] < 180), WAY[61], WAY)
-OF_THREE = [
-    f"{name},{x},{y},{v}"
-    for (x, y), row in zip(PLACES, LEVELS, strict=True)
-    for name, v in zip("abc", row, strict=True)
-]
 
 DROPS = [-50 - np.arange(ROWS) % 3 - 40 * (np.arange(ROWS) == 100 + i) for i in range(12)]
 

@@ -11,7 +11,6 @@ from gsparc.data.schema import Stations
 from gsparc.models import aligned_rows, fitting
 from gsparc.models.aligned_rows import align_phases, align_rows
 from gsparc.models.gsparc import Gsparc
-from gsparc.physics import row_factors
 from gsparc.physics.row_factors import align_factors
 from gsparc.runs.align_site import align_to_site
 from gsparc.tables.checks.coherence import set_unknown_factor
@@ -26,22 +25,6 @@ def logged():
     return set_unknown_factor(
         packets.measurements(given, packets.logged(channel, tones, 0)), "auto"
     )
-
-
-@pytest.mark.slow
-def test_neighbours_are_alike_after_alignment_and_test_rows_are_not_looked_at(logged):
-    fold = packets.shares(logged, 0)
-    turned, _ = align_phases(logged, fold)
-    assert (
-        turned.site.phase_reference == "neighbours" and turned.site.unknown_factor == "phase+delay"
-    )
-    assert (turned.target[fold.test] == logged.target[fold.test]).all()
-    assert np.allclose(np.abs(turned.target), np.abs(logged.target), rtol=1e-4)
-    other = np.array(logged.target)
-    other[fold.test] = 0
-    again, _ = align_phases(replace(logged, target=other), fold)
-    assert (again.target[fold.train] == turned.target[fold.train]).all()
-    assert align_phases(turned, fold)[0] is turned
 
 
 def test_rows_that_are_coherent_stay_as_they_are():
@@ -84,27 +67,6 @@ def test_antennas_at_known_places_bring_the_carriers_phase_back():
 def _site():
     site = packets.measurements(*packets.robot()).site
     return replace(site, static_end="rx", rx_rotation=np.eye(3))
-
-
-def test_a_free_gain_is_a_unit_row(logged):
-    free = replace(logged, site=replace(logged.site, unknown_factor="phase+delay+gain"))
-    fold = packets.shares(free, 0)
-    target = align_phases(free, fold)[0].target[fold.train]
-    assert np.ptp(np.abs(target).mean((1, 2))) < 0.5 * np.ptp(
-        np.abs(free.target[fold.train]).mean((1, 2))
-    )
-    told = align_factors(target, target * 2, np.zeros(target.shape[2]), "phase+delay+gain")
-    assert np.allclose(np.abs(told), 2, rtol=1e-3)
-
-
-@pytest.mark.slow
-def test_rows_in_parts_are_turned_as_all_at_once(logged, monkeypatch):
-    """Ten thousand rows of 64 tones before four antennas took 8 GB."""
-    whole = align_rows(Snapshots.from_rows(logged, np.arange(300)), "phase", logged.site)
-    monkeypatch.setattr(aligned_rows, "AT_ONCE", 64)
-    monkeypatch.setattr(row_factors, "AT_ONCE", 64)
-    again = align_rows(Snapshots.from_rows(logged, np.arange(300)), "phase", logged.site)
-    assert np.allclose(again.factors, whole.factors)
 
 
 def test_stations_that_are_missing_took_the_places_of_others():
@@ -161,15 +123,3 @@ def test_one_row_of_a_station_has_nothing_to_be_turned_to(logged):
     """The nearest others of a row alone were an IndexError."""
     found = align_rows(Snapshots.from_rows(logged, np.arange(1)), "phase+delay", logged.site)
     assert found.factors.shape == (1, logged.target.shape[2]) and (found.factors == 1).all()
-
-
-def test_what_any_packet_of_a_place_measured_is_known_of_their_mean(logged):
-    several = logged.subset(np.array([0, 0, 1]), logged.site)
-    mask = np.ones(several.target.shape, bool)
-    mask[0, 0, 3] = mask[2, 0, 5] = False
-    noise = np.full(3, 0.2, np.float32)
-    rows, mean = aligned_rows.average_packets(
-        replace(several, mask=mask, noise_variance=noise), np.arange(3)
-    )
-    assert rows.tolist() == [0, 2] and mean.mask[0].all() and not mean.mask[2, 0, 5]
-    assert mean.noise_variance[rows].tolist() == pytest.approx([0.1, 0.2])

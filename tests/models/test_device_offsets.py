@@ -10,11 +10,9 @@ import pytest
 import torch
 
 import gsparc
-from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.data.splits import Fold
 from gsparc.models.device_offsets import take_off_devices, without_devices
-from gsparc.models.method import Prediction
 from gsparc.prediction.answers import predict_file
-from gsparc.runs.baselines import fit_baseline
 from gsparc.tables.own import from_arrays
 
 RNG = np.random.default_rng(5)
@@ -61,16 +59,6 @@ def test_a_device_without_training_rows_is_the_mean_one():
         data, Fold(train, train[:0], np.flatnonzero(PHONE == "third"))
     ).site.device_levels[0]
     assert levels[2].tolist() == levels[3].tolist() and levels[2, 1] > 40
-
-
-@pytest.mark.parametrize("name", ["gp", "idw", "kriging"])
-def test_baselines_learn_what_the_mean_device_reads_and_answer_as_each(name):
-    data = campaign()
-    split = make_split(data.moving, SplitSettings())
-    spread = {}
-    for own in (data, from_arrays({**ARRAYS, "rssi_db": LEVEL})):
-        spread[own is data] = fit_baseline(name, own, split).scores.figures()["rmse_db"]
-    assert spread[True] < 2.5 and spread[True] < 0.6 * spread[False], spread
 
 
 def test_answers_of_a_named_device_and_of_the_mean_one():
@@ -127,19 +115,6 @@ def test_devices_are_of_powers():
         )
 
 
-def test_variances_of_levels_add():
-    site = take_off_devices(
-        campaign(), Fold(np.arange(240), np.zeros(0, int), np.zeros(0, int))
-    ).site
-    one = Prediction(torch.tensor([[2.0]]), torch.tensor([0.0]))
-    said = one.of_devices(site)
-    unit = site.power_unit("dB")
-    assert float(unit.variance(said.mean, said.variance)) == pytest.approx(
-        site.device_levels[:, 3, 1].mean(), rel=1e-5
-    )
-    assert one.of_devices(campaign().site) is one
-
-
 def test_a_device_that_differs_at_one_carrier_has_an_offset_there():
     """Of two phones and four cells one offset for all left 4 dB at one: left-out errors of 4.01
     dB there were 3.34 with its own.
@@ -160,12 +135,3 @@ def test_a_device_that_differs_at_one_carrier_has_an_offset_there():
     level -= half - np.where(phone == "left", -1, 1)
     levels = take_off_devices(from_arrays({**rows, "rssi_db": level}), every).site.device_levels
     assert np.ptp(levels[:, 1, 0]) < 0.15 and levels[0, 1, 0] == pytest.approx(1, abs=0.25)
-    asked = Prediction(torch.ones(2, 1), torch.zeros(2))
-    site = from_arrays({**rows, "rssi_db": level + half}).site
-    told = take_off_devices(from_arrays({**rows, "rssi_db": level + half}), every).site
-    named = torch.tensor([1, 1]), torch.tensor([0, 2])
-    ratio = asked.of_devices(told, *named).mean[:, 0].log10().diff() * 10
-    assert float(ratio[0]) == pytest.approx(
-        float(told.device_levels[2, 1, 0] - told.device_levels[0, 1, 0]), abs=1e-4
-    )
-    assert asked.of_devices(site, *named) is asked

@@ -2,9 +2,6 @@
 and what is said of how to go on is true.
 """
 
-from dataclasses import replace
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 from posts import POSTS, heard
@@ -12,7 +9,7 @@ from refusals import refused
 from scenes import fold_of
 
 from gsparc.base import executor
-from gsparc.models import checkpoint, fitting
+from gsparc.models import fitting
 from gsparc.models.baselines.nearest import Nearest
 from gsparc.models.per_station import PerStation, station_site
 from gsparc.training.context import FitContext
@@ -97,39 +94,6 @@ def test_a_run_that_begins_anew_leaves_no_parts_of_the_one_before(town, tmp_path
     assert [path.parent.name for path in tmp_path.glob("station*/model.ckpt")] == ["station0"]
 
 
-def test_a_finished_fold_is_taken_from_its_folder(town, tmp_path):
-    data, fold = town
-    context = FitContext(tmp_path / "fold0", stations="each")
-    method, Resumable.fits, Resumable.stop_at = PerStation(Resumable()), 0, 0
-    report = method.fit(data, fold, context)
-    extra = fitting.run_extra(replace(report, cpu_s=50.0), data, fold, context)
-    checkpoint.save(tmp_path / "fold0" / "model.ckpt", method, extra=extra)
-    again, found = fitting.fit_or_resume(
-        PerStation(Resumable()), data, fold, replace(context, resume=tmp_path / "fold0")
-    )
-    assert Resumable.fits == 3 and found.seconds == report.seconds and again.site is not None
-    assert found.cpu_s == 50.0
-
-
-@pytest.mark.parametrize("where", ["here", pytest.param("joblib", marks=pytest.mark.slow)])
-def test_processor_seconds_of_stations_that_were_finished_before_were_left_out(
-    town, tmp_path, elsewhere, where
-):
-    Resumable.stop_at = 0
-    if where != "here":
-        elsewhere(where)
-    fitting.fit_or_resume(PerStation(Resumable()), *town, FitContext(tmp_path / "run"))
-    for file in (tmp_path / "run").glob("station*/model.ckpt"):
-        stored = checkpoint.read(file)
-        extra = stored.extra | {"train_cpu_s": 10.0}
-        method = Resumable().create_as(stored.target)
-        method.restore(stored.site, stored.state)
-        checkpoint.save(file, method, stored.config, extra)
-    resumed = FitContext(tmp_path / "on", resume=tmp_path / "run")
-    _, report = fitting.fit_or_resume(PerStation(Resumable()), *town, resumed)
-    assert 30.0 < report.cpu_s < 31.0
-
-
 def test_the_log_did_not_say_which_of_42_antennas_it_was_nor_what_was_left(
     town, tmp_path, caplog, monkeypatch
 ):
@@ -152,25 +116,3 @@ def test_a_third_of_the_log_was_numbers_of_stations_fitted_in_a_second(
     caplog.set_level("INFO", "gsparc")
     fitted(town, tmp_path)
     assert not [one for one in caplog.messages if "station 1 of 3" in one]
-
-
-@pytest.mark.parametrize(
-    ("given", "found"), [("run", "run"), ("run/fold1", "run"), ("run/fold1/refit/last.ckpt", "run")]
-)
-def test_the_folder_of_a_run_is_told_from_what_is_in_it(tmp_path, given, found):
-    (tmp_path / "run" / "fold1" / "refit").mkdir(parents=True)
-    (tmp_path / "run" / "fold1" / "refit" / "last.ckpt").touch()
-    assert fitting.run_folder(tmp_path / given, fitting.FOLDS) == tmp_path / found
-
-
-@pytest.mark.parametrize(
-    ("labels", "found"),
-    [
-        (["gp (Vecchia 30)"] * 2, "gp (Vecchia 30)"),
-        (["gp (Vecchia 30)", "gp (Vecchia 30)", "gp"], "gp (Vecchia 30 in 2 of 3)"),
-        (["gp"] * 2, "gp"),
-        ([], "gp"),
-    ],
-)
-def test_several_fits_are_named_by_what_most_say(labels, found):
-    assert fitting.common_label("gp", [SimpleNamespace(label=label) for label in labels]) == found

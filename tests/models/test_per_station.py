@@ -107,20 +107,6 @@ def test_a_station_never_heard_is_asked_with_both_ends_and_its_constant_may_be_t
         score_methods(fits.methods, town, split)
 
 
-def test_one_model_of_all_stations_where_that_is_said(town, tmp_path):
-    fold = Fold(np.arange(0, len(town), 2), np.arange(0), np.arange(1, len(town), 2))
-    method = wrap_per_station(method_class("mean")(), town)
-    method.fit(town, fold, FitContext(tmp_path, stations="together"))
-    assert (
-        len(dict(method)) == 1
-        and len(torch.unique(method.predict(town.batch(fold.test)).mean)) == 1
-    )
-    with pytest.raises(
-        ValueError, match="stations='togehter': one of auto, each, together is needed"
-    ):
-        FitContext(tmp_path, stations="togehter")
-
-
 def test_both_ends_moving_is_refused_by_whoever_knows_one(tmp_path):
     walk = walked(40)
     data = from_arrays({"tx_position": walk, "rx_position": walk[::-1] + 1, "rssi_db": -walk[:, 0]})
@@ -217,31 +203,6 @@ def test_chunks_of_many_stations_asked_every_model(town, fold, tmp_path, monkeyp
 def test_seconds_of_stations_were_said_to_be_unused(town):
     assert wrap_per_station(method_class("gsparc")(), town).takes_effort
     assert not wrap_per_station(method_class("idw")(), town).takes_effort
-
-
-def test_models_of_stations_left_folders_in_the_current_one(town, fold, tmp_path):
-    """A search keeps what it finds in `run_dir`;
-    without one that of station 0 became ./station0.
-    """
-    folders = []
-
-    class Writes(method_class("mean")):
-        def fit(self, data, fold, context):
-            folders.append(context.run_dir)
-            return super().fit(data, fold, context)
-
-    for context in (FitContext(), FitContext(tmp_path)):
-        wrap_per_station(Writes(), town).fit(town, fold, context)
-    assert set(folders[: len(POSTS)]) == {Path()} and tmp_path / "station0" in folders
-
-
-@pytest.mark.slow
-def test_stations_that_are_fitted_elsewhere_are_the_same_bits(town, fold, tmp_path, elsewhere):
-    torch.set_num_threads(1)
-    here, batch = fitted("gp", town, fold, tmp_path / "here"), town.batch(fold.test)
-    elsewhere("joblib")
-    there = fitted("gp", town, fold, tmp_path / "there")
-    assert torch.equal(here.predict(batch).mean, there.predict(batch).mean)
 
 
 def test_a_station_at_an_unknown_place_answered_for_all(town, fold, tmp_path):

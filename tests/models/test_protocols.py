@@ -30,7 +30,7 @@ from gsparc.datasets.load import load
 from gsparc.field.gaussians import FieldSettings
 from gsparc.models import checkpoint, loading
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.method import Method, MethodFactory, import_path, suitable_threads
+from gsparc.models.method import Method, MethodFactory, import_path
 from gsparc.models.moving_array.method import MovingArrayField
 from gsparc.models.moving_array.triangulate import SearchSettings as BearingSearchSettings
 from gsparc.models.per_station import wrap_per_station
@@ -316,20 +316,6 @@ def test_a_reduction_leaves_the_method_as_it_was(name, settings):
     for part in ("mean", "confidence", "variance"):
         one, two = getattr(before, part), getattr(after, part)
         assert (one is None and two is None) or torch.equal(one, two)
-
-
-@pytest.mark.parametrize(
-    ("name", "places", "inside"), [("gp", 1, 1), ("gp", 2, 2), ("nerf2", 1, 2)]
-)
-def test_threads_of_a_query(monkeypatch, name, places, inside):
-    """Single places are answered by one thread; what is rendered keeps them all."""
-    threads = [2]
-    monkeypatch.setattr(torch, "get_num_threads", lambda: threads[-1])
-    monkeypatch.setattr(torch, "set_num_threads", threads.append)
-    with pytest.raises(ZeroDivisionError), suitable_threads(method_class(name)(), places):
-        assert torch.get_num_threads() == inside
-        raise ZeroDivisionError
-    assert torch.get_num_threads() == 2  # also after an error
 
 
 def served(predictor: Predictor, data: Measurements, rows: np.ndarray) -> torch.Tensor:

@@ -7,13 +7,11 @@ import numpy as np
 import pytest
 import torch
 from kinds import KINDS
-from scenes import fold_of
 
 from gsparc.data.schema import LIGHT
 from gsparc.data.splits import Fold
 from gsparc.models import fitting
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.per_station import wrap_per_station
 from gsparc.models.refined_places import Linearised, estimate_place_errors, move_rows
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
@@ -45,33 +43,6 @@ def test_displacements_are_those_of_a_ridge_regression():
     ]
     assert np.corrcoef(found.numpy().ravel(), np.ravel(ridge))[0, 1] > 0.999
     assert np.square(found.numpy() - error).mean() < 0.1 * np.square(error).mean() and gain > 50
-
-
-def test_a_place_without_error_stays_and_one_far_too_large_gains_nothing():
-    _, seen = _told()
-    std = torch.full((40,), 0.02, dtype=torch.float64)
-    std[::2] = 0.0
-    found, _ = estimate_place_errors(seen, torch.arange(40), std)
-    assert not found[::2].any() and found[1::2].all()
-    exact = replace(
-        seen, residual=0.1 * torch.randn(40, 4, generator=torch.manual_seed(1)).double()
-    )
-    assert estimate_place_errors(exact, torch.arange(40), std)[1] < 0
-
-
-def test_what_was_not_measured_says_nothing_and_rows_of_one_place_share():
-    _, seen = _told()
-    std = torch.full((40,), 0.02, dtype=torch.float64)
-    hidden = replace(seen, variance=seen.variance.clone())
-    hidden.variance[:, 2:] = torch.inf
-    fewer = Linearised(seen.residual[:, :2], seen.slope[:, :2], seen.variance[:, :2])
-    of_all, of_fewer = (
-        estimate_place_errors(each, torch.arange(40), std) for each in (hidden, fewer)
-    )
-    assert torch.allclose(of_all[0], of_fewer[0]) and of_all[1] == pytest.approx(of_fewer[1])
-    halves = [torch.cat(part.split(2, 1)) for part in (seen.residual, seen.slope, seen.variance)]
-    stations = estimate_place_errors(Linearised(*halves), torch.arange(40).repeat(2), std)
-    assert torch.allclose(stations[0], estimate_place_errors(seen, torch.arange(40), std)[0])
 
 
 def _channels(error_m, rows=130, seed=0):
@@ -115,30 +86,11 @@ def test_known_errors_of_places_cost_less_than_unknown_ones():
     assert "positions moved by" in report.notes[0] and report.cost.stages["measured places"] > 0
 
 
-@pytest.mark.slow
-def test_an_error_of_zero_changes_nothing():
-    exact, _, fold = _channels(0.0)
-    plain, zero = (_fitted(exact, fold, **settings)[0] for settings in ({}, {"position_std": 0.0}))
-    batch = exact.batch(fold.test)
-    assert torch.equal(plain.predict(batch).mean, zero.predict(batch).mean)
-
-
 def test_exact_places_stay_though_errors_are_claimed():
     exact, _, fold = _channels(0.0)
     method, report = _fitted(exact, fold, position_std=0.02)
     assert "positions stay as measured" in report.notes[0]
     assert _missed(method, exact, fold) < 0.02
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["powers", "channels of an array", "powers of several stations"])
-def test_every_field_with_rows_left_out_takes_them(kind, tmp_path):
-    data = KINDS[kind](tmp_path)
-    fold = fold_of(data)
-    _, report = fitting.fit_or_resume(
-        wrap_per_station(Gsparc(position_std=0.05), data), data, fold, BRIEF
-    )
-    assert any("with errors of places" in note or "is not used" in note for note in report.notes)
 
 
 def test_rendered_spectra_say_that_positions_count_as_exact(tmp_path, caplog):

@@ -4,38 +4,13 @@ import pytest
 from refusals import refused
 
 from gsparc.base import instantiate
-from gsparc.models import registry
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.baselines.idw import InverseDistance
-from gsparc.models.registry import build, method_class, plain_methods
+from gsparc.models.registry import build, method_class
 
 
 def test_a_typo_gets_the_nearest_name():
     refused("did you mean 'nearest'", method_class, "neareast")
     refused(r"there are .*gp, gsparc, .*idw", method_class, "xxxxxxxx")
-
-
-class Twice(InverseDistance):
-    """A plain method of somebody's own."""
-
-    baseline_order = 45
-
-
-class Thrice(Twice):
-    """No plain one, though it derives from one."""
-
-
-def test_a_plain_method_is_its_class_and_its_name(monkeypatch):
-    """It stood in five lists."""
-    paths = {kind.__name__.lower(): f"{__name__}.{kind.__name__}" for kind in (Twice, Thrice)}
-    before, every = plain_methods(), registry.all_methods() | paths
-    monkeypatch.setattr(registry, "all_methods", lambda: every)
-    plain_methods.cache_clear()
-    assert plain_methods() == (*before[:4], "twice", *before[4:]) and before[3:6:2] == (
-        "idw",
-        "direct_beam",
-    )
-    plain_methods.cache_clear()
 
 
 def test_a_config_becomes_a_method():

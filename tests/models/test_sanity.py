@@ -5,7 +5,6 @@ what is right is never refused.
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 from boxes import room_of_spectra
 from closed import fitted_to
@@ -17,7 +16,6 @@ from gsparc.data.splits import Fold
 from gsparc.models import checkpoint, fitting, loading, sanity
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean
-from gsparc.models.closed_form import LeftOutRows
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.per_station import PerStation
 from gsparc.models.powers.together import learning
@@ -101,16 +99,6 @@ def test_what_is_right_is_not_refused(campaign, folds, tmp_path):
     )
 
 
-def test_a_member_that_answers_what_is_no_number_answers_nothing():
-    data, rows = room_of_spectra(), np.arange(40)
-    good, _ = fitted_to(GaussianProcess(), data, rows)
-    poisoned, _ = fitted_to(GaussianProcess(), data, rows)
-    poisoned.mean = poisoned.mean * torch.nan
-    fold = Fold(rows, np.arange(40, 60), rows[:0])
-    kept, texts = sanity._refuse_members([(0.5, good), (0.5, poisoned)], data, fold)
-    assert kept == [good] and len(texts) == 1 and "NaN" in texts[0]
-
-
 def test_a_mixture_does_without_a_member_that_is_worse_than_the_simpler_one():
     data, rows = room_of_spectra(), np.arange(40)
     members = [fitted_to(GaussianProcess(), data, rows)[0] for _ in range(2)]
@@ -123,20 +111,3 @@ def test_a_mixture_does_without_a_member_that_is_worse_than_the_simpler_one():
     both.keep_members(kept)
     assert both.members == members[:1] and both.weights == (1.0,) and both.started == "process"
     assert "times that of gp" in texts[0]
-
-
-def test_rows_are_drawn_over_stations_and_small_ones_are_whole():
-    station = np.repeat(np.arange(7), [300, 300, 20, 300, 3, 300, 300])
-    rows = sanity._draw_over_stations(np.arange(len(station)), station)
-    assert len(rows) == sanity.JUDGED and set(np.bincount(station[rows])) == {195, 196, 20, 3}
-
-
-def test_the_mean_is_that_of_the_other_rows_of_a_station():
-    data = lying_still()
-    rows = np.arange(0, len(data), 7)
-    every, level = np.arange(len(data)), data.site.target.to_real(data.target)[:, 0].astype(float)
-    alone = LeftOutRows(rows, torch.zeros(0), torch.zeros(0))
-    errors = sanity._errors_of_mean(data, Fold.of_all(every), rows, alone)
-    for row, error in zip(rows, errors, strict=True):
-        others = (data.station == data.station[row]) & (every != row)
-        assert error == pytest.approx((level[row] - level[others].mean()) ** 2, rel=1e-3)

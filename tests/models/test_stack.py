@@ -10,7 +10,6 @@ from gsparc.models.stack import (
     best_weights,
     error_products,
     explained_variance,
-    mixture_errors,
     weigh,
 )
 
@@ -54,16 +53,6 @@ def test_a_mixture_need_not_be_surely_better_where_that_is_not_asked_for():
 def test_rows_of_one_unit_do_not_make_a_mixture():
     """One square of floor: whichever mixture fits it says nothing about the next."""
     assert sorted(weights_of([noisy(0.3, 1), noisy(0.31, 2)], TARGET, 0 * EACH)) == [0, 1]
-
-
-def test_complex_predictions_are_weighed_as_they_are_summed():
-    turned = torch.complex(noisy(0.3, 1), noisy(0.3, 2))
-    other = torch.complex(noisy(0.3, 3), noisy(0.3, 4))
-    target = torch.complex(TARGET, TARGET)
-    found = weights_of([turned, other], target, EACH)
-    both = found[0] * turned + found[1] * other
-    told = [explained_variance(one, target, False) for one in (both, turned, other)]
-    assert told[0] > max(told[1:])
 
 
 def test_silent_targets_still_give_weights():
@@ -194,13 +183,6 @@ def test_weights_are_the_best_of_a_grid():
         for b in np.linspace(0, 1 - a, 41)
     ]
     assert least <= min(float(w @ gram @ w) for w in grid) + 1e-9
-
-
-def test_a_mixture_is_taken_where_it_pays():
-    errors = drawn([1.0, 1.05])
-    weights = weigh(gram_of(errors), np.arange(400), "square")
-    assert weights == pytest.approx([0.5, 0.5], abs=0.1)
-    assert mixture_errors(weights, gram_of(errors)).mean() < 0.7 * (errors[:, 0] ** 2).mean()
 
 
 @pytest.mark.parametrize("deviations,common", [([1.0, 5.0], 0.0), ([0.1, 0.1], 1.0)])

@@ -119,18 +119,3 @@ def test_an_array_may_be_switched_off():
 )
 def test_terms_that_mean_nothing_here(kind, effects, message):
     refused(message, chosen, kind, effects)
-
-
-@pytest.mark.parametrize(
-    ("kind", "effects", "count", "message"),
-    [
-        ("spectrum", {}, 1, "the target is spectrum; walls mirror channels"),
-        ("unplaced csi", {}, 1, "the dataset does not say where the static end is"),
-        ("unplaced rssi", {}, 1, "the dataset does not say where the static end is"),
-        ("csi", {"phase": False}, 1, r"model\.effects\.phase=false"),
-        ("csi", {}, 0, r"model\.field\.count=0 is the residual alone"),
-        ("rssi", {"visibility": False}, 1, "of received powers walls only hide"),
-    ],
-)
-def test_what_known_walls_cannot_serve(kind, effects, count, message):
-    refused(f"init=scene is not possible: .*{message}", chosen, kind, effects, "scene", count=count)

@@ -283,20 +283,6 @@ def test_plans_and_views_of_other_fields_are_refused():
 ROOT = Path(__file__).parents[2]
 
 
-def test_inputs_on_strides_are_understood():
-    scene, pose, grid = random_scene(n=9), poses(0), SphereGrid.hemisphere(10, 40)
-    wide = torch.empty(9, 6, dtype=torch.float64)[:, ::2]
-    wide.copy_(scene.means)
-    rest = (scene.quats, scene.scales, scene.opacities)
-    plain, strided = (make_plan(means, *rest, pose, grid) for means in (scene.means, wide))
-    assert all(torch.equal(a, b) for a, b in zip(plain.buffers, strided.buffers, strict=True))
-    images = [
-        composite(plan, means, *rest, scene.features).image
-        for plan, means in ((plain, scene.means), (strided, wide))
-    ]
-    assert torch.equal(*images)
-
-
 def test_calls_have_the_layout_of_the_kernels():
     assert ctypes.sizeof(calls.Call) == _native.CALL_BYTES
     assert list(projection.PROJECTIONS) == _native.PROJECTIONS

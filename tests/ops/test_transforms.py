@@ -11,7 +11,6 @@ from refusals import refused
 from torch.autograd import forward_ad
 from torch.func import hessian, jacfwd, jacrev, jvp, vjp, vmap
 
-from gsparc.field.losses import ssim
 from gsparc.ops import (
     Cutoff,
     Pose,
@@ -153,23 +152,6 @@ def test_gaussians_mapped_over_a_plan_got_past_the_refusal(backend):
         refused(r"vmap over Gaussians or poses is not possible: give P poses", vmap(made), several)
 
 
-def test_second_derivatives_by_either_road():
-    model = field()
-
-    def power(backend):
-        return lambda opacities: image(backend)(*model[:3], opacities, model[4]).square().sum()
-
-    leaf = model[3].clone().requires_grad_()
-    (slope,) = torch.autograd.grad(power("reference")(leaf), leaf, create_graph=True)
-    rows = [torch.autograd.grad(part, leaf, retain_graph=True)[0] for part in slope]
-    assert torch.allclose(hessian(power("cpu"))(model[3]), torch.stack(rows), rtol=1e-8, atol=1e-9)
-    (slope,) = torch.autograd.grad(power("cpu")(leaf), leaf, create_graph=True)
-    with pytest.raises(
-        RuntimeError, match=r"kernels have no second derivatives: take backend='reference'"
-    ):
-        torch.autograd.grad(slope.sum(), leaf)
-
-
 @pytest.mark.parametrize("projection", ["tangent", "equirect"])
 def test_the_hessian_in_means_was_off_by_five_percent(projection):
     """The frame of `tangent` was orthonormal to first order only."""
@@ -279,13 +261,3 @@ def test_a_frozen_view_was_a_constant_to_transforms(backend):
         dual = forward_ad.make_dual(model[3], model[3])
         with pytest.raises(RuntimeError, match="a frozen view has no derivatives"):
             freeze(plan, *model[:3], dual, version=0)
-
-
-def test_similarity_has_forward_mode():
-    image, target = torch.rand(2, 1, 12, 13, generator=torch.Generator().manual_seed(0))
-    step, direction = 1e-3, torch.ones_like(image)
-    found = jvp(lambda image: ssim(image, target), (image,), (direction,))[1]
-    ends = [ssim(image + sign * step * direction, target) for sign in (1, -1)]
-    assert found.abs().max() > 0 and torch.allclose(
-        found, (ends[0] - ends[1]) / (2 * step), rtol=2e-2
-    )

@@ -25,9 +25,6 @@ SETTINGS = {
     "two threads": {"OMP_NUM_THREADS": "2"},
 }
 HARD = sorted(str(path) for path in (ROOT / "tests" / "hard_cases").glob("test_*.py"))
-ROOMS = [
-    f"tests/{room}" for room in ("ops", "physics", "processes", "models", "field", "prediction")
-]
 
 
 def assert_all_pass(setting: str, *paths: str) -> None:
@@ -63,11 +60,3 @@ OFTEN = "OpenBLAS Haswell"  # where the suite failed once; the others are alike,
 )
 def test_problems_and_hard_cases_pass(setting):
     assert_all_pass(setting, "tests/oracle", *HARD)
-
-
-@pytest.mark.slow
-@pytest.mark.rare
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("setting", SETTINGS)
-def test_numeric_rooms_pass(setting):
-    assert_all_pass(setting, *ROOMS)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsparc.physics.row_factors import align_factors, resolvable_delays
+from gsparc.physics.row_factors import align_factors
 
 TONES = 312.5e3 * np.r_[-26:0, 1:27]
 
@@ -38,9 +38,3 @@ def test_nothing_free_turns_nothing_and_silent_rows_stay():
     assert (align_factors(true, true, TONES, "none") == 1).all()
     assert np.isfinite(align_factors(0 * true, true, TONES, "phase+delay+gain")).all()
     assert np.isfinite(align_factors(true, 0 * true, TONES, "phase+delay+gain")).all()
-
-
-def test_delays_cover_what_tones_tell_apart_and_no_more():
-    tried = resolvable_delays(TONES)
-    assert tried[0] == pytest.approx(-0.5 / 312.5e3, rel=0.02) and tried[-1] == -tried[0]
-    assert len(resolvable_delays(np.zeros(1))) == 1  # one tone tells no delay

@@ -28,12 +28,5 @@ def test_no_more_than_the_share_is_lost():
     assert basis.project(known).shape[1] < 200 and 0 < left <= 0.02  # of both modes
 
 
-def test_thinned_pixels_are_those_of_the_full_image():
-    known = images()
-    basis = fit_separable([known.double()], 1e-12)
-    thin = basis.subsample_pixels(2).images(basis.project(known))
-    torch.testing.assert_close(thin, known[:, ::2, ::2], rtol=1e-5, atol=1e-5)
-
-
 def test_a_basis_of_nothing_is_refused():
     refused("needs images", fit_separable, [], 0.1)

@@ -4,8 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-import torch
-from refusals import refused
 
 from gsparc.base.files import write_samples
 from gsparc.evaluation.scores import score_methods
@@ -15,7 +13,6 @@ from gsparc.models.baselines.mean import Mean
 from gsparc.prediction.timing import ClockSettings
 from gsparc.runs.baselines import baselines_for, fit_baseline
 from gsparc.runs.evaluate import evaluate
-from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
 QUICK = ClockSettings(rounds=3, least=2, warmup=1)
@@ -91,17 +88,6 @@ def test_samples_had_the_nmse_of_baselines_and_none_of_the_method(campaign, fold
     np.testing.assert_array_equal(found.columns["nmse"], found.columns["baseline/idw/nmse"])
 
 
-def test_the_evaluated_baseline_equals_its_own_row(campaign, folds, tmp_path):
-    data, split = campaign("spectrum", 40), folds(40)
-    facts = evaluated(InverseDistance, data, split).facts
-    for figure in ("ssim", "ssim_gauss", "psnr_db", "skill"):
-        assert facts[f"test/{figure}"] == facts[f"baseline/idw/{figure}"]
-    assert facts["baseline/nearest/skill"] == 0
-    assert facts["test/skill"] == pytest.approx(
-        1 - facts["test/mse"] / facts["baseline/nearest/mse"]
-    )
-
-
 def test_a_method_that_is_a_baseline_too_was_fitted_twice(campaign, folds, monkeypatch):
     """`model=gp` was fitted again as its own baseline, for a second row of equal figures."""
     data, split = campaign("rssi", 40), folds(40)
@@ -149,18 +135,6 @@ def test_folds_are_pooled(campaign, folds, monkeypatch):
     assert facts["time/train_total_s"] == pytest.approx(5 * facts["time/train_s"])
 
 
-def test_the_prefix_names_the_subset(campaign, folds, tmp_path):
-    data, split = campaign("spectrum", 40), folds(40)
-    methods, _ = fit_all(Mean, data, split)
-    facts = evaluate(
-        methods, None, data, split, eval_on="train", baselines=("nearest",), clock=QUICK
-    ).facts
-    assert facts["train/samples"] == len(split.folds[0].train) and "test/ssim" not in facts
-    # The nearest training row is the row itself: its error is no bar.
-    assert facts["train/skill"] is None and facts["time/train_s"] is None
-    refused("eval_on='tset'", evaluate, methods, None, data, split, eval_on="tset", clock=QUICK)
-
-
 @pytest.mark.parametrize("name", ["nearest", "gp"])
 def test_baselines_have_not_seen_the_rows_they_are_scored_on(campaign, folds, name):
     data, split = campaign("csi", 40), folds(40)
@@ -168,24 +142,6 @@ def test_baselines_have_not_seen_the_rows_they_are_scored_on(campaign, folds, na
         assert fit_baseline(name, data, split, subset).scores.figures()["nmse"] > 0.001
     assert fit_baseline(name, data, split, "test").methods[0].count_components() == 30
     assert fit_baseline(name, data, split, "val").methods[0].count_components() == 27
-
-
-def test_wrong_counts_are_refused(campaign, folds, tmp_path):
-    data, split = campaign("spectrum", 40), folds(40, 2)
-    methods, seconds = fit_all(Mean, data, split)
-    refused(
-        "1 methods for the 2 folds", evaluate, methods[0], seconds[:1], data, split, clock=QUICK
-    )
-    refused(
-        "1 training times for 2 methods", evaluate, methods, seconds[0], data, split, clock=QUICK
-    )
-
-
-def test_a_poisoned_prediction_is_not_scored(campaign, folds, tmp_path):
-    data, split = campaign("spectrum", 40), folds(40)
-    (method,), _ = fit_all(Mean, data, split)
-    method.value[:, 3] = torch.nan
-    refused("NaN or Inf", evaluate, method, None, data, split, clock=QUICK)
 
 
 def test_a_method_of_seconds_a_query_is_not_timed_in_batches(campaign, folds, monkeypatch):
@@ -211,19 +167,3 @@ def test_a_row_that_decides_sums_is_named_beside_a_median(campaign, folds, tmp_p
         f"row {row} alone makes 100.0% of the error or power"
     )
     write_summary(tmp_path / "summary.json", facts)
-
-
-def test_rows_of_links_whose_both_ends_moved_name_both_places(folds, tmp_path):
-    """Training ended with an error after it: six coordinates of a link were taken for three."""
-    ends = np.random.default_rng(0).uniform(0, 10, (2, 40, 3))
-    power = -40 - 20 * np.log10(np.linalg.norm(ends[0] - ends[1], axis=1))
-    data = from_arrays(
-        {"tx_position": ends[0], "rx_position": ends[1], "rssi_db": power, "carrier_hz": 1e9}
-    )
-    found = evaluated(InverseDistance, data, folds(40), baselines=()).columns
-    for end, names in zip(
-        ends, (("tx_x_m", "tx_y_m", "tx_z_m"), ("x_m", "y_m", "z_m")), strict=True
-    ):
-        np.testing.assert_allclose(
-            np.column_stack([found[n] for n in names]), end[found["row"]], atol=1e-6
-        )

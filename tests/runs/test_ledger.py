@@ -15,7 +15,6 @@ from omegaconf import OmegaConf
 
 from gsparc.data.split_files import write_split
 from gsparc.data.splits import Fold, Split
-from gsparc.evaluation.results import read_summary
 from gsparc.evaluation.summary import write_summary
 from gsparc.runs import ledger
 from gsparc.runs.inputs import read_inputs
@@ -101,15 +100,6 @@ def test_an_interrupted_job_goes_on_and_then_counts_as_done(tmp_path, name, resu
     assert (
         seen == [str(tmp_path / resumed), *([None] * again)] and not (tmp_path / FAILURE).exists()
     )
-
-
-def test_a_checkpoint_of_another_state_is_not_gone_on_from(tmp_path):
-    for data in "ed":
-        with pytest.raises(KeyboardInterrupt):
-            run_once(tmp_path, state(data=data), cut_short(tmp_path))
-    seen = []
-    run_once(tmp_path, state(data="e"), ends(tmp_path, 1, seen))
-    assert seen == [None]
 
 
 def test_a_job_killed_after_its_record_took_the_summary_of_another_state(tmp_path):
@@ -209,25 +199,6 @@ def plugin(tmp_path, monkeypatch):
         sys.modules.pop(name, None)
 
 
-@pytest.mark.parametrize(
-    ("file", "counts"),
-    [
-        ("lone_helper.py", True),
-        ("README.md", False),
-        ("lone_other.py", False),  # a new program beside it that nobody imports
-    ],
-)
-def test_a_plugin_s_helper_was_edited_and_it_counted_as_done(tmp_path, plugin, file, counts):
-    """Two jobs were done already, 2.93 dB where over 20 is right."""
-    run_once(tmp_path, state(), ends(tmp_path, 1))
-    (plugin / file).write_text("VALUE = 2\n")
-    changed = [str(plugin / file)] if counts else []
-    assert state().changes(read_summary(tmp_path / "job.json")) == changed
-    assert (read_finished(tmp_path, state()) is None) == counts
-    assert read_finished(tmp_path, state(), reuse=True) == {"value": 1}
-    assert run_once(tmp_path, state(), ends(tmp_path, 2)) == {"value": 2 if counts else 1}
-
-
 def test_a_new_program_in_the_clone_threw_finished_sweeps_away(tmp_path, plugin):
     run_once(tmp_path, state(), ends(tmp_path, 1))
     (plugin / "lone_other.py").write_text("VALUE = 2\n")  # that nobody imports
@@ -246,27 +217,6 @@ def test_cells_were_current_whose_method_s_own_files_had_changed(monkeypatch):
     assert len({*found}) == 4 and not {"numpy", "gsparc.runs.ledger"} & {*program()}
     monkeypatch.setattr(ledger, "provenance", lambda: {"git": None})
     assert program()["gsparc"] == version("gsparc")
-
-
-def test_a_method_that_was_imported_by_an_interrupted_job_counts(tmp_path, plugin):
-    with pytest.raises(KeyboardInterrupt):
-        run_once(tmp_path, state(), cut_short(tmp_path))
-    (plugin / "lone_helper.py").write_text("VALUE = 2\n")
-    seen = []
-    run_once(tmp_path, state(), ends(tmp_path, 1, seen))
-    assert seen == [None]
-
-
-def test_a_file_that_a_setting_names_counts_by_its_content(tmp_path):
-    walls, states = tmp_path / "walls.yaml", []
-    for text in ("[]", "[1]"):
-        walls.write_text(text)
-        states.append(
-            FitInputs.from_config(
-                OmegaConf.create({"init": {"file": str(walls)}, "workers": len(text)})
-            )
-        )
-    assert states[0].files != states[1].files and states[0].settings == states[1].settings
 
 
 @pytest.mark.parametrize("how", ["folder", "list", "link", "inner link", "nested"])
@@ -304,16 +254,6 @@ def test_files_that_a_setting_names_in_a_list_a_folder_or_behind_a_link_count_by
     assert of().files != before.files and of().settings == before.settings
 
 
-def test_a_release_behind_a_link_counts_by_its_content(tmp_path):
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "release").mkdir()
-    (tmp_path / "release" / "spectrum").symlink_to(tmp_path / "elsewhere")
-    config = compose("dataset=rfid", f"dataset.root='{tmp_path}/release'", "model=mean")
-    before = FitInputs.from_config(config)
-    (tmp_path / "elsewhere" / "1.png").write_text("1")
-    assert before.unread != FitInputs.from_config(config).unread
-
-
 def test_a_job_that_begins_anew_says_why(tmp_path, caplog):
     caplog.set_level("INFO", "gsparc")
     run_once(tmp_path, state(), ends(tmp_path, 1))
@@ -322,16 +262,6 @@ def test_a_job_that_begins_anew_says_why(tmp_path, caplog):
     assert caplog.messages == [
         f"{tmp_path}: runs again, as these changed since it ran: settings.effort"
     ]
-
-
-def test_a_run_that_went_on_said_that_it_began_anew(tmp_path, caplog):
-    """`ckpt_path=` is no setting of the fit, and wins over whatever else changed."""
-    caplog.set_level("INFO")
-    one, other = (OmegaConf.create({"seed": 0, "ckpt_path": path}) for path in (None, "RUN"))
-    assert FitInputs.from_config(one) == FitInputs.from_config(other)
-    run_once(tmp_path, state(settings={"effort": 1}), ends(tmp_path))
-    run_once(tmp_path, state(settings={"effort": 3}), ends(tmp_path), again=True, resumes=True)
-    assert not any("runs again" in message for message in caplog.messages)
 
 
 def test_a_folder_that_a_callback_writes_to_made_a_killed_job_begin_anew(tmp_path):

@@ -125,12 +125,6 @@ def test_stations_of_equal_names_were_unknown_where_one_had_no_places(lost):
     np.testing.assert_allclose(same.tx, places, equal_nan=True)
 
 
-def test_stations_at_one_place_are_known_by_their_names():
-    mast = {"station_position": POSTS[[0, 0, 0]]}
-    same = align_to_site(town((1, 2, 0), **mast), town(**mast).site)
-    np.testing.assert_array_equal(same.station[:3], [1, 2, 0])
-
-
 def test_degrees_about_another_origin_were_taken_for_the_same_metres():
     """Another part of a drive has another origin: its places were hundreds of metres off."""
     latitude, longitude = 48 + RNG.uniform(0, 0.02, 80), 179.99 + RNG.uniform(0, 0.02, 80)

@@ -17,7 +17,7 @@ from gsparc.commands.train import train
 from gsparc.evaluation.results import read_run
 from gsparc.models import checkpoint
 from gsparc.runs import run_lock
-from gsparc.runs.ledger import LEFT, set_earlier_aside
+from gsparc.runs.ledger import LEFT
 from gsparc.runs.open_runs import open_run
 from gsparc.runs.run_lock import LOCK, RunLock, hold_folder, locked, release_folders
 
@@ -134,13 +134,6 @@ def test_a_failed_run_left_its_split_beside_the_summary_of_the_one_before(tmp_pa
     refused("of different runs; give the folds of one", open_run, models, {})
 
 
-def test_a_command_that_is_refused_leaves_no_summary_of_the_one_before(tmp_path):
-    (tmp_path / "summary.json").write_text("{}")
-    given = ["ckpt=none.ckpt", f"hydra.run.dir={tmp_path}"]
-    assert_refused(knock(COMMANDS["evaluate"].run, "evaluate", given), "no such checkpoint")
-    assert not (tmp_path / "summary.json").exists() and (tmp_path / "summary.json.earlier").exists()
-
-
 @pytest.mark.parametrize(("goes_on", "kept"), [(None, False), ("run", True)])
 def test_a_new_run_went_on_in_the_log_of_the_one_before(goes_on, kept, tmp_path, monkeypatch):
     (tmp_path / "train.log").write_text("of the first run")
@@ -162,15 +155,6 @@ def test_what_a_run_goes_on_from_is_not_set_aside(tmp_path):
         "summary.json.earlier",
         "split.json",
     }
-
-
-def test_a_split_alone_was_called_results(tmp_path, caplog):
-    caplog.set_level("INFO")
-    (tmp_path / "split.json").write_text("{}")
-    set_earlier_aside(tmp_path)
-    assert caplog.messages == [
-        f"{tmp_path}: files of an earlier run there were renamed to NAME.earlier"
-    ]
 
 
 def test_half_written_files_of_killed_runs_stayed_for_ever(tmp_path):

@@ -1,7 +1,5 @@
 """`effects=auto`: requirements, what each effect contributes, and which are kept."""
 
-import dataclasses
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +8,7 @@ from refusals import refused
 
 from gsparc.simulate import auto
 from gsparc.simulate.attribution import Deliverable, SurveyProbe
-from gsparc.simulate.auto import AutoSettings, Choice
-from gsparc.simulate.deciding import Decision
+from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, Effects
 from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.spectrum import SpectrumSettings
@@ -118,12 +115,6 @@ def test_coverage_drops_what_is_below_a_decibel():
     assert choice.verdict is not None and choice.verdict.kept and choice.verdict.met == 1.0
 
 
-def test_stricter_deliverable_keeps_more():
-    loose, strict = decided("csi -10 dB").effects, decided("csi -60 dB").effects
-    assert set(loose.enabled) < set(strict.enabled)
-    assert strict == replace(FULL, edge_diffraction=False)  # there is none in the record
-
-
 def test_effects_dropped_together_are_judged_together():
     """Each of two effects alone is within tolerance, both together are not."""
     record = [(0, 0, 1.0), (REFRACTION, 1, 0.15), (DIFFRACTION, 1, 0.15)]
@@ -155,35 +146,6 @@ def test_few_failures_prove_the_quantile(probes, quantile, confidence, most):
         assert (outside.sum(1) <= most).mean() < 1 - confidence + 0.01
 
 
-def test_fewer_rays_are_taken_where_probes_stay_within_tolerance():
-    """By powers of another trace: of 3 of 128 outside."""
-    choice = replace(decided("coverage +-1 dB"), effects=FULL)
-
-    def tried(outside):
-        probe = probe_of(heard(128))
-        gain = probe.paths.gain * 1.05
-        gain[: outside * len(RECORD)] *= 2
-        thinned = replace(probe.paths, gain=gain)
-        return auto.choose_rays(choice, AutoSettings(full=FULL), probe, thinned, 300)
-
-    taken = tried(3)
-    row = taken.table[-1]
-    assert taken.samples == 300 and not row.kept and row.effect == "rays > 300"
-    assert row.error == pytest.approx(20 * np.log10(1.05), rel=1e-4)
-    for without in (tried(4), auto.keep_all_rays(taken)):
-        assert without.samples is None and without.table[-1].kept
-    assert Choice.from_dict(dataclasses.asdict(taken)) == taken
-
-
-def test_violated_requirement_is_reported():
-    other = probe_of(heard(30, [(0, 0, 1.0), (DIFFRACTION, 1, 3.0)]))
-    choice, settings = decided("coverage +-1 dB"), AutoSettings()
-    verdict = auto.verify_choice(
-        choice, settings, other.errors(choice.effects, settings.required)
-    ).verdict
-    assert verdict is not None and not verdict.kept and verdict.met == 0.0
-
-
 def test_spectra_are_judged_against_the_nearest_receiver():
     choice = decided("spectrum skill 0.9")
     assert choice.effects.line_of_sight and choice.effects.specular
@@ -209,8 +171,3 @@ def test_channel_error_of_a_dropped_path_is_its_share_of_energy():
         0.01 / 1.01, rel=1e-4
     )
     assert probe.nmse(FULL)[0] == 0.0
-
-
-def test_decision_survives_its_file():
-    decision = Decision(decided("coverage +-1 dB"), FULL, 300)
-    assert Decision.from_dict(json.loads(json.dumps(dataclasses.asdict(decision)))) == decision

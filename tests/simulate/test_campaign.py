@@ -1,12 +1,8 @@
 """Whole campaigns on our own engine: no ray tracer needed."""
 
-import gc
 import json
-import shutil
 import time
-import tracemalloc
 from dataclasses import replace
-from pathlib import Path
 
 import h5py
 import numpy as np
@@ -19,18 +15,14 @@ from gsparc.commands.check import main as check
 from gsparc.data import blocks
 from gsparc.data.schema import LIGHT
 from gsparc.datasets.load import load
-from gsparc.datasets.sionna import _in_decibels
 from gsparc.pictures.simulated import draw_floor_plan
-from gsparc.simulate import assembly, deciding
 from gsparc.simulate import campaign as campaigns
-from gsparc.simulate.assembly import SECONDS, assemble_dataset, join_shards, shard_arrays
+from gsparc.simulate import deciding
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.report import choice_table, describe_choice, summary_facts
-from gsparc.simulate.scenes.build import build_survey
 from gsparc.simulate.scenes.settings import SceneSettings
-from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.shoebox import Room, ShoeboxEngine, trace_room
 from gsparc.simulate.spectrum import ArraySettings
 from gsparc.tables.own import load_own
@@ -145,22 +137,6 @@ def test_file_is_read_as_powers(tmp_path):
     np.testing.assert_allclose(powers[~heard], power[heard].min(), rtol=1e-4)
 
 
-def test_outlier_does_not_set_the_sensitivity():
-    """In a town one path was 66 dB below the next:
-    43 places without any counted as weaker still.
-    """
-    rng = np.random.default_rng(0)
-    power = 10 ** (rng.uniform(-140, -80, 400) / 10)
-    weakest = np.sort(power)[1]
-    power[power.argmin()] = 10**-21.0
-    power[power.argsort()[-2:]] = 0
-    found = _in_decibels(power)
-    np.testing.assert_allclose(found["sensitivity_db"], 10 * np.log10(weakest))
-    assert np.isnan(found["rssi_db"]).sum() == 3
-    # Nothing missing: every power is one
-    assert "sensitivity_db" not in _in_decibels(power[power > 0])
-
-
 def test_noise_has_the_stated_power_and_is_the_same_put_together_on_disk(tmp_path, monkeypatch):
     simulate(plan(), tmp_path / "clean.h5")
     disturbed = plan(effects=replace(MIRROR, noise_snr_db=20.0))
@@ -234,15 +210,6 @@ def test_transmitters_are_stations_and_every_pair_is_there_once(tmp_path):
     draw_floor_plan(outcome, tmp_path / "plan.png")
 
 
-def test_walk_has_times(tmp_path):
-    rows = [f"{0.5 + 0.2 * i:.1f},0.5,1.2,{0.2 * i:.1f}" for i in range(26)]
-    (tmp_path / "walk.csv").write_text("\n".join(["x,y,z,time_s", *rows]))
-    walk = {"kind": "file", "file": str(tmp_path / "walk.csv")}
-    simulate(plan(scene=replace(SCENE, receivers=walk), shard=26), tmp_path / "walk.h5")
-    stored, _ = arrays(tmp_path / "walk.h5")
-    np.testing.assert_allclose(stored["time_s"], np.arange(26) * 0.2)
-
-
 def test_parts_of_another_simulation_are_refused(tmp_path):
     """Of other settings, or of another table of places: shards are kept by the number of a row."""
     table, out = tmp_path / "places.csv", tmp_path / "box.h5"
@@ -252,20 +219,6 @@ def test_parts_of_another_simulation_are_refused(tmp_path):
     for another in (plan(shard=20), listed):
         table.write_text("x,y,z\n1,1,1.2\n2,1,1.2\n3,4,1.2\n")
         refused("different simulation", simulate, another, out)
-
-
-def test_interrupted_removal_leaves_no_shards_without_their_plan(tmp_path):
-    """Shards whose plan was removed first would pass for those of any other simulation."""
-
-    def dies(folder):
-        next(Path(folder).glob("*plan.json")).unlink()
-        raise KeyboardInterrupt
-
-    interrupted(shutil, "rmtree", plan(), tmp_path / "box.h5", dies)
-    (tmp_path / "box.h5").unlink()
-    simulate(plan(csi=ArraySettings(rows=2, columns=2)), tmp_path / "box.h5")
-    assert arrays(tmp_path / "box.h5")[0]["csi"].shape[1:] == (4, 4)
-    assert {path.name for path in tmp_path.iterdir()} == {"box.h5"}
 
 
 def test_existing_file_is_not_overwritten(tmp_path):
@@ -290,22 +243,6 @@ def test_auto_decides_verifies_and_is_drawn(tmp_path):
     assert choice_table(choice).row_count == len(choice.table)
     draw_floor_plan(outcome, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 10_000
-
-
-def test_probes_are_rows_of_the_file(tmp_path, monkeypatch):
-    """No row is traced twice."""
-    real, traced = ShoeboxEngine.trace, []
-
-    def counts(self, receivers, effects, seed=None):
-        traced.append((len(receivers), effects.depth))
-        return real(self, receivers, effects, seed)
-
-    monkeypatch.setattr(ShoeboxEngine, "trace", counts)
-    first = simulate(plan(effects=FEW_PROBES), tmp_path / "first.h5")
-    assert sum(count for count, _ in traced) == 60 and first.effects.depth < 4
-    simulate(plan(effects=first.effects), tmp_path / "same.h5")
-    # What probes kept of their full trace is what a run with the choice finds.
-    assert_same(tmp_path / "first.h5", tmp_path / "same.h5")
 
 
 class Rays(ShoeboxEngine):
@@ -358,14 +295,6 @@ def test_fewer_rays_are_simulated_where_verified(tmp_path, monkeypatch):
     )
 
 
-def test_fewer_rays_are_refused_where_they_miss(tmp_path, monkeypatch):
-    asked, many = with_rays(monkeypatch, 1.2), replace(SCENE, num_receivers=200)
-    outcome = simulate(plan(scene=many, effects=asked), tmp_path / "box.h5")
-    choice, row = outcome.decision.choice, outcome.decision.choice.table[-1]
-    assert choice.samples is None and row.effect == "rays > 90000" and row.kept and row.failures > 0
-    assert json.loads(arrays(tmp_path / "box.h5")[1]["sampling"])["samples"] == 300_000
-
-
 def test_refuted_choice_is_not_simulated(tmp_path, monkeypatch):
     """A run said NOT MET and simulated the choice all the same."""
     real, full = deciding.auto.verify_choice, replace(MIRROR, depth=4)
@@ -381,74 +310,6 @@ def test_refuted_choice_is_not_simulated(tmp_path, monkeypatch):
     assert "NOT MET by less (line of sight, specular, depth" in describe_choice(
         outcome.decision.choice
     )
-
-
-def test_everything_is_simulated_where_few_rows_are_left(tmp_path, monkeypatch):
-    """By a count of rows: measured seconds let the load of a machine decide what a file holds."""
-    monkeypatch.setattr("gsparc.simulate.scenes.build.ShoeboxEngine", Rays)
-    monkeypatch.setattr(deciding, "COMPILING", 10)
-    few = simulate(plan(effects=FEW_PROBES), tmp_path / "few.h5")
-    assert few.effects.depth == 4 and few.decision.choice.effects.depth < 4
-    many = simulate(
-        plan(effects=FEW_PROBES, scene=replace(SCENE, num_receivers=120)), tmp_path / "many.h5"
-    )
-    assert many.effects == many.decision.choice.effects
-
-
-def test_kill_between_first_shard_and_decision_mixes_no_effects(tmp_path):
-    """The shard of a decision nobody had noted stayed,
-    beside rows of the decision taken instead of it.
-    """
-    probed = plan(effects=FEW_PROBES)
-    interrupted(Shards, "write_note", probed, tmp_path / "cut.h5")
-    stale = tmp_path / "cut.h5.parts" / "shard_0000.npz"
-    stale.write_bytes(stale.read_bytes()[:100])
-    outcome = simulate(probed, tmp_path / "cut.h5")
-    assert outcome.effects.depth < 4
-    simulate(plan(effects=outcome.effects), tmp_path / "whole.h5")
-    assert_same(tmp_path / "whole.h5", tmp_path / "cut.h5")
-
-
-def put_together(out: Path, receivers: int) -> int:
-    """Write a file from shards whose rows are those of 20 traced places, again and again;
-    peak memory [B].
-    """
-    asked = plan(
-        scene=replace(SCENE, num_receivers=receivers),
-        effects=replace(MIRROR, noise_snr_db=20.0),
-        spectrum=replace(SMALL, height=45, width=90),
-        csi=ArraySettings(rows=4, columns=4),
-    )
-    survey, shards = (
-        build_survey(asked.scene, asked.sampling),
-        Shards(out, {"receivers": receivers}),
-    )
-    wavelength = survey.engine.wavelength
-    made = shard_arrays(survey.trace(np.arange(20), MIRROR), asked, wavelength)
-    turned = np.random.default_rng(0).permutation(receivers).reshape(-1, 20)
-    for number, rows in enumerate(turned, 1):
-        shards.write(number, {**made, ROWS: rows, SECONDS: np.array(0.0)})
-    usual = gc.get_threshold()
-    gc.set_threshold(700, 10, 10)  # Python's own: what is looked for seldom stays longer
-    tracemalloc.start()
-    try:
-        assemble_dataset(asked, survey, None, None, 0.0, shards, join_shards(shards, receivers))
-        return tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
-        gc.set_threshold(*usual)
-
-
-@pytest.mark.slow
-def test_memory_does_not_grow_with_spectra_and_channels(tmp_path, monkeypatch):
-    """They were all held at once: at 100,000 receivers tens of gigabytes."""
-    monkeypatch.setattr(blocks, "BIG", 2**16)
-    monkeypatch.setattr(blocks, "BLOCK", 2**16)
-    monkeypatch.setattr(assembly, "WEAKEST", 0.25)
-    few, many = (put_together(tmp_path / f"{n}.h5", n) for n in (100, 1000))
-    stored, _ = arrays(tmp_path / "1000.h5")
-    row = stored["spectrum"][0].nbytes + stored["csi"][0].nbytes
-    assert row > 4000 and many - few < 0.25 * 900 * row and len(stored["path_offsets"]) == 1001
 
 
 @pytest.mark.parametrize(

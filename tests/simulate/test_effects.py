@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from gsparc.simulate.effects import DIFFUSE, EDGE, REFRACTION, SPECULAR, Effects, from_config
-from gsparc.simulate.paths import TracedPaths, join_receivers
+from gsparc.simulate.paths import TracedPaths
 
 EVERYTHING = Effects(depth=3)
 
@@ -63,14 +63,6 @@ def test_path_needs_all_its_mechanisms_and_depth():
 def test_contradictions_are_refused(config, words):
     with pytest.raises(ValueError, match=words):
         from_config(config)
-
-
-def test_receivers_that_lose_everything_stay():
-    found = paths_of([0, SPECULAR, SPECULAR], [0, 1, 1], owner=[0, 0, 1])
-    less = found.keep_effects(Effects(depth=3).switch_off("specular"))
-    assert less.offsets.tolist() == [0, 1, 1] and less.received_power().tolist() == [1.0, 0.0]
-    both = join_receivers([found, less])
-    assert len(both) == 4 and both.received_power().tolist() == [2.0, 1.0, 1.0, 0.0]
 
 
 def test_delay_spread_of_two_equal_paths():

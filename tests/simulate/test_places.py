@@ -71,26 +71,6 @@ def test_a_third_coordinate_beside_degrees_was_ignored():
     np.testing.assert_allclose(found.position, [0, 111.03, 12.0], atol=0.02)
 
 
-@pytest.mark.parametrize(
-    "entry, words",
-    [
-        ({"postion_m": [0, 0, 1]}, "no such setting"),
-        ({}, "give position_m"),
-        ({"position_m": [0, 0, 1], "position_deg": [1, 2]}, "give position_m"),
-        ({"position_m": [0, 0]}, "height_m"),
-        ({"position_m": [0, float("nan"), 1]}, "finite"),
-        ({"position_m": [0, 0, 1], "pattern": "horn"}, "horn': one of iso"),
-        ({"position_m": [0, 0, 1], "sectors": 0}, "at most 12"),
-        ({"position_deg": [95.0, 0.0], "height_m": 2}, "outside -90 to 90"),
-        ({"name": "a", "position_m": [0, 0, 1]}, "'a' twice"),
-    ],
-)
-def test_bad_transmitters_are_refused(entry, words):
-    refused(
-        words, place_transmitters, [entry, entry], lambda across: np.zeros(len(across)), SOMEWHERE
-    )
-
-
 def test_grid_leaves_out_occupied_places():
     found = laid(kind="grid", spacing_m=2.0)
     assert len(found.places) == 11 * 6 - 4 and found.time_s is None

@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from refusals import refused
 from shoeboxes import scatter
 
 from gsparc.data.schema import LIGHT
@@ -114,18 +113,3 @@ def test_noise_level_and_seed():
     ratio = np.mean(np.abs(clean.csi) ** 2) / np.mean(np.abs(noisy.csi - clean.csi) ** 2)
     assert 10 * np.log10(ratio) == pytest.approx(20, abs=0.7)
     np.testing.assert_array_equal(noisy.csi, trace_room(ROOM, tx, rx, 2.4e9, snr_db=20, seed=1).csi)
-
-
-def test_positions_outside_are_refused():
-    with pytest.raises(ValueError, match="rx, row 1"):
-        trace_room(ROOM, np.array([0.0, 1, 1]), np.array([[0.0, 1, 1.5], [9.0, 1, 1]]), 2.4e9)
-    room = Room(ROOM.lower, ROOM.upper, ROOM.reflection, PILLAR)
-    refused(
-        "inside an occluder",
-        trace_room,
-        room,
-        np.array([1.2, 1.8, 1]),
-        np.array([0.0, 1, 1.5]),
-        2.4e9,
-    )
-    refused("upper", Room, ROOM.upper, ROOM.lower, ROOM.reflection)

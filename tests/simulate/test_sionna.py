@@ -2,19 +2,14 @@
 where Sionna is not installed (`make sionna`).
 """
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
-import torch
-from refusals import refused
 
 from gsparc.datasets.load import load
 from gsparc.simulate import llvm, raytracer
-from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import BITS, Effects
 from gsparc.simulate.raytracer import RayTracer, Sampling
@@ -69,33 +64,6 @@ def places():
         stands_clear_of(conference_room()),
         seed=0,
     )
-
-
-def test_one_thread_is_deterministic():
-    """Of several threads the faster one's candidate stays:
-    a hundredth of receivers differed by rounding.
-    """
-    where = draw_places(
-        800,
-        np.array(CONFERENCE.area_m),
-        CONFERENCE.height_m,
-        stands_clear_of(conference_room()),
-        seed=0,
-    )
-    before = torch.get_num_threads()
-    try:
-        torch.set_num_threads(1)
-        few = Sampling(samples=1_000, batch=400)
-        one, two = (
-            RayTracer(conference_room(), TRANSMITTER, 2.44e9, few).trace(
-                where, replace(PLAIN, depth=3)
-            )
-            for _ in range(2)
-        )
-    finally:
-        torch.set_num_threads(before)
-    for name in ("delay", "direction", "gain"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
 def test_line_of_sight_is_friis(room, places):
@@ -198,24 +166,6 @@ def test_calls_have_one_of_few_sizes():
         assert all(count <= size and size in (1, 3, 8, 23, 67, 200) for count, size in parts)
 
 
-def test_other_places_compile_nothing(places):
-    """Each receiver's coordinates were constants of a kernel of its own, a fifth of the time of
-    tracing, and so were the number of receivers of a call and that of rays."""
-    import drjit as dr
-
-    room = RayTracer(conference_room(), TRANSMITTER, 2.44e9, QUICK)
-    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
-        room.trace(places[:20], PLAIN)
-        dr.kernel_history()
-        room.trace(places[20:50], PLAIN)
-        compiled = [kernel for kernel in dr.kernel_history() if not kernel.get("cache_hit", True)]
-        room.with_samples(1777).trace(places[:50], PLAIN)
-        anew = [kernel for kernel in dr.kernel_history() if not kernel.get("cache_hit", True)]
-    assert len(compiled) < 10  # of what follows the number of paths
-    # Of rays
-    assert all(kernel["operation_count"] < 1000 for kernel in anew if kernel["size"] == 1777)
-
-
 def test_polarisation_edges_and_scattering_are_recorded(room, places):
     paths = room.trace(places[:10], Effects(depth=2))
     assert paths.gain.shape[1] == 2 and np.abs(paths.gain[:, 1]).max() > 0
@@ -273,43 +223,3 @@ def test_town_with_sectors_in_degrees(tmp_path):
     assert read.site.georeference == outcome.survey.georeference
     latitude, longitude = read.site.georeference.to_degrees(places[:, :2])
     assert np.ptp(latitude) < 0.003 and abs(np.median(longitude) + 30) < 0.001
-
-
-def test_scene_file_of_the_user(tmp_path):
-    import sionna.rt as rt
-
-    own = replace(
-        CONFERENCE,
-        builder=None,
-        xml=str(rt.scene.floor_wall),
-        area_m=((-3, -3), (3, 3)),
-        transmitter_m=(-2.0, 0.0, 3.0),
-        num_receivers=20,
-    )
-    survey = build_survey(own, QUICK)
-    engine, receivers = survey.engine, survey.places
-    assert engine.trace(receivers, PLAIN).received_power().min() > 0
-    refused("no such file", build_survey, replace(own, xml=str(tmp_path / "none.xml")), QUICK)
-    (tmp_path / "bad.xml").write_text("<scene version='2.1.0'><oops/></scene>")
-    refused("cannot read it", build_survey, replace(own, xml=str(tmp_path / "bad.xml")), QUICK)
-
-
-def test_auto_in_the_conference_room(tmp_path):
-    asked = AutoSettings(probes=16, held_back=16, full=Effects(depth=2))
-    plan = CampaignSettings(CONFERENCE, asked, sampling=QUICK, check=8, shard=20)
-    outcome = simulate(plan, tmp_path / "room.h5")
-    assert outcome.decision is not None and outcome.decision.choice.verdict is not None
-    assert outcome.effects.line_of_sight and outcome.effects.specular
-    assert outcome.convergence is not None and 0 < outcome.convergence.nmse < 0.5
-    with h5py.File(tmp_path / "room.h5") as file:
-        table = json.loads(file.attrs["auto"])["table"]
-        assert {row["effect"] for row in table} >= {
-            "diffuse",
-            "refraction",
-            "depth > 1",
-            "polarisation",
-        }
-        assert all(row["failures"] >= 0 for row in table)
-        assert "itu-glass" in json.loads(file.attrs["materials"])
-    spectra = load({"name": "sionna", "file": str(tmp_path / "room.h5")})
-    assert spectra.site.convergence_error == pytest.approx(outcome.convergence.spectrum_nmse)

@@ -82,11 +82,3 @@ def test_both_polarisations_add_their_powers():
     )
     np.testing.assert_allclose(one, two, atol=1e-6)
     assert high[0] == pytest.approx(2**0.5 * low[0], rel=1e-5)
-
-
-@pytest.mark.parametrize(
-    "settings, words", [({"rows": 0}, "at least 1"), ({"spacing": 0}, "above 0")]
-)
-def test_bad_settings_are_refused(settings, words):
-    with pytest.raises(ValueError, match=words):
-        SpectrumSettings(**settings)

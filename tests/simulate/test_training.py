@@ -2,17 +2,13 @@
 a stored model.
 """
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from campaigns import compose
 from crashes import small_campaign
 
-import gsparc
 from gsparc.base.errors import DataError
-from gsparc.commands.train import train
 from gsparc.datasets.load import load
 from gsparc.datasets.sionna import with_true_targets
 from gsparc.simulate.campaign import simulate
@@ -54,38 +50,3 @@ def test_fewer_effects_are_tested_on_the_full_simulation(kind, box, tmp_path):
         with_true_targets(alone, elsewhere, "dataset.truth=x")
     with pytest.raises(DataError, match="same test rows"):
         with_true_targets(alone, replace(whole, release_split=None), "dataset.truth=x")
-
-
-def test_outages_are_the_truth_s(box):
-    whole = load({"name": "sionna", "file": str(box), "target": "rssi"})
-    test = whole.release_split[1]
-    deaf = np.zeros(len(whole), bool)
-    deaf[[test[0], whole.release_split[0][0]]] = True
-    fewer = replace(whole, censored=deaf, mask=~deaf[:, None])
-    mixed = with_true_targets(fewer, whole, "dataset.truth=x")
-    assert not mixed.censored[test].any() and mixed.mask[test].all() and mixed.censored.sum() == 1
-    back = with_true_targets(whole, fewer, "dataset.truth=x")
-    assert back.censored.sum() == 1 and back.censored[test[0]] and not back.mask[test[0]].any()
-
-
-@pytest.mark.parametrize("kind", ROAD)
-def test_simulated_dataset_is_trained_like_any_other(kind, box, tmp_path):
-    settings = [
-        *ROAD[kind],
-        f"dataset.file={box}",
-        f"dataset.target={kind}",
-        "threads=1",
-        "logger=none",
-    ]
-    facts, objects = train(compose(*settings), tmp_path / "run")
-    stored = json.loads((tmp_path / "run" / "summary.json").read_text())
-    for name in ("zero", "mean", "nearest", "idw", "gp"):
-        assert np.isfinite(stored[f"baseline/{name}/skill"])
-    assert stored["dataset/name"] == "box" and stored["time/train_s"] > 0
-    assert facts["test/skill"] > stored["baseline/mean/skill"]
-    data = load({"name": "sionna", "file": str(box), "target": kind})
-    predictor = gsparc.load(objects.checkpoints[0])
-    ask = predictor.spectrum if kind == "spectrum" else predictor.csi
-    rows = data.release_split[1][:3]
-    said = ask(rx=data.rx_position[rows] + data.site.origin)
-    assert np.shape(said)[0] == 3 and np.isfinite(np.asarray(said)).all()

@@ -73,17 +73,6 @@ def test_a_carrier_and_a_spacing_say_what_a_list_of_tones_does():
     np.testing.assert_allclose(interpret(raw, "file").data.site.subcarriers_hz, TONES)
 
 
-def test_one_amplitude_is_one_power():
-    arrays = {
-        "rx_position": PLACES,
-        "tx_position": END,
-        "csi": AMPLITUDE[:, 0, 0],
-        "frequency_hz": TONES[0],
-    }
-    data = from_arrays(arrays)
-    assert data.site.stations is None and data.site.carrier_hz == TONES[0]
-
-
 @pytest.mark.parametrize(
     "changes",
     [

@@ -1,20 +1,16 @@
 """Everything a disk can hand us: refused in one clear line that names file, row and expectation."""
 
 import io
-import json
 import time
 import warnings
 import zipfile
 from pathlib import Path
 
-import h5py
 import numpy as np
 import pytest
 from releases import SPOILT
 
 from gsparc.base.errors import DataError
-from gsparc.datasets.load import load
-from gsparc.datasets.newrf import read_newrf
 from gsparc.datasets.own import read_any
 from gsparc.datasets.rfid import load_rfid
 from gsparc.tables.own import from_arrays, load_own, write_own
@@ -280,30 +276,6 @@ def test_a_file_that_cannot_be_opened_is_a_line(tmp_path, csi_arrays, refused, m
     refused(r"a\.npz: cannot be read .*Permission denied", load_own, tmp_path / "a.npz")
 
 
-def test_hdf5_name_that_is_no_text_is_refused_or_ignored(tmp_path, csi_arrays):
-    path = tmp_path / "name.h5"
-    write_own(path, csi_arrays)
-    with h5py.File(path, "a") as file:
-        file[b"\xff\xfe\xfd"] = np.ones(3)
-        del file.attrs["content_sha256"]
-    assert len(load_own(path)) == 12
-
-
-@pytest.mark.parametrize("name", ["tx_pos", "rx_pos", "csi", "frequency_hz"])
-def test_newrf_without(tmp_path, csi_arrays, refused, name):
-    arrays = {
-        "tx_pos": np.zeros(3),
-        "rx_pos": csi_arrays["rx_position"],
-        "csi": csi_arrays["csi"][:, 0, 0],
-        "frequency_hz": np.array(2.4e9),
-    }
-    (tmp_path / "room.npz").write_bytes(_archive(arrays))
-    assert len(load({"name": "newrf", "file": str(tmp_path / "room.npz")})) == 12
-    del arrays[name]
-    (tmp_path / "room.npz").write_bytes(_archive(arrays))
-    refused(rf"room\.npz, {name}: missing", read_newrf, tmp_path / "room.npz")
-
-
 @pytest.mark.parametrize(
     "text,says",
     [
@@ -324,35 +296,6 @@ def test_attributes_that_are_none(tmp_path, csi_arrays, refused, text, says):
     np.savez(tmp_path / "own.npz", attributes=np.array(text), **csi_arrays)
     said = str(refused(says, load_own, tmp_path / "own.npz"))
     assert "own.npz, " in said and "set_int_max_str_digits" not in said
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize(
-    ("dtype", "unit"),
-    [(np.complex128, unit) for unit in (1e-310, 1e-200, 1e200, 1e300)]
-    + [(np.complex64, unit) for unit in (1e-42, 1e-38, 1e38)],
-)
-def test_channels_in_units_at_the_edge_of_numbers(csi_arrays, dtype, unit):
-    """Units of 1e-310 were refused row by row;
-    dividing in complex64 by 1e-42 gave NaN or a digit or two.
-    """
-    plain = from_arrays(csi_arrays)
-    tiny = from_arrays({**csi_arrays, "csi": (csi_arrays["csi"] * unit).astype(dtype)})
-    tolerance = 2e-3 if unit == 1e-42 else 1e-5
-    assert np.abs(tiny.target - plain.target).max() < tolerance * np.abs(plain.target).max()
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize("value", [1e39, 1.7e308])
-def test_a_channel_beyond_float32_is_refused_without_a_warning_before(csi_arrays, value, refused):
-    channels = csi_arrays["csi"].astype(np.complex64)
-    channels[3, 0, 0] = 3e38 + 3e38j  # as a sum of squares it was infinite, with a warning
-    assert np.isfinite(from_arrays({**csi_arrays, "csi": channels}).target).all()
-    channels = csi_arrays["csi"].astype(np.complex128)
-    channels[3, 0, 0] = value * (1 + 1j)
-    refused(
-        r"csi, row 3: (beyond float32|not finite)", from_arrays, {**csi_arrays, "csi": channels}
-    )
 
 
 HOLLOW = {
@@ -377,16 +320,3 @@ def test_files_of_nothing_but_brackets_or_lines_took_minutes(tmp_path, name):
     with pytest.raises(DataError, match=r"nearly nothing but|more than 10,000 values") as refused:
         read_any(tmp_path / name)
     assert time.process_time() - began < 2 and len(refused.value.problems) == 1
-
-
-def test_rows_of_records_keep_their_numbers_and_keys_stand_once(tmp_path, refused):
-    """A null between records moved all numbers by one;
-    of two keys of one name the second counted.
-    """
-    rows = [{"x": i, "y": i % 7, "rssi": -50 - i} for i in range(30)]
-    file = tmp_path / "a.json"
-    file.write_text(json.dumps([*rows[:3], None, *rows[3:]]))
-    names = read_any(file).data.row_names
-    assert names[:4] == ["row 0", "row 1", "row 2", "row 4"]
-    file.write_text(json.dumps(rows).replace('"x": 7,', '"x": 7, "at": {"z": 1, "z": 2},'))
-    refused("'z' is twice in one record", read_any, file)

@@ -48,29 +48,6 @@ def test_a_subset_of_rows_without_names_was_an_index_error(csi_arrays):
     assert len(read.subset(np.arange(3))) == 3
 
 
-def test_the_same_content_has_the_same_hash_in_both_formats(tmp_path, spectrum_arrays):
-    hashes = {
-        write_own(tmp_path / f"a{s}", spectrum_arrays).site.sha256 for s in (".npz", ".h5", ".hdf5")
-    }
-    hashes |= {load_own(tmp_path / f"a{s}").site.sha256 for s in (".npz", ".h5", ".hdf5")}
-    assert len(hashes) == 1
-    spectrum_arrays["spectrum"][0, 0, 0] += 1e-3
-    assert from_arrays(spectrum_arrays).site.sha256 not in hashes
-
-
-def test_spectra_are_brought_to_unit_scale(spectrum_arrays):
-    assert from_arrays(spectrum_arrays).site.target_scale == 1
-    tiny = from_arrays({**spectrum_arrays, "spectrum": spectrum_arrays["spectrum"] * 1e-9})
-    assert (
-        tiny.target.max() == 1
-        and tiny.site.target_scale == spectrum_arrays["spectrum"].max() * 1e-9
-    )
-    grey = from_arrays(
-        {**spectrum_arrays, "spectrum": (spectrum_arrays["spectrum"] * 255).astype(np.uint8)}
-    )
-    assert grey.target.dtype == np.uint8 and grey.site.grid.width == 36 and grey.site.grid.periodic
-
-
 def test_images_smaller_than_the_losses_window_are_noted():
     """The two numbers must be one: data do not know of losses."""
     assert SSIM_WINDOW == 2 * WINDOW_RADIUS + 1

@@ -106,18 +106,6 @@ def test_ranks_beside_names_of_another_word_are_asked(write):
     assert wide.site.stations.name == ("1", "2")
 
 
-SELDOM = np.where(np.arange(ROWS)[:, None] % 40 == 0, LEVELS[:, :1], 100).astype(int)
-
-
-@pytest.mark.parametrize("name", ["MAC", "spot "])
-def test_rarely_heard_stations_of_a_block_were_dropped(write, name):
-    levels = np.c_[LEVELS.astype(int), np.repeat(SELDOM, 3, axis=1)]
-    heads = ",".join(f"{name}{number}" for number in range(1, 7))
-    path = write(table(f"x,y,{heads}", *PLACES.T, *levels.T))
-    names = read_any(path, guess=True).data.site.stations.name
-    assert len(names) == 6 and names[0] == f"{name}1"
-
-
 @pytest.mark.parametrize("way", ["RSSI A...RSSI C*-1", ["RSSI A*-1", "RSSI B*-1", "RSSI C*-1"]])
 def test_one_answer_takes_all_columns_of_a_block(write, way):
     content = table("x,y,RSSI A,RSSI B,RSSI C", *PLACES.T, *-LEVELS.T)
@@ -163,14 +151,6 @@ def test_heads_that_hold_a_coordinate_are_proposed(write, refused, heads, says):
     refused(says, parse_table, write(table(f"{heads},rssi", *GRID.T, LEVELS[:, 0])))
 
 
-def test_exchanged_degrees_of_a_few_rows_are_named_and_left_out(write):
-    exchanged = np.arange(ROWS) % 60 == 7
-    places = np.where(exchanged[:, None], GRID[:, ::-1] - [41, 0], GRID - [0, 41])
-    found = said(write(table("lat,lon,rssi", *places.T, LEVELS[:, 0])))
-    assert "line 9, line 69, line 129, line 189: latitude and longitude are exchanged" in found
-    assert "these 4 of 240 rows are left out" in found
-
-
 def test_points_that_a_spreadsheet_moved_are_one_sentence(write, refused):
     moved = [f"4.652.{row}.391" if row % 3 else f"{row}.5" for row in range(100, 100 + ROWS)]
     error = refused(
@@ -207,36 +187,7 @@ def test_pairs_that_no_row_names_were_taken_for_silence(tmp_path):
     assert (Own(path).load().censored > 0).any()
 
 
-@pytest.mark.parametrize(
-    "start, says",
-    [(b"\xd4\xc3\xb2\xa1", "pcap"), (b"\x89PNG\r\n", "a picture"), (b"\xff\xd8\xff", "a picture")],
-)
-def test_logs_and_pictures_are_named_by_their_first_bytes(tmp_path, refused, start, says):
-    (tmp_path / "log.csv").write_bytes(start + bytes(range(200)))
-    refused(f"not a table of text but .*{says}", parse_table, tmp_path / "log.csv")
-
-
 def test_heads_that_say_which_of_a_list_were_stations(write):
     path = write(table("x,y,rsrp_serving,rsrp_best_neighbour,rsrp_gap", *PLACES.T, *LEVELS.T))
     with pytest.raises(DataError, match=r"rssi_db=rsrp_serving \(.*=rsrp_best_neighbour"):
         Own(path).load()
-
-
-def test_names_in_numbered_columns_were_levels(write):
-    names = [f"02:00:00:00:00:{ord(name):x}" for name in RANKS[0]]
-    columns = (names, RANKS[1], names, RANKS[3])
-    data = read_any(write(table("x,y,bssid1,level1,bssid2,level2", *PLACES.T, *columns))).data
-    assert {*data.site.stations.name} == {*names}
-
-
-def test_a_checkpoint_keeps_answers_and_a_later_setting_replaces_them(write, tmp_path):
-    """`height` of a later command was overridden by the `z` that training had kept."""
-    from gsparc.tables.columns_file import read_columns
-
-    path = write(table("x,y,floor,rssi", *PLACES.T, BAND, LEVELS[:, 0]))
-    raw = parse_table(path, {"height": "floor*3.2"})
-    assert raw.said == {"height": "floor*3.2"}
-    said(path, columns={"height": "floor*3.2"})
-    assert read_columns(beside(path), raw.heads)["z"] == "floor*3.2"
-    again = parse_table(path, {"height": "floor*4"}, columns_file=beside(path))
-    assert again.arrays["rx_position"][:, 2].max() == 4

@@ -205,35 +205,6 @@ def test_stations_without_heights_stood_at_0_m_with_no_warning(tmp_path):
     assert isinstance(said, Caution)
 
 
-COLUMNS = {
-    "DL EARFCN": 3,
-    "Antenna Height [m]": 6,
-    "Azimuth": 7,
-    "M-Tilt": 8,
-    "E-Tilt": 9,
-    "HBW": 10,
-    "Tx Power [dBm]": 11,
-}
-
-
-@pytest.mark.parametrize("head", COLUMNS)
-@pytest.mark.parametrize("factor", [1e3, 1e-3])
-def test_a_column_of_a_list_was_believed_at_any_magnitude(tmp_path, head, factor):
-    """A power of 20,000 was good: levels of -560 to 27 dBm."""
-    _, drive, heads, sites = drive_of(tmp_path)
-    column = COLUMNS[head]
-    scaled = [[*row[:column], row[column] * factor, *row[column + 1 :]] for row in sites]
-    listed = write(tmp_path / "sites.csv", [one.partition(" [")[0] for one in heads], scaled)
-    try:
-        notes = " ".join(read_any(drive, stations_file=listed).notes)
-    except DataError as refused:
-        notes = str(refused)
-    assert any(
-        word in notes
-        for word in (head.partition(" [")[0] + "' holds", "earfcn: some", "no listed station")
-    ), notes
-
-
 def read_list(folder, **columns):
     """Stations of a list with further columns, and all notes."""
     _, drive, heads, sites = drive_of(folder)
@@ -244,18 +215,6 @@ def read_list(folder, **columns):
     ]
     reading = read_any(drive, stations_file=write(folder / "sites.csv", names, rows))
     return reading.data.site, " ".join(reading.notes)
-
-
-@pytest.mark.parametrize(
-    ("head", "values", "says"),
-    [
-        ("Power", [20000], r"'Power' holds 20000 .* in another unit\? .*: W, mW"),
-        ("EIRP", [2000], r"'EIRP' holds 2000 .* in another unit\? .*: W, mW"),
-        ("Azimuth", [0, 0.9, 0.6], r"'Azimuth' holds 0 in .*deg, .*rad"),
-    ],
-)
-def test_the_units_that_may_be_are_named(tmp_path, head, values, says, refused):
-    refused(says, read_list, tmp_path, **{head: values})
 
 
 def test_unknown_azimuths_and_widths_are_no_numbers(tmp_path):
@@ -318,24 +277,3 @@ def test_the_unit_of_a_cell_that_a_warning_advises_is_read(tmp_path):
     assert not change(tmp_path, "Tx Power [W]", lambda v: "43 dBm")
     (said,) = change(tmp_path, "Tx Power [dBm]", lambda v: "20 parsecs", every=False)
     assert "'20 parsecs' in line 5: no station_power_db; unknown" in said
-
-
-@pytest.mark.parametrize(
-    ("head", "values", "unit"),
-    [
-        ("Azimuth", np.radians, "rad"),
-        ("HBW", np.radians, "rad"),
-        ("Tx Power", lambda v: 20, "W"),
-        ("Antenna Height", lambda v: -25, ""),
-    ],
-)
-def test_a_column_in_another_unit_was_believed(tmp_path, head, values, unit):
-    said, *_ = change(tmp_path, head, values)
-    assert re.search(f"{head}' holds .* in another unit.*{unit}", said), said
-    assert not unit or not change(tmp_path, f"{head} [{unit}]", values)
-
-
-def test_powers_of_0_beside_others_are_unknown(tmp_path):
-    site, notes = read_list(tmp_path, **{"Tx Power [dBm]": [0, 43, 46]})
-    power = site.stations.sector[:, 4]
-    assert set(power[np.isfinite(power)]) == {43, 46} and "station_power_db, 0 unknown" in notes

@@ -6,21 +6,15 @@ import pytest
 from doors import said
 from scipy.io import savemat
 from strangers import (
-    ALONG,
-    AT,
-    BAND,
     CASES,
     DEAF,
     EAST,
-    FLOOR,
     LEVELS,
     NORTH,
-    OF_THREE,
     ONE_CELL,
     PLACES,
     RNG,
     ROWS,
-    STUCK,
     ZONES,
     long,
     table,
@@ -63,13 +57,6 @@ def test_a_cell_that_is_no_place_is_refused_in_a_line(write, cell):
     )
 
 
-def test_a_list_of_stations_has_places_in_one_cell(write, tmp_path):
-    sites = [f"POINT({16.37 + x / 7.4e4:.6f} {48.2 + y / 1.1e5:.6f})" for x, y in AT]
-    (tmp_path / "sites.csv").write_text(table("name,geometry", ["AP1", "AP2", "AP3"], sites))
-    levels = table("lat,lon,AP1,AP2,AP3", NORTH, EAST, *LEVELS.T)
-    assert "3 stations in a box of" in said(write(levels), stations_file=tmp_path / "sites.csv")
-
-
 def test_what_is_silent_is_learned_as_such_and_what_is_not_is_not(write):
     data = read_any(write(wide(100))).data
     assert data.censored.sum() == 394 and (data.censored == DEAF.ravel()).all()
@@ -88,26 +75,6 @@ def test_saturated_levels_were_learned_and_scored_as_measured(write):
         above = LEVELS[:, 0] >= least
         assert (data.censored == np.where(above, -1, 0)).all() and (data.mask[:, 0] == ~above).all()
     np.testing.assert_allclose(level, np.minimum(LEVELS[:, 0], -76), atol=1e-3)
-
-
-def test_the_log_of_a_run_left_out_what_check_warns_of(write, caplog):
-    path = write(long("phone", FLOOR, level=ALONG, places=STUCK))
-    Own(path).load()
-    warned = [
-        line.removeprefix("warning").strip()
-        for line in said(path).splitlines()
-        if line.startswith("warning")
-    ]
-    logged = [record.getMessage() for record in caplog.records if record.levelname == "WARNING"]
-    assert len(warned) > 1 and all(any(text in line for line in logged) for text in warned), warned
-
-
-def test_absent_links_are_silent_only_where_somebody_says_so(write):
-    path = write("\n".join(["station,x,y,rssi", *OF_THREE[::3], *OF_THREE[1::6]]))
-    unknown, silent = read_any(path).data, read_any(path, absent="silent").data
-    assert unknown.censored is None and len(silent) == 2 * ROWS
-    assert silent.censored.sum() == ROWS // 2
-    assert len(np.unique(np.c_[silent.moving, silent.station], axis=0)) == 2 * ROWS
 
 
 def channels() -> dict[str, np.ndarray]:
@@ -193,14 +160,6 @@ def test_a_mark_beside_strong_levels_was_a_saturation_or_not_heard(write):
         found, data = said(path), read_any(path).data
         assert "as well as weak ones: no value, left out" in found and data.censored is None, found
         assert len(data) == (~some).sum()
-
-
-def test_cells_without_their_name_were_refused_without_the_columns_that_name_them(write):
-    eci = np.where(BAND == 0, "", (500 + FLOOR).astype(str))
-    path = write(long("cell_id,psc,arfcn", eci, 101 + FLOOR, 1300 + 0 * FLOOR))
-    assert (
-        "no station; expected its name, or dataset.columns.station=psc+arfcn, which no row lacks"
-    ) in said(path)
 
 
 def test_levels_in_hundredths_of_a_decibel_were_refused_row_by_row(write):

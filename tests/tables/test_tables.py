@@ -100,21 +100,6 @@ def test_units_are_converted_and_said(write):
     assert "MHz turned into Hz" in said and "taken as the receiver's" in said
 
 
-def test_every_guess_is_said_and_what_is_not_used(write):
-    notes = parse_table(
-        write("lat,lng,RSRP [dBm],SINR,battery\n40,8,-80,3,1\n40.1,8,-81,3,1\n")
-    ).notes
-    assert set(notes) >= {
-        "column 'RSRP [dBm]' taken as rssi_db [dBm]",
-        "column 'lat' taken as latitude [deg]",
-        "column 'lng' taken as longitude [deg]",
-        "not used: columns 'SINR', 'battery'",
-        "no height of the receiver: taken as 0 m",
-    }
-    arrays = parse_table(write("x,y,z,rssi_db\n1,2,3,4\n5,6,7,8\n")).arrays
-    assert arrays["rssi_db"].tolist() == [4, 8]
-
-
 def test_a_column_of_times_was_listed_as_not_used_without_a_word(write):
     notes = parse_table(write("x,y,rssi,day\n1,2,-80,Mon\n4,5,-81,Tue\n")).notes
     said = next(note for note in notes if "'day'" in note)
@@ -252,18 +237,6 @@ def test_a_column_that_another_file_lacks_was_refused_without_how_to_leave_it_ou
     )
 
 
-def test_long_layout_with_places_in_columns(write):
-    text = "x,y,z,rssi,gateway,gateway_x,gateway_y,gateway_z\n"
-    text += "1,1,1,-80,g7,9,9,3\n1,1,1,-85,12,0,0,3\n2,1,1,-81,g7,9,9,3\n"
-    arrays = parse_table(write(text)).arrays
-    assert arrays["station"].tolist() == [0, 1, 0] and arrays["station_name"].tolist() == [
-        "g7",
-        "12",
-    ]
-    np.testing.assert_array_equal(arrays["station_position"], [[9, 9, 3], [0, 0, 3]])
-    assert "tx_position" in arrays and "rx_position" not in arrays  # gateways listen
-
-
 def test_long_layout_with_a_second_file(write, caplog):
     listed = "Name;lat;lon;height [m];sensitivity_db;frequency [MHz]\n33;40,1;8,1;10;-120;800\n"
     listed += "212;40,2;8,2;20;-110;1800\n5;41;8;3;-110;800\n"
@@ -373,11 +346,6 @@ def test_negative_numbers_of_tones_lost_their_sign(write, refused):
         ("csi_re_0_1", "'csi_re_0_1': .* is no number of a tone"),
     ):
         refused(says, parse_table, write(text.replace("csi_re_-1", head)), ENDS)
-
-
-def test_runs_and_names_of_rows(write):
-    arrays = parse_table(write("x,y,rssi,run,row_name\n1,2,-3,7,p\n2,2,-3,8,q\n")).arrays
-    assert arrays["run"].tolist() == ["7", "8"] and arrays["row_name"].tolist() == ["p", "q"]
 
 
 def test_two_ends_in_degrees_become_stations(write):

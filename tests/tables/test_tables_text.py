@@ -14,8 +14,6 @@ from gsparc.tables import text as text_file
 from gsparc.tables.own import interpret
 from gsparc.tables.read import parse_table
 
-PLAIN = "x,y,z,rssi\n1,2,3,-80\n4,5,6,-81.5\n"
-
 
 def test_stations_of_unknown_place_could_not_be_read(write, refused):
     """The schema had them, of powers, and methods estimate where they are."""
@@ -47,12 +45,6 @@ def test_rows_that_begin_like_comments_vanished(write, mark):
     assert table.arrays["rssi_db"].tolist() == [-60.0 - i for i in range(27)]
     assert table.arrays["station"].tolist() == [1, 2, 0] * 9
     assert f"18 rows begin with '{mark}1' or the like, the first in line 2" in table.notes
-
-
-def test_comments_below_the_heads_are_said(write):
-    table = parse_table(write(PLAIN + "# turned back here, see notes\n7,8,9,-70\n"))
-    assert table.arrays["rssi_db"].tolist() == [-80, -81.5, -70]
-    assert "1 comments below the heads, the first in line 4" in table.notes
 
 
 def test_a_no_break_space_between_columns(write):

@@ -182,14 +182,6 @@ def test_columns_of_json_as_pandas_writes_them_were_one_record(tmp_path):
     assert_levels(read_any(tmp_path / "log.json"))
 
 
-def test_gateways_of_an_uplink_stand_where_it_says(tmp_path):
-    (tmp_path / "ttn.jsonl").write_text(FILES["ttn.jsonl"])
-    site = read_any(tmp_path / "ttn.jsonl").data.site
-    assert site.static_end == "rx" and np.ptp(site.stations.position[:, 1]) == pytest.approx(
-        22240, rel=1e-3
-    )
-
-
 def test_feather_and_gzip_were_unknown_endings(tmp_path, refused):
     pytest.importorskip("pyarrow")
     frame = pd.DataFrame(RECORDS)
@@ -279,13 +271,6 @@ def test_rows_between_two_fixes_were_refused_one_by_one(tmp_path):
     assert len(read_any(path).data) == 20 and (
         "no place; these 40 of 60 rows are left out"
     ) in said(path)
-
-
-def test_half_a_place_hid_all_other_faults_of_a_file(tmp_path):
-    path, longitude = tmp_path / "drive.csv", np.char.mod("%.6f", LONGITUDE)
-    longitude[3] = ""
-    path.write_text(text("lat,lon,RSRP", np.char.mod("%.6f", LATITUDE), longitude, LEVEL[:, 0]))
-    assert len(read_any(path).data) == COUNT - 1 and "line 5: no place" in said(path)
 
 
 def test_advice_on_columns_was_no_word_of_a_shell():

@@ -2,28 +2,20 @@
 read back from what they wrote.
 """
 
-import json
 import os
-import struct
 import subprocess
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
-import yaml
 from campaigns import brief, spectra
 from doors import knock
 from PIL import Image
 
 from gsparc.commands.train import main
-from gsparc.field.optimizer import OptimizerSettings
 from gsparc.training.tracking import (
     PartLogger,
     log_picture,
@@ -31,65 +23,6 @@ from gsparc.training.tracking import (
     tensorboard_logger,
     wandb_logger,
 )
-
-BLOCK, HEAD, START = 32768, 7, 7  # bytes
-
-
-@dataclass
-class Offline:
-    """A run as the service would show it."""
-
-    name: str = ""
-    group: str = ""
-    tags: list[str] = field(default_factory=list)
-    config: dict[str, Any] = field(default_factory=dict)
-    rows: list[dict[str, Any]] = field(default_factory=list)
-
-    def series(self, key: str) -> list[tuple[int, Any]]:
-        """Steps and values."""
-        return [(row["trainer/global_step"], row[key]) for row in self.rows if key in row]
-
-
-def records(path: Path) -> Iterator[bytes]:
-    content, at, whole = path.read_bytes(), START, b""
-    while at + HEAD <= len(content):
-        if BLOCK - at % BLOCK < HEAD:
-            at += BLOCK - at % BLOCK
-            continue
-        _, length, kind = struct.unpack("<IHB", content[at : at + HEAD])
-        whole += content[at + HEAD : at + HEAD + length]
-        at += HEAD + length
-        if kind in (1, 4):  # whole, or the last part
-            yield whole
-            whole = b""
-
-
-def offline_run(folder: Path) -> Offline:
-    """Of the only one in a run's folder."""
-    from wandb.proto.wandb_internal_pb2 import Record
-
-    (file,) = (folder / "wandb").glob("offline-run-*/*.wandb")
-    run = Offline()
-    for one in records(file):
-        record = Record()
-        record.ParseFromString(one)
-        kind = record.WhichOneof("record_type")
-        if kind == "run" and record.run.display_name:
-            run.name, run.group, run.tags = (
-                record.run.display_name,
-                record.run.run_group,
-                [*record.run.tags],
-            )
-        if kind == "config":
-            run.config |= {item.key: json.loads(item.value_json) for item in record.config.update}
-        if kind == "history":
-            items = {
-                item.key or ".".join(item.nested_key): json.loads(item.value_json)
-                for item in record.history.item
-            }
-            run.rows.append(items)
-    return run
-
 
 COUNTS = {0: 40, 1: 30}  # of Gaussians, in the jobs of the sweep
 
@@ -204,55 +137,3 @@ def test_wandb_warned_of_what_the_program_itself_had_said(tmp_path):
         text=True,
     )
     assert said.returncode == 0 and "WARNING" not in said.stderr, said.stderr
-
-
-def rises(steps) -> bool:
-    return len(steps) > 0 and list(steps) == sorted(set(steps))
-
-
-@pytest.mark.slow
-def test_dashboards_knew_neither_settings_nor_name_nor_sweep_and_a_refit_began_its_series_again(
-    sweep,
-):
-    for folder, (job, count) in zip(sweep, COUNTS.items(), strict=True):
-        run = offline_run(folder)
-        assert (run.name, run.group) == (f"{job} model.field.count={count}", "swept")
-        assert run.tags == ["own", "random", "gsparc"]
-        model, trainer = run.config["model"], run.config["trainer"]
-        assert model["field"]["count"] == count and trainer["max_steps"] == 20
-        assert model["optimizer"]["positions"] == 1e-3
-        for key in ("train/loss", "refit/train/loss", "val/psnr_db"):
-            assert rises([step for step, _ in run.series(key)]), key
-        told = {key for row in run.rows for key in row}
-        rates = {key.removeprefix("rate/") for key in told if key.startswith("rate/")}
-        assert (
-            {"positions", "emission"}
-            < rates
-            <= {setting.name for setting in fields(OptimizerSettings)}
-        )
-        assert {"final/test/psnr_db", "test rows.filenames", "results.path"} <= told
-        settings = yaml.safe_load((folder / "csv" / "version_0" / "hparams.yaml").read_text())
-        assert settings["model"]["field"]["count"] == count and settings["seed"] == 0
-        rows = pd.read_csv(folder / "csv" / "version_0" / "metrics.csv")
-        for key in ("train/loss", "refit/train/loss", "val/psnr_db", "refit/rate/positions"):
-            assert rises(rows.step[rows[key].notna()]), key
-        assert rows["final/test/psnr_db"].notna().sum() == 1
-        if find_spec("tensorboard"):
-            assert_on_tensorboard(folder / "tensorboard", count)
-
-
-def assert_on_tensorboard(folder: Path, count: int) -> None:
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-    from tensorboard.plugins.hparams.plugin_data_pb2 import HParamsPluginData
-
-    found = EventAccumulator(str(folder)).Reload()
-    for key in ("train/loss", "refit/train/loss", "val/psnr_db"):
-        assert rises([one.step for one in found.Scalars(key)]), key
-    (content,) = found.PluginTagToContent("hparams").keys() & {"_hparams_/session_start_info"}
-    told = HParamsPluginData.FromString(
-        found.PluginTagToContent("hparams")[content]
-    ).session_start_info.hparams
-    assert told["model/field/count"].number_value == count and told["seed"].number_value == 0
-    assert len(found.Scalars("final/test/psnr_db")) == 1
-    assert found.Images("test rows")
-    assert b"gsparc" in found.Tensors("results/text_summary")[0].tensor_proto.string_val[0]

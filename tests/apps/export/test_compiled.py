@@ -4,7 +4,6 @@ what is damaged is refused.
 
 import importlib.util
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -388,24 +387,3 @@ def test_the_command_writes_a_folder_whose_library_and_example_build(tmp_path, m
     said = subprocess.run(query, check=True, capture_output=True, text=True).stdout
     expected = float(predictor.rssi(rx=[110.0, 60, 1], unit="linear")[0])
     assert float(said.split("first value ")[1].split(",")[0]) == pytest.approx(expected, rel=1e-4)
-
-
-@pytest.mark.slow
-def test_a_distilled_form_was_wrong_by_the_law_of_distance_outside_its_box():
-    """19 dB far away, where the training box was told to .011 dB."""
-    predictor = of_powers(80, "kriging")
-    found = make.compile_model(predictor, 256)
-    said = re.search(r"outside their box ([\d.]+), ([\d.]+) at the worst", found.summary)
-    assert found.form.predictor is not None and said is not None
-    for away in (3.0, 30.0, 200.0):
-        middle = predictor.site.moving_box.mean(0) + predictor.site.origin
-        around = np.linspace(0, 2 * np.pi, 24)
-        reach = away * np.ptp(predictor.site.moving_box[:, :2], axis=0).max() / 2
-        places = middle + reach * np.c_[np.cos(around), np.sin(around), 0 * around]
-        error = found.form.predictor.rssi(**{predictor.site.moving_end: places})
-        error = error - predictor.rssi(**{predictor.site.moving_end: places})
-        assert np.abs(error).max() < min(1.5, 1.5 * float(said[2])), (
-            away,
-            np.abs(error).max(),
-            said[0],
-        )

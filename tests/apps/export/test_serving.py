@@ -19,7 +19,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from crashes import Limited
 
 import gsparc
 from gsparc.base.limits import SettingError
@@ -155,17 +154,6 @@ def test_the_level_of_silence_is_null(monkeypatch):
     assert status == 200 and json.loads(body)["values"] == [[None], [None]]
 
 
-def test_channels_are_pairs():
-    predictor = fitted("csi")
-    with Served(predictor) as served:
-        _, body, headers = served.post(np.array([[5, 5, 1]], "<f4").tobytes(), RAW)
-    expected = predictor.csi(rx=[[5.0, 5, 1]])
-    assert headers["x-shape"] == "1,1,1,2"
-    np.testing.assert_allclose(
-        np.frombuffer(body, "<f4"), [expected.real.item(), expected.imag.item()], rtol=1e-4
-    )
-
-
 def test_32_clients_get_their_own_answers_computed_together(powers, monkeypatch):
     rng = np.random.default_rng(2)
     given = [rng.uniform(0, 10, (1 + i % 3, 3)) for i in range(32 * 8)]
@@ -212,28 +200,6 @@ def test_malformed_requests_are_refused_and_the_next_is_answered(served, body, k
     assert served.post(as_json([[1, 2, 1]]))[0] == 200
 
 
-def test_one_bad_request_of_a_batch_spoils_no_other(powers):
-    with Served(powers, delay_ms=300) as served, ThreadPoolExecutor(2) as clients:
-        good = clients.submit(served.post, as_json([[1, 2, 1]]))
-        bad = clients.submit(served.post, as_json([[1, 2, 1e300]]))
-        assert (good.result()[0], bad.result()[0]) == (200, 422)
-
-
-def test_a_client_that_dies_is_no_matter(powers, caplog):
-    with Served(powers) as served:
-        for sent in (
-            b"POST /predict HTTP/1.1\r\nhost: a\r\ncontent-length: 500\r\n\r\n{",
-            b"POST /predict HTTP/1.1\r\nhost: a\r\ncontent-length: "
-            b"25\r\n\r\n" + b'{"places": [[1, 2, 1.5]]}',
-            b"nonsense\r\n\r\n",
-        ):
-            for _ in range(8):
-                with socket.create_connection(("127.0.0.1", served.port)) as client:
-                    client.sendall(sent)
-        assert served.post(as_json([[1, 2, 1]]))[0] == 200
-    assert not [record for record in caplog.records if record.levelname == "ERROR"]
-
-
 def test_a_token_is_asked_for(powers):
     with Served(powers, token="secret") as served:
         for path in ("/docs", "/openapi.json", "/nowhere"):
@@ -278,23 +244,6 @@ def test_numbers_of_an_answer_are_limited(spectra):
         np.testing.assert_allclose(raw.reshape(30, 18, 36), expected, rtol=1e-4, atol=1e-6)
     with pytest.raises(ValueError, match="numbers=600: one place's answer holds 648"):
         build_application(spectra, Limits(numbers=600), None)
-
-
-def test_few_places_do_not_wait_for_many(powers, monkeypatch):
-    sizes, own = [], powers.rssi
-    with Served(powers, most=40) as served, ThreadPoolExecutor(12) as clients:
-
-        def slow(rx):
-            sizes.append(len(rx))
-            time.sleep(0.2)
-            return own(rx=rx)
-
-        monkeypatch.setattr(powers, "rssi", slow)
-        large = [clients.submit(served.post, as_json(np.ones((40, 3)))) for _ in range(8)]
-        assert served.within(5, lambda: len(sizes) > 0)
-        assert served.post(as_json([[1, 2, 1]]))[0] == 200
-        assert len(sizes) < 8, "answered before the last of the large ones began"
-        assert {one.result()[0] for one in large} == {200}
 
 
 def test_requests_beyond_the_connections_are_refused_until_one_ends(powers):
@@ -443,22 +392,6 @@ def test_bodies_that_said_they_are_packed_were_read_as_places(served, coding, st
     assert answer[0] == status and (status == 200 or b"Content-Encoding" in answer[1])
 
 
-def test_raw_places_are_of_one_media_type_alone(served):
-    """`application/octet-streamx` was taken for raw, and of two types the first counted."""
-    assert served.post(np.zeros((1, 3), "<f4").tobytes(), RAW + "x")[0] == 422
-    body = np.zeros((1, 3), "<f4").tobytes()
-    head = (
-        f"POST /predict HTTP/1.1\r\nHost: a\r\nConnection: close\r\nContent-Length: {len(body)}\r\n"
-    )
-    with socket.create_connection(("127.0.0.1", served.port), timeout=10) as client:
-        types = f"Content-Type: {RAW}\r\nContent-Type: application/json\r\n\r\n"
-        client.sendall((head + types).encode() + body)
-        answer = b""
-        while part := client.recv(65536):
-            answer += part
-    assert answer.startswith(b"HTTP/1.1 422") and b"Content-Type twice" in answer
-
-
 @pytest.fixture
 def told(tmp_path, monkeypatch):
     """A model's file, the model, and a server of it that is told rows."""
@@ -511,20 +444,6 @@ def test_levels_that_were_measured_change_the_answers_and_are_stored(told):
         assert running.post(json.dumps(rows), path="/update")[0] == 404
 
 
-def test_rows_that_a_full_disk_refused_were_answered_by_all_the_same(told):
-    """The file cannot be written, which is no `OSError` then: nothing was taken back,
-    and it said 422.
-    """
-    path, predictor, post = told
-    before, answers = path.read_bytes(), post(as_json([[1, 2, 1]]), path="/predict")[1]
-    with Limited(len(before) // 2):
-        status, body, _ = post(ROW)
-    assert status == 507 and b"cannot be written (File too large)" in body
-    assert not predictor.versions and path.read_bytes() == before
-    assert post(as_json([[1, 2, 1]]), path="/predict")[1] == answers
-    assert post(ROW)[0] == 200 and len(gsparc.load(path).rows) == len(predictor.rows) == 1
-
-
 def test_rows_of_a_key_that_are_posted_twice_are_taken_once(told):
     """A client that tried again after a lost answer told its rows twice."""
     path, predictor, post = told
@@ -545,16 +464,3 @@ def test_rows_that_another_process_told_the_file_were_overwritten(told):
         file.store(versions_extra(other.versions))
     assert post(ROW)[0] == 200
     assert predictor.rows.tolist() == gsparc.load(path).rows.tolist() == [0, 1, 2, 3]
-
-
-def test_a_file_that_was_made_anew_is_what_answers_or_is_left_alone(told):
-    path, predictor, post = told
-    old = path.read_bytes()
-    fitted(save=path, model="mean")
-    assert post(ROW)[0] == 200 and predictor.method.label == "mean, updated"
-    fitted("csi", save=path)
-    other = path.read_bytes()
-    status, body, _ = post(ROW)
-    assert status == 500 and b"start the server again" in body and path.read_bytes() == other
-    path.write_bytes(old[:1000])
-    assert post(ROW)[0] == 500 and len(predictor.rows) == 1

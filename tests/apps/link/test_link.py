@@ -18,12 +18,10 @@ from gsparc.apps.link.adaptation import Adaptation, Band, Rates
 from gsparc.apps.link.channels import true_channels
 from gsparc.apps.link.pusch import Pusch, frequency_correlation
 from gsparc.apps.link.study import (
-    beam_facts,
     beam_gain,
     beam_loss_db,
     find_crossing,
     rate_facts,
-    send_blocks,
 )
 from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
@@ -98,23 +96,6 @@ def test_beams_gain_the_number_of_antennas_and_lose_what_is_wrong() -> None:
     assert abs(float(beam_loss_db(true, true + noise).mean()) - 3.0) < 0.3
 
 
-def test_beams_without_a_prediction_or_without_a_channel_have_figures() -> None:
-    """A prediction of exactly 0, or one silent test channel, ended the command:
-    -inf is no figure.
-    """
-    true = drawn()(4, 2, 3)
-    silent = true.clone()
-    silent[1] = 0
-    nothing = beam_facts(true, torch.zeros_like(true), np.ones(4, bool))
-    assert nothing["beams/2/loss_db"] == pytest.approx(100) == nothing["beams/2/loss_db_mean"]
-    some = beam_facts(silent, silent, np.array([False, True, False, False]))
-    assert some["beams/silent"] == 1 and some["beams/2/loss_db_max"] == pytest.approx(0, abs=1e-5)
-    assert some["beams/2/loss_db_accepted"] is None
-    assert beam_facts(0 * true, true, np.ones(4, bool)) == {"beams/positions": 4, "beams/silent": 4}
-    for facts in (nothing, some):
-        assert all(value is None or np.isfinite(value) for value in facts.values())
-
-
 def test_where_nothing_can_be_carried_nothing_falls_short() -> None:
     """At -50 dB the oracle carries nothing: 0 / 0 ended the command after its work."""
     none = np.zeros(2)
@@ -165,24 +146,6 @@ def test_export_on_any_grid(trained) -> None:
     assert np.abs(found.delay_s).max() < 1 / 312.5e3
     with pytest.raises(ValueError, match=r"expected \(B, 64, 26\)"):
         predictor.csi(uplink=heard[:, :8])
-
-
-def test_a_coarse_look_may_be_all_there_is() -> None:
-    """coarse = fine once asked for a second part of no blocks."""
-
-    class Half:
-        def run(self, band, level, order, batch):
-            assert len(order)
-            failed = np.arange(len(order)) % 2 == 0
-            own = {"ebno_db": level, "position": order, "failed": failed, "wrong": failed * 0.1}
-            return pd.concat(
-                [pd.DataFrame(own | {"receiver": name}) for name in ("perfect", "predicted")]
-            )
-
-    nothing = Band(*[torch.zeros(5, 1)] * 3)
-    for fine, blocks in ((8, 8), (20, 20)):
-        found = send_blocks(Half(), nothing, [1.0], (8, fine, 4))
-        assert len(found) == 2 * blocks
 
 
 @needs_sionna

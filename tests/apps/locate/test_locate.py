@@ -8,17 +8,15 @@ import numpy as np
 import pytest
 import torch
 import towns
-from campaigns import powers, spectra
+from campaigns import spectra
 from refusals import refused
 
 import gsparc
 from gsparc.apps.locate import locate
 from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.site_field import SiteField
-from gsparc.apps.locate.snapshots import group_snapshots
 from gsparc.models import checkpoint
 from gsparc.models.method import predict_with_threads
-from gsparc.tables.own import from_arrays
 
 
 @pytest.fixture(scope="module")
@@ -105,29 +103,6 @@ def test_stations_at_one_place_were_asked_in_different_parts(tmp_path, monkeypat
         torch.from_numpy(np.tile(predictor.site.moving_box[:1, :3], (7, 1)))
     )
     assert rows == [8, 6], "of two stations"
-
-
-def test_missing_and_silent_stations_are_no_values(tmp_path):
-    predictor = gsparc.load(towns.trained(powers(tmp_path / "own.npz"), "gp"))
-    place = (predictor.site.moving_box + predictor.site.origin).mean(0)
-    power = predictor.rssi(**{predictor.site.moving_end: place[None]})
-    loud, quiet = (locate(predictor, power, silent=silent)[0] for silent in (None, [[True]]))
-    assert quiet.area > loud.area, "below a level is less than at a level"
-    linear = locate(predictor, 10 ** (power.astype(float) / 10), unit="linear")[0]
-    assert np.allclose(linear.place, loud.place) and linear.area == loud.area
-
-
-def test_visits_of_a_place_are_snapshots_of_their_own():
-    """The second row of a station there is of the second snapshot,
-    whichever order stations come in.
-    """
-    place = np.repeat([[0.0, 0, 1], [5, 5, 1], [9, 0, 1]], [4, 4, 2], axis=0)
-    station, level = np.array([0, 1, 1, 0, 0, 1, 0, 1, 0, 1]), -50.0 - np.arange(10)
-    ends = {"station_position": np.array([[0.0, 9, 5], [9, 9, 5]]), "station": station}
-    data = from_arrays({"rx_position": place, "rssi_db": level, **ends})
-    values = group_snapshots(data, np.arange(10)).values.reshape(-1, 2)
-    heard = (values - values.max() - 50).round().int().tolist()
-    assert sorted(heard) == sorted([[-50, -51], [-53, -52], [-54, -55], [-56, -57], [-58, -59]])
 
 
 @pytest.mark.parametrize(

@@ -16,24 +16,6 @@ def gaussians(cells, middles, width=0.2):
     return PlacePosterior(cells, density - np.log((np.exp(density) * cells.volume).sum()))
 
 
-def test_cells_cover_the_plane_that_was_walked():
-    cells = cover_box(PLACES, 400, False)
-    assert (
-        300 < len(cells) < 600
-        and (cells.edge[:, 2] == 0).all()
-        and (cells.centre[:, 2] == 1.5).all()
-    )
-    assert cells.volume.sum() == pytest.approx(np.ptp(PLACES[:, :2], axis=0).prod())
-
-
-def test_halves_fill_the_whole():
-    cells = cover_box(PLACES, 50, False)
-    finer = cells.halve()
-    assert len(finer) == 4 * len(cells) and finer.volume.sum() == pytest.approx(cells.volume.sum())
-    one = cells.subset(np.array([3])).halve()
-    assert np.abs(one.centre - cells.centre[3]).max(0) == pytest.approx(cells.edge[3] / 4)
-
-
 def test_cells_near_trained_places():
     walked = PLACES[PLACES[:, 0] < 1.0]
     both = np.concatenate([walked, [[4.0, 2.0, 1.5]]])
@@ -57,19 +39,6 @@ def test_peak_is_between_middles_of_cells():
     cell = cells.centre[found.log_density.argmax()]
     assert np.linalg.norm(found.peak()[:2] - truth) < 0.3 * np.linalg.norm(cell[:2] - truth)
     assert found.peak()[2] == 1.5
-
-
-@pytest.mark.slow
-def test_errors_of_recorded_places_widen_an_area():
-    cells = cover_box(PLACES, 8_000, False)
-    sharp = gaussians(cells, [[2.0, 1.0]])
-    wide = PlacePosterior(cells, sharp.sharp, 0.3)
-    area = cells.volume[densest_cells(wide.log_density, cells.volume, 0.9)].sum()
-    assert area == pytest.approx(-2 * np.pi * (0.2**2 + 0.3**2) * np.log(0.1), rel=0.03)
-    place = np.array([2.3, 1.1, 1.5])
-    assert wide.log_density_at(place) == pytest.approx(
-        wide.log_density[cells.index_of(place)], abs=0.05
-    )
 
 
 def test_area_of_a_known_density_holds_its_share():

@@ -9,10 +9,7 @@ import pytest
 from PIL import Image
 from pyproj import Transformer
 from refusals import refused
-from towns import town_model
 
-import gsparc
-from gsparc.apps.maps import predict_map
 from gsparc.apps.maps.area import lay_grid
 from gsparc.apps.maps.floor_plan import read_floor_plan
 from gsparc.apps.maps.geojson import read_shapes
@@ -109,46 +106,6 @@ def test_spoilt_grids(said, how):
     refused(said, lay_grid, None, **{"area": [0, 0, 4, 4], "height_m": 1.5, "step_m": 0.5, **how})
 
 
-@pytest.mark.parametrize(
-    "said, content",
-    [
-        ("empty polygon", '{"type": "Polygon", "coordinates": [[[0, 0], [1, 1], [2, 2], [0, 0]]]}'),
-        ("no polygon|corners", '{"type": "Polygon", "coordinates": []}'),
-        ("not readable", '{"type": "Polygon", "coordinates": [[[0, 0], ["a", 1], [2, 2]]]}'),
-        ("NaN", '{"type": "Polygon", "coordinates": [[[0, 0], [NaN, 1], [2, 2]]]}'),
-        ("no polygon", '{"type": "LineString", "coordinates": [[0, 0], [1, 1]]}'),
-        ("no polygon", '{"type": "FeatureCollection", "features": []}'),
-        ("not readable", "not json"),
-        ("not readable", "[1, 2]"),
-    ],
-)
-def test_spoilt_polygons(tmp_path, said, content):
-    path = tmp_path / "a.geojson"
-    path.write_text(content)
-    refused(said, lay_grid, None, str(path), 1.5, 0.5)
-
-
-@pytest.mark.parametrize(
-    "said, points, content",
-    [
-        ("has no scale", None, None),
-        ("two points", [[0, 0, 0, 0]], None),
-        ("two points", [[0, 0, 1, "x"], [50, 50, 1, 1]], None),
-        ("no scale", [[5, 5, 0, 0], [5, 5, 9, 9]], None),
-        ("one place", [[0, 0, 1, 1], [50, 50, 1, 1]], None),
-        ("not an image", [[0, 0, 0, 0], [9, 9, 9, 9]], "hello"),
-        ("no such file", None, ""),
-    ],
-)
-def test_spoilt_plans(tmp_path, said, points, content):
-    path = image(tmp_path / "p.png")
-    if content is not None:
-        path.unlink()
-    if content:
-        path.write_text(content)
-    refused(said, read_floor_plan, path, points)
-
-
 def test_a_plan_of_too_many_pixels_was_said_to_be_no_image(tmp_path):
     with (tmp_path / "p.png").open("wb") as file:
         file.write(b"\x89PNG\r\n\x1a\n")
@@ -162,18 +119,3 @@ def test_a_plan_of_too_many_pixels_was_said_to_be_no_image(tmp_path):
         r"too large an image .Image size .2500000000 pixels..; at most 178,956,970 pixels are read"
     )
     refused(said, read_floor_plan, tmp_path / "p.png", None)
-
-
-@pytest.mark.parametrize(
-    "said, how",
-    [
-        ("no station 'nord'", {"stations": ["nord"]}),
-        ("name one", {"stations": []}),
-        ("0 to 1", {"load": 1.5}),
-        ("one per station", {"load": [1, 1, 1]}),
-        ("no station 'south'", {"load": {"south": 1}}),
-        ("stood still", {"other_end": [0, 0, 1]}),
-    ],
-)
-def test_spoilt_maps(said, how):
-    refused(said, predict_map, gsparc.load(town_model()), **{"step_m": 5.0, **how})

@@ -24,21 +24,3 @@ def test_a_screen_is_drawn_where_it_stands():
     assert np.mean(np.abs(wrong) < 2 * deviation) > 0.8
     names = [layer.name for layer in change_layers(field)]
     assert names == ["change", "change_deviation"]
-
-
-def test_cells_that_are_called_by_numbers_had_no_map_of_changes():
-    """Of two cells 101 and 102 in one model `select_station` was asked for the cells 0 and 1."""
-    both = np.stack([levels(PLACES, 0), levels(PLACES, 1)], 1)
-    # It serves one half
-    both[:, 1] += np.where(PLACES[:, 0] < np.median(PLACES[:, 0]), 30.0, -30.0)
-    stations = {
-        "station_position": [[9.0, 9.0, 2.6], [1.0, 1.0, 2.6]],
-        "station_name": ["101", "102"],
-    }
-    predictor = gsparc.fit(rx=PLACES, rssi=both, model="gsparc", **stations)
-    predictor.update(rx=PLACES[:60], rssi=both[:60] - [0.0, 11.0])
-    field = add_changes(predict_map(predictor, step_m=2.0, promise=None), predictor)
-    served = [field.extra[CHANGE][field.best_server == number] for number in (0, 1)]
-    assert abs(np.median(served[0])) < 2 and np.median(served[1]) < -8
-    change, deviation = predictor.select_station("102").change(rx=PLACES[:1])
-    assert change[0] < -8 and deviation[0] > 0

@@ -7,8 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
-from campaigns import channels
 from matplotlib.colors import rgb_to_hsv, to_rgb
 from matplotlib.figure import Figure
 from refusals import refused
@@ -18,7 +16,7 @@ from towns import MASTS, town_model
 import gsparc
 from gsparc.apps.maps import layers, pictures, plan_measurements, plan_pictures, strongest
 from gsparc.apps.maps.layers import Layer, Legend, assign_colours, label_places, list_layers
-from gsparc.apps.maps.making import _hearing_floors, choose_stations, predict_map
+from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.promise import Promise, map_notes
 from gsparc.apps.maps.refining import sample_adaptively
 from gsparc.apps.maps.strongest import (
@@ -30,12 +28,8 @@ from gsparc.apps.maps.strongest import (
 )
 from gsparc.base.errors import DataError
 from gsparc.data.georeference import Georeference
-from gsparc.data.splits import Fold
-from gsparc.models.registry import method_class
 from gsparc.prediction.left_out import HeldOutLevels
 from gsparc.prediction.predictor import Predictor
-from gsparc.tables.own import load_own
-from gsparc.training.context import FitContext
 
 
 @pytest.fixture(scope="module")
@@ -107,17 +101,6 @@ def test_chunks_do_not_change_a_map(predictor, monkeypatch):
     assert np.allclose(predict_map(predictor, step_m=5.0).power_db, whole.power_db, atol=1e-4)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("engine", ["joblib", "ray"])
-def test_a_map_made_elsewhere_is_the_same_bits(predictor, engine, elsewhere):
-    torch.set_num_threads(1)
-    here = predict_map(predictor, step_m=1.0)
-    elsewhere(engine)
-    there = predict_map(predictor, step_m=1.0)
-    for name in ("power_db", "lower_db", "upper_db", "best_server", "outage"):
-        np.testing.assert_array_equal(getattr(here, name), getattr(there, name))
-
-
 def test_ratio_of_signal_to_interference_by_hand():
     power = np.array([[-50.0, np.nan, np.nan], [-60.0, -60.0, np.nan]])
     assert sinr(power, np.array([1.0, 1.0]), None)[0] == pytest.approx(10)
@@ -130,18 +113,6 @@ def test_ratio_of_signal_to_interference_by_hand():
     assert best_server(power).tolist() == [0, 1, REFUSED]
     assert read_loads({"b": 0.2}, ["a", "b"]).tolist() == [1.0, 0.2]
     assert read_loads({"Roof": 0.2}, ["a", "b"], ["Tower", "Roof"]).tolist() == [1.0, 0.2]
-
-
-def test_each_band_has_levels_and_servers_of_its_own(predictor, monkeypatch):
-    stations = replace(predictor.site.stations, carrier_hz=np.array([8e8, 2.6e9]))
-    monkeypatch.setattr(predictor, "site", replace(predictor.site, stations=stations))
-    found = predict_map(predictor, step_m=10.0)
-    drawn = {layer.name: layer.values for layer in list_layers(found)}
-    for number, band in enumerate(("800 MHz", "2600 MHz")):
-        np.testing.assert_array_equal(drawn[f"power {band}"], found.power_db[number])
-        assert (drawn[f"best_server {band}"] == 0).all()
-    # Nobody interferes on another carrier
-    assert (drawn["overlap"] == 1).all() and "sinr" not in drawn
 
 
 def test_sectors_that_err_together_are_told_apart():
@@ -234,16 +205,6 @@ def test_a_station_was_named_best_where_nothing_was_known_or_above_the_floor(pre
     assert silent.all() and not other.any() and not doubts["power"]
 
 
-def test_the_floor_of_a_station_is_its_level_or_what_was_weakest():
-    level, row = np.append(np.linspace(-100, -50, 101), [-90.0, -70.0]), np.arange(103)
-    evidence = HeldOutLevels(
-        level, level, np.ones(103), np.zeros(103), row, (row > 100) * 1, row > 100
-    )
-    promise = Promise(evidence, np.zeros((1, 3)), np.zeros(1, np.int64), 1.0)
-    assert _hearing_floors(promise, [0, 1], None) == pytest.approx([-99.5, -90])
-    assert _hearing_floors(None, [0, 1], -95.0).tolist() == [-95, -95]
-
-
 def test_a_threshold_below_all_that_was_measured_was_said_to_be_met_everywhere(predictor):
     """100.0% of a city (100.0% to 100.0%) had -100 dBm or more,
     where the weakest measured was -100.6.
@@ -294,28 +255,6 @@ def test_interpolated_cells_are_as_exact_as_asked_for():
     assert asked > 0.9 * count and np.nanmax(np.abs(exact - every)) < 1e-4
     sure, _ = sample_adaptively(ask, inside, lambda v: np.inf + 0 * v, inside)
     assert np.array_equal(sure, every, equal_nan=True)
-
-
-@pytest.mark.slow
-def test_channels_have_a_power(tmp_path):
-    data = load_own(channels(tmp_path / "own.npz"))
-    method, rows = method_class("image_source_gp")(), np.arange(len(data))
-    method.fit(data, Fold(rows, rows[:0], rows[:1]), FitContext(tmp_path, effort=0.1))
-    found = predict_map(Predictor(method, data.site), step_m=0.5, height_m=1.2)
-    assert found.power_db.shape[0] == 1 and np.isfinite(found.power_db).all()
-    assert (found.expected_error_db > 0).all() and not found.extra
-    near = np.argmax(found.power_db[0])  # where it is loudest is near the transmitter
-    place = found.grid.places(np.array([near]))[0, :2]
-    assert np.linalg.norm(place - [1, 1]) < 1.0
-
-
-def test_nothing_is_promised_of_a_station_that_was_never_heard(predictor):
-    nothing = HeldOutLevels(*(np.zeros(0) for _ in range(7)))
-    promise = Promise(nothing, np.zeros((4, 3)), np.zeros(4, np.int64), 1.0)
-    names, notes = choose_stations(predictor, None, promise)
-    assert names == ["west"] and "east was never heard" in notes[0]
-    with pytest.raises(DataError, match="never heard"):
-        choose_stations(predictor, ["east"], promise)
 
 
 def test_a_map_named_cells_by_the_numbers_of_the_drive_where_the_list_has_names(
@@ -376,20 +315,6 @@ def test_a_legend_of_ten_cells_did_not_say_that_others_serve_less(drawn, predict
     pictures.draw_layer(field, layer, "unused.png", "")
     words = [text.get_text() for text in drawn[0].legends[0].get_texts()]
     assert "14 more, that serve less: best_server.csv" in words
-
-
-def test_a_legend_of_twelve_cells_left_two_out(drawn, predictor):
-    field = predict_map(predictor, step_m=4.0)
-    number = np.arange(field.grid.inside.size).reshape(field.grid.inside.shape) % 12
-    legend = layers.Legend("", -0.5, 11.5)
-    pictures.draw_layer(
-        field,
-        layers.Layer("best_server", 1.0 * number, legend, tuple("abcdefghijkl")),
-        "unused.png",
-        "",
-    )
-    words = [text.get_text() for text in drawn[0].legends[0].get_texts()]
-    assert {*"abcdefghijkl"} <= {*words} and not any("more" in word for word in words)
 
 
 def test_a_fall_of_a_tenth_of_a_decibel_looked_like_one_to_nothing(drawn, predictor):

@@ -209,19 +209,6 @@ def test_two_stations_leave_none_out(together):
     assert new_station_error(learned).stations == 0
 
 
-@pytest.mark.parametrize(
-    "said, how",
-    [
-        ("at least 1", {"count": 0}),
-        ("no such file", {"sites": "missing.geojson"}),
-        ("stations=together", {}),
-    ],
-)
-def test_spoilt_wishes(together, said, how):
-    model = together[2] if how else town_model()  # whose stations are known ones alone
-    refused(said, place_station, gsparc.load(model), threshold_db=-75.0, **how)
-
-
 def test_a_new_station_among_bands_was_put_in_one_that_nobody_named(together):
     site = gsparc.load(together[2]).site
     assert "band" not in assumption(site, 8.0, NewAntenna())

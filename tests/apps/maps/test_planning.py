@@ -12,7 +12,6 @@ from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances, weig
 from gsparc.apps.maps.planning import find_neighbours, plan_measurements
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import StreetGraph, Tour, Ways
-from gsparc.base.errors import DataError
 from gsparc.models.abilities import JointLevels
 from gsparc.prediction.jointly import JointMixin
 from gsparc.prediction.left_out import HeldOutLevels
@@ -85,13 +84,6 @@ def test_places_of_a_plan_were_two_lumps(predictor):
     corners = np.array([[0.0, 0], [1, 0], [10, 0], [11, 0]])
     near = find_neighbours(corners, 2)
     assert near[0].tolist() == [True, True, False, False]
-
-
-def test_places_lie_in_the_polygon_that_can_be_walked(tmp_path):
-    triangle = {"type": "Polygon", "coordinates": [[[0, 0], [30, 0], [0, 30], [0, 0]]]}
-    (tmp_path / "yard.geojson").write_text(json.dumps(triangle))
-    found = plan_measurements(None, 9, [0, 0, 30, 30], walkable=tmp_path / "yard.geojson")
-    assert len(found.places) == 9 and (found.places[:, :2].sum(1) <= 30).all()
 
 
 def test_it_stops_where_a_place_gains_too_little(predictor):
@@ -194,21 +186,3 @@ def test_a_drive_went_straight_from_place_to_place_where_streets_were_given():
     path = ways.path_through(np.array([0, 1]))
     assert [50, 0] in path.tolist() and [50, 40] in path.tolist()
     assert np.hypot(*np.diff(path, axis=0).T).sum() == pytest.approx(130)
-
-
-@pytest.mark.parametrize(
-    "how, said",
-    [
-        ({"count": 0}, "at least 1"),
-        ({"count": 2, "route_m": -1}, "above 0"),
-        ({"count": 2, "start": [1]}, "two finite numbers"),
-        ({"count": 2, "least_gain_db": -1}, "at least 0"),
-        ({"count": 2, "length_m": 0}, "above 0"),
-        ({"count": 2, "goal": "best"}, "one of strongest, all"),
-        ({"count": 2, "area": None}, "nothing says where"),
-        ({"count": 2, "walkable": "missing.geojson"}, "no such file"),
-    ],
-)
-def test_spoilt_wishes(how, said):
-    with pytest.raises(DataError, match=said):
-        plan_measurements(None, **{"area": [0, 0, 9, 9], **how})

@@ -1,10 +1,9 @@
 """What is answered at a place, and what is said of why."""
 
 import numpy as np
-import pytest
 
-from gsparc.apps.view.answer import Answer, PlacePaths, merge_paths, predict_answer
-from gsparc.apps.view.building import BOX, MIRROR, draw_rays
+from gsparc.apps.view.answer import Answer, PlacePaths, merge_paths
+from gsparc.apps.view.building import BOX, MIRROR
 from gsparc.apps.view.reasons import explain_level, legend_html
 from gsparc.apps.view.scene import Faces
 
@@ -19,20 +18,6 @@ def test_a_fade_is_said_to_be_one():
     assert "their powers" not in said
 
 
-@pytest.mark.slow
-def test_a_spectrum_and_a_power_are_answered(spectrum_view, power_view):
-    spectrum = predict_answer(
-        spectrum_view.viewed.predictor_of(None), spectrum_view.initial_places(None)
-    )
-    assert spectrum.spectrum.shape == (16, 32) and spectrum.level_db is None
-    assert set(spectrum.ends) == {"tx", "rx"}
-    name = power_view.viewed.stations[1]
-    asked, at = power_view.viewed.predictor_of(name), power_view.initial_places(name)
-    power = predict_answer(asked, at)
-    assert power.level_db == pytest.approx(float(asked.rssi(**at)[0]), abs=1e-3)
-    assert power.spread_db > 0 and power.spectrum is None
-
-
 def test_a_path_that_two_searches_found_is_one_path():
     """Their direct paths were two, each 6 dB too weak, that "add up"."""
     one, other = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
@@ -43,15 +28,6 @@ def test_a_path_that_two_searches_found_is_one_path():
     np.testing.assert_allclose(found.gain_db, [-20, -40])
     np.testing.assert_array_equal(found.delay_ns, [5.0, 9.0])
     assert len(merge_paths(gain, np.array([5.0, 9.0, 5.1, 9.0]), None).gain_db) == 3
-
-
-def test_rays_are_as_long_as_their_delays():
-    towards = np.array([[1.0, 0, 0], [0, 1, 0]])
-    rays = PlacePaths(np.array([-40.0, -50]), np.array([10.0, 20]), towards)
-    lines, ends = draw_rays(Answer({"rx": np.ones(3)}, paths=rays), 100.0)
-    length = np.linalg.norm(ends.places - 1, axis=1)
-    np.testing.assert_allclose(length, [2.998, 5.996], rtol=1e-3)
-    assert lines.segments.shape == (2, 2, 3)
 
 
 def test_what_surfaces_are_is_said_once_of_each_colour():

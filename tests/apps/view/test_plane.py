@@ -4,9 +4,8 @@ import numpy as np
 from campaigns import channels
 from towns import trained
 
-from gsparc.apps.maps.layers import Legend
 from gsparc.apps.view.answer import predict_answer
-from gsparc.apps.view.plane import plane_sheet, refine_plane, weakest_place
+from gsparc.apps.view.plane import refine_plane, weakest_place
 from gsparc.apps.view.site_view import lay_power_plane
 from gsparc.apps.view.viewed import open_model
 
@@ -24,21 +23,6 @@ def test_the_last_plane_is_what_the_model_says_of_every_cell(power_view):
     second = weakest_place(planes[-1], [first])
     assert np.linalg.norm(second - first) >= 0.1 * max(grid.inside.shape) * grid.step
     assert weakest_place(planes[-1], grid.places()) is None
-
-
-def test_a_sheet_lies_north_up_and_is_clear_where_nothing_is_known(power_view):
-    grid = power_view.grid
-    values = np.zeros(grid.inside.shape)
-    values[0, 0] = np.nan  # south-west
-    dot = power_view.station("west").dot
-    assert power_view.station("west").power is not None
-    # So that dots are seen whole
-    made = plane_sheet("plane", grid, values, Legend("", 0.0, 1.0), dot / 2)
-    assert made.image[-1, 0, 3] == 0 and (made.image[:-1, :, 3] > 0).all()
-    left, _, _, high = grid.extent
-    assert dot > 0
-    np.testing.assert_allclose(made.corner, [left, high, grid.height - dot / 2])
-    assert made.right[0] > 0 and made.down[1] < 0
 
 
 def test_a_plane_of_channels_has_the_level_that_answers_have(tmp_path):

@@ -3,7 +3,6 @@
 import numpy as np
 
 from gsparc.apps.maps.floor_plan import FloorPlan
-from gsparc.apps.maps.layers import Legend
 from gsparc.apps.view.building import build_scene
 from gsparc.apps.view.scene import EXTENT, DrawingFrame
 
@@ -14,17 +13,6 @@ def test_a_site_far_from_its_origin_is_drawn_to_the_millimetre():
     drawn = frame.to_drawn(places)
     assert drawn.dtype == np.float32 and np.ptp(drawn, axis=0).max() == EXTENT
     np.testing.assert_allclose(frame.to_world(drawn), places, atol=1e-3)
-
-
-def test_values_that_are_not_known_are_grey():
-    legend = Legend.over("level", np.array([np.nan, 0.0, 1.0, np.inf]))
-    found = legend.to_colours(np.array([np.nan, 0.0, 1.0, 5.0]))
-    assert tuple(found[0]) == (170, 170, 170) and (found[2] == found[3]).all()
-    assert (found[1] != found[2]).any()
-    assert (
-        Legend.over("nothing", np.full(3, np.nan)).high
-        > Legend.over("nothing", np.full(3, np.nan)).low
-    )
 
 
 def test_a_floor_plan_and_the_grid_lie_beneath_the_plane(power_view):

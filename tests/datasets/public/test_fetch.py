@@ -1,17 +1,10 @@
 """Public data from a local server: what comes, what is refused in one line, and what is kept."""
 
-import contextlib
 import csv
-import gzip
 import os
-import signal
-import subprocess
-import sys
 import threading
 import time
-from pathlib import Path
 
-import mirrors
 import pytest
 from filelock import FileLock
 from mirrors import begin, mirrored, offer, sound, source_of
@@ -21,7 +14,7 @@ from gsparc.base.errors import DataError
 from gsparc.commands import data as command
 from gsparc.datasets.load import datamodule
 from gsparc.datasets.public import fetch as fetching
-from gsparc.datasets.public.fetch import fetch, fetched_path, public_sets
+from gsparc.datasets.public.fetch import fetch, public_sets
 
 ONE, TWO = os.urandom(3000), b"x,y,z\n" * 200
 
@@ -189,42 +182,6 @@ def test_a_cache_that_cannot_be_written(mirror, monkeypatch, tmp_path, refused):
         assert fetch("room") == room.folder
 
 
-SLOW = """
-import sys
-sys.path[:0] = [{helpers!r}]
-import pytest
-from filelock import FileLock
-from mirrors import offer, source_of
-from gsparc.datasets.public.fetch import fetch
-with pytest.MonkeyPatch.context() as patch:
-    offer(patch, {folder!r}, source_of("release/1.bin", b"1" * 5000))
-    fetch("room", timeout_s=60)
-"""
-
-
-def test_a_fetch_that_was_killed_is_said_again(mirror, monkeypatch, tmp_path):
-    room = offer(
-        monkeypatch,
-        tmp_path,
-        mirror.serve("release/1.bin", b"1" * 5000, lambda r, c: (stalls(r, c), time.sleep(3))),
-    )
-    helpers = str(Path(mirrors.__file__).parent)
-    child = subprocess.Popen(
-        [sys.executable, "-c", SLOW.format(helpers=helpers, folder=str(tmp_path))]
-    )
-    deadline = time.monotonic() + 60
-    while not mirror.asked and time.monotonic() < deadline:
-        time.sleep(0.05)
-    child.send_signal(signal.SIGKILL)
-    child.wait()
-    assert len(list(room.folder.glob("tmp*"))) == 1  # begun, and left
-    with pytest.raises(DataError, match="gsparc data room"):
-        offer(monkeypatch, tmp_path, *room.sources, dataset="newrf")
-        fetched_path("newrf")
-    fetch("room", retries=0)
-    assert sorted(path.name for path in room.folder.iterdir()) == [".lock", "1.bin"]
-
-
 def test_data_without_files_say_in_one_line_how_to_get_them(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     for name, says in {
@@ -262,48 +219,6 @@ def test_the_list_tells_size_licence_and_source(capsys):
     assert (
         "github.com/wenchaozheng/WRF-GSplus at e564f31844"
     ) in listed and "no licence stated" in listed
-
-
-@pytest.mark.slow
-def test_more_than_the_known_size_is_not_read(mirror, monkeypatch, tmp_path, refused):
-    """A mirror that sent 300 MB for 386 kB was read thrice to its end."""
-    sent = []
-
-    def flood(request, content):
-        begin(request)
-        with contextlib.suppress(OSError):
-            for _ in range(1000):
-                request.wfile.write(os.urandom(2**16))
-                sent.append(2**16)
-
-    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, flood, flood, flood))
-    refused("not the 3,000 bytes of the pinned revision", fetch, "room")
-    assert sum(sent) < 3 * 20e6
-
-
-def test_a_byte_now_and_then_never_ended(mirror, monkeypatch, tmp_path, refused):
-    def drips(request, content):
-        begin(request, Content_Length=len(content))
-        with contextlib.suppress(OSError):
-            for one in content:
-                request.wfile.write(bytes([one]))
-                if mirror.stop.wait(0.02):
-                    return
-
-    monkeypatch.setattr(fetching, "PATIENCE", 2)
-    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, drips))
-    refused("the server sends too little in the time", fetch, "room", timeout_s=0.1, retries=0)
-
-
-def test_what_is_packed_on_the_wire_is_not_unpacked(mirror, monkeypatch, tmp_path, refused):
-    def packed(request, content):
-        body = gzip.compress(bytes(10**7))
-        begin(request, Content_Encoding="gzip", Content_Length=len(body))
-        with contextlib.suppress(OSError):
-            request.wfile.write(body)
-
-    offer(monkeypatch, tmp_path, mirror.serve("release/1.bin", ONE, packed))
-    refused("not the 3,000 bytes", fetch, "room", retries=0)
 
 
 def test_who_waits_for_another_fetch_is_told(mirror, monkeypatch, tmp_path, caplog):

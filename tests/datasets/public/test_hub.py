@@ -7,7 +7,6 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import numpy as np
 import pytest
 
-from gsparc.base.errors import DataError
 from gsparc.datasets.load import load
 from gsparc.datasets.public import fetch as fetching
 from gsparc.datasets.public import hub
@@ -113,12 +112,3 @@ def test_a_fetch_that_was_cut_off_goes_on_with_its_revision(room):
 def test_a_folder_that_the_hub_has_no_more_is_said(room, refused):
     room.clear()
     refused("makers/sets has no folder room", fetch, "room", accept=True)
-
-
-def test_a_hub_that_is_not_reached_is_one_line(room, monkeypatch):
-    from huggingface_hub import constants
-
-    monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:1")
-    with pytest.raises(DataError, match="makers/sets: ") as error:
-        fetch("room", accept=True)
-    assert "say it again" in str(error.value) and "\n" not in str(error.value)

@@ -6,7 +6,6 @@ Each hostile file would leave a mark; no mark may appear. Naive: `pickle.load` a
 """
 
 import builtins
-import io
 import os
 import pickle
 import subprocess
@@ -23,7 +22,6 @@ from doors import assert_refused, knock
 
 import gsparc
 from gsparc.commands.listing import COMMANDS
-from gsparc.commands.train import main as train
 from gsparc.models import checkpoint
 from gsparc.models.checkpoint import CheckpointError
 from gsparc.models.registry import build
@@ -109,24 +107,6 @@ def test_nothing_executes(sound, tmp_path, name, place):
     assert not (tmp_path / MARK).exists()
 
 
-def test_commands_refuse_them_in_one_line(sound, tmp_path):
-    path = altered(
-        sound[0], tmp_path / "hostile.ckpt", state={"x": payloads(tmp_path / MARK)["eval"]}
-    )
-    assert_refused_everywhere(path, sound[1], tmp_path / "run", "could run code")
-    given = [
-        "dataset=own",
-        f"dataset.file={sound[1]}",
-        f"ckpt_path={path}",
-        f"hydra.run.dir={tmp_path / 'r2'}",
-    ]
-    answer = knock(
-        train, "train.py", [*given, "logger=none", "threads=1", "model.effects.phase=false"]
-    )
-    assert_refused(answer, "could run code", tmp_path / "r2")
-    assert not (tmp_path / MARK).exists()
-
-
 @pytest.mark.parametrize(
     "target",
     [
@@ -206,38 +186,6 @@ def nested(width: int, depth: int) -> list:
 )
 def test_content_that_does_not_fit(sound, tmp_path, changes, says):
     assert_refused_here(altered(sound[0], tmp_path / "odd.ckpt", **changes), says)
-
-
-def other_files() -> dict[str, bytes]:
-    """Files of other kinds under the name of a checkpoint."""
-    archive, empty = io.BytesIO(), io.BytesIO()
-    with zipfile.ZipFile(archive, "w") as made:
-        made.writestr("data.pkl", b"cos\nsystem\n(S'true'\ntR.")
-    with zipfile.ZipFile(empty, "w"):
-        pass
-    array = io.BytesIO()
-    np.savez(array, a=np.ones(3))
-    weights = io.BytesIO()
-    torch.save({"w": torch.ones(2)}, weights)
-    return {
-        "text": b"hello",
-        "pickle": pickle.dumps({"a": 1}),
-        "zip": archive.getvalue(),
-        "empty zip": empty.getvalue(),
-        "npz": array.getvalue(),
-        "weights": weights.getvalue(),
-        "zeros": bytes(5000),
-    }
-
-
-@pytest.mark.parametrize("kind", [*other_files(), "absent", 0.0, 0.01, 0.3, 0.9, 0.999])
-def test_files_of_other_kinds_and_cut_short(sound, tmp_path, kind):
-    path, content = tmp_path / "other.ckpt", sound[0].read_bytes()
-    cut = isinstance(kind, float)
-    if kind != "absent":
-        path.write_bytes(content[: int(kind * len(content))] if cut else other_files()[kind])
-    says = "not a gsparc checkpoint, or cut short" if cut else r"other\.ckpt: "
-    assert_refused_here(path, "no such checkpoint" if kind == "absent" else says)
 
 
 def test_an_ordinary_unpickler_would_run_them(tmp_path):

@@ -139,17 +139,6 @@ def test_every_array_spoilt_in_every_way(tmp_path, kind, name, way):
     assert "\n" not in str(refused.value)
 
 
-@pytest.mark.parametrize("kind,name,way", sorted(LEFT_OUT))
-def test_a_row_without_a_place_is_left_out(tmp_path, kind, name, way):
-    arrays = {"channels": channels, "spectra": spectra}[kind]()
-    rows = len(arrays[name])
-    arrays[name] = WAYS[way](arrays[name])
-    path = store(tmp_path / "spoilt.npz", arrays)
-    answer = knock(lambda: check([str(path)]), "check", [])
-    assert answer.status == 0 and f"these 1 of {rows} rows are left out" in "".join(answer.out)
-    assert len(load_own(path)) == rows - 1
-
-
 @pytest.mark.parametrize("name,way", sorted(HARMLESS))
 def test_what_is_not_refused_is_finite(tmp_path, name, way):
     arrays = channels() if name in channels() else spectra()

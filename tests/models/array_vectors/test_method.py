@@ -1,20 +1,16 @@
 """The static-array model end to end: renderer, Gaussian process, kernel choice, state, queries."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 from known_arrays import array_site, measure, spectra, walk
 from releases import real
 
-from gsparc.data.splits import Fold, Split
+from gsparc.data.splits import Fold
 from gsparc.datasets.load import load, split_for
 from gsparc.datasets.rfid import planar_array
 from gsparc.evaluation.scores import score_methods
-from gsparc.field.encoding import EncodingSettings
 from gsparc.field.gaussians import FieldSettings
-from gsparc.models.array_vectors import splat_init
 from gsparc.models.array_vectors.vector_gp import (
     align_by_likelihood,
     index_mirror_elements,
@@ -36,13 +32,6 @@ def _fold(rows):
     order = np.random.default_rng(0).permutation(rows)
     cut = rows // 5
     return Fold(np.sort(order[2 * cut :]), np.sort(order[cut : 2 * cut]), np.sort(order[:cut]))
-
-
-@pytest.fixture(scope="module")
-def small(known_campaign, tmp_path_factory):
-    """64 Gaussians fitted to 96 of the spectra, its report and folder."""
-    method, folder = ArrayField(SMALL), tmp_path_factory.mktemp("run")
-    return method, method.fit(known_campaign[0], _fold(160), FitContext(folder)), folder
 
 
 @pytest.mark.parametrize(
@@ -127,37 +116,6 @@ def test_fit_without_a_run_folder_writes_nothing(known_campaign, tmp_path, monke
     monkeypatch.chdir(tmp_path)
     ArrayField(SMALL).fit(known_campaign[0], _fold(160), FitContext())
     assert not list(tmp_path.iterdir())
-
-
-def test_it_beats_neighbours(known_campaign, small, tmp_path):
-    data, folds = known_campaign[0], (_fold(160),)
-    split, (method, report, folder) = Split("known", folds), small
-    assert report.seconds > 0 and (folder / "array_recovery.csv").exists()
-    nearest = method_class("nearest")()
-    nearest.fit(data, split.folds[0], FitContext(tmp_path))
-    ours, theirs = (score_methods([m], data, split) for m in (method, nearest))
-    assert ours.samples["mse"].mean() < 0.3 * theirs.samples["mse"].mean()
-
-
-def test_many_rows_are_told_by_few_places_and_aligned_by_a_part(
-    known_campaign, small, tmp_path, monkeypatch
-):
-    data, whole, few = known_campaign[0], small[0], ArrayField(SMALL)
-    few.settings = replace(
-        few.settings, emission=replace(few.settings.emission, encoding=EncodingSettings(anchors=40))
-    )
-    few.fit(data, _fold(160), FitContext(tmp_path))
-    assert few.fitted_model().emission.encoding.width == 40
-    assert whole.fitted_model().emission.encoding.width == 128
-    batch = data.batch(_fold(160).test)
-    said = [m.predict(batch).mean for m in (whole, few)]
-    assert (said[0] - said[1]).square().mean() < 5e-3 * batch.target.square().mean()
-    monkeypatch.setattr(splat_init, "MOST_ROWS", 60)
-    few.fit(data, _fold(160), FitContext(tmp_path))
-    assert few.fitted_model().emission.encoding.width == 40
-    again = few.predict(batch).mean
-    errors = [(found - batch.target).square().mean() for found in (again, said[1])]
-    assert errors[0] < 1.5 * errors[1], errors
 
 
 def test_antennas_at_one_place_are_refused(tmp_path):

@@ -5,9 +5,8 @@ each solved once.
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
-from known_arrays import array_site, measure, room_vectors, spectra, walk
+from known_arrays import array_site, spectra
 from releases import release
 
 from gsparc.datasets.load import load
@@ -72,35 +71,6 @@ def test_restarts_are_counted_and_no_clock_ends_them(known_campaign, monkeypatch
         assert (96 in starts) == (most >= 96) and 384 not in starts
 
 
-@pytest.mark.parametrize("rows", [2, 3, 5])
-def test_very_few_spectra_and_a_zero_vector_of_a_zero_spectrum(known_campaign, rows):
-    data, _ = known_campaign
-    images = np.concatenate([data.target[: rows - 1], np.zeros_like(data.target[:1])])
-    found = recover_vectors(data.site, images, data.tx[:rows])
-    assert np.isfinite(found.vectors).all() and np.abs(found.vectors[-1]).max() < 1e-2
-
-
-def test_only_requested_rows_are_recovered_and_each_once(known_campaign, monkeypatch, caplog):
-    caplog.set_level("INFO", "gsparc")
-    data, _ = known_campaign
-    data = replace(data, site=replace(data.site, sha256="fresh"))
-    asked, inner = [], vector_cache.recover_vectors
-    monkeypatch.setattr(vector_cache, "AT_ONCE", 10)
-    monkeypatch.setattr(
-        vector_cache, "recover_vectors", lambda *a: asked.append(len(a[1])) or inner(*a)
-    )
-    watch = Stopwatch()  # of one fit, which pays once
-    first = vector_cache.recover_cached(data, np.arange(10), watch=watch)
-    again = vector_cache.recover_cached(data, np.arange(5, 25), watch=watch)
-    assert asked == [10, 8, 7]
-    np.testing.assert_array_equal(again.vectors[:5], first.vectors[5:])
-    assert not any("computed before" in said for said in caplog.messages)
-    other = replace(data, site=replace(data.site, sha256="another"))
-    vector_cache.recover_cached(other, np.arange(3))
-    vector_cache.recover_cached(other, np.arange(3), seed=1)
-    assert asked == [10, 8, 7, 3, 3]
-
-
 def test_seconds_of_vectors_that_another_fit_had_solved_were_not_counted(
     known_campaign, monkeypatch, caplog
 ):
@@ -140,14 +110,3 @@ def test_real_spectra_are_sixteen_complex_numbers():
     rows = np.arange(40, 80)
     found = recover_vectors(data.site, data.target[rows], data.tx[rows])
     assert np.median(found.residual) < 1e-3 and not found.is_suspect.any()
-
-
-def test_an_array_without_mirror_symmetry_has_no_twins_to_confuse():
-    array = np.array([[0.0, 0, 0], [0.16, 0, 0], [0.48, 0, 0], [0, 0.16, 0], [0, 0.4, 0]])
-    site = array_site(SphereGrid.hemisphere(20, 40), array)
-    tx = walk(20)
-    vectors, _ = room_vectors(tx, 1, array)
-    data = measure(site, tx, vectors)
-    found = recover_vectors(site, data.target, tx)
-    unit = [v / np.linalg.norm(v, axis=1, keepdims=True) for v in (found.vectors, vectors)]
-    assert np.median(np.abs((unit[0].conj() * unit[1]).sum(1))) > 0.999

@@ -2,19 +2,15 @@
 and what follows from it.
 """
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
 from campaigns import compose
 from contexts import short
-from known_arrays import spectra
 
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.field.frozen import gaussian_vectors
-from gsparc.models.array_vectors import splat_init
 from gsparc.models.array_vectors.cross_validation import choose_kernel
 from gsparc.models.array_vectors.vector_cache import recover_cached
 from gsparc.models.array_vectors.vector_gp import align_by_likelihood, index_mirror_elements
@@ -75,60 +71,6 @@ def test_the_field_is_the_posterior_of_the_vectors(trained, process):
     np.testing.assert_allclose(
         model.unknown_shares(batch.tx, batch.rx).numpy(), variance, atol=1e-4
     )
-
-
-@pytest.mark.slow
-def test_spectra_are_of_the_known_and_the_unknown_share(trained, process):
-    method, data, fold = trained
-    said, batch = method.predict(Query(*_ends(data, fold.test))), data.batch(fold.test)
-    mean, variance = process
-    background = torch.from_numpy(data.targets(fold.train).numpy().mean(0))
-    known = spectra(data.site, torch.from_numpy(mean)).square()
-    wanted = (
-        (known + torch.from_numpy(variance)[:, None, None] * background.square())
-        .sqrt()
-        .clamp(max=1)
-    )
-    torch.testing.assert_close(said.mean.double(), wanted, atol=2e-3, rtol=0)
-    assert (said.mean - batch.target).square().mean() < 0.01 * batch.target.square().mean()
-
-
-def test_all_is_unknown_far_away_and_little_at_data(trained):
-    method, data, fold = trained
-    tx, rx = _ends(data, fold.train)
-    far = method.predict(Query(tx[:10] + torch.tensor([9.0, -8.0, 3.0]), rx))
-    background = method.fitted_model().response.background
-    torch.testing.assert_close(far.mean, background.expand(10, -1, -1), atol=1e-5, rtol=0)
-    assert (far.confidence == 0).all() and (far.variance == far.variance[0]).all()
-    near = method.predict(Query(tx, rx))
-    assert near.confidence.min() > 0.5 and near.variance.max() < 0.5 * far.variance[0]
-    assert (method.fitted_model().unknown_shares(tx, rx) < 0.05).all()
-
-
-def test_a_start_at_random_divides_by_the_maximum(known_campaign, tmp_path):
-    data, _ = known_campaign
-    fold = Fold(np.arange(40), np.arange(40, 44), np.arange(44, 50))
-    method = _trained(data, fold, tmp_path, "model.field.count=20", "init=sphere", steps=3)
-    assert not method.fitted_model().tells_unknown
-    said = method.predict(Query(*_ends(data, fold.test)))
-    assert (said.mean.flatten(1).amax(1) > 0.999).all() and said.variance is None
-
-
-def test_silent_gaussians_are_no_division_by_zero(known_campaign, trained, tmp_path):
-    """A field that the receiver does not see emits nothing: all numbers stay finite."""
-    data, _ = known_campaign
-    found = splat_init.learn_vector_process(data, np.arange(20), 1024, 0, tmp_path)
-    method, _, _ = trained
-    model = build(
-        compose("model.effects.array=true", "model.effects.residual=false", COUNT).model
-    ).create_for(data)
-    model.restore(data.site, method.state())
-    with torch.no_grad():
-        model.fitted_model().gaussians.opacity_logits.fill_(-40.0)
-    batch = data.batch(np.arange(1))
-    few = replace(found, weights=torch.ones(100, 16, dtype=torch.complex128))
-    splat_init.set_emissions(model.fitted_model(), few, batch.rx)
-    assert torch.isfinite(model.fitted_model().emission.weight2).all()
 
 
 @pytest.mark.slow

@@ -128,18 +128,6 @@ def test_a_place_nobody_gave_is_estimated_and_said():
     assert len(plain) == 1 and law_variance(method.law) < 1.3 * law_variance(known.law)
 
 
-def test_both_ends_move():
-    rng = np.random.default_rng(0)
-    ends = rng.uniform(-30, 30, (200, 6))
-    far = np.linalg.norm(ends[:, :3] - ends[:, 3:], axis=1)
-    law = fit_law(
-        PowerRows(ends, -30 - 22 * np.log10(far) + rng.standard_normal(200), far < 0), None
-    )
-    assert law.place is None and law.exponent == pytest.approx(2.2, abs=0.15)
-    mean = law.mean(torch.from_numpy(ends)).numpy()
-    assert np.allclose(mean, law.mean(torch.from_numpy(ends[:, [3, 4, 5, 0, 1, 2]])).numpy())
-
-
 def test_the_floor_holds_near_the_place():
     law = Law(-40.0, 2.0, 5.0, 1.0, (0.0, 0.0, 0.0))
     places = torch.tensor([[0.0, 0, 0], [5.0, 0, 0], [50.0, 0, 0]], dtype=torch.float64)

@@ -14,26 +14,7 @@ from gsparc.data.target import TARGETS
 from gsparc.datasets.load import load, split_for
 from gsparc.evaluation.scores import score_methods
 from gsparc.models.baselines.gp import GaussianProcess, principal_components
-from gsparc.processes.density import left_out_density
-from gsparc.processes.fit_kernel import choose_left_out_kernel
-from gsparc.processes.kernel import Kernel
 from gsparc.training.context import FitContext
-
-
-def test_chosen_kernel_is_a_minimum(campaign):
-    data = campaign("spectrum", 40)
-    scores = torch.from_numpy(principal_components(data.target, data.site.target, 512).scores)
-    kernel = choose_left_out_kernel(data.moving, scores.numpy(), 288, 1)
-    places = torch.from_numpy(data.moving)
-    at = {
-        step: left_out_density(
-            [(Kernel.from_length(kernel.length * step, kernel.noise).gram(places), scores)],
-            288,
-            False,
-        )[0]
-        for step in (0.8, 1.0, 1.25)
-    }
-    assert at[1.0] == min(at.values())
 
 
 @pytest.mark.parametrize("kind", ["spectrum", "csi", "rssi"])
@@ -49,23 +30,6 @@ def test_components_are_the_principal_ones(campaign, kind):
     left = ((rows - reference.inverse_transform(reference.transform(rows))) ** 2).mean()
     assert parts.lost == pytest.approx(left, rel=1e-3, abs=1e-9)
     assert whole.lost == pytest.approx(0, abs=1e-9)
-
-
-def test_the_strongest_components_leave_out_a_stated_share(campaign, folds, tmp_path):
-    data, fold = campaign("spectrum", 40), folds(40).folds[0]
-    whole = GaussianProcess()
-    whole.fit(data, fold, FitContext(tmp_path))
-    less, batch = whole.with_strongest(0.1), data.batch(fold.test)
-    assert len(less.axes) < len(whole.axes)
-    target = whole.scores.given_values().square().sum()
-    rest = float(target - less.scores.given_values().square().sum())
-    assert 0 < rest <= 0.1 * float(target)
-    entries = len(whole.scores.rows) * len(whole.mean)
-    assert less.lost - whole.lost == pytest.approx(rest / entries, rel=1e-6)
-    one, other = whole.predict(batch), less.predict(batch)
-    assert float((one.mean - other.mean).square().mean()) < 0.2 * float(one.mean.var())
-    assert (other.variance > one.variance).all()
-    assert len(whole.with_strongest(0.0).axes) == len(whole.axes)
 
 
 def test_a_query_of_an_averaged_process_read_every_pixel_of_its_components(
@@ -118,15 +82,6 @@ def test_prediction_and_variance_are_scikit_learns(campaign, folds, tmp_path):
     assert torch.allclose(
         found.variance, torch.from_numpy(2 * deviation[:, 0] ** 2).float(), rtol=1e-3
     )
-
-
-def test_few_components_say_so(campaign, folds, tmp_path):
-    data, fold = campaign("spectrum", 48), folds(48).folds[0]
-    gp = GaussianProcess(components=4)
-    notes = gp.fit(data, fold, FitContext(tmp_path)).notes
-    assert any("4 components" in note for note in notes) and gp.axes.shape[0] == 4
-    with pytest.raises(ValueError, match="components"):
-        GaussianProcess(components=0)
 
 
 def test_metric_formats_on_the_real_subset(tmp_path):

@@ -1,7 +1,6 @@
 """The simple baselines, what all of them share, and kriging from the nearest of many places."""
 
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +11,6 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines import kriging
 from gsparc.models.baselines.idw import InverseDistance
-from gsparc.models.baselines.kriging import Kriging, Variogram
 from gsparc.models.registry import method_class
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
@@ -46,15 +44,6 @@ def test_idw_weighs_by_inverse_squared_distance(campaign, folds, tmp_path):
     )
     with pytest.raises(ValueError, match="neighbours"):
         InverseDistance(neighbours=0)
-
-
-def test_mean_is_the_mean(campaign, folds, tmp_path):
-    data, fold = campaign("spectrum", 30), folds(30).folds[0]
-    rows = np.concatenate([fold.train, fold.val])
-    batch = data.batch(fold.test)
-    found = fitted("mean", data, fold, tmp_path).predict(batch).mean
-    assert torch.allclose(found[0], data.targets(rows).mean(0), atol=1e-6)
-    assert torch.equal(found[0], found[-1])
 
 
 @pytest.mark.parametrize("name", ["mean", "nearest", "idw", "gp"])
@@ -106,47 +95,6 @@ def test_kriging_of_many_rows_asked_for_all_memory(tmp_path, monkeypatch):
         ]
     )
     assert (error + 40 + torch.from_numpy(places[70:, 0]).float()).abs().max() < 1.5
-
-
-def test_runs_were_taken_as_one_without_a_word(campaign, folds, tmp_path):
-    data = campaign("csi")
-    fold = folds(len(data)).folds[0]
-    several = replace(data, run=np.arange(len(data)) % 2)
-    said = [InverseDistance().fit(d, fold, FitContext(tmp_path)).notes for d in (several, data)]
-    assert any("channels of 2 runs" in note for note in said[0])
-    assert not any("runs" in note for note in said[1])
-
-
-def field(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Places, powers [dB] of a smooth field with noise, and queries among them."""
-    rng = np.random.default_rng(0)
-    places = np.concatenate([rng.uniform(0, 30, (count, 2)), np.ones((count, 1))], 1)
-    level = 6 * np.sin(places[:, 0] / 3) + 4 * np.cos(places[:, 1] / 4)
-    return (
-        places,
-        (level + rng.normal(0, 0.5, count)).astype(np.float32)[:, None],
-        places[:40] + 0.1,
-    )
-
-
-def krige(
-    places: np.ndarray, decibels: np.ndarray, queries: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    method = Kriging()
-    method.positions, method.values, method.channels = places, decibels, None
-    method.variogram = Variogram(0.25, 25.0, 5.0)
-    method._factor_system()
-    place, weights, variance = method._weights(queries)
-    return (weights * decibels[place, 0]).sum(1), variance
-
-
-def test_nearest_places_screen_the_others(monkeypatch):
-    places, decibels, queries = field(600)
-    whole, spread = krige(places, decibels, queries)
-    monkeypatch.setattr(kriging, "WHOLE", 100)
-    near, wider = krige(places, decibels, queries)
-    assert np.abs(near - whole).max() < 0.15 and np.sqrt(np.mean((near - whole) ** 2)) < 0.05
-    assert (wider >= spread - 1e-9).all() and np.abs(wider / spread - 1).max() < 0.05
 
 
 def test_two_places_have_no_variogram():

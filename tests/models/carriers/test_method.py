@@ -15,14 +15,13 @@ from refusals import refused
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.carriers import method
 from gsparc.models.carriers.alone import CarriersAlone
 from gsparc.models.carriers.array import carriers_obstacle
 from gsparc.models.carriers.geometry import STEP, find_paths, ways
 from gsparc.models.carriers.method import CarrierField
 from gsparc.models.carriers.plain import DirectBeam, OtherCarriers
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.per_station import PerStation, wrap_per_station
+from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose, SphereGrid
 from gsparc.physics.lags import SpectrumLags
@@ -131,18 +130,6 @@ def test_a_carrier_that_was_never_measured_is_predicted(room):
     assert error(method, room, test) < 0.6 * error(fit(DirectBeam(), room, test), room, test)
 
 
-def test_a_stored_method_answers_the_same(room, fitted, tmp_path):
-    torch.save(fitted.state(), tmp_path / "state.pt")
-    again = CarrierField()
-    again.restore(room.site, torch.load(tmp_path / "state.pt", weights_only=True))
-    batch = room.batch(LAST)
-    for part in ("mean", "variance", "unknown"):
-        torch.testing.assert_close(
-            getattr(again.predict(batch), part), getattr(fitted.predict(batch), part)
-        )
-    assert again.count_components() == fitted.count_components()
-
-
 def test_a_query_without_a_carrier_is_asked_for_one(fitted):
     with pytest.raises(ValueError, match=r"which carrier\? say station=, one of rx at 1000 MHz"):
         fitted.predict(Query(torch.zeros(1, 3), Pose.identity(torch.zeros(3))))
@@ -161,42 +148,6 @@ def test_an_array_that_carriers_see_differently_is_not_one(room):
     )
     assert carriers_obstacle(plain.site) == "carriers see through different arrays"
     refused("carriers: carriers see through different arrays", fit, CarrierField(), plain, LAST)
-
-
-def test_more_rows_than_a_process_takes_were_refused(room, monkeypatch):
-    """Over 4,000 rows `model=gsparc` ended in an error;
-    whole places all over the site are learned from.
-    """
-    monkeypatch.setattr(method, "MOST_ROWS", 60)
-    monkeypatch.setattr(method, "CHOSEN_ON", 30)
-    field, none = CarrierField(), np.zeros(0, np.int64)
-    report = field.fit(room, Fold(np.arange(100), none, np.arange(100, 150)), FitContext(Path()))
-    learned = len(field.rows)
-    assert 30 <= learned <= 60 and learned % CARRIERS == 0
-    assert f"{learned} of 100 rows are learned from" in report.notes[-1]
-    assert torch.isfinite(field.predict(room.batch(np.arange(100, 150))).mean).all()
-
-
-@pytest.mark.slow
-def test_carriers_that_share_nothing_were_smoothed_over_all(room):
-    """Of carriers with smooth fields of their own:
-    one process over all lost .5 dB to one of each.
-    """
-    rng = np.random.default_rng(1)
-    waves = rng.normal(size=(CARRIERS, 3, 3)) * 0.7
-    phase = (
-        np.einsum("nd,ncd->nc", room.tx, waves[room.station].transpose(0, 2, 1))
-        + room.station[:, None]
-    )
-    shapes = rng.uniform(0, 1, (CARRIERS, 3, *room.target.shape[1:]))
-    mixed = np.einsum("nc,nchw->nhw", np.cos(phase), shapes[room.station]) / 6 + 0.5
-    alone = replace(room, target=mixed.astype(np.float32))
-    train = np.setdiff1d(np.arange(len(room)), LAST)
-    gp = PerStation(GaussianProcess())
-    gp.fit(alone, Fold(train, train[:0], LAST), FitContext(Path()))
-    field = fit(CarrierField(), alone, LAST)
-    assert field.shares[0] > 0.9
-    assert error(field, alone, LAST) < 1.05 * error(gp, alone, LAST)
 
 
 @pytest.mark.slow

@@ -49,21 +49,6 @@ def test_dense_receivers_tell_and_far_away_nothing_is_said(dense):
     assert far.mean.abs().max() < 1e-3 and far.confidence.max() < 1e-3
 
 
-@pytest.mark.slow
-def test_many_rows_are_told_by_the_nearest(dense, monkeypatch):
-    data, fold, whole, _ = dense
-    monkeypatch.setattr(complex_gp, "MOST_ROWS", 100)
-    near, notes = _fit(data, fold)
-    assert near.label == "complex_gp (Vecchia 100)" and whole.label == "complex_gp"
-    assert any("predicted from the 100 nearest" in note for note in notes), notes
-    batch = data.batch(fold.test)
-    said, exactly = (method.predict(batch) for method in (near, whole))
-    errors = [nmse(found.mean.numpy(), batch.target.numpy()) for found in (said, exactly)]
-    assert errors[0] < 1.5 * errors[1] < 0.4, errors
-    missed = (said.mean - batch.target).abs().square().mean()
-    assert 0.2 < said.variance.mean() / missed < 5
-
-
 def test_places_visited_again_hid_all_others_from_the_nearest_rows(monkeypatch):
     """From 6,001 rows on the nearest hundred were visits of one place:
     NMSE .31 for .07 with fewer.
@@ -159,25 +144,3 @@ def test_settings_of_many_rows_are_chosen_on_some(monkeypatch):
     method, notes = _fit(data, fold)
     assert f"on 100 of {len(fold.train) + len(fold.val)} rows, drawn evenly" in notes[1]
     assert error(method, data, fold.test) < 0.3
-
-
-def test_channels_without_noise():
-    """4 antennas x 52 tones at 5.18 GHz, two receivers a hair apart: nearly the same row twice."""
-    rng = np.random.default_rng(1)
-    place = rng.uniform([0.2, 0.2, 0.5], [7.8, 5.8, 2.0], (120, 3))
-    place[1::2] = place[::2] + 1e-6
-    tones, still = 5.18e9 + 312500.0 * np.arange(-26, 26), np.array([1.0, 1.0, 2.5])
-    array = np.c_[np.zeros(4), (np.arange(4) - 1.5) * 0.029, np.zeros(4)]
-    far = np.linalg.norm(place[:, None] + array - still, axis=-1)[..., None]
-    arrays = {
-        "rx_position": place,
-        "tx_position": still,
-        "array_position": array,
-        "frequency_hz": tones,
-    }
-    data = from_arrays(
-        {**arrays, "csi": np.exp(-2j * np.pi * tones * far / 299792458.0) / far}, {"name": "ofdm"}
-    )
-    rows = np.arange(120)
-    method, _ = _fit(data, Fold(rows[:-1], rows[:0], rows[-1:]))
-    assert error(method, data, rows[-1:]) < 0.1

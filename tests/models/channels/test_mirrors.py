@@ -2,7 +2,6 @@
 and of use to one that was never heard.
 """
 
-from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -17,7 +16,6 @@ from gsparc.models.channels.columns import group_channels
 from gsparc.models.channels.evidence import compress_groups, normalise_power
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
-from gsparc.models.channels.mirrors import find_mirrors
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.probe import Probe, likelihood_gains
 from gsparc.models.channels.terms import Direct, Images, Isotropic, Noise
@@ -94,34 +92,12 @@ def test_a_probe_gains_what_the_likelihood_rises():
         probe = probe.add_wave(waves[0], level)
 
 
-@pytest.mark.slow
-def test_a_wall_at_any_azimuth_is_found_by_ends_of_unknown_phases():
-    data = _data(*_site([WALL], ends=4, count=50, side=0.7, turned=2.0))
-    groups, prior = _bare(data)
-    parts = compress_groups(groups, prior)
-    planes = find_mirrors(parts, parts, prior, WAVELENGTH, 1)
-    plane = planes[0].numpy() * np.sign(planes[0, 0].item())
-    assert np.arccos(plane[:3] @ WALL[:3]) < 0.05
-    assert plane[3] + plane[:3] @ data.site.origin == pytest.approx(WALL[3], abs=0.05)
-
-
 def test_no_wall_is_kept_where_there_is_none():
     data = _data(*_site([], ends=4, count=50, side=0.4, turned=2.0))
     field, _ = fitted_to(
         ChannelField(ChannelSettings(mirrors=2, directions=False)), data, np.arange(len(data))
     )
     assert field.prior.find_term(Images) is None and not len(field.objects().planes)
-
-
-def test_a_plane_between_an_end_and_the_places_mirrors_nothing():
-    plane = torch.tensor([[1.0, 0.0, 0.0, 0.5], [0.0, 1.0, 0.0, 3.0]], dtype=torch.float64)
-    (group, *_), prior = _bare(_data(*_site([WALL], ends=1)))
-    frame, slot = (
-        replace(prior.frame, middle=torch.zeros(3).double()),
-        replace(group.slot, end=plane[0, :3]),
-    )
-    waves = Images.from_planes(frame, plane).waves(replace(group, slot=slot))
-    assert waves.abs().sum(1).bool().tolist() == [False, True]
 
 
 @pytest.mark.slow

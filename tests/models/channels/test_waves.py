@@ -1,6 +1,6 @@
 """The closed-form field of complex channels."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,9 +9,6 @@ from closed import conditioned, fitted_to
 from rooms import WAVELENGTH, shoebox
 from scenes import answer_error
 
-from gsparc.data.ends import NOBODY, Ends
-from gsparc.data.query import Query
-from gsparc.data.schema import Stations
 from gsparc.data.splits import Fold
 from gsparc.models.channels import evidence
 from gsparc.models.channels.columns import SlotPlaces, coherent_bands, group_channels
@@ -22,7 +19,6 @@ from gsparc.models.channels.kernels import (
     directional_correlation,
     fibonacci_sphere,
     number_cells_by_bisection,
-    spread_directions,
 )
 from gsparc.models.channels.prior import ChannelPrior
 from gsparc.models.channels.terms import (
@@ -34,8 +30,7 @@ from gsparc.models.channels.terms import (
     Leakage,
     Noise,
 )
-from gsparc.models.channels.terms.term import ChannelTerm, Frame
-from gsparc.ops import Pose
+from gsparc.models.channels.terms.term import Frame
 from gsparc.processes.left_out import rows_of_groups
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
@@ -139,16 +134,6 @@ def test_one_direction_is_the_mean_of_plane_waves_and_all_are_the_isotropic_fiel
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=0)
 
 
-def test_flat_places_get_a_half_sphere():
-    flat = torch.from_numpy(_sent().moving)
-    half = spread_directions(flat, K, 12)
-    assert len(half) == 12 and abs(half[:, 2].sign().sum()) == 12
-    assert (
-        abs(spread_directions(torch.randn(30, 3, dtype=torch.float64), K, 12)[:, 2].sign().sum())
-        < 12
-    )
-
-
 def test_slopes_of_the_evidence_and_what_compression_costs():
     data = _sent(120, diffuse=1.0, side=0.3)
     prior = _prior(data, envelope=2.0)
@@ -181,34 +166,6 @@ def test_slopes_of_the_evidence_and_what_compression_costs():
     mine = torch.from_numpy(np.flatnonzero(cell == 2))
     own = torch.linalg.solve(inverse[mine[:, None], mine], (inverse @ group.target)[mine])
     assert (error[mine] - own).abs().max() < 0.03 * own.abs().max()
-
-
-@dataclass(frozen=True)
-class _Tilt(ChannelTerm):
-    """A gain that grows along x, the least that a term has to say."""
-
-    def covariance(self, a, b):
-        return self.power * a.places[:, :1] * b.places[:, 0]
-
-    def variance(self, a):
-        return self.power * a.places[:, 0].square()
-
-
-def test_a_term_that_says_its_covariance_alone_is_learned_and_answers():
-    data = _sent(60, direct=0.0, leakage=0.0)
-    data = replace(data, target=data.target + 30 * data.moving[:, :1, None].astype(np.complex64))
-    zero, one = torch.zeros(3).double(), torch.ones(1).double()
-    frame = Frame(zero, 20.0, 0.2, 0.3, zero)
-    groups = tuple(map(evidence.normalise_power, group_channels(data, np.arange(40), False)))
-    errors = []
-    for more in ((), (_Tilt(frame, 0.2 * one),)):
-        prior = ChannelPrior((Isotropic(frame, one), *more, Noise(frame, 0.01 * one)))
-        prior, _ = evidence.fit_powers(evidence.compress_groups(groups, prior), prior, 0.0)
-        errors.append(
-            answer_error(conditioned(prior, data, np.arange(40)), data, np.arange(40, 60))
-        )
-    assert errors[1] < 0.5 * errors[0]
-    assert prior[_Tilt].power > 10 * prior[Isotropic].power
 
 
 @pytest.mark.parametrize("correlated", [False, True])
@@ -319,13 +276,3 @@ def test_tones_far_apart_are_bands_of_their_own():
     found = coherent_bands(tones, 10.0)
     assert len(coherent_bands(tones, 0.1)) == 1 and len(found) > 4
     assert sorted(sum(found, ())) == list(range(40))
-
-
-def test_the_one_station_at_an_unknown_place_was_nobody(campaign):
-    here = np.array([[1.0, 2, 3], [np.nan] * 3])
-    site = replace(campaign("csi", 8, "tx").site, stations=Stations(here, ("known", "unknown")))
-    asked = torch.from_numpy(np.concatenate([here[::-1], here[:1] + 1]))
-    ends = Ends.from_query(
-        site, Query(asked, Pose(torch.zeros(3, 3), torch.eye(3).expand(3, 3, 3)))
-    )
-    assert ends.station.tolist() == [1, 0, NOBODY]

@@ -5,7 +5,7 @@ import pytest
 import torch
 from closed import conditioned, fitted_to
 from releases import real
-from rooms import WAVELENGTH, nmse
+from rooms import WAVELENGTH
 from scenes import answer_error, fold_of
 
 from gsparc.data.query import Query
@@ -21,7 +21,6 @@ from gsparc.models.channels.terms.term import Frame
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.per_station import wrap_per_station
-from gsparc.models.terms import EffectSettings
 from gsparc.prediction.predictor import Predictor
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
@@ -106,17 +105,6 @@ def test_each_end_has_the_covariance_of_its_own_powers():
 
 
 @pytest.mark.slow
-def test_one_field_of_all_ends_is_better_than_plain_processes():
-    data = _ceiling(ends=4, count=40, shift=(0.03, -0.02, 0.0))
-    fold = fold_of(data)
-    field, notes = fitted_to(ChannelField(QUICK), data, np.concatenate([fold.train, fold.val]))
-    assert len(field.stations) == 4 and any("angles to ends" in note for note in notes)
-    plain = wrap_per_station(ComplexGP(), data)
-    plain.fit(data, fold, FitContext())
-    assert answer_error(field, data, fold.test) < 0.7 * answer_error(plain, data, fold.test)
-
-
-@pytest.mark.slow
 def test_an_end_that_was_never_heard_has_the_direct_wave():
     data = _ceiling(ends=9, turned=0.2)
     known, left = np.flatnonzero(data.station < 7), np.flatnonzero(data.station >= 7)
@@ -131,22 +119,6 @@ def test_an_end_that_was_never_heard_has_the_direct_wave():
     assert missed < 0.9 * batch.target.abs().square().mean()
     assert 0.2 < float(missed / found.variance.mean()) < 4
     assert found.unknown.mean() > 3 * heard.unknown.mean()
-
-
-@pytest.mark.slow
-def test_runs_of_all_ends_differ_by_one_phase():
-    runs = np.arange(80) % 2
-    data = _ceiling(runs=runs)
-    fold = fold_of(data)
-    field, _ = fitted_to(ChannelField(QUICK), data, np.concatenate([fold.train, fold.val]))
-    found = field.runs.factors[1] / field.runs.factors[0]
-    torch.testing.assert_close(found.abs(), torch.ones(()).double())
-    assert abs(abs(float(found.angle())) - 0.9) < 0.1
-    batch = data.batch(fold.test)
-    with torch.no_grad():
-        turned = field.predict(Query(batch.tx, batch.rx, batch.station)).mean
-    right = answer_error(field, data, fold.test)
-    assert right < 0.5 * nmse(turned.numpy(), batch.target.numpy())
 
 
 @pytest.mark.slow
@@ -189,15 +161,3 @@ def test_measured_ceiling_in_squares():
     plain = wrap_per_station(ComplexGP(), data)
     plain.fit(data, fold, FitContext())
     assert answer_error(field, data, fold.test) < 0.55 * answer_error(plain, data, fold.test)
-
-
-@pytest.mark.slow
-def test_a_model_of_each_station_answers_by_place_as_well_as_by_row():
-    """Rows of a later station carry its number, of which a site of one end knew nothing."""
-    data = _ceiling(ends=2, count=30)
-    fold = fold_of(data)
-    method = wrap_per_station(Gsparc(EffectSettings(phase=False)), data)
-    method.fit(data, fold, FitContext(stations="each"))
-    batch = data.batch(fold.test)
-    by_place, by_row = method.predict(Query(batch.tx, batch.rx)), method.predict(batch)
-    torch.testing.assert_close(by_place.mean, by_row.mean)

@@ -9,22 +9,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from gains import gains, phased
+from gains import phased
 from rooms import PILLAR, WAVELENGTH
 
-from gsparc.models.image_sources.clutter import finite_mirrors, search
-from gsparc.models.image_sources.clutter.blocking import Clutter, plane_tangents, visible_share
+from gsparc.models.image_sources.clutter import finite_mirrors
+from gsparc.models.image_sources.clutter.blocking import Clutter, plane_tangents
 from gsparc.models.image_sources.clutter.boxes import find_occluding_box
-from gsparc.models.image_sources.clutter.finite_mirrors import find_patch, find_small_mirrors
+from gsparc.models.image_sources.clutter.finite_mirrors import find_small_mirrors
 from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, UnexplainedRows
-from gsparc.models.image_sources.clutter.search import find_clutter
 from gsparc.models.image_sources.gp_likelihood import GainPosterior
-from gsparc.models.image_sources.known.method import ReflectionPhasePrior
-from gsparc.models.image_sources.query import EnsembleMeans
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, SourceScene
 from gsparc.physics.mirror_planes import all_sequences
-from gsparc.processes.worker import Cancelled, cancel_when, end_when
+from gsparc.processes.worker import Cancelled, cancel_when
 
 SIZE = torch.tensor([4.0, 3.0, 2.5], dtype=torch.float64)
 TRANSMITTER = SIZE * torch.tensor([0.15, 0.27, 0.75], dtype=torch.float64)
@@ -87,22 +84,6 @@ def test_a_patch_reflects_inside_only_and_hides_what_is_behind():
     )
     assert (seen[:, 1] > 0.5).tolist() == [True, False, False]
     assert (seen[:, 0] > 0.5).tolist() == [True, True, False]
-
-
-def test_batched_queries_and_variance_include_clutter():
-    rows = replace(_rows(30), target=torch.randn(30, 1, dtype=torch.complex64))
-    scenes = [_scene(_boxed(_box())), _scene(Clutter.empty())]
-    members = [GainPosterior(rows, phased(each, torch.arange(7.0))) for each in scenes]
-    queries = _rows(6, seed=5).position
-    tone = torch.tensor([2.4e9], dtype=torch.float64)
-    means, variance, _ = EnsembleMeans(members).predict(queries, tone)
-    for member, mean in zip(members, means, strict=True):
-        asked = Rows(queries, tone.expand(6), torch.empty(6, 0), torch.arange(6))
-        waves = member.scene.replace_sequences(member.scene.sequences).unobstructed_waves(asked)
-        expected = (waves[:, :, None] * gains(member, queries)).sum(1)
-        torch.testing.assert_close(mean[:, :, 0], expected, rtol=1e-3, atol=1e-4)
-    bare = EnsembleMeans(members[1:]).predict(queries, tone)[1]
-    assert not torch.allclose(variance, bare)
 
 
 def test_score_is_what_the_best_multiple_gains():
@@ -206,63 +187,3 @@ def test_a_search_for_mirrors_in_a_wide_room_ends_when_it_is_told():
         finite_mirrors._count_cells(room, plane_tangents(WALLS[0]), cells[0][1])
     )
     assert 3 * count < 1.1 * finite_mirrors.MOST_CELLS, "a plane and one wall: three sequences"
-
-
-def test_a_late_search_keeps_clutter_and_a_cancelled_one_ends():
-    """A round of everything went on after the clock; now each step is left in the middle."""
-    rows = _beside_a_table(60)[0].rows
-    start, looks = _bare(), []
-    late = lambda: looks.append(0) or len(looks) > 40  # noqa: E731
-    with end_when(late):
-        found = find_clutter(rows, start, torch.Generator().manual_seed(0))
-    assert isinstance(found, SourceScene) and len(looks) < 60
-    with cancel_when(lambda: True), pytest.raises(Cancelled):
-        find_clutter(rows, start, torch.Generator().manual_seed(0))
-
-
-def test_an_infinite_mirror_becomes_finite():
-    planes, clutter = _table()
-    sequences = (*_sequences(1), (6,), (6, 5), (2, 6))
-    true = SourceScene(
-        TRANSMITTER, planes, sequences, torch.zeros(10), -4.0, KernelVisibility(0.95), clutter
-    )
-    rows = _truth(true, _rows(250))
-    start = phased(replace(true, clutter=Clutter.empty()), torch.zeros(10))
-    left = _unexplained(rows, start)
-    patch, score = find_patch(left, 6)
-    assert score > 10
-    learned, told = (
-        visible_share(
-            left.paths.select_sequences([7]), Clutter(clutter.boxes, each[None], (6,)), planes
-        )
-        > 0.5
-        for each in (patch, clutter.patches[0])
-    )
-    assert (learned == told).float().mean() > 0.85
-
-
-@pytest.mark.slow
-def test_a_pillar_is_clutter_and_an_empty_room_has_none(monkeypatch):
-    generator = torch.Generator().manual_seed(0)
-    for name, value in {"EPOCHS": 1, "BOXES": 2, "MIRRORS": 1}.items():
-        monkeypatch.setattr(search, name, value)
-    for clutter, boxes in ((_boxed(_box()), True), (Clutter.empty(), False)):
-        rows = _truth(_scene(clutter), _rows(150))
-        start = _bare()
-        found = find_clutter(rows, start, generator)
-        assert bool(len(found.clutter.boxes)) == boxes
-        bare, learned = (GainPosterior(rows, each).nll for each in (start, found))
-        assert learned <= bare
-    assert not len(found.clutter)
-
-
-def test_walls_of_equal_phase_shift_give_a_phase_prior():
-    scene = _scene(Clutter.empty())
-    phase = torch.tensor([0.3, *[0.3 + np.pi] * 6]) + 0.1 * torch.tensor([0.0, 1, -1, 1, -1, 1, -1])
-    phase_prior = ReflectionPhasePrior.from_scene(phased(scene, phase))
-    assert phase_prior.turn == pytest.approx(np.pi)
-    assert phase_prior.concentration > 3
-    expected = phase_prior.expected_phases(phase[0], ((0, 1),))
-    assert torch.cos(expected - 0.3).item() == pytest.approx(1.0, abs=1e-5)
-    scattered = phased(scene, torch.arange(7.0) * 2.1)
-    assert ReflectionPhasePrior.from_scene(scattered).concentration < phase_prior.concentration

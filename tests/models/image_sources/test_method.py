@@ -1,7 +1,6 @@
 """The method end to end on rooms whose every source is known."""
 
 import copy
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -15,18 +14,13 @@ from scenes import error
 from shoeboxes import as_arrays
 
 from gsparc import load
-from gsparc.data.query import Query
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.rows import rows_of_measurements
 from gsparc.models.mixture.methods import ImageSources
-from gsparc.physics.mirror_planes import reflect
 from gsparc.prediction.predictor import Predictor
 from gsparc.tables.own import from_arrays
-from gsparc.training import race
 from gsparc.training.context import FitContext
-from gsparc.training.race import FellBehind, Race
 
 
 def _predicted(method, data, index):
@@ -71,17 +65,6 @@ def test_rows_factored_in_float32_answered_otherwise_on_other_machines(small):
     assert (query.level - known).abs().max() < 1e-7 * known.abs().max()
 
 
-def test_variance_is_of_the_size_of_the_error(small):
-    _, data, fold, method, _ = small
-    prediction = _predicted(method, data, fold.test)
-    missed = (prediction.mean - data.targets(fold.test)).abs().square().mean((1, 2))
-    assert 0.5 < prediction.variance.mean() / missed.mean() < 2
-    assert prediction.confidence.min() > 0.9
-    rx = data.batch(fold.test[:1]).rx
-    outside = method.predict(Query(torch.zeros(1, 3), replace(rx, position=rx.position + 30.0)))
-    assert outside.confidence[0] <= prediction.confidence.min()
-
-
 def test_paths_sum_to_the_prediction(small, tmp_path):
     """Gains, delays and directions are what `predict` adds up;
     the loudest comes from the transmitter.
@@ -120,35 +103,10 @@ def test_a_reflection_that_two_solutions_found_was_two_paths(small):
     assert np.abs(summed - channel).max() < 1e-3 * np.abs(channel).max()
 
 
-def test_objects_mirror_the_transmitter_into_its_images(small):
-    method = small[3]
-    scene, planes = method.members[0].scene, torch.from_numpy(method.objects().planes)
-    torch.testing.assert_close(planes[:, :3].norm(dim=1), torch.ones(len(planes)).double())
-    end = scene.transmitter + method.frame.middle
-    for sequence, place in zip(scene.sequences, scene.sources, strict=True):
-        if len(sequence) == 1:
-            assert torch.allclose(
-                reflect(end, planes[sequence[0]]), place + method.frame.middle, atol=1e-6
-            )
-
-
 def test_without_a_query_there_was_an_error(small):
     """Its variance was reshaped to a size of -1."""
     _, data, _, method, _ = small
     assert _predicted(method, data, np.zeros(0, np.int64)).mean.shape == (0, 1, 1)
-
-
-def test_a_search_ends_that_could_add_too_little_to_another_solution(tmp_path, monkeypatch):
-    monkeypatch.setattr(race, "LEAST_GAIN", math.inf)
-    monkeypatch.setattr(race, "STALLED", -math.inf)
-    _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=1)
-    method = ImageSourceGP(searches=4, search_rows=60, margin=1.0, max_sources=2, clutter=False)
-    group, looks = fold.train[::3], []
-    target = data.batch(group).target
-    another = Race.from_mean(group, 1.1 * target, target, lambda *look: looks.append(look))
-    with pytest.raises(FellBehind, match="of the energy of rows held out"):
-        method.fit(data, fold, FitContext(tmp_path, leave_out=(group,), race=another))
-    assert looks and all(what.endswith("sources") and error > 0 for what, error in looks)
 
 
 def test_two_searches_at_the_noise_floor_are_enough(tmp_path):
@@ -157,44 +115,6 @@ def test_two_searches_at_the_noise_floor_are_enough(tmp_path):
     assert "of 8 searches (two agree up to noise, which is enough)" in report.notes[0]
     # both threads may have started one more when the second ended
     assert 2 <= len(method.members) <= 2 + torch.get_num_threads()
-
-
-@pytest.mark.slow
-def test_known_array_elements_are_receivers_of_their_own(tmp_path):
-    array = np.array([[0.0, 0.0, 0.0], [0.06, 0.0, 0.0], [0.0, 0.06, 0.0]])
-    _, data, fold = shoebox(60, size=(3.0, 2.5, 2.2), max_order=1, array=array)
-    assert rows_of_measurements(data, fold.train, 10_000, 0).target.shape == (
-        3 * len(fold.train),
-        1,
-    )
-    method, _ = fitted(data, fold, tmp_path, clutter=False)
-    assert _predicted(method, data, fold.test).mean.shape == (len(fold.test), 3, 1)
-    assert error(method, data, fold.test) < 0.03
-
-
-@pytest.mark.slow
-def test_tones_not_measured_are_predicted_by_delay(tmp_path):
-    frequency = 2.4e9 + np.arange(16) * 2e6
-    _, data, fold = shoebox(100, size=(3.0, 2.5, 2.2), max_order=1, frequency_hz=frequency)
-    mask = np.zeros(data.target.shape, bool)
-    mask[..., ::4] = True
-    known = replace(data, mask=mask)
-    assert set(rows_of_measurements(known, fold.train, 1000, 0).frequency.tolist()) <= set(
-        frequency[::4]
-    )
-    method, _ = fitted(known, fold, tmp_path, clutter=False)
-    prediction = _predicted(method, data, fold.test).mean.numpy()
-    assert nmse(prediction[..., 1::4], data.targets(fold.test).numpy()[..., 1::4]) < 0.02
-
-
-def test_gather_keeps_to_its_limit_and_spreads_over_the_band():
-    frequency = 2.4e9 + np.arange(64) * 1e6
-    _, data, fold = shoebox(30, size=(3.0, 2.5, 2.2), max_order=0, frequency_hz=frequency)
-    rows = rows_of_measurements(data, fold.train, 4 * len(fold.train), 0)
-    assert len(rows) == 4 * len(fold.train) and len(rows.frequency.unique()) > 16
-    for receiver in rows.receiver.unique():
-        assert (rows.frequency[rows.receiver == receiver].diff() >= 15e6).all()
-    assert len(rows_of_measurements(data, fold.train, 10, 0)) == 10
 
 
 def test_spectra_and_zero_channels_are_refused_in_one_line(tmp_path):

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 from gains import fitted, phased
-from rooms import shoebox
 from scenes import error, fold_of
 
 from gsparc.models.image_sources.backprojection import gains_and_amplitudes, rough_gains
@@ -18,7 +17,7 @@ from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, _nll
 from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.image_sources.refine import refine_scene
-from gsparc.models.image_sources.rows import rows_of_measurements, static_array
+from gsparc.models.image_sources.rows import rows_of_measurements
 from gsparc.models.image_sources.scene import KernelVisibility, SourceScene, spherical_waves
 from gsparc.physics.mirror_planes import bisector, image_rotations, images, reflect
 from gsparc.physics.waves import LIGHT
@@ -86,21 +85,6 @@ def test_four_antennas_at_a_hundred_places(four):
     assert np.linalg.norm(np.array(true)[:, None] - found, axis=-1).min(1).max() < 0.05
 
 
-@pytest.mark.slow
-def test_paths_of_each_antenna_sum_to_the_prediction(four):
-    method, data, fold = four
-    batch = data.batch(fold.test[:5])
-    gain, delay, direction, _ = method.paths(batch)
-    assert gain.shape == delay.shape == (5, 4, method.count_components())
-    assert direction.shape == (5, method.count_components(), 3)
-    assert torch.allclose(gain.sum(-1), method.predict(batch).mean[..., 0], atol=1e-4)
-    antennas = torch.from_numpy(static_array(data.site, 4) + data.site.static_position)
-    direct = torch.linalg.vector_norm(
-        torch.from_numpy(data.moving[fold.test[:5]])[:, None] - antennas, dim=-1
-    )
-    assert (delay[:, :, 0] * LIGHT - direct).abs().max() < 0.01
-
-
 def test_orientation_of_first_and_second_order():
     """Mirrors in planes of any slant: the image of an antenna is that of the centre plus Q a."""
     draws = torch.Generator().manual_seed(0)
@@ -154,18 +138,6 @@ def test_quick_scores_of_an_array_are_those_without_a_covariance():
 
 
 @pytest.mark.slow
-def test_rotated_array_and_tones(tmp_path):
-    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    data, fold = _uplink(50, antennas=2, tones=CARRIER + 5e6 * np.arange(2), rotation=turn)
-    method, _ = fitted(data, fold, tmp_path, clutter=False)
-    assert error(method, data, fold.test) < 0.02
-    rows = np.arange(len(data))[:, None, None]
-    turned = replace(data, rx_rotation=np.where(rows == 3, np.eye(3), data.rx_rotation))
-    with pytest.raises(ValueError, match="row 3: the static receiver of 2 antennas is turned"):
-        method.fit(turned, fold, FitContext(tmp_path))
-
-
-@pytest.mark.slow
 def test_antennas_with_phases_of_their_own(tmp_path):
     """Cables of unknown length: no source was found."""
     data, fold = _uplink(100)
@@ -184,13 +156,6 @@ def test_antennas_of_unknown_places_are_outputs_of_their_own():
         replace(data, site=replace(data.site, array=None)), fold.train, 1000, 0
     )
     assert rows.target.shape == (len(fold.train), 2) and rows.array is None
-
-
-def test_rows_draw_antennas_so_that_places_are_many():
-    tones, array = CARRIER + 1e6 * np.arange(8), np.eye(4, 3) / 30
-    _, data, fold = shoebox(60, max_order=0, frequency_hz=tones, array=array)
-    rows = rows_of_measurements(data, fold.train, 2 * len(fold.train), 0)
-    assert len(rows.receiver.unique()) == len(fold.train) and len(rows) == 2 * len(fold.train)
 
 
 def test_the_inner_matrix_of_hardly_any_noise_has_a_factor():

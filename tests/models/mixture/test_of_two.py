@@ -4,14 +4,12 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from boxes import room_of_spectra
 from closed import fitted_to
 from interference import plane
 
 from gsparc.data.schema import Measurements
-from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.closed_form import ClosedForm
-from gsparc.models.mixture.methods import Bearings, Powers
+from gsparc.models.mixture.methods import Powers
 from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.powers.field import PowerField
 
@@ -19,19 +17,6 @@ from gsparc.models.powers.field import PowerField
 def mixed(mixture: Mixture, members: Sequence[ClosedForm], data: Measurements) -> Mixture:
     mixture.members, mixture.weights, mixture.site = list(members), (0.3, 0.7), data.site
     return mixture
-
-
-def test_each_member_is_reduced_and_variance_is_left_out():
-    data = room_of_spectra()
-    pair = [fitted_to(GaussianProcess(), data, rows)[0] for rows in (np.arange(20), np.arange(40))]
-    both, batch = mixed(Bearings(), pair, data), data.batch(np.arange(40, 60))
-    knobs = {"keep": 0.5, "stride": 2, "confidence": False}
-    assert set(both.reduction_settings()) == set(knobs)
-    means = [member.reduce(knobs, {}).predict(batch).mean for member in pair]
-    lean = both.reduce(knobs, {}).predict(batch)
-    assert torch.allclose(lean.mean, 0.3 * means[0] + 0.7 * means[1]) and lean.variance is None
-    assert not torch.allclose(lean.mean, both.predict(batch).mean)
-    assert both.reduce({}, {}) is both
 
 
 def test_a_mixture_of_two_was_fitted_anew_where_each_member_forgets():

@@ -1,10 +1,8 @@
 import numpy as np
 import torch
-from distances import far
 
 from gsparc.models.moving_array.residual import (
     energies_and_axes,
-    error_and_likeliest_kernel,
     fit_residual,
 )
 from gsparc.processes.kernel import Kernel
@@ -30,31 +28,6 @@ def test_left_out_predictions_are_those_of_the_others(monkeypatch):
     weights = np.linalg.solve(KERNEL.gram(at[1:]).numpy(), (values[others] - mean).numpy())
     wanted = mean.numpy() + KERNEL.correlations(at[:1], at[1:]).numpy() @ weights
     np.testing.assert_allclose(predicted[0], wanted[0], atol=1e-3)
-
-
-def test_axes_are_spared_that_predictions_do_not_need():
-    places, values = rows()
-    residual, predicted = fit_residual(KERNEL, places, values, 30)
-    assert 3 <= len(residual.axes) <= 8
-    missed = (predicted - values).square().sum()
-    assert missed < 0.2 * (values - values.mean(0)).square().sum()
-    again = residual.coefficients(far(places, places))
-    assert (again - values).square().mean() < missed / values.numel()
-    fewer = residual.keep_axes(2)
-    assert fewer.axes.shape == (2, 30) and fewer.weights.shape == (40, 2)
-
-
-def test_without_axes_the_mean_remains_and_the_kernel_of_smooth_rows_is_found():
-    places, values = rows()
-    residual, predicted = fit_residual(KERNEL, places, values, 0)
-    torch.testing.assert_close(
-        residual.coefficients(far(places[:2], places)), values.mean(0).expand(2, 30)
-    )
-    assert predicted.shape == values.shape
-    error, kernel = error_and_likeliest_kernel(places, values)
-    assert (
-        error < 0.2 * float((values - values.mean(0)).square().sum(1).mean()) and kernel.noise < 0.1
-    )
 
 
 def test_axes_are_the_same_from_either_side():

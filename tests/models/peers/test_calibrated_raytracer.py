@@ -25,7 +25,6 @@ from gsparc.simulate.calibration import (
 )
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import RayTracer, Sampling
-from gsparc.simulate.scenes.build import has_known_scene, known_scene
 from gsparc.simulate.scenes.settings import SceneSettings
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
@@ -88,14 +87,6 @@ def test_where_no_scene_is_known_it_says_so_in_one_line(scene, words):
     method = CalibratedRayTracer(scene=scene)
     error = refused(words, method.fit, measurements(np.ones(60)), FOLD, FitContext())
     assert str(error).startswith("calibrated_raytracer: ")
-
-
-def test_a_room_without_triangles_names_no_scene():
-    boxy = SceneSettings("box", 30, CARRIER_HZ, 0.0, 1, room={"size_m": [6, 5, 3]})
-    assert not has_known_scene(said(boxy)) and not has_known_scene({})
-    assert not has_known_scene({"scene": "a street"})
-    street = SceneSettings("canyon", 30, CARRIER_HZ, 0.0, 1, builtin="simple_street_canyon")
-    assert has_known_scene(said(street)) and known_scene(None, said(street), 2e9).carrier_hz == 2e9
 
 
 def test_without_the_ray_tracer_it_says_what_to_install(monkeypatch):
@@ -171,21 +162,3 @@ def test_it_predicts_where_nobody_measured_and_is_stored(wall, tmp_path):
     torch.testing.assert_close(
         again.predict(test).mean, method.predict(test).mean, rtol=1e-4, atol=0
     )
-
-
-@pytest.mark.slow
-def test_channels_are_predicted_up_to_one_factor(wall):
-    apply_materials(wall, dict.fromkeys(used_materials(wall), TRUE))
-    tones = CARRIER_HZ + np.linspace(-2e7, 2e7, 4)
-    csi = wall.trace(places(), PLAIN).responses(tones, np.zeros((1, 3)), wall.wavelength) * 3j
-    data = from_arrays(
-        {"csi": csi, "rx_position": places(), "tx_position": STATION, "frequency_hz": tones},
-        said(SceneSettings("floor_wall", 30, CARRIER_HZ, 0.0, 4, builtin="floor_wall")),
-    )
-    method = CalibratedRayTracer()
-    method.fit(data, FOLD, FitContext())
-    test = data.batch(FOLD.test)
-    missed = (
-        method.predict(test).mean - test.target
-    ).abs().square().sum() / test.target.abs().square().sum()
-    assert missed < 0.05

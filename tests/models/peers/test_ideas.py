@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from known_arrays import array_site, measure, room_vectors, walk
-from scenes import answer_error, error, fold_of, lobes, room, shadowed, wandering
+from scenes import answer_error, error, lobes, room, shadowed, wandering
 from scipy.special import eval_legendre
 
 from gsparc.data.query import Query
 from gsparc.data.splits import Fold
-from gsparc.datasets.rfid import planar_array
 from gsparc.models.baselines.kriging import fit_variogram
 from gsparc.models.peers.gsrf import count_terms, fourier_legendre
 from gsparc.models.per_station import wrap_per_station
@@ -133,18 +131,6 @@ def test_ngrf_finds_the_waves_of_a_room_that_interpolation_cannot(tmp_path):
     assert error(method, data, fold.test) < min(0.5 * plain, 0.3)
 
 
-@pytest.mark.slow
-def test_ngrf_shows_its_waves_through_an_array(tmp_path):
-    """Sixteen elements in a traced room, a tag carried along a path."""
-    grid, array = SphereGrid.hemisphere(18, 36), planar_array(4, 4, 0.16)
-    tx = walk(120)
-    data = measure(array_site(grid, array), tx, room_vectors(tx, 1, array)[0])
-    fold = fold_of(data)
-    known = error(fitted("mean", data, fold, tmp_path), data, fold.test)
-    method = fitted("ngrf", data, fold, tmp_path, count=40, max_steps=400, rate=5e-3)
-    assert error(method, data, fold.test) < 0.75 * known
-
-
 def test_rays_that_meet_by_chance_are_no_virtual_transmitter():
     """Of 126 in a conference room 100 had fewer than five rays,
     some of them taken from the true ones.
@@ -227,28 +213,3 @@ def test_kriging_knows_how_far_shadows_reach(tmp_path):
     assert (miss[sure > np.median(sure)] ** 2).mean() < (miss[sure <= np.median(sure)] ** 2).mean()
     far = Pose(batch.rx.position[:1] + 1000.0, batch.rx.rotation[:1])
     assert method.predict(Query(batch.tx[:1], far)).confidence < 0.05
-
-
-def test_kriging_maps_the_power_of_channels(tmp_path, campaign, folds):
-    """A channel's power is kriged in decibels; a map of power knows no phase between its points."""
-    data, fold = campaign("csi", 60), folds(60).folds[0]
-    method = fitted("kriging", data, fold, tmp_path)
-    batch = data.batch(fold.test)
-    said = method.predict(batch).mean
-    assert said.shape == batch.target.shape and said.is_complex()
-    rows = data.batch(fold.train)  # at a measured place the map is the measurement, less the nugget
-    method.variogram = type(method.variogram)(
-        0.0, method.variogram.variance, method.variogram.range
-    )
-    method._factor_system()
-    there = method.predict(rows).mean
-    assert torch.allclose(there, rows.target, atol=1e-2 * float(rows.target.abs().max()))
-
-
-def test_kriging_of_silent_training_channels_is_silent(tmp_path, campaign, folds):
-    """Silence has no decibels: a traceback about infinities came."""
-    data, fold = campaign("csi", 40), folds(40).folds[0]
-    data.target[np.concatenate([fold.train, fold.val])] = 0
-    method = fitted("kriging", data, fold, tmp_path)
-    batch = data.batch(fold.test)
-    assert method.predict(batch).mean.abs().max() < 1e-15

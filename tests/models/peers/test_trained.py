@@ -194,24 +194,3 @@ def test_a_peer_shows_its_gaussians_and_what_they_emit(tmp_path, name, kind):
     both = data.batch(fold.test[:2])
     square = (cloud.strengths**2 + elsewhere.strengths**2) / 2
     np.testing.assert_allclose(method.gaussians(both).strengths ** 2, square, rtol=1e-5)
-
-
-def test_planar_gaussians_are_shown_in_the_directions_that_they_brighten(tmp_path):
-    data, fold = lobes(tmp_path)
-    method = brief("swiftwrf")
-    method.fit(data, fold, FitContext(tmp_path))
-    network, batch = method.network, data.batch(fold.test[:1])
-    with torch.no_grad():
-        network.strengths.zero_()
-        network.strengths[7] = 0.9
-    cloud = method.gaussians(batch)
-    receiver = data.site.static_position
-    np.testing.assert_allclose(np.linalg.norm(cloud.means - receiver, axis=1), 1, rtol=1e-5)
-    assert cloud.strengths.argmax() == 7
-    brightest = int(method.predict(batch).mean[0].argmax())
-    towards = data.site.grid.directions().reshape(-1, 3)[brightest].double().numpy()
-    turn = np.eye(3) if data.site.rx_rotation is None else data.site.rx_rotation
-    assert turn @ towards @ (cloud.means[7] - receiver) > 0.95
-    moving, fold = lobes(tmp_path, "rx")
-    method.fit(moving, fold, FitContext(tmp_path))
-    refused("a receiver that moves", method.gaussians, batch)

@@ -4,14 +4,12 @@ and is left as it was.
 
 from __future__ import annotations
 
-import copy
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 import torch
-from boxes import room_of_spectra
 from campaigns import brief, channels, compose, spectra
 
 from gsparc.commands.train import TrainedRun, train
@@ -22,10 +20,7 @@ from gsparc.field.gaussians import FieldSettings
 from gsparc.models import reduced
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.mean import Mean
-from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.method import Method, Prediction
-from gsparc.models.moving_array.method import MovingArrayField
-from gsparc.models.moving_array.triangulate import SearchSettings as BearingSearchSettings
 from gsparc.models.splat.array import ArrayField
 from gsparc.training.context import FitContext
 
@@ -113,53 +108,12 @@ def test_fewer_places_say_what_all_of_them_said(through_array):
     assert unsure[0] > unsure[1] > unsure[2]
 
 
-def test_an_array_spares_pixels_and_its_confidence(through_array):
-    coarse = through_array.less(stride=3, confidence=False)
-    assert through_array.away(coarse) < 0.05 and through_array.answer(coarse).confidence is None
-    wide, whole = through_array.answer(through_array.less(stride=2)), through_array.answer()
-    torch.testing.assert_close(
-        wide.mean[:, ::2, ::2], whole.mean[:, ::2, ::2], atol=1e-5, rtol=1e-4
-    )
-    assert torch.equal(wide.confidence, whole.confidence) and torch.equal(
-        wide.variance, whole.variance
-    )
-
-
-def test_a_process_of_sources_spares_searches_and_its_variance(tmp_path):
-    data = load({"name": "own", "file": str(channels(tmp_path / "own.npz", rows=60, shape="S"))})
-    case = Case.fit(
-        ImageSourceGP(searches=2, search_rows=40, max_sources=4, clutter=False), data, 3
-    )
-    silent = case.less(confidence=False)
-    assert case.away(silent) < 1e-9 and case.answer(silent).variance is None
-    one = case.less(searches=1)
-    assert len(one.members) == 1 and case.answer(one).variance is not None
-    assert float(one.weights.sum()) == pytest.approx(1)
-
-
 def test_a_gaussian_process_spares_components_pixels_and_its_variance(process):
     whole = process.less(confidence=False)
     assert process.away(whole) < 1e-8 and process.answer(whole).variance is None
     assert process.less(confidence=True) is process.method
     few = process.less(keep=0.2, stride=2)
     assert few.count_components() < len(process.method.axes) and 0 < process.away(few) < 0.3
-
-
-@pytest.fixture(scope="module")
-def crossings() -> Case:
-    search = BearingSearchSettings(sources=17, rows=40, candidates=2000, steps=20)
-    return Case.fit(MovingArrayField(search, components=64, seed=0), room_of_spectra())
-
-
-def test_a_field_of_bearings_spares_components_pixels_and_its_variance(crossings):
-    assert crossings.less(confidence=True) is crossings.method
-    silent = crossings.less(confidence=False)
-    assert crossings.away(silent) < 1e-8 and crossings.answer(silent).variance is None
-    error = [crossings.away(crossings.less(keep=share)) for share in (0.5, 0.05)]
-    assert 0 < error[0] < error[1] < 0.3
-    coarse = crossings.less(stride=2)
-    assert crossings.answer(coarse).mean.shape == crossings.answer().mean.shape
-    assert 0 < crossings.away(coarse) < 0.05
 
 
 def test_strides_that_do_not_divide_the_columns_are_left_out(process, caplog):
@@ -180,21 +134,3 @@ def test_a_method_without_knobs_has_one_point(field):
 def test_rendered_channels_spare_directions(tmp_path):
     case = Case.trained(train(compose(*brief(channels(tmp_path / "own.npz"))), tmp_path / "run")[1])
     assert case.away(case.less(stride=2)) < 0.2
-
-
-def own_copy(case):
-    method = copy.copy(case.method)
-    return case._replace(method=method)
-
-
-@pytest.mark.parametrize("stride", [1, 2])
-def test_a_process_beside_spares_pixels_with_the_field(field, process, stride):
-    both = own_copy(field)
-    both.method._average = process.method, 0.5
-    spared = process.answer(process.less(confidence=False, stride=stride)).mean
-    wanted = 0.5 * field.answer(field.less(stride=stride)).mean + 0.5 * spared
-    found = both.answer(both.less(stride=stride, confidence=True)).mean
-    assert torch.allclose(found, wanted, atol=1e-4)
-    whole, own = both.answer(), field.answer()
-    assert torch.allclose(whole.mean, 0.5 * own.mean + 0.5 * process.answer().mean, atol=1e-4)
-    assert torch.equal(whole.confidence, own.confidence)  # its variance is not computed

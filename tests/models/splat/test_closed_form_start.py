@@ -68,15 +68,6 @@ def test_a_network_with_hidden_units_has_no_closed_form(smooth):
         started(smooth, emission=dataclasses.replace(KERNEL, hidden=4))
 
 
-def test_the_prior_comes_from_the_given_rows_alone(smooth):
-    poisoned = smooth.target.copy()
-    poisoned[40:] = np.nan
-    clean = learn_prior(smooth, ROWS, 1024, 0)
-    other = learn_prior(dataclasses.replace(smooth, target=poisoned), ROWS, 1024, 0)
-    assert clean.length == other.length and clean.noise == other.noise
-    assert torch.equal(clean.anchors, torch.from_numpy(smooth.moving[ROWS]).float())
-
-
 def test_anchors_are_capped_and_drawn_by_seed(smooth):
     few = [learn_prior(smooth, ROWS, 10, seed).anchors for seed in (0, 0, 1)]
     assert len(few[0]) == 10 and torch.equal(few[0], few[1]) and not torch.equal(few[0], few[2])
@@ -90,16 +81,3 @@ def test_holes_of_masked_spectra_are_filled_not_learned(smooth):
     assert error(model, smooth, ROWS) < 0.2 * spread(smooth)
     naive = started(dataclasses.replace(smooth, target=holes))
     assert error(naive, smooth, ROWS) > 2 * error(model, smooth, ROWS)
-
-
-def test_rows_without_their_neighbours_are_as_a_fit_without_them(smooth):
-    """The kernel stays: what is left out is the rows alone."""
-    model, left = starting(smooth)
-    assert left is not None and len(left.centres) == len(ROWS)
-    errors = ((left.predicted - left.images[left.centres]) ** 2).mean(-1)
-    nearest = np.nanmean(errors[0])
-    shown = error(model, smooth, ROWS)
-    assert (
-        shown < nearest < spread(smooth)
-    )  # harder than rows it has seen, easier than knowing the mean alone
-    assert nearest <= np.nanmean(errors[1:])

@@ -11,7 +11,7 @@ from gsparc.data.query import Query
 from gsparc.datasets.load import load as load_data
 from gsparc.models.registry import build
 from gsparc.models.splat import method as splatting
-from gsparc.models.splat.method import QUERY_CHUNK, LearnedField
+from gsparc.models.splat.method import LearnedField
 from gsparc.ops import Pose
 
 
@@ -47,15 +47,6 @@ def still(tmp_path_factory):
     """A field before a receiver that stands, and what it learned from."""
     folder = tmp_path_factory.mktemp("still")
     return fitted(spectra(folder / "own.npz"), folder)[:2]
-
-
-def test_many_queries_are_answered_in_chunks(still, tmp_path):
-    for method, data in (still, fitted(spectra(tmp_path / "own.npz", moving="rx"), tmp_path)[:2]):
-        rows = np.resize(np.arange(len(data)), QUERY_CHUNK + 7)
-        together = method.predict(data.batch(rows))
-        last = data.batch(rows[-3:])
-        assert len(together.mean) == QUERY_CHUNK + 7 == len(together.confidence)
-        assert torch.allclose(together.mean[-3:], method.predict(last).mean, atol=1e-4)
 
 
 def test_a_static_receiver_is_frozen_and_another_pose_and_an_edit_are_seen(still):
@@ -102,17 +93,6 @@ def test_refit_learns_from_validation_rows_too_and_keeps_a_learned_confidence(tm
         )
     else:
         assert torch.equal(seen["true"][1], seen["false"][1])
-
-
-def test_seeds_repeat_and_differ(tmp_path):
-    file, found = spectra(tmp_path / "own.npz"), []
-    data = load_data({"name": "own", "file": str(file)})
-    fold = fold_of(data)
-    for seed in (0, 0, 1):
-        method = learned(file)
-        method.fit(data, fold, short(tmp_path / str(len(found)), 15, seed=seed))
-        found.append(method.fitted_model().gaussians.means)
-    assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
 
 
 def test_a_closed_form_start_that_cannot_be_says_what_it_needs(tmp_path):

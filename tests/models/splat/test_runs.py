@@ -12,7 +12,6 @@ from gsparc.datasets.load import split_for
 from gsparc.evaluation.scores import score_methods, unseen_runs
 from gsparc.models import loading
 from gsparc.models.method import Method, Prediction
-from gsparc.models.run_factors import RunFactors
 from gsparc.tables.own import from_arrays
 
 
@@ -64,16 +63,3 @@ def test_runs_that_were_not_learned_from_are_scored_after_their_best_phase():
     known = score_methods([method], data, split, "train").figures()["nmse"]
     # A known run's phase is to be known
     assert known == pytest.approx(abs(np.exp(1j) - 1) ** 2, rel=1e-4)
-
-
-def test_aligned_channels_are_restored():
-    data = from_arrays(arrays(World("tone", 5, 1, "rx", "metres", "none", "random", 30), 0))
-    factors = torch.polar(torch.arange(1.0, 6.0).double(), torch.arange(5.0).double())
-    runs = RunFactors(np.arange(5), factors)
-    aligned = runs.remove_factors(data)
-    assert aligned.run is None and RunFactors.has_several_runs(data, np.arange(30))
-    found = runs.apply_factors(
-        Prediction(aligned.targets(np.arange(30))), torch.from_numpy(data.run)
-    )
-    assert torch.allclose(found.mean, data.targets(np.arange(30)), atol=1e-6)
-    assert runs.look_up(torch.tensor([7])).item() == 1  # nothing is known of that one

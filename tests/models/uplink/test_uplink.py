@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from cities import city, deaf, fold, folder, uplink_field
+from cities import city, deaf, fold, uplink_field
 
 from gsparc.data.splits import Split
-from gsparc.datasets.argos import load_argos
 from gsparc.models.baselines.ridge import Ridge
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.uplink.error_model import estimate_noise
@@ -113,37 +112,6 @@ def test_confidence_is_larger_where_errors_are_smaller_also_on_a_narrow_grid_of_
         assert ((found.confidence > 0) & (found.confidence < 1)).all()
         error, sure = _relative(found.mean, true), found.confidence > found.confidence.median()
         assert error[sure].median() < factor * error[~sure].median()
-
-
-@pytest.mark.parametrize("inputs", ["own", pytest.param("all", marks=pytest.mark.slow)])
-def test_ridge_with_a_dead_antenna_leaves_it_silent(inputs) -> None:
-    """A Gram matrix of zeros ended in the library's sequences about singular matrices."""
-    data = city("all")
-    uplink = data.uplink.copy()
-    uplink[:, 0] = 0
-    method = Ridge(inputs)
-    method.fit(replace(data, uplink=uplink), fold(), FitContext())
-    heard = torch.from_numpy(uplink[fold().test])
-    predicted = method.predict(replace(data.batch(fold().test), uplink=heard)).mean
-    assert torch.isfinite(predicted).all() and predicted[:, 1:].abs().min() > 0
-    assert inputs == "all" or (predicted[:, 0] == 0).all()
-
-
-def test_eight_antennas_in_a_row_that_do_not_state_their_noise(tmp_path) -> None:
-    """The release's own layout: a line has one direction cosine,
-    and noise is read off empty delays.
-    """
-    for name in ("csidata.npy", "base-station.yml"):
-        (tmp_path / name).write_bytes((folder() / name).read_bytes())
-    text = (tmp_path / "base-station.yml").read_text()
-    kept = [line for line in text.splitlines() if not line.startswith("noise_power")]
-    (tmp_path / "base-station.yml").write_text("\n".join(kept))
-    data = load_argos(tmp_path)
-    assert data.noise_variance is None and data.uplink.shape[1] == 8
-    method = UplinkField(SearchSettings(rounds=3, picks=4, final=2), teachers=60)
-    method.fit(data, fold(), FitContext())
-    assert method.search.shape[1] == 1
-    assert float(_errors(method, data).median()) < 0.3
 
 
 def test_columns_are_the_slopes_and_their_inner_products() -> None:

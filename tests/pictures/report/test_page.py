@@ -4,13 +4,10 @@ import re
 
 import pytest
 from campaigns import compose, runs_in
-from matplotlib.colors import to_hex
 
 from gsparc.commands.listing import COMMANDS
 from gsparc.commands.report import task
 from gsparc.evaluation.results import Run, frame, frame_of_runs
-from gsparc.pictures import plots
-from gsparc.pictures.drawing import style_of
 from gsparc.pictures.report.page import make_sections, render_html, warnings
 
 arguments = COMMANDS["report"].arguments
@@ -59,19 +56,6 @@ def test_what_a_run_is_called_cannot_become_a_script(run_dir, tmp_path):
     run_dir(tmp_path / "x", name="<script>alert(1)</script>")
     text = render_html("<b>", "now", make_sections(frame(tmp_path / "x")))
     assert "<script>alert" not in text and "<b>" not in text
-
-
-def test_a_baseline_that_is_a_run_too_was_drawn_twice(run_dir, tmp_path):
-    """And in another plot it had the colour of another method."""
-    for name in ("gsparc", "gp"):
-        run_dir(tmp_path / name, name=name)
-    runs = frame(tmp_path)
-    axes = plots.draw_distributions(runs, ["psnr_db"]).axes[0]
-    assert sorted(axes.get_legend_handles_labels()[1]) == ["gp", "gsparc"]
-    colours = {
-        to_hex(one.get_color()).upper() for one in axes.lines if one.get_label() in ("gsparc", "gp")
-    }
-    assert colours == {style_of(name).colour for name in ("gsparc", "gp")}
 
 
 @pytest.mark.slow

@@ -2,24 +2,18 @@
 
 import csv
 import json
-import re
-import subprocess
-import sys
 from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 
 import pandas as pd
 import pytest
-from campaigns import brief, spectra
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from gsparc.evaluation.console import ConsoleHandler
 from gsparc.pictures.report.sweep import FAILURE, SweepReport, equal_settings
-
-ROOT = Path(__file__).parents[3]
 
 
 def of_job(folder: Path, mode: RunMode = RunMode.MULTIRUN):
@@ -45,16 +39,6 @@ def test_a_failure_is_said_once_and_kept_and_the_sweep_goes_on(tmp_path, caplog)
         f"error: job {tmp_path.name} (seed=3) failed, others go on: no such file\n"
     )
     assert "second line" in caplog.text  # in the job's own log
-
-
-def test_a_single_run_and_a_good_job_are_left_alone(tmp_path):
-    single = failed(ValueError("x"))
-    SweepReport().on_job_end(of_job(tmp_path, RunMode.RUN), single)
-    assert single.status == JobStatus.FAILED
-    good = JobReturn()
-    good.return_value, good.status = 1.0, JobStatus.COMPLETED
-    SweepReport().on_job_end(of_job(tmp_path), good)
-    assert good.return_value == 1.0 and not list(tmp_path.iterdir())
 
 
 def of_sweep(folder: Path):
@@ -106,31 +90,6 @@ def test_a_sweep_with_a_failed_job_ends_with_status_1(three, tmp_path, capsys):
         SweepReport(retime=False).on_multirun_end(of_sweep(tmp_path))
     assert end.value.code == 1 and (tmp_path / "sweep.csv").exists()
     assert "1 jobs failed: c0" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_a_real_sweep_times_its_models_alone_after_a_failure(tmp_path):
-    file = spectra(tmp_path / "own.npz")
-    settings = brief(file, "trainer.max_steps=4", "model.field.count=40,-1")
-    command = [
-        sys.executable,
-        "train.py",
-        "-m",
-        *[s for s in settings if s != "model.field.count=40"],
-    ]
-    sweep = tmp_path / "sweep"
-    done = subprocess.run(
-        [*command, f"hydra.sweep.dir={sweep}", "hydra/launcher=joblib", "hydra.launcher.n_jobs=2"],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
-    assert done.returncode == 1, done.stderr
-    assert done.stdout.count("failed, others go on") == 1 and "error: failed" not in done.stdout
-    assert "1 jobs failed" in done.stdout
-    timed = sorted(path.parent.name for path in sweep.glob("*/render_ms.csv"))
-    assert timed == ["0"] and re.search(r"job 1 \(.*model\.field\.count=-1.*\) failed", done.stdout)
-    assert (sweep / "sweep.csv").read_text().count("\n") == 3  # heads, the run, its baseline
 
 
 def test_settings_that_change_nothing_were_tabled_as_if_they_were_compared():

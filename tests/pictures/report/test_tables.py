@@ -20,19 +20,6 @@ def cells(table, row: int) -> dict:
     return dict(zip([c.name for c in table.columns], table.rows[row], strict=True))
 
 
-def test_runs_are_found_in_a_sweep_and_named_by_what_differs(three):
-    rows = own_rows(frame(three[0].parent))
-    assert [run.folder.name for run in rows.run] == ["a0", "a1", "b0"] and list(rows.seed) == [
-        0,
-        1,
-        0,
-    ]
-    settings = ["gsparc emission.hidden=8"] * 2 + ["gsparc emission.hidden=64"]
-    assert list(own_rows(short_settings(rows)).setting) == settings
-    assert {*own_rows(short_settings(rows[:2])).setting} == {"gsparc"}
-    assert list(tables.groups_of(rows)) == settings[1:]
-
-
 @pytest.mark.parametrize(
     ("folder", "text", "message"),
     [
@@ -241,16 +228,3 @@ def test_settings_were_told_apart_without_a_word_on_the_seed_that_they_share(run
     for seeds in (1, 2):
         runs = sweep_of(run_dir, tmp_path / str(seeds), [(29.0, 28.7)] * seeds)
         assert (said in tables.table_of_leads(runs).markdown()) == (seeds == 1)
-
-
-def test_a_method_without_chance_had_differences_without_error(run_dir, tmp_path):
-    """Three seeds of a closed form are one fit:
-    its difference is known as well as its test rows tell it.
-    """
-    runs = sweep_of(run_dir, tmp_path, [(29.0, 28.7)] * 3)
-    for row in own_rows(runs).itertuples():
-        change = np.repeat([0.1, 0.0], 12)  # on half of the rows
-        samples = row.run.samples
-        samples["psnr_db"] = samples["psnr_db"] + (change if "on" in row.setting else -change)
-    (lead,) = tables.table_of_leads(runs).rows
-    assert lead[3] == "24 test rows" and lead[2].error == pytest.approx(0.1 / 23**0.5)

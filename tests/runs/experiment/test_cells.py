@@ -48,37 +48,6 @@ def test_a_whole_table_comes_before_further_efforts_and_seeds():
     assert "rfid/random/waves/1/1" in names(kind="csi")
 
 
-def test_every_room_has_its_first_table_before_any_has_a_second():
-    rooms = [problem("a"), problem("b")]
-    found = [str(cell) for _, cell in plan_cells(rooms, METHODS, [1], [0, 1])]
-    assert found == [
-        "a/random/gp/any/any",
-        "b/random/gp/any/any",
-        "a/random/fast/1/0",
-        "b/random/fast/1/0",
-        "a/random/fast/1/1",
-        "b/random/fast/1/1",
-    ]
-
-
-def test_a_draw_of_a_split_is_the_seed_of_every_method():
-    draws = [problem("a", "blocks", draw=n) for n in range(2)]
-    found = [(p.draw, str(cell)) for p, cell in plan_cells(draws, METHODS, [1], [5, 6])]
-    assert found == [
-        (0, "a/blocks/gp/any/0"),
-        (1, "a/blocks/gp/any/1"),
-        (0, "a/blocks/fast/1/0"),
-        (1, "a/blocks/fast/1/1"),
-    ]
-
-
-@pytest.mark.parametrize("needed", ["stations", "scene"])
-def test_a_method_takes_part_where_what_it_needs_is_there(needed):
-    methods = {"one": Contender("one", ("model=gp",), **{needed: True})}
-    problems = [problem("a"), problem("b", **{needed: True})]
-    assert [cell.dataset for _, cell in plan_cells(problems, methods, [], [])] == ["b"]
-
-
 def test_only_filters_and_a_pattern_of_nothing_is_an_error():
     assert names("*/gp/*", "*/fast/0.3/0") == ["rfid/random/gp/any/any", "rfid/random/fast/0.3/0"]
     refused("only: 'rfid/rndom/\\*' matches no cell", names, "rfid/rndom/*")
@@ -106,17 +75,6 @@ def test_methods_take_part_where_they_are_said_to_and_tell_what_they_read():
         ("rfid", "walls"),
         ("rfid", "directions"),
     ]
-
-
-@pytest.mark.slow
-def test_every_method_of_the_default_comparison_composes():
-    config = OmegaConf.to_container(compose(config="compare"), resolve=True)
-    for contender in read_entries("methods", Contender, config["methods"]).values():
-        assert compose(*contender.overrides(0.3)).model
-    assert config["ours"] in config["methods"]
-    for split in read_entries("splits", SplitChoice, config["splits"]).values():
-        assert set(split.datasets) <= set(config["datasets"])
-        assert compose("dataset=newrf", "dataset.file=x", *split.overrides).split.name
 
 
 def test_one_model_of_a_network_was_fitted_under_four_names():

@@ -1,51 +1,12 @@
 """Errors disturb only what they are said to disturb, and every variant sees the same ones."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from invented import divide, invent
-from rooms import directed
 
 from gsparc.runs.experiment.disturb import (
     Disturbance,
-    add_direction_errors,
-    add_position_errors,
-    thin_fold,
 )
-
-
-def test_positions_move_where_asked_and_by_what_was_asked():
-    data, fold = invent(rows=400), divide(400).folds[0]
-    moved = add_position_errors(data, fold.test, 0.1, seed=0)
-    assert np.array_equal(moved.tx[fold.train], data.tx[fold.train]) and moved.target is data.target
-    assert np.std(moved.tx[fold.test] - data.tx[fold.test]) == pytest.approx(0.1, rel=0.1)
-
-
-def test_directions_turn_by_what_was_asked_and_nothing_else():
-    data, _, _ = directed(40)
-    there = add_direction_errors(data, 2.0, seed=0)
-    angle = np.linalg.norm(
-        np.concatenate(there.directions) - np.concatenate(data.directions), axis=1
-    )
-    assert abs(np.degrees(np.sqrt(np.mean(angle**2) / 2)) - 2) < 0.2
-    assert there.target is data.target and there.rx_position is data.rx_position
-    few = add_direction_errors(data, 0.0, seed=0, missing=0.5)
-    more = add_direction_errors(data, 0.0, seed=0, false=0.5)
-    counts = [sum(map(len, d.directions)) for d in (few, data, more)]
-    assert counts[0] < 0.6 * counts[1] and counts[2] > 1.4 * counts[1]
-    with pytest.raises(ValueError, match="no directions of arrival"):
-        add_direction_errors(replace(few, directions=None), 1.0, seed=0)
-
-
-def test_smaller_training_sets_are_subsets_of_larger_ones():
-    fold = divide(48).folds[0]
-    half, fewer, same = (thin_fold(fold, keep, seed=1) for keep in (0.5, 6, 1))
-    assert np.array_equal(same.train, fold.train) and half.test is fold.test
-    assert (len(half.train), len(half.val)) == (16, 2) and len(fewer.train) + len(fewer.val) == 6
-    assert set(fewer.train) < set(half.train) < set(fold.train) and set(fewer.val) <= set(half.val)
-    assert set(thin_fold(fold, 0.5, seed=2).train) != set(half.train)
-    assert np.array_equal(thin_fold(fold, 1000, seed=1).train, fold.train)
 
 
 def test_what_is_learned_from_and_what_is_asked_are_disturbed_apart():

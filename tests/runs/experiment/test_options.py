@@ -16,8 +16,6 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 from worlds import World, arrays
 
-from gsparc.base import executor
-from gsparc.base.executor import Engine
 from gsparc.datasets.load import datamodule, split_for
 from gsparc.evaluation.console import to_dict
 from gsparc.models.registry import build, fill_defaults
@@ -250,23 +248,6 @@ def test_residual_false_left_a_moving_array_its_residual():
     given = "model=gsparc", "model.effects.residual=false"
     unused, answers = fitted("moving", *given)
     assert not unused and not torch.equal(answers, fitted("moving", "model=gsparc")[1])
-
-
-@pytest.mark.slow
-def test_copies_by_station_of_other_processes_name_their_settings():
-    """Stations fitted by joblib: everything was named, as nothing was read in this process."""
-    given = (
-        "model=idw",
-        "stations=each",
-        "model.neighbours=4",
-        "model.power=1.0",
-        "trainer.max_steps=3",
-    )
-    executor.use_engine(Engine("joblib", 2))
-    try:
-        assert fitted("stations", *given)[0] == {"trainer.max_steps"}
-    finally:
-        executor.use_engine(Engine())
 
 
 def test_phases_of_snapshots_mean_nothing_to_powers():

@@ -39,20 +39,6 @@ def test_rows_of_the_same_test_rows_stand_beside_a_new_method(file):
     )
 
 
-def test_rows_beside_were_left_out_of_the_quickest_and_their_efforts_had_tables(file):
-    """Two cells had five tables, and `fastest` named a slower method than the first row."""
-    others = [filled("gsrf", 29.0, 0, effort) for effort in (1.0, 3.0)]
-    published = averages(others).assign(query_ms=0.5, results=[[], []])
-    tables = split_by_problem(beside_published(averages([filled("gp", 29.2)]), published))
-    assert [list(table.effort.dropna()) for table in tables] == [[1.0]]
-    page = markdown(tables, "gsparc")
-    assert (
-        "fastest within 0.5 dB of the best: gsrf, 0.5 ms a query"
-    ) in page and "*: a row of beside=" in page
-    tables = split_by_problem(beside_published(averages([filled("mine", 29.2, 0, 3.0)]), published))
-    assert [list(table.method) for table in tables] == [["mine", "gsrf"]]
-
-
 def test_rows_of_other_data_stood_beside(file):
     """Test rows were known by their numbers, which another simulation of a room has, too."""
     own = averages([filled("mine", 31.0, **{"dataset/sha256": "other"})])

@@ -43,12 +43,6 @@ def test_rows_average_over_seeds_and_stand_in_blocks_best_first():
     assert gsparc.seeds == 2 and gsparc.query_ms == 0.5 and np.isnan(gsrf.query_ms)
 
 
-def test_a_column_of_single_seeds_told_nothing():
-    first, _, alone = split_by_problem(averages(FOUND))
-    assert "seeds, same split" in markdown([first], "gsparc")
-    assert "seeds, same split" not in markdown([alone], "gsparc")
-
-
 def test_draws_are_paired_with_the_best_and_have_standard_errors():
     """The spread over draws is of the rows: what two methods differ by
     on the same rows is known better.
@@ -71,17 +65,6 @@ def test_draws_are_paired_with_the_best_and_have_standard_errors():
     assert (
         "; 1.10 ± 0.06 dB better than idw (standard error over the same 3 draws): significant"
     ) in said
-
-
-def test_a_method_that_cannot_be_on_a_split_is_said_in_the_picture(tmp_path, monkeypatch):
-    there = [("drawn", "gp"), ("drawn", "gp_together"), ("stations", "gp")]
-    drawn = {"kind": "rssi", "drawn": True}
-    found = averages([filled(method, 5.0, 0, split=split, **drawn) for split, method in there])
-    figures = []
-    monkeypatch.setattr(plots, "save", lambda figure, path, also: figures.append(figure))
-    plots.draw_splits(found, tmp_path / "city.png")
-    texts = [[text.get_text() for text in axis.texts] for axis in figures[0].axes]
-    assert texts == [["5, fit 1 s"] * 2, ["5, fit 1 s", "not possible"]]
 
 
 def test_marks_of_the_legend_were_others_than_those_of_the_points(tmp_path, monkeypatch):
@@ -109,22 +92,6 @@ def test_losers_are_not_hidden():
     said = said_of(far)
     assert "2.00 dB behind gp" in said
     assert "nearest (simple) also beats gsparc, by 1.00 dB" in said
-
-
-def test_what_an_earlier_program_measured_is_said():
-    old = filled("gsrf", 29.0, 0, 1.0, earlier="0123abcd")
-    found = split_by_problem(averages([*FOUND[:1], old]))[0]
-    assert list(found.earlier) == ["", "0123abcd"]
-    assert "another commit of this program: gsrf (0123abcd)" in " | ".join(remarks(found, "gsparc"))
-
-
-def test_how_a_method_approximates_stands_behind_its_name():
-    labels = ["gp (Vecchia 30)", "gp", "gp (Vecchia 30)"]
-    found = [filled("gp", 30.0, i, 1.0, **{"model/label": label}) for i, label in enumerate(labels)]
-    (block,) = split_by_problem(averages(found))
-    assert list(block.label) == [" (Vecchia 30)"] and ("gp (Vecchia 30)") in markdown(
-        [block], "gsparc"
-    )
 
 
 def test_lists_were_compared_by_their_listed_rows_alone():
@@ -244,18 +211,6 @@ def test_the_csv_file_had_other_signs_than_the_console():
     assert (gsparc.score_db, gsparc.draws, gsparc.seeds) == (5.5, 1, 2) and np.isnan(
         gsparc.score_error_db
     )
-
-
-def test_errors_are_in_units_of_the_best_plain_method_of_the_same_draws():
-    """An average over fewer draws, and a method that is not plain, are no measure."""
-    draws = [("gp", 4.0, 6.0), ("kriging", 1.0), ("gsparc", 3.0, 5.0), ("gsrf", 2.0, 2.0)]
-    cells = [row for draw in draws for row in drawn(*draw, kind="rssi")]
-    rows = averages(cells).set_index("method")
-    assert rows.error["gsparc"] == 4.0 and rows.ratio["gsparc"] == pytest.approx(0.8)
-    spectra = averages([filled("gp", 20.0), filled("gsparc", 26.0, 0, 1.0)]).set_index("method")
-    assert spectra.error["gp"] == pytest.approx(0.1)
-    assert spectra.ratio.to_dict() == pytest.approx({"gp": 1.0, "gsparc": 10**-0.3})
-    assert averages([filled("gsrf", 20.0, 0, 1.0)]).ratio.isna().all()
 
 
 def test_what_methods_were_given_besides_places_was_not_said():

@@ -81,26 +81,3 @@ def test_rows_without_power_divided_by_zero():
     data = waves(0)
     data.target[:30] = 0
     assert estimate_coherence(data).unknown_factor == "none"
-
-
-def test_a_gain_for_each_packet_was_told_from_fifteen_pairs_that_fade():
-    """Fifteen pairs scatter by 3 dB of fading alone; four hundred of them do not."""
-    found = {}
-    for pairs in (15, 300):
-        draw, tones = np.random.default_rng(5), 5e9 + 1e6 * np.arange(30)
-        places = np.repeat(
-            np.c_[7.0 * np.arange(pairs), np.zeros(pairs), np.ones(pairs)], 2, axis=0
-        )
-        places[1::2, 0] += 0.002
-        shape = draw.standard_normal((pairs, 30)) + 1j * draw.standard_normal((pairs, 30))
-        level = 10 ** (draw.normal(0, 3.0, (2 * pairs, 1)) / 20)
-        turned = np.exp(2j * np.pi * draw.uniform(size=(2 * pairs, 1)))
-        given = {"rx_position": places, "tx_position": np.array([9.0, 9, 3]), "frequency_hz": tones}
-        data = interpret(
-            Raw({**given, "csi": np.repeat(shape, 2, axis=0) * level * turned}, {}), "pairs"
-        ).data
-        found[pairs] = estimate_coherence(data).unknown_factor
-    assert found == {15: "phase", 300: "phase+delay+gain"} or found == {
-        15: "phase",
-        300: "phase+gain",
-    }

@@ -12,7 +12,6 @@ from releases import real
 from gsparc.base.errors import Caution
 from gsparc.data.splits import Fold, Split
 from gsparc.models.registry import method_class
-from gsparc.prediction.fit import fit
 from gsparc.runs.align_site import align_to_site
 from gsparc.runs.evaluate import evaluate
 from gsparc.tables.own import from_arrays, interpret
@@ -78,21 +77,6 @@ def test_null_tones_were_most_of_every_figure(name, junk):
     assert [found[one] for one in both] == pytest.approx([right[one] for one in both], rel=1e-4)
 
 
-def test_channels_are_answered_in_the_shape_of_the_file():
-    arrays = spoilt(30)
-    predictor = fit(
-        arrays["rx_position"],
-        model="nearest",
-        **{k: arrays[k] for k in ("csi", "frequency_hz")},
-        tx=arrays["tx_position"],
-    )
-    told = predictor.csi(rx=arrays["rx_position"])
-    assert told.shape == arrays["csi"].shape
-    assert (np.isnan(told) == (NULLS | DEAD[:, None])).all()
-    here = ~np.isnan(told[0])
-    np.testing.assert_allclose(told[:, here], arrays["csi"][:, here], rtol=1e-5)
-
-
 @pytest.mark.parametrize("other", ["few rows", "other nulls"])
 def test_another_file_has_the_tones_that_were_learned(other):
     """Few rows do not tell what is constant; other files may lack other tones."""
@@ -109,21 +93,6 @@ def test_another_file_has_the_tones_that_were_learned(other):
     assert (~mask).any(0).nonzero()[0].tolist() == lost
     value = (data.target * data.site.target_scale)[:, mask]
     np.testing.assert_allclose(value, arrays["csi"][:, ~DEAD][:, :, ~NULLS][:, mask], rtol=1e-4)
-
-
-def test_stuck_stations_are_named_and_kept():
-    rng = np.random.default_rng(0)
-    at = rng.uniform(0, 5, (ROWS, 3))
-    levels = -60 - 5 * rng.random((ROWS, 3))
-    levels[:, 2] = -62.5
-    posts = {
-        "station_position": rng.uniform(0, 5, (3, 3)),
-        "station_name": np.array(["a", "b", "stuck"]),
-    }
-    reading = interpret(Raw({"rx_position": at, "rssi_db": levels} | posts), "levels")
-    (note,) = [note for note in reading.notes if isinstance(note, Caution)]
-    assert note == "all rows of station stuck are the same: are they measurements?"
-    assert len(reading.data) == 3 * ROWS
 
 
 def test_check_named_no_null_tone_of_a_card():

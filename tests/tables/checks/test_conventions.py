@@ -129,20 +129,6 @@ def test_another_convention_of_spectra_was_good(tmp_path, name):
     assert data.target.shape == (ROWS, 18, 36)
 
 
-def test_what_rows_do_not_tell_apart_is_said():
-    clean = channels()
-    turns = np.exp(2j * np.pi * np.random.default_rng(0).random(ROWS))[:, None, None]
-    (said,) = convention_warnings(from_arrays(clean | {"csi": (clean["csi"] * turns).conj()}))
-    assert (
-        "dataset.conjugate=true or dataset.reverse_tones=true, which these rows do not tell apart"
-    ) in said
-
-
-@pytest.mark.parametrize("setting", ["zenith", "array_mm", "exchange_axes"])
-def test_a_convention_that_cannot_be_is_refused(tmp_path, setting, refused):
-    refused(f"dataset.{setting}", mended_by, tmp_path, channels(), setting)
-
-
 def test_tones_before_antennas_were_refused_without_what_to_say(tmp_path):
     """`frequency_hz: expected shape () or (K,), here () or (2,), found (16,)`,
     with `exchange_axes`, too.

@@ -26,12 +26,6 @@ def reading(**change: np.ndarray) -> Reading:
     )
 
 
-def test_stations_in_reach_are_not_spoken_of():
-    assert not any("static end" in note for note in reading().notes)
-    far = reading(station_latitude=np.array([48.2, 48.12]))  # a broadcast tower in the next town
-    assert not any("static end" in note for note in far.notes)
-
-
 def test_stations_thousands_of_kilometres_from_all_rows_were_good(refused):
     """Rows with latitude and longitude swapped, 5,285 km from their stations."""
     there = reading()
@@ -54,26 +48,6 @@ def test_stations_thousands_of_kilometres_from_all_rows_were_good(refused):
         if "static end" in note
     ]
     assert "120" in said and "km from all rows" in said
-
-
-def test_utm_rows_and_stations():
-    rng = np.random.default_rng(1)
-    metres = dict.fromkeys(
-        ("latitude", "longitude", "station_latitude", "station_longitude", "rx_height")
-    )
-    metres["station_height"] = None
-    rows = np.column_stack(
-        [rng.uniform(691e3, 692e3, 40), rng.uniform(5334e3, 5335e3, 40), np.full(40, 1.5)]
-    )
-    posts = np.array([[691.5e3, 5334.5e3, 30.0], [691.2e3, 5334.1e3, 25.0]])
-    good = reading(**metres, rx_position=rows, station_position=posts)
-    assert not any("static end" in note for note in good.notes)
-    with pytest.raises(DataError, match=r"are x and y swapped\?"):
-        reading(**metres, rx_position=rows, station_position=posts[:, [1, 0, 2]])
-    with pytest.raises(
-        DataError, match=r"km from all rows, which reach over .* in one system and unit"
-    ):
-        reading(**metres, rx_position=rows - [691e3, 5334e3, 0], station_position=posts)
 
 
 def test_heights_above_the_sea_and_above_the_ground_were_good():

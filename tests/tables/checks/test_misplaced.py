@@ -68,10 +68,3 @@ def test_a_transmitter_that_moved_between_runs_was_good():
 def test_places_that_levels_bear_out_are_not_doubted(seed):
     assert not misplaced_warnings(CITIES[seed])
     assert not misplaced_warnings(link_levels(from_arrays(flight(seed))))
-
-
-def test_levels_that_say_nothing_of_places_are_no_evidence():
-    right, rng = CITIES[0], np.random.default_rng(0)
-    for level in (np.full(len(right.level_db), -80.0), rng.normal(-80, 8, len(right.level_db))):
-        assert not misplaced_warnings(replace(right, level_db=level))
-    assert not misplaced_warnings(replace(right, station_position=np.full((30, 3), np.nan)))

@@ -51,19 +51,6 @@ def test_copies_of_places_were_neighbours_at_no_distance(tmp_path):
     assert propose_side(powers(tmp_path / "a.npz", places)) is None
 
 
-def test_of_several_carriers_it_was_not_said_whose_wavelengths_are_counted():
-    places, far = (
-        np.array([[0.0, 0, 0], [3.0, 0, 0]]),
-        ("the nearest other place is 3 m away (median)"),
-    )
-    assert (
-        spacing_words(places, np.array([3e9, 1e9])) == f"{far}, 10 wavelengths of the lowest "
-        "carrier, 1 GHz"
-    )
-    assert spacing_words(places, np.array([1e9])) == f"{far}, 10 wavelengths"
-    assert spacing_words(places, np.array([np.nan])) == far
-
-
 def test_one_place_alone_has_no_squares(tmp_path):
     data = powers(
         tmp_path / "a.npz", np.tile([1.0, 2.0, 3.0], (5, 1)) + [[0, 0, 0.1 * i] for i in range(5)]

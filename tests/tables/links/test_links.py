@@ -10,7 +10,6 @@ import pytest
 from gsparc.base.errors import DataError
 from gsparc.base.limits import SettingError
 from gsparc.data.selection import Selection
-from gsparc.datasets.describe import describe
 from gsparc.tables.checks.unit_warnings import unit_warnings
 from gsparc.tables.own import from_arrays, interpret
 from gsparc.tables.raw import Raw
@@ -82,13 +81,6 @@ def test_three_access_points_by_their_positions_alone():
     assert any("taken as 3 stations" in note for note in found.notes)
 
 
-def test_powers_may_have_an_unknown_transmitter():
-    found = read({"rx_position": WALK, "rssi_db": LEVELS[:, 0]})
-    assert found.data.site.static_position is None and np.isnan(found.data.tx).all()
-    assert np.isfinite(found.data.site.box).all() and "place is unknown" in found.notes[0]
-    assert "unknown place" in dict(describe(found.data))["stays"]
-
-
 def test_missing_powers_are_no_rows_and_are_counted():
     """A mask over missing powers was advised and then refused."""
     holes = LEVELS.copy()
@@ -98,16 +90,6 @@ def test_missing_powers_are_no_rows_and_are_counted():
     assert "3 of 30 values are missing" in found.notes[0]
     masked = read(town(mask=np.isfinite(holes)))
     np.testing.assert_array_equal(masked.data.station, found.data.station)
-
-
-def test_powers_below_the_sensitivity_are_kept_as_that():
-    holes = np.where(LEVELS < -80, np.nan, LEVELS)
-    data = read(town(rssi_db=holes, sensitivity_db=-80.0)).data
-    assert len(data) == PLACES * STATIONS
-    np.testing.assert_array_equal(data.censored.reshape(PLACES, STATIONS), np.isnan(holes))
-    np.testing.assert_array_equal(data.mask[:, 0], data.censored == 0)
-    level = 10 * np.log10(data.target[data.censored > 0] * data.site.target_scale)
-    np.testing.assert_allclose(level, -80, atol=1e-3)
 
 
 def test_levels_below_the_sensitivity_were_refused():
@@ -128,19 +110,6 @@ def test_levels_below_the_sensitivity_were_refused():
     assert any(
         "levels lie below sensitivity_db: taken as not heard; has it the" in n for n in found.notes
     )
-
-
-def test_the_mask_wins_over_the_sensitivity():
-    holes = np.where(LEVELS < -80, np.nan, LEVELS)
-    mask = np.ones_like(holes, bool)
-    mask[np.isnan(holes)] = False
-    assert read(town(rssi_db=holes, mask=mask, sensitivity_db=-80.0)).data.censored is None
-
-
-def test_the_files_own_split_names_rows_of_the_file():
-    data = read(town(split_train=np.arange(8), split_test=np.array([8, 9]))).data
-    np.testing.assert_array_equal(np.unique(data.place[data.release_split[1]]), [8, 9])
-    assert data.subset(np.arange(6)).release_split is None  # its rows are numbered otherwise
 
 
 def test_carriers_that_could_be_of_rows_or_stations_were_taken_without_a_word():
@@ -213,22 +182,6 @@ SPOILT = {
 def test_what_is_wrong_is_one_line(refused, case):
     arrays, says = SPOILT[case]
     refused(says, read, arrays)
-
-
-def test_degrees_become_metres_and_back():
-    north = 40.76 + RNG.uniform(0, 0.01, PLACES)
-    east = -111.84 + RNG.uniform(0, 0.01, PLACES)
-    posts = {
-        "station_latitude": np.array([40.76, 40.77, 40.765]),
-        "station_longitude": np.full(3, -111.835),
-    }
-    found = read(degrees(north, east, tx_height=1.5, **posts))
-    data = found.data
-    world = data.tx[::STATIONS, :2] + data.site.origin[:2]
-    back = data.site.georeference.to_degrees(world)
-    np.testing.assert_allclose(back[0], north, atol=1e-8)
-    np.testing.assert_allclose(back[1], east, atol=1e-8)
-    assert any("no station_height: taken as 0 m" in note for note in found.notes)
 
 
 def changed(array, *changes):
@@ -410,24 +363,6 @@ def test_arrays_and_attributes_of_another_form_were_tracebacks(case):
     with pytest.raises(DataError) as caught:
         interpret(Raw(arrays, attributes), "town.npz")
     assert any(re.search(says, line) for line in caught.value.problems), caught.value.problems
-
-
-@pytest.mark.parametrize("count", [1, 2, 5])
-@pytest.mark.parametrize("stations", [1, 12])
-def test_a_level_of_0_far_above_all_others_was_the_strongest(count, stations):
-    """One 0 among -42 to -100 was a station next door; three were below the weakest."""
-    rng = np.random.default_rng(0)
-    level = np.round(rng.uniform(-100, -42, 240))
-    level[rng.choice(240, count, replace=False)] = 0
-    arrays = {"rx_position": rng.uniform(0, 50, (240, 3)), "rssi_db": level}
-    if stations > 1:
-        posts = rng.uniform(0, 50, (stations, 3))
-        arrays |= {"station": np.arange(240) % stations, "station_position": posts}
-    reading = interpret(Raw(arrays), "file")
-    assert len(reading.data) == 240 - count
-    assert 10 * np.log10(reading.data.target.max() * reading.data.site.target_scale) < -41
-    (said,) = [note for note in reading.notes if "exactly 0" in note]
-    assert "no value, left out; dataset.not_heard=[0]" in said and reading.data.censored is None
 
 
 def test_a_carrier_per_row_was_refused_without_a_list_of_stations():

@@ -54,24 +54,6 @@ def test_a_part_stays_censored_where_it_heard_nothing_and_only_there():
     )
 
 
-def test_rows_of_a_long_file_and_its_parts_by_the_stations_name():
-    raw = wide()
-    arrays = {k: v for k, v in raw.arrays.items() if k != "rssi_db"}
-    long = Raw(
-        {**arrays, "station": np.arange(12) % 2, "rssi_db": raw.arrays["rssi_db"][:, 0]}, {}, {}
-    )
-    assert parted(long, {"b": (6,)}).station.tolist() == [0, 1, 0, 1, 0, 1, 0, 2, 0, 2, 0, 2]
-    kept = parted(long, {"b": (6,)}, stations=["b"])
-    assert kept.site.stations.name == ("b", "b from row 6") and kept.station.tolist() == [
-        0,
-        0,
-        0,
-        1,
-        1,
-        1,
-    ]
-
-
 def unplaced() -> Raw:
     return Raw({"rx_position": np.eye(4)[:, :3], "tx_position": np.ones(3), "rssi_db": np.zeros(4)})
 

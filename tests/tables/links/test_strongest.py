@@ -7,7 +7,6 @@ from releases import release
 
 from gsparc.base.errors import DataError, Severe
 from gsparc.datasets.powder import read_powder
-from gsparc.tables.links.strongest import number_lists
 from gsparc.tables.own import from_arrays, interpret
 from gsparc.tables.raw import Raw
 
@@ -136,13 +135,6 @@ def test_rows_have_levels_of_their_own():
     assert np.allclose(found, [-90, -95], atol=1e-4)
 
 
-def test_moments_of_one_place():
-    place, station = np.array([0, 0, 0, 0, 1, 1]), np.array([1, 2, 1, 3, 1, 2])
-    assert number_lists(place, station).tolist() == [0, 0, 1, 1, 2, 2]
-    apart = np.array([0, 1, 2, 0, 1, 2, 0, 1, 2])
-    assert number_lists(apart, np.repeat([1, 2, 3], 3)).tolist() == apart.tolist()
-
-
 @pytest.mark.parametrize("wide", [False, True])
 def test_cells_below_a_floor_were_taken_for_lost(wide):
     """Of a row for each heard cell `check` said good,
@@ -195,18 +187,6 @@ def test_silence_of_a_station_without_a_stated_level_was_lost(absent, recwarn):
         counts.append((reading.data.censored > 0).sum())
         assert not any("nan" in note or "missing" in note for note in reading.notes)
     assert counts[0] == counts[1] and not recwarn.list
-
-
-@pytest.mark.parametrize("share", [0.005, 0.1, 0.5])
-def test_lost_levels_are_below_no_floor(share):
-    """At random, and of cells that were off."""
-    one, rng = network(1), np.random.default_rng(0)
-    off = one.measured.copy()
-    for cell, first in enumerate(rng.integers(0, 500, off.shape[1])):
-        off[first : first + int(400 * share), cell] = np.nan
-    for level in (off, np.where(rng.random(off.shape) < share, np.nan, one.measured)):
-        arrays = {"rx_position": one.moment, "station_position": one.place, "rssi_db": level}
-        assert interpret(Raw(arrays), "drive").data.censored is None
 
 
 def test_silence_was_believed_of_lists_of_the_strongest():
@@ -306,21 +286,6 @@ def test_a_station_of_one_place_made_lists_of_the_strongest_of_all_others():
     assert not [note for note in reading.notes if "strongest" in note]
 
 
-def test_what_lists_leave_out_depended_on_the_order_of_rows():
-    """The file's order drew other unlisted links, below other levels."""
-    arrays = network(0).arrays(4)
-    rows = len(arrays["rssi_db"])
-
-    def unlisted(order):
-        data = from_arrays({k: v[order] if len(v) == rows else v for k, v in arrays.items()})
-        links = np.c_[data.station, data.moving + data.site.origin, data.target][data.censored == 1]
-        return links[np.lexsort(links.round(3).T)]
-
-    first = unlisted(np.arange(rows))
-    for order in (np.arange(rows)[::-1], np.random.default_rng(0).permutation(rows)):
-        np.testing.assert_allclose(unlisted(order), first, rtol=1e-5, atol=1e-3)
-
-
 def serving(one, **more):
     """The strongest cell alone at each moment of a drive."""
     best = one.measured.argmax(1)
@@ -363,19 +328,3 @@ def test_a_log_of_the_serving_cell_was_learned_as_if_the_others_were_unknown(sta
     assert wrong.mean() < 0.02
     reading = interpret(Raw(arrays, {"absent": "silent"}), "drive")
     assert any(isinstance(note, Severe) and "leave absent out" in note for note in reading.notes)
-
-
-def test_one_station_at_each_moment_is_not_always_the_one_that_serves():
-    """Cells asked one after the other, or where somebody chose to,
-    tell nothing of those that were not.
-    """
-    one, rng = network(2), np.random.default_rng(0)
-    rows = np.arange(len(one.moment))
-    by_turns, second = rows % 30, np.argsort(-one.measured, 1)[rows, rng.integers(0, 5, len(rows))]
-    east = np.where(
-        one.moment[:, 0] > np.median(one.moment[:, 0]), *one.measured.mean(0).argsort()[[0, -1]]
-    )
-    for chosen in (by_turns, second, east):
-        arrays = serving(one, station=chosen, rssi_db=one.measured[rows, chosen])
-        reading = interpret(Raw(arrays), "drive")
-        assert reading.data.censored is None and not [n for n in reading.notes if "strongest" in n]

@@ -107,15 +107,3 @@ def test_a_mirror_is_found_where_it_is(scenario):
     for path, at in ((0, PLACES), (1, point)):
         np.testing.assert_allclose(leaves[:, path], towards(STILL, at), atol=1e-4)
     np.testing.assert_allclose(arrives[:, 1], towards(PLACES, point), atol=1e-4)
-
-
-def test_the_package_of_that_name_reads_it(tmp_path, monkeypatch):
-    package = pytest.importorskip("deepmimo", reason="deepmimo 4 is not installed")
-    folder = tmp_path / "deepmimo_scenarios" / "mirror"
-    folder.mkdir(parents=True)
-    deepmimo.write_scenario(folder, Mirror(), PLACES)
-    monkeypatch.chdir(tmp_path)
-    how = package.ChannelParameters()
-    how.bs_antenna.shape = np.array([1, 1])
-    found = package.load("mirror").compute_channels(how)[:, 0, 0, 0] * how.ofdm.subcarriers**0.5
-    np.testing.assert_allclose(found, Mirror().paths(PLACES).gain[:, 0].sum(-1), rtol=1e-4)

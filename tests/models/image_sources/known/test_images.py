@@ -10,7 +10,6 @@ from rooms import PILLAR, shoebox
 from gsparc.data.walls import SceneWalls, box_faces
 from gsparc.models.image_sources.clutter.blocking import visible_share
 from gsparc.models.image_sources.clutter.unfold import Unfolding
-from gsparc.models.image_sources.known import images as known
 from gsparc.models.image_sources.known.images import Mirrors, walls_in_frame
 from gsparc.physics.mirror_planes import images
 
@@ -94,24 +93,6 @@ def test_triangles_of_a_box_are_six_planes_with_a_rectangle_each():
     assert sides.prod(1).sum() == pytest.approx(2 * (12 + 10 + 7.5), rel=1e-5)
 
 
-def test_walls_of_one_plane_that_do_not_touch_are_apart():
-    one = np.array([[0, 0, 0], [1, 0, 0], [1, 0, 2], [0, 0, 2.0]])
-    moved = [np.array([3, 0, 0]), np.array([5, 0.005, 0])]
-    found = Mirrors.from_walls(
-        SceneWalls((one, one + moved[0], one[::-1] + moved[1]), NOTHING), np.zeros(3)
-    )
-    assert len(found.planes) == 1 and found.clutter.plane == (0, 0, 0)
-    assert found.large_planes(0.5) == [0] and found.large_planes(1.5) == []
-
-
-def test_of_a_fine_mesh_the_smallest_are_left_out(monkeypatch):
-    monkeypatch.setattr(known, "MOST_PATCHES", 2)
-    faces = tuple(np.eye(3) * size + size * 10 for size in (1.0, 2.0, 3.0))
-    found = Mirrors.from_walls(SceneWalls(faces, NOTHING), np.zeros(3))
-    assert found.left_out == 1 and len(found.clutter.patches) == 2
-    assert torch.isfinite(found.clutter.patches).all()
-
-
 WALL = np.array([[2.0, -3, 0], [2, 3, 0], [2, 3, 3], [2, -3, 3]])
 FLOOR = np.array([[-5.0, -5, 3], [5, -5, 3], [5, 5, 3], [-5, 5, 3]])
 BOX = np.array([[[0.0, 5, 0], [1, 6, 2]]])
@@ -132,14 +113,6 @@ def test_walls_floors_and_both_sides_of_a_box_are_counted():
     ]
     found = walls.columns(torch.tensor(ends, dtype=torch.float64))
     assert found.tolist() == [[1, 0], [0, 0], [0, 0], [0, 1], [2, 0], [0, 0], [0, 0]]
-
-
-def test_either_end_of_a_path_may_move():
-    walls = walls_in_frame(SceneWalls((WALL,), BOX[:0]), np.zeros(3), None)
-    both = torch.tensor(
-        [[0.0, 0, 1, 4, 0, 1], [4, 0, 1, 0, 0, 1], [0, 0, 1, 1, 0, 1]], dtype=torch.float64
-    )
-    assert walls.columns(both)[:, 0].tolist() == [1, 1, 0]
 
 
 def test_a_place_beside_a_long_wall_crosses_it_once_at_most():

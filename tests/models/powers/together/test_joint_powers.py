@@ -148,7 +148,7 @@ def test_all_stations_at_once_are_answered_as_one_by_one():
     known = every.subset(np.flatnonzero(rng.random(240) < np.linspace(0.3, 0.9, 6)[every.station]))
     posterior = own.condition(known, terms, 0)
     places, number = torch.from_numpy(every.places[:15]), torch.from_numpy(every.station[:15])
-    mean, left = posterior.answer(places, number)
+    mean, left = posterior.answer(places, number, float64=True)
     for one in number.unique().tolist():
         alone = posterior.answer(places[number == one], number[number == one], float64=True)
         assert torch.allclose(mean[number == one], alone[0], atol=1e-9)
