@@ -58,8 +58,9 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [(some, with_reduction(method, some, inputs)) for some in settings]
     clock = replace(BLOCKS, rounds=config.rounds, rounds_s=config.rounds_s)
-    how = data, run.split, config.eval_on, clock
-    points, beside = tradeoff.measure_points(candidates, threads, config.baselines, *how)
+    points, beside = tradeoff.measure_points(
+        candidates, threads, config.baselines, data, run.split, config.eval_on, clock
+    )
     model_points = points[points.kept_with_model == 1]
     if config.store:
         operating_point.store_points(Path(config.ckpt), model_points.to_dict("records"), inputs)

@@ -85,8 +85,17 @@ def train(
             facts = {**evaluation.facts, **summary.provenance(), **fits.facts(), "run_id": run_id}
             facts |= {"seed": int(config.seed), "options/unused": unused}
             if in_full:
-                results = facts, evaluation.examples, config.eval_on
-                draw_run(fits.methods[0], data, split, inputs.walls, *results, run_dir, loggers)
+                draw_run(
+                    fits.methods[0],
+                    data,
+                    split,
+                    inputs.walls,
+                    facts,
+                    evaluation.examples,
+                    config.eval_on,
+                    run_dir,
+                    loggers,
+                )
         evaluation.write(run_dir, run_id=run_id)
         summary.write_summary(run_dir / SUMMARY, facts)
         return facts, TrainedRun(fits.methods, folds.checkpoints(contexts), data, split, evaluation)

@@ -151,8 +151,9 @@ def _draw_brackets(runs: list[Row]) -> Figure:
             if k.startswith(stem) and k.endswith(end)
         }
         samples = {k: v[np.isfinite(v)] for k, v in {**beside, _label(row): data[name]}.items()}
-        how = {"tick_labels": list(samples), "showfliers": False, "patch_artist": True}
-        boxes = errors_axis.boxplot(list(samples.values()), **how)
+        boxes = errors_axis.boxplot(
+            list(samples.values()), tick_labels=list(samples), showfliers=False, patch_artist=True
+        )
         for box, method in zip(boxes["boxes"], [*beside, row["method"]], strict=True):
             box.set(facecolor=style_of(method).colour, alpha=0.5)
         errors_axis.tick_params(axis="x", labelrotation=30)

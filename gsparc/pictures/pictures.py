@@ -158,9 +158,16 @@ def draw_spectra(examples: Examples, title: str) -> Figure:
     Under each prediction stand its PSNR and SSIM, and the confidence of the last one.
     """
     predicted, edges = examples.predicted, examples.edges
-    how: dict[str, Any] = {"sharex": True, "sharey": True, "grid": False}
     count, across = len(examples.rows), len(predicted) + 2
-    figure, axes = panels(max(1.75 * across, 8.5), 1.55 * count + 1.2, count, across, **how)
+    figure, axes = panels(
+        max(1.75 * across, 8.5),
+        1.55 * count + 1.2,
+        count,
+        across,
+        sharex=True,
+        sharey=True,
+        grid=False,
+    )
     options: dict[str, Any] = {"origin": "lower", "aspect": "auto", "extent": edges}
     metric = SpectrumMetrics()
     for values in predicted.values():

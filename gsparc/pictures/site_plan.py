@@ -150,8 +150,15 @@ def draw_site(
     if places.level_db is not None:
         heard = heard & np.isfinite(places.level_db)
         if heard.any():
-            shown = places.place[heard], places.level_db[heard]
-            draw_values(axes[0], *shown, size, 0.01, places.label, extend="both")
+            draw_values(
+                axes[0],
+                places.place[heard],
+                places.level_db[heard],
+                size,
+                0.01,
+                places.label,
+                extend="both",
+            )
     for axis, (low, high) in zip(axes[0], frames, strict=True):
         axis.grid(alpha=0.3)
         _draw_map(axis, data, places, low, high, jumping, size)
@@ -239,9 +246,16 @@ def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> Non
 def _draw_suspicious(axis: Any, places: Spots, low: np.ndarray, high: np.ndarray) -> None:
     near, far = np.flatnonzero(places.suspicious & ~places.far), np.flatnonzero(places.far)
     if len(near):
-        marks = {"s": 90, "facecolors": "none", "edgecolors": "red", "linewidths": 1.5}
         label = f"suspicious level ({len(near)} place{'s' * (len(near) > 1)})"
-        axis.scatter(*places.place[near].T, label=label, zorder=3, **marks)
+        axis.scatter(
+            *places.place[near].T,
+            label=label,
+            zorder=3,
+            s=90,
+            facecolors="none",
+            edgecolors="red",
+            linewidths=1.5,
+        )
     if len(far):
         # At the edge, 2 % inside: at its place it would shrink the site to a point.
         edge = np.clip(

@@ -148,8 +148,10 @@ def evaluate(
     # A method that is a baseline (model=gp) has one fit and one row:
     # another would only differ in seconds.
     same = FittedBaseline(methods, scores, tuple(seconds or ()))
-    told = eval_on, learned, hearing
-    fits = {n: same if n == shared else fit_baseline(n, data, split, *told) for n in names}
+    fits = {
+        n: same if n == shared else fit_baseline(n, data, split, eval_on, learned, hearing)
+        for n in names
+    }
     others = {f"baseline/{name}": fit for name, fit in fits.items()}
     facts: dict[str, Any] = {}
     scores_of = {eval_on: scores, **{room: other.scores for room, other in others.items()}}

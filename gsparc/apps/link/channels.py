@@ -51,8 +51,9 @@ class BandChannels:
     def select_positions(self, index: np.ndarray) -> BandChannels:
         """Return some of the positions."""
         at = torch.from_numpy(index)
-        rest = self.variance[at], self.confidence[at], self.source
-        return BandChannels(self.true[at], self.predicted[at], *rest)
+        return BandChannels(
+            self.true[at], self.predicted[at], self.variance[at], self.confidence[at], self.source
+        )
 
     def band(self) -> Band:
         """Return the first antenna's band; what states no variance is taken for exact."""

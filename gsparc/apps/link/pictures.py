@@ -53,8 +53,9 @@ def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, pat
             axes[0, column].plot(
                 curve.index[curve.errors == 0], limit, "v", color=colour, fillstyle="none"
             )
-            style_above = {**style, "capsize": 2, "label": label, "linewidth": 1.2}
-            axes[0, column].errorbar(curve.index, bler, reach, **style_above)
+            axes[0, column].errorbar(
+                curve.index, bler, reach, **style, capsize=2, label=label, linewidth=1.2
+            )
             axes[1, column].plot(curve.index, curve.ber.where(curve.ber > 0), **style)
         axes[0, column].set_title(f"{modulation.upper()}, one layer, {title}", fontsize=10)
         # 10 % is the target of rate adaptation in 5G NR (TS 38.214, 5.2.2.1).

@@ -65,8 +65,9 @@ class LinkStudy:
         grid = predict_channels(self.method, self.data, self.fold.test, frequency_hz, self.one)
         evidence = band_evidence(grid, self.data, self.fold, self.fold.test)
         promise = Guarantee(**settings["promise"])
-        how = settings["confidence"], settings["spatial"], int(settings["seed"])
-        kind, threshold, self.test, aside = calibrate_threshold(evidence, promise, *how)
+        kind, threshold, self.test, aside = calibrate_threshold(
+            evidence, promise, settings["confidence"], settings["spatial"], int(settings["seed"])
+        )
         confidences, setting = as_confidence(kind, evidence.scores[kind]), settings["threshold"]
         self.least = confidence_threshold(kind, threshold) if setting is None else float(setting)
         self.confidence = confidences[self.test]
@@ -137,14 +138,14 @@ class LinkStudy:
         heard = self.data.targets(self.fold.train)[:, self.antenna]
         correlation = frequency_correlation(heard, self.tones, self.spacing_hz, self.count)
         shape = self.shape
-        how = (
+        pusch = Pusch(
+            modulation,
             shape["blocks"],
             shape["spacing_khz"],
             correlation,
             shape["iterations"],
             self.receivers,
         )
-        pusch = Pusch(modulation, *how)
         sizes = shape["coarse"], shape["fine"], shape["batch"]
         blocks = study.send_blocks(pusch, self.grid.band(), levels, sizes)
         rates = study.error_curves(blocks, self.accepted)

@@ -39,14 +39,18 @@ def locate_fingerprints(config: DictConfig, run_dir: Path) -> Report:
     SHARE.check("dataset.held_out", chosen.held_out)
     rows = read_fingerprints(chosen.file)
     how: Any = "file" if config.data else chosen.split
-    cut = float(chosen.side_m), float(chosen.held_out)
     if config.data:
         reference, heard = (
             rows,
             read_fingerprints(config.data, False).select_access_points(rows.access_point),
         )
     else:
-        reference, heard = map(rows.subset, split_fingerprints(rows, how, *cut, int(config.seed)))
+        reference, heard = map(
+            rows.subset,
+            split_fingerprints(
+                rows, how, float(chosen.side_m), float(chosen.held_out), int(config.seed)
+            ),
+        )
     heard = heard.subset(sample_rows(config, len(heard.level)))
     both = fingerprint_snapshots(heard), fingerprint_snapshots(reference)
     place, query_ms, fit_s = locate_by_neighbours(METHOD, *both[::-1])

@@ -146,10 +146,17 @@ class Locator:
                 search.cells.volume,
             )
             area = float(volume[densest_cells(posterior.log_density, volume, mass)].sum())
-            estimate = posterior.peak(), area, posterior.count_modes(mass), posterior
             seconds, true = time.perf_counter() - started, heard.place[number]
             inside = int(posterior.mass_above(true) <= mass) if np.isfinite(true).all() else None
-            return Located(*estimate, seconds, doubt, inside)
+            return Located(
+                posterior.peak(),
+                area,
+                posterior.count_modes(mass),
+                posterior,
+                seconds,
+                doubt,
+                inside,
+            )
 
         yield from (answer for _, answer in run_each(one, range(len(heard)), "snapshots"))
 

@@ -32,10 +32,9 @@ def write_kmz(path: str | Path, field: FieldMap, layers: Sequence[Layer]) -> Non
     from rasterio.warp import calculate_default_transform, reproject
 
     profile = raster_profile(field)
-    size = profile["width"], profile["height"]
     x_low, x_high, y_low, y_high = field.grid.extent
     to, width, height = calculate_default_transform(
-        profile["crs"], DEGREES, *size, x_low, y_low, x_high, y_high
+        profile["crs"], DEGREES, profile["width"], profile["height"], x_low, y_low, x_high, y_high
     )
     west, south, east, north = array_bounds(height, width, to)
     box = {"north": north, "south": south, "east": east, "west": west}
@@ -45,8 +44,15 @@ def write_kmz(path: str | Path, field: FieldMap, layers: Sequence[Layer]) -> Non
         for number, layer in enumerate(layers):
             image = np.zeros((4, height, width), np.uint8)
             cells = np.moveaxis(np.flipud(_colours(layer)), 2, 0)  # images go from north to south
-            how = {"src_crs": profile["crs"], "dst_crs": DEGREES, "resampling": Resampling.nearest}
-            reproject(cells, image, src_transform=profile["transform"], dst_transform=to, **how)
+            reproject(
+                cells,
+                image,
+                src_transform=profile["transform"],
+                dst_transform=to,
+                src_crs=profile["crs"],
+                dst_crs=DEGREES,
+                resampling=Resampling.nearest,
+            )
             picture, file = BytesIO(), f"{number}.png"
             imsave(picture, np.ascontiguousarray(np.moveaxis(image, 0, 2)))
             archive.writestr(file, picture.getvalue())

@@ -40,9 +40,10 @@ def draw_layer(
         nothing = np.where(field.refused, 1.0, np.nan)
         draw_cells(axis, field.grid, nothing, None, cmap=ListedColormap(["0.89"]), zorder=1)
         legend = layer.legend
-        limits = {"vmin": legend.low, "vmax": legend.high}
         colours = ListedColormap(layer.table())
-        image = draw_cells(axis, field.grid, layer.values, plan, cmap=colours, **limits)
+        image = draw_cells(
+            axis, field.grid, layer.values, plan, cmap=colours, vmin=legend.low, vmax=legend.high
+        )
         for line in outlines:
             axis.plot(*line.T, color="0.3", linewidth=0.6, zorder=2.6)
         for cells_of, hatch, why in layer.doubts:
@@ -101,12 +102,15 @@ def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
 def _hatch(axis: Any, field: FieldMap, cells: np.ndarray, hatch: str, why: str) -> None:
     """Hatch cells (ny, nx) of a map; a map of a single row or column has no area to hatch."""
     if min(cells.shape) > 1 and cells.any():
-        how: dict[str, Any] = {
-            "hatches": ["", hatch],
-            "levels": [-0.5, 0.5, 1.5],
-            "colors": "none",
-        }
-        hatches = axis.contourf(field.grid.x, field.grid.y, cells.astype(float), zorder=2.5, **how)
+        hatches = axis.contourf(
+            field.grid.x,
+            field.grid.y,
+            cells.astype(float),
+            zorder=2.5,
+            hatches=["", hatch],
+            levels=[-0.5, 0.5, 1.5],
+            colors="none",
+        )
         hatches.set(edgecolor="black", linewidth=0.0)
         axis.fill(
             [], [], facecolor="white", edgecolor="black", linewidth=0.0, hatch=hatch, label=why
@@ -128,8 +132,10 @@ def draw_floor_plan(axis: Any, plan: FloorPlan) -> None:
     """Draw the floor plan, where it lies."""
     height, width = plan.image.shape[:2]
     along, at = plan.scale, plan.shift  # rows go down: their step is -j times that of columns
-    matrix = along.real, along.imag, along.imag, -along.real, at.real, at.imag
-    turn = Affine2D.from_values(*matrix) + axis.transData
+    turn = (
+        Affine2D.from_values(along.real, along.imag, along.imag, -along.real, at.real, at.imag)
+        + axis.transData
+    )
     axis.imshow(plan.image, extent=(0, width, height, 0), transform=turn, zorder=0, clip_on=True)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -35,14 +34,22 @@ def draw_measurement_plan(
     figure, axes, room = from_above.map_panels(frames, 2, CURVE, 2 * CURVE)
     errors = np.concatenate([batch.error_before, batch.error_after])
     # 99.5 %: a single corner far from all rows would flatten the rest.
-    limits = {"vmin": float(errors.min()), "vmax": float(np.percentile(errors, 99.5)) + 1e-9}
+    most = float(np.percentile(errors, 99.5)) + 1e-9
     done = f"after these {len(batch.places)}"
     parts = (batch.error_before, "now"), (batch.error_after, done)
     for row, (values, title) in zip(axes, parts, strict=True):
         image = np.full(batch.grid.inside.shape, np.nan)
         image[batch.grid.inside] = values
         for axis, (low, high) in zip(row, frames, strict=True):
-            mesh = draw_cells(axis, batch.grid, image, plan, cmap="cividis", **limits)
+            mesh = draw_cells(
+                axis,
+                batch.grid,
+                image,
+                plan,
+                cmap="cividis",
+                vmin=float(errors.min()),
+                vmax=most,
+            )
             for line in outlines:
                 axis.plot(*line.T, color="0.6", linewidth=0.6, zorder=2.6)
             from_above.set_bounds(axis, low, high, batch.grid.origin, title=title)
@@ -53,8 +60,14 @@ def draw_measurement_plan(
             from_above.draw_measured(axis, places)
     for axis in axes[1]:
         axis.plot(*batch.path.T, color="red", linewidth=1, zorder=3)
-        dots: dict[str, Any] = {"color": "red", "markeredgecolor": "white", "markersize": 6}
-        axis.plot(*batch.places[:, :2].T, "o", zorder=3, **dots)
+        axis.plot(
+            *batch.places[:, :2].T,
+            "o",
+            zorder=3,
+            color="red",
+            markeredgecolor="white",
+            markersize=6,
+        )
         for number, place in enumerate(batch.places[:MOST_NUMBERS], 1):
             from_above.annotate(axis, str(number), place[:2])
     colour_bar(mesh, axes, "expected error [dB]")

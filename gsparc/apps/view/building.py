@@ -67,8 +67,15 @@ def build_scene(
     ground = float(min(low, viewed.heights()[0]) if viewed.site.kind in MAPPED else low)
     if plan is not None:
         corners = np.column_stack([plan.corners(), np.full(4, ground - BENEATH * extent)])
-        edges = corners[1] - corners[0], corners[3] - corners[0]
-        parts.append(PlacedPicture("floor plan", corners[0], *edges, plan.image))
+        parts.append(
+            PlacedPicture(
+                "floor plan",
+                corners[0],
+                corners[1] - corners[0],
+                corners[3] - corners[0],
+                plan.image,
+            )
+        )
     if seen is not None:
         chosen = evenly_spaced(len(seen.places), MOST_POINTS)
         legends[VALUES] = legend = Legend.over(seen.label, seen.values[chosen])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from gsparc.apps.maps.layers import Legend
@@ -40,8 +38,15 @@ def panel_image(answer: Answer, site: Site) -> np.ndarray | None:
     axis = axes[0, 0]
     if answer.spectrum is not None:
         assert site.grid is not None
-        how: dict[str, Any] = {"origin": "lower", "extent": site.grid.edges(), "aspect": "auto"}
-        axis.imshow(answer.spectrum, cmap=SPECTRUM.colours, vmin=0, vmax=1, **how)
+        axis.imshow(
+            answer.spectrum,
+            cmap=SPECTRUM.colours,
+            vmin=0,
+            vmax=1,
+            origin="lower",
+            extent=site.grid.edges(),
+            aspect="auto",
+        )
         axis.grid(False)
         axis.set(
             xlabel="azimuth at the receiver [°]", ylabel="elevation [°]", title="power by direction"

@@ -190,10 +190,15 @@ def run_jobs(
         return not late
 
     waiting, refused = missing if train else [], list[str]()
-    how: dict[str, Any] = {"cost": lambda one: one.expected_s, "wanted": fits, "refused": refused}
     try:
         for job, _ in run_list(
-            partial(_fit_once, fit), waiting, "cells", name=lambda one: str(one.name), **how
+            partial(_fit_once, fit),
+            waiting,
+            "cells",
+            name=lambda one: str(one.name),
+            cost=lambda one: one.expected_s,
+            wanted=fits,
+            refused=refused,
         ):
             rows[str(job.name)] = row = job.row()
             value = format(row["value"], number_format(row["figure"]))

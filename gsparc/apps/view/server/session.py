@@ -83,8 +83,9 @@ class Session:
             self.client.scene.add_icosphere(
                 f"/{end}/dot", radius=0.014 * EXTENT, color=(214, 39, 40)
             )
-            above: Any = {"position": (0, 0, 0.03 * EXTENT), "anchor": "bottom-center"}
-            self.client.scene.add_label(f"/{end}/name", ENDS[end], **above)
+            self.client.scene.add_label(
+                f"/{end}/name", ENDS[end], position=(0, 0, 0.03 * EXTENT), anchor="bottom-center"
+            )
             gizmo.on_update(self._dragged(end))
             self.gizmos[end] = gizmo
 
