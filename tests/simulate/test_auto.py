@@ -11,7 +11,7 @@ from refusals import refused
 from gsparc.simulate import auto
 from gsparc.simulate.attribution import Deliverable, SurveyProbe
 from gsparc.simulate.auto import AutoSettings, Choice
-from gsparc.simulate.deciding import Decision
+from gsparc.simulate.campaign import Decision
 from gsparc.simulate.effects import DIFFRACTION, DIFFUSE, REFRACTION, SPECULAR, Effects
 from gsparc.simulate.paths import TracedPaths
 from gsparc.simulate.spectrum import SpectrumSettings

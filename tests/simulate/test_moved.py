@@ -8,8 +8,7 @@ from gsparc.simulate.effects import Effects
 from gsparc.simulate.raytracer import Sampling
 from gsparc.simulate.scenes.build import build_survey
 from gsparc.simulate.scenes.conference import conference_room
-from gsparc.simulate.scenes.moved import Move, move_solids
-from gsparc.simulate.scenes.settings import SceneSettings
+from gsparc.simulate.scenes.settings import Move, SceneSettings, move_solids
 
 FACTS = {
     "name": "room",
