@@ -21,11 +21,10 @@ from gsparc.runs.baselines import same_as_baseline
 from gsparc.runs.evaluate import TrainedRun, evaluate
 from gsparc.runs.experiment import folds, options
 from gsparc.runs.experiment.runner import Job
-from gsparc.runs.inputs import RunInputs, describe_inputs, read_inputs
+from gsparc.runs.inputs import RunInputs, describe_inputs, objective, read_inputs, train_once
 from gsparc.runs.ledger import set_earlier_aside
 from gsparc.runs.output import show_training
 from gsparc.runs.run_lock import locked
-from gsparc.runs.train_once import objective, train_once
 from gsparc.training import tracking
 from gsparc.training.context import FitContext
 

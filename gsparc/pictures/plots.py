@@ -37,7 +37,7 @@ from gsparc.pictures.drawing import (
     style_of,
 )
 from gsparc.pictures.report.tables import groups_of, interval_of_figure
-from gsparc.prediction.pareto import pareto_front
+from gsparc.prediction.operating_point import pareto_front
 from gsparc.runs.experiment.table import methods_by_mean_behind, shown
 
 WIDE, TALL = 7.0, 3.8

@@ -34,8 +34,7 @@ from gsparc.pictures.from_above import (
     set_bounds,
     split_frame,
 )
-from gsparc.tables.checks.level_steps import LevelStep
-from gsparc.tables.checks.link_levels import LinkLevels
+from gsparc.tables.checks.level_steps import LevelStep, LinkLevels
 from gsparc.tables.checks.plausibility import find_outlier_rows
 
 NAMED = 15  # stations; of more only their number is said

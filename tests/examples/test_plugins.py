@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 
 import gsparc
 from gsparc.commands.evaluate import evaluate_files
-from gsparc.commands.shared.plugins import offer_plugins
+from gsparc.commands.shared.cli import offer_plugins
 from gsparc.commands.train import train
 from gsparc.data.splits import Fold
 from gsparc.datasets.load import datamodule
@@ -28,7 +28,7 @@ from gsparc.evaluation.console import error_in_one_line
 from gsparc.models.registry import build, method_class
 from gsparc.runs.experiment.cells import load_every_problem
 from gsparc.runs.experiment.contenders import unlisted_contenders
-from gsparc.runs.settings import to_dict
+from gsparc.runs.output import to_dict
 from gsparc.training.context import FitContext
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -7,9 +7,9 @@ from strangers import BAND, CASES, LEVELS, PLACES, ROWS, table
 
 from gsparc.base.errors import DataError
 from gsparc.datasets.own import Own, read_any
-from gsparc.tables.columns_file import beside
 from gsparc.tables.read import parse_table
-from gsparc.tables.roles import are_alike
+from gsparc.tables.said_columns import beside
+from gsparc.tables.sheet import are_alike
 
 TWO = table("x,y,RSRP,RSSI", *PLACES.T, *LEVELS[:, :2].T)
 EQUAL = table("x,y,RSRP,RSSI", *PLACES.T, LEVELS[:, 0], LEVELS[:, 0])
@@ -231,7 +231,7 @@ def test_names_in_numbered_columns_were_levels(write):
 
 def test_a_checkpoint_keeps_answers_and_a_later_setting_replaces_them(write, tmp_path):
     """`height` of a later command was overridden by the `z` that training had kept."""
-    from gsparc.tables.columns_file import read_columns
+    from gsparc.tables.said_columns import read_columns
 
     path = write(table("x,y,floor,rssi", *PLACES.T, BAND, LEVELS[:, 0]))
     raw = parse_table(path, {"height": "floor*3.2"})

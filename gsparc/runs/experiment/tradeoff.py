@@ -20,7 +20,7 @@ from gsparc.evaluation.table import Column, Row
 from gsparc.models.method import Method
 from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import Settings
-from gsparc.prediction.pareto import defined_figure, describe_point, pareto_front
+from gsparc.prediction.operating_point import defined_figure, describe_point, pareto_front
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import FACTS, ClockSettings, time_beside_copy
 from gsparc.runs.baselines import fit_baseline

@@ -13,8 +13,7 @@ from towns import town_model
 
 import gsparc
 from gsparc.apps.maps import predict_map
-from gsparc.apps.maps.area import lay_grid
-from gsparc.apps.maps.floor_plan import read_floor_plan
+from gsparc.apps.maps.area import lay_grid, read_floor_plan
 from gsparc.apps.maps.geojson import read_shapes
 from gsparc.data.georeference import Georeference
 

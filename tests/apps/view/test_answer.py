@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsparc.apps.view.answer import Answer, PlacePaths, merge_paths, predict_answer
+from gsparc.apps.view.answer import PlaceAnswer, PlacePaths, merge_paths, predict_answer
 from gsparc.apps.view.building import BOX, MIRROR, draw_rays
 from gsparc.apps.view.reasons import explain_level, legend_html
 from gsparc.apps.view.scene import Faces
@@ -13,9 +13,13 @@ HERE = np.zeros(3)
 
 def test_a_fade_is_said_to_be_one():
     paths = PlacePaths(np.array([-40.0, -40.5]), np.array([10.0, 20]), None)
-    said = " | ".join(explain_level(Answer({"rx": HERE}, level_db=-60.0, paths=paths), "rx", None))
+    said = " | ".join(
+        explain_level(PlaceAnswer({"rx": HERE}, level_db=-60.0, paths=paths), "rx", None)
+    )
     assert "they cancel each other: 22.8 dB less than their powers" in said
-    said = " | ".join(explain_level(Answer({"rx": HERE}, level_db=-37.5, paths=paths), "rx", None))
+    said = " | ".join(
+        explain_level(PlaceAnswer({"rx": HERE}, level_db=-37.5, paths=paths), "rx", None)
+    )
     assert "their powers" not in said
 
 
@@ -48,7 +52,7 @@ def test_a_path_that_two_searches_found_is_one_path():
 def test_rays_are_as_long_as_their_delays():
     towards = np.array([[1.0, 0, 0], [0, 1, 0]])
     rays = PlacePaths(np.array([-40.0, -50]), np.array([10.0, 20]), towards)
-    lines, ends = draw_rays(Answer({"rx": np.ones(3)}, paths=rays), 100.0)
+    lines, ends = draw_rays(PlaceAnswer({"rx": np.ones(3)}, paths=rays), 100.0)
     length = np.linalg.norm(ends.places - 1, axis=1)
     np.testing.assert_allclose(length, [2.998, 5.996], rtol=1e-3)
     assert lines.segments.shape == (2, 2, 3)

@@ -6,9 +6,8 @@ from towns import trained
 
 from gsparc.apps.maps.layers import Legend
 from gsparc.apps.view.answer import predict_answer
-from gsparc.apps.view.plane import plane_sheet, refine_plane, weakest_place
-from gsparc.apps.view.site_view import lay_power_plane
-from gsparc.apps.view.viewed import open_model
+from gsparc.apps.view.building import open_model
+from gsparc.apps.view.site_view import lay_power_plane, plane_sheet, refine_plane, weakest_place
 
 
 def test_the_last_plane_is_what_the_model_says_of_every_cell(power_view):

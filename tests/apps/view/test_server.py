@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from towns import trained
 
+from gsparc.apps.view.building import open_model
 from gsparc.apps.view.site_view import SiteView, lay_power_plane
-from gsparc.apps.view.viewed import open_model
 
 viser = pytest.importorskip("viser", reason="viser is not installed: pip install 'gsparc[viewer]'")
 
@@ -24,8 +24,7 @@ from websockets.sync.client import connect  # noqa: E402
 
 from gsparc.apps.view.latest_job import LatestJobQueue  # noqa: E402
 from gsparc.apps.view.server.page import render_page  # noqa: E402
-from gsparc.apps.view.server.serve import PageServer  # noqa: E402
-from gsparc.apps.view.server.session import Session  # noqa: E402
+from gsparc.apps.view.server.session import PageServer, Session  # noqa: E402
 
 
 @pytest.fixture
