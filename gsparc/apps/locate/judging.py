@@ -20,11 +20,10 @@ from matplotlib.patches import Rectangle
 from omegaconf import DictConfig, OmegaConf
 
 from gsparc.apps.locate import locator as locating
-from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.locator import Located, Locator
 from gsparc.apps.locate.neighbours import locate_by_neighbours
 from gsparc.apps.locate.posterior import beyond_box, cover_box
-from gsparc.apps.locate.search import Nuisances
+from gsparc.apps.locate.search import Nuisances, Trust
 from gsparc.apps.locate.snapshots import Scans, SiteField, group_snapshots
 from gsparc.base.errors import DataError
 from gsparc.base.files import write_samples

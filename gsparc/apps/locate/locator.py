@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from gsparc.apps.locate.likelihood import Trust
 from gsparc.apps.locate.posterior import Cells, PlacePosterior, beyond_box, cover_box, densest_cells
 from gsparc.apps.locate.search import (
     Nuisances,
     PlaceSearch,
+    Trust,
     calibrate_level,
     calibrate_trust,
     compute_misfit,

@@ -7,9 +7,14 @@ import pytest
 import torch
 
 from gsparc.apps.locate import search
-from gsparc.apps.locate.likelihood import Trust, level_misfit
 from gsparc.apps.locate.posterior import cover_box
-from gsparc.apps.locate.search import PlaceSearch, calibrate_level, calibrate_trust
+from gsparc.apps.locate.search import (
+    PlaceSearch,
+    Trust,
+    calibrate_level,
+    calibrate_trust,
+    level_misfit,
+)
 
 STATIONS = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [10, 10, 0]])
 CORNERS = np.array([[0.0, 0, 0], [10.0, 10, 0]])

@@ -13,7 +13,7 @@ from refusals import refused
 
 import gsparc
 from gsparc.apps.locate import locate
-from gsparc.apps.locate.likelihood import Trust
+from gsparc.apps.locate.search import Trust
 from gsparc.apps.locate.snapshots import SiteField, group_snapshots
 from gsparc.models import checkpoint
 from gsparc.models.method import predict_with_threads
