@@ -337,8 +337,11 @@ def draw_splits(rows: pd.DataFrame, path: Path, also: Sequence[str] = ()) -> Non
                 fontsize=7.5,
             )
         draws = int(cells.seeds.max())
-        axis.set(title=f"{split}, {draws} draw{'s' * (draws > 1)}", xlim=(0, 1.5 * most))
-        axis.set_xlabel(axis_of(cells.figure.iloc[0]))
+        axis.set(
+            title=f"{split}, {draws} draw{'s' if draws > 1 else ''}",
+            xlabel=axis_of(cells.figure.iloc[0]),
+            xlim=(0, 1.5 * most),
+        )
         axis.set_yticks(np.arange(len(names)), names)
         axis.grid(axis="y", visible=False)
     grid[0, 0].set_ylim(len(names) - 0.4, -0.6)

@@ -302,6 +302,6 @@ def _draw_level(
         axis.plot(np.searchsorted(rows, row), levels.level_db[row], "o", mec="red", mfc="none")
     axis.set(
         title=f"{levels.names[station]}: steps that the places do not explain",
+        xlabel="place, in the order of measuring",
         ylabel=f"level [{unit}]",
     )
-    axis.set_xlabel("place, in the order of measuring")

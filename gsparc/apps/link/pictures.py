@@ -79,9 +79,10 @@ def draw_rates(
         mean = [getattr(rate, name).mean() / 1e6 for rate in rates]
         curves.plot([rate.snr_db for rate in rates], mean, style, label=label)
     curves.set(
-        xlabel="median signal-to-noise ratio [dB]", ylabel="mean throughput of one layer [Mbit/s]"
+        title=title,
+        xlabel="median signal-to-noise ratio [dB]",
+        ylabel="mean throughput of one layer [Mbit/s]",
     )
-    curves.set_title(title)
     curves.legend()
     middle = rates[len(rates) // 2]
     # Misses of three and more are rare: one box for them.
@@ -113,7 +114,10 @@ def draw_acceptance(
                 rates.index, rates[name], ".-", color=colour, label=label.removesuffix(", accepted")
             )
         axis.axvline(share, color="grey", linestyle=":", label="accepted")
-        axis.set(xlabel="share of positions accepted, surest first", ylabel="block error rate")
-        axis.set_title(f"{modulation.upper()} at {ebno_db:g} dB")
+        axis.set(
+            title=f"{modulation.upper()} at {ebno_db:g} dB",
+            xlabel="share of positions accepted, surest first",
+            ylabel="block error rate",
+        )
         axis.legend(fontsize=8)
     save(figure, path)

@@ -223,8 +223,11 @@ def draw_measurement_plan(
             curve, f"{expected[number]:.2f} dB", np.array([number, expected[number]])
         )
     # From 0: a fall of a tenth of a decibel is not to look like one to nothing.
-    curve.set(ylim=(0, 1.15 * expected.max()), xlabel="places, the most telling first")
-    curve.set_ylabel("expected error over the area [dB]")
+    curve.set(
+        xlabel="places, the most telling first",
+        ylabel="expected error over the area [dB]",
+        ylim=(0, 1.15 * expected.max()),
+    )
     curve.grid(alpha=0.3)
     save(figure, path, 100)
 

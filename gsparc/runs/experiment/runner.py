@@ -146,10 +146,6 @@ def _tried(make: Callable[[Piece], Made], piece: Piece) -> tuple[Any, str]:
         )
 
 
-def _fit_once(fit: Fit, job: Job) -> None:
-    run_once(job.folder, job.state, partial(fit, job), reuse=job.reuse)
-
-
 def run_jobs(
     jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float | None = None
 ) -> pd.DataFrame:
@@ -192,7 +188,7 @@ def run_jobs(
     waiting, refused = missing if train else [], list[str]()
     try:
         for job, _ in run_list(
-            partial(_fit_once, fit),
+            lambda job: run_once(job.folder, job.state, partial(fit, job), reuse=job.reuse),
             waiting,
             "cells",
             name=lambda one: str(one.name),
