@@ -79,7 +79,7 @@ def _section(name: str, rows: pd.DataFrame) -> str:
     several = f"one split; ± deviation over {rows.seeds.max()} seeds, others one seed"
     alone = several if rows.seeds.max() > 1 else "one split, one seed"
     made = f"{rows.seeds.max()} draws (± standard error)" if draws else alone
-    load = f"load {rows.load.min():.1f} to {rows.load.max():.1f} a core"
+    load = f"load {rows.load.min():.1f} to {rows.load.max():.1f}"
     table = Table.from_rows(f"{name}: {WHAT[name]}", columns, rows.to_dict("records"))  # type: ignore[arg-type]
     return f"{table.markdown()}\n{made}; {load}.\n"
 
