@@ -172,13 +172,20 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """Return remarks on a table: rows that are not unseen, stand-ins, a busy machine,
     a baseline that is better.
     """
-    seen = {
-        "train": ["these are training rows: eval_on=test scores rows that were not learned from"],
-        "val": [
-            "methods, but not baselines, used these validation rows: compare methods with "
-            "eval_on=test"
-        ],
-    }
+    whole = facts.get("split/name") == "none"  # `run_conditions` says what was scored
+    seen = (
+        {}
+        if whole
+        else {
+            "train": [
+                "these are training rows: eval_on=test scores rows that were not learned from"
+            ],
+            "val": [
+                "methods, but not baselines, used these validation rows: compare methods with "
+                "eval_on=test"
+            ],
+        }
+    )
     stated = [key.split("/") for key in facts if key.endswith(f"/{CALIBRATION}")]
     chi2 = {key[1]: facts["/".join(key)] for key in stated if key[0] == "baseline"}
     chi2[str(facts.get("model/label"))] = facts.get(f"{prefix}/{CALIBRATION}")
@@ -235,6 +242,10 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
     if facts.get("split/name") == "none" and not facts.get("split/test"):
         count = facts["split/train"] + facts["split/val"]
         conditions.append(f"nothing was tested: all {count} rows were learned from (split=none)")
+        if any(key.startswith("val/") for key in facts):
+            conditions[-1] += (
+                f"; the table leaves {facts['split/val']} out, which had a say in settings only"
+            )
     if facts.get("split/foreign"):
         conditions.append(f"the model was trained on {facts['split/foreign']}")
     if facts.get("split/without_baselines"):

@@ -26,6 +26,13 @@ from gsparc.processes.uncertainty import censored_distribution
 from gsparc.training.context import FitContext
 
 
+def forget(method: Method, data: Measurements, rows: np.ndarray) -> Method | None:
+    """Return a method as it is but for its rows, which are these (n,) alone; None if it cannot."""
+    if not isinstance(method, Reconditions):
+        return None
+    return method.copy_conditioned(without_devices(data, method.fitted_site), rows)
+
+
 @dataclass(frozen=True)
 class Learned:
     """A fitted method with what it learned from.
@@ -64,11 +71,8 @@ class Learned:
         One that can forget rows does so, with its settings as they are; another one is fitted anew,
         as all are where `anew`.
         """
-        if not anew and isinstance(self.method, Reconditions):
-            rows = np.sort(fold.learned())
-            less = self.method.copy_conditioned(
-                without_devices(self.data, self.method.fitted_site), rows
-            )
+        if not anew:
+            less = forget(self.method, self.data, np.sort(fold.learned()))
             if less is not None:
                 return less
         # Nobody goes on from this fit: its checkpoints and curves go with the folder.

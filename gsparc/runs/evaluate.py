@@ -31,6 +31,7 @@ from gsparc.models.method import Method
 from gsparc.physics.decibels import to_decibels
 from gsparc.prediction import timing
 from gsparc.prediction.hearing import Hearing
+from gsparc.prediction.left_out import forget
 from gsparc.prediction.timing import ClockSettings, query_calls, time_beside_copy, time_interleaved
 from gsparc.runs.baselines import FittedBaseline, baselines_for, fit_baseline
 
@@ -122,7 +123,8 @@ def evaluate(
         timed: whether latencies are measured.
         hearing: see `score_methods`; as checkpoints hold it.
 
-    Nothing is scored or timed where `split=none` left no test rows.
+    Where `split=none` left no test rows, a method that can forget its validation rows is scored and
+    timed at them, as `val/*`; one that cannot is not.
 
     Returns:
         `test/*`, `baseline/<name>/*`, `time/*`, `machine/*`, `memory/*`, `model/*`,
@@ -136,7 +138,17 @@ def evaluate(
     if seconds is not None and len(seconds) != len(methods):
         raise ValueError(f"{len(seconds)} training times for {len(methods)} methods")
     if split.name == "none" and eval_on == "test":
-        return Evaluation(_about(methods, seconds, data, split), {})
+        about = _about(methods, seconds, data, split)
+        fold, compares = split.folds[0], timed and learned is None and baselines != []
+        less = forget(methods[0], data, fold.train) if compares else None
+        if less is None:
+            return Evaluation(about, {})
+        told: dict[str, Any] = {
+            "eval_on": "val",
+            "hearing": [Hearing.from_learned(data, fold.train)],
+        }
+        left_out = evaluate(less, seconds, data, split, baselines=baselines, clock=clock, **told)
+        return replace(left_out, facts=left_out.facts | about)
     if hearing is None:
         learned_data, before = learned or (data, split)
         hearing = [Hearing.from_learned(learned_data, fold.learned()) for fold in before.folds]

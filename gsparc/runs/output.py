@@ -283,14 +283,14 @@ def show_training(
     stations: Mapping[str, Any],
 ) -> None:
     """Show the table of a training, the worst of its `stations`, and remarks."""
+    scored = (config.eval_on, "val")  # the second where `split=none` left no test rows
+    tested = [rows for rows in scored if any(key.startswith(f"{rows}/") for key in facts)]
+    eval_on = tested[0] if tested else config.eval_on
     drawn = config.split.get("seed") is not None and not split.of_release
     draw = f" (split.seed={config.split.seed})" if drawn else ""
-    title = (
-        f"{facts['dataset/name']}, split {split.title}{draw}, {config.eval_on}, seed {config.seed}"
-    )
-    tables = tables_of(facts, title, config.eval_on, stations)
-    tested = any(name.startswith(f"{config.eval_on}/") for name in facts)
-    show_result(run_dir, *tables * tested, lines=remarks(facts, config.eval_on))
+    title = f"{facts['dataset/name']}, split {split.title}{draw}, {eval_on}, seed {config.seed}"
+    tables = tables_of(facts, title, eval_on, stations) if tested else []
+    show_result(run_dir, *tables, lines=remarks(facts, eval_on))
 
 
 def tables_of(

@@ -6,6 +6,7 @@ import re
 import sys
 
 import numpy as np
+import pandas as pd
 import pytest
 import towns
 import yaml
@@ -89,6 +90,23 @@ def test_a_last_fit_from_all_rows_tests_nothing_and_serves_all_the_same(tmp_path
     found, _, _ = evaluate_files([tmp_path / "run" / "model.ckpt"], own, eval_on="val")
     assert found.facts["val/rmse_db"] < 1  # an interpolator of rows that it has learned
     assert np.isfinite(gsparc.load(tmp_path / "run" / "model.ckpt").rssi(rx=[1.0, 1.0, 1.0]))
+
+
+def test_a_last_fit_stood_beside_no_baseline(tmp_path):
+    """A default behind `gp` on a whole campus said nothing of it: no row was tested."""
+    file, run = powers(tmp_path / "own.npz"), tmp_path / "run"
+    given = [f"dataset.file={file}", "dataset=own", "split=none", "threads=1"]
+    done = knock(COMMANDS["train"].run, "train", [*given, f"hydra.run.dir={run}"])
+    assert done.status == 0, done
+    facts = json.loads((run / "summary.json").read_text())
+    fold = json.loads((run / "split.json").read_text())["folds"][0]
+    assert sorted(pd.read_csv(run / "per_sample.csv")["row"]) == sorted(fold["val"])
+    # It answers these rows without them; they are what it knows afterwards.
+    known = evaluate_files(
+        [run / "model.ckpt"], {"name": "own", "file": str(file)}, eval_on="val", baselines=[]
+    )[0].facts
+    assert known["val/rmse_db"] < facts["val/rmse_db"] < facts["baseline/mean/rmse_db"]
+    assert "the table leaves 8 out" in "\n".join(done.out)
 
 
 def test_evaluate_took_no_settings_of_the_data(tmp_path):
