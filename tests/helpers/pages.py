@@ -250,6 +250,7 @@ class Tiny:
             words.pop("dataset.root", None)
             words |= {"dataset.file": self.data("city")} if "dataset.file" in words else {}
         if name == "compare":
+            words |= {"beside": str(ROOT / words["beside"])} if "beside" in words else {}
             table = words.get("experiment", "results/rfid").removeprefix("results/")
             words.pop("datasets.wideband.root", None)  # no small data have ten carriers
             several = {"ceiling": ("exp005", "exp006"), "halls": ("hall_1", "hall_2")}
