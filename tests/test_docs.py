@@ -15,7 +15,7 @@ import pytest
 from hydra import compose, initialize_config_module
 from pages import FOLDERS, PAGES, PRESENT, ROOT, commands, said
 
-from gsparc.commands.shared.plugins import offer_scenes
+from gsparc.commands.shared.cli import offer_scenes
 from gsparc.models.registry import built_in_methods
 from gsparc.simulate.scenes.shipped import list_shipped_scenes
 

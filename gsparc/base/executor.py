@@ -178,8 +178,14 @@ def _in_threads(
 
 
 def _jobs(calls: Iterable[Any], workers: int) -> Results:
-    how: dict[str, Any] = {"pre_dispatch": workers, "batch_size": 1, "max_nbytes": None}
-    jobs = joblib.Parallel(workers, "loky", return_as="generator_unordered", **how)
+    jobs = joblib.Parallel(
+        workers,
+        "loky",
+        return_as="generator_unordered",
+        pre_dispatch=workers,
+        batch_size=1,
+        max_nbytes=None,
+    )
     warnings.filterwarnings("ignore", ".*tasks which were still being", UserWarning)  # at an error
     yield from jobs(joblib.delayed(call)(*arguments) for call, *arguments in calls)
 

@@ -45,9 +45,10 @@ def task(call: CommandCall) -> Result:
     few = explain_too_few(len(evidence), promise)
     stored_lines = [] if few is None or config.store else [few]
     if config.store:
-        how = promise, config.confidence, bool(config.spatial), int(config.seed)
         for unseen in opened:
-            stored, bound = unseen.calibrate_and_store(*how)
+            stored, bound = unseen.calibrate_and_store(
+                promise, config.confidence, bool(config.spatial), int(config.seed)
+            )
             # An infinite threshold accepts nobody, and JSON has no infinity.
             threshold = stored.threshold if np.isfinite(stored.threshold) else None
             facts["stored/kind"], facts["stored/threshold"] = stored.kind, threshold

@@ -48,7 +48,7 @@ def check(
     from gsparc.datasets.own import read_any
     from gsparc.models.powers.together.network import check_azimuths
     from gsparc.prediction.foreseen import describe_few_rows
-    from gsparc.tables.columns_file import write_columns
+    from gsparc.tables.said_columns import write_columns
 
     try:
         # Read on with the likeliest of what is open, so that all that is open is said.

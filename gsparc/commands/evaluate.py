@@ -79,8 +79,13 @@ def task(call: CommandCall) -> Result:
     given, run_dir, paths = call.given, call.folder, call.paths
     if paths[0].endswith(".npz"):
         return _judge_map(paths[0], given["dataset"], run_dir)
-    how = {"eval_on": given["eval_on"], "baselines": given["baselines"]}
-    evaluation, data, split = evaluate_files(paths, given["dataset"], given["split"], **how)
+    evaluation, data, split = evaluate_files(
+        paths,
+        given["dataset"],
+        given["split"],
+        eval_on=given["eval_on"],
+        baselines=given["baselines"],
+    )
     facts = {**evaluation.facts, "ckpt": ", ".join(paths)}
     evaluation.write(run_dir)
     rows, eval_on = frame_of_runs([Run(run_dir, facts)]), given["eval_on"]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from gsparc.apps.locate.fingerprints import locate_fingerprints
-from gsparc.apps.locate.judging import locate_by_model
+from gsparc.apps.locate.judging import locate_by_model, locate_fingerprints
 from gsparc.apps.locate.neighbours import PLAIN
-from gsparc.apps.maps.floor_plan import read_plan_settings
+from gsparc.apps.maps.area import read_plan_settings
 from gsparc.base.limits import (
     POSITIVE,
     SHARE,

@@ -5,15 +5,13 @@ from __future__ import annotations
 from fnmatch import fnmatch
 from typing import Any
 
-from gsparc.apps.maps.changed import add_changes, change_layers
+from gsparc.apps.maps.area import read_plan_settings
 from gsparc.apps.maps.covered import covered_between
 from gsparc.apps.maps.field_map import FieldMap
-from gsparc.apps.maps.floor_plan import read_plan_settings
 from gsparc.apps.maps.geojson import read_outlines
-from gsparc.apps.maps.geotiff import check_geotiff, write_classes, write_geotiff
+from gsparc.apps.maps.geotiff import check_geotiff, write_classes, write_geotiff, write_kmz
 from gsparc.apps.maps.intervals import cross_validate
-from gsparc.apps.maps.kmz import write_kmz
-from gsparc.apps.maps.layers import Layer, file_name, list_layers
+from gsparc.apps.maps.layers import Layer, add_changes, change_layers, file_name, list_layers
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.pictures import draw_layer
 from gsparc.apps.maps.promise import PromiseSettings, map_notes, read_or_gather

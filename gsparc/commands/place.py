@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import isnan
 
 from gsparc.apps.maps import placing
-from gsparc.apps.maps.plan_pictures import draw_placement
+from gsparc.apps.maps.pictures import draw_placement
 from gsparc.apps.maps.promise import read_or_gather, reopen_training
 from gsparc.evaluation.summary import coordinates
 from gsparc.models import checkpoint

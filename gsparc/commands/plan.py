@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
-from gsparc.apps.maps.floor_plan import read_plan_settings
+from gsparc.apps.maps.area import read_plan_settings
 from gsparc.apps.maps.geojson import read_outlines, write_shapes
-from gsparc.apps.maps.plan_pictures import draw_measurement_plan
+from gsparc.apps.maps.pictures import draw_measurement_plan
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import read_or_gather
 from gsparc.commands.map import stations_of

@@ -23,9 +23,8 @@ from gsparc.prediction.timing import BLOCKS, peak_memory
 from gsparc.runs.experiment import tradeoff
 from gsparc.runs.ledger import FitInputs, measurements_hash, run_once
 from gsparc.runs.open_runs import Opened, open_run
-from gsparc.runs.output import Result, in_multirun, run_directory
+from gsparc.runs.output import Result, in_multirun, run_directory, to_dict
 from gsparc.runs.run_lock import locked
-from gsparc.runs.settings import to_dict
 from gsparc.training import tracking
 
 log = logging.getLogger(__name__)
@@ -58,8 +57,9 @@ def _swept(config: DictConfig, run: Opened, run_dir: Path) -> None:
     log.info("%d combinations, %s threads", len(settings), " and ".join(map(str, threads)))
     candidates = [(some, with_reduction(method, some, inputs)) for some in settings]
     clock = replace(BLOCKS, rounds=config.rounds, rounds_s=config.rounds_s)
-    how = data, run.split, config.eval_on, clock
-    points, beside = tradeoff.measure_points(candidates, threads, config.baselines, *how)
+    points, beside = tradeoff.measure_points(
+        candidates, threads, config.baselines, data, run.split, config.eval_on, clock
+    )
     model_points = points[points.kept_with_model == 1]
     if config.store:
         operating_point.store_points(Path(config.ckpt), model_points.to_dict("records"), inputs)

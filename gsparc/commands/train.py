@@ -21,11 +21,10 @@ from gsparc.runs.baselines import same_as_baseline
 from gsparc.runs.evaluate import TrainedRun, evaluate
 from gsparc.runs.experiment import folds, options
 from gsparc.runs.experiment.runner import Job
-from gsparc.runs.inputs import RunInputs, describe_inputs, read_inputs
+from gsparc.runs.inputs import RunInputs, describe_inputs, objective, read_inputs, train_once
 from gsparc.runs.ledger import set_earlier_aside
 from gsparc.runs.output import show_training
 from gsparc.runs.run_lock import locked
-from gsparc.runs.train_once import objective, train_once
 from gsparc.training import tracking
 from gsparc.training.context import FitContext
 
@@ -85,8 +84,17 @@ def train(
             facts = {**evaluation.facts, **summary.provenance(), **fits.facts(), "run_id": run_id}
             facts |= {"seed": int(config.seed), "options/unused": unused}
             if in_full:
-                results = facts, evaluation.examples, config.eval_on
-                draw_run(fits.methods[0], data, split, inputs.walls, *results, run_dir, loggers)
+                draw_run(
+                    fits.methods[0],
+                    data,
+                    split,
+                    inputs.walls,
+                    facts,
+                    evaluation.examples,
+                    config.eval_on,
+                    run_dir,
+                    loggers,
+                )
         evaluation.write(run_dir, run_id=run_id)
         summary.write_summary(run_dir / SUMMARY, facts)
         return facts, TrainedRun(fits.methods, folds.checkpoints(contexts), data, split, evaluation)

@@ -7,11 +7,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from gsparc.apps.maps.floor_plan import read_plan_settings
-from gsparc.apps.view.building import cloud_colours, model_gaussians
+from gsparc.apps.maps.area import read_plan_settings
+from gsparc.apps.view.building import cloud_colours, model_gaussians, open_model
 from gsparc.apps.view.ply import write_ply
 from gsparc.apps.view.site_view import SiteView, lay_power_plane
-from gsparc.apps.view.viewed import open_model
 from gsparc.base.errors import DataError
 from gsparc.base.files import write_whole
 from gsparc.base.limits import whole
@@ -69,7 +68,7 @@ def view_of(settings: dict[str, Any]) -> SiteView:
 def serve(view: SiteView, host: str, port: int) -> str:
     """Serve until Ctrl-C; return what is said then."""
     # Imported here, as viser is an extra that splat files do without.
-    from gsparc.apps.view.server.serve import PageServer
+    from gsparc.apps.view.server.session import PageServer
 
     server = PageServer(view, host, port)
     log.info("open %s in a browser; Ctrl-C ends it", server.address)

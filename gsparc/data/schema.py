@@ -123,7 +123,7 @@ class Stations:
 
 
 @dataclass(frozen=True)
-class Links:
+class StaticEnds:
     """What a file says of its links beyond the plain schema.
 
     Attributes:

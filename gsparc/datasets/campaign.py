@@ -24,8 +24,7 @@ from gsparc.datasets.datamodule import DataModule
 from gsparc.datasets.public.fetch import fetched_path, fetched_path_or_none
 from gsparc.tables.advice import run_warnings
 from gsparc.tables.checks.conventions import convention_warnings
-from gsparc.tables.checks.level_steps import LevelStep, find_level_steps
-from gsparc.tables.checks.link_levels import LinkLevels, link_levels
+from gsparc.tables.checks.level_steps import LevelStep, LinkLevels, find_level_steps, link_levels
 from gsparc.tables.checks.plausibility import sanity_warnings
 from gsparc.tables.checks.unit_warnings import unit_warnings
 from gsparc.tables.own import interpret

@@ -172,8 +172,15 @@ class DataModule(pl.LightningDataModule, ABC):
         """
         trainer = self.trainer
         rank, devices = (0, 1) if trainer is None else (trainer.global_rank, trainer.world_size)
-        how = self._rows().train, self.batch_size, self.seed, self._batches_shown, rank, devices
-        return StepLoader(self.measurements, *how)
+        return StepLoader(
+            self.measurements,
+            self._rows().train,
+            self.batch_size,
+            self.seed,
+            self._batches_shown,
+            rank,
+            devices,
+        )
 
     def val_dataloader(self) -> RowsLoader:
         """Return validation rows in order, all of them on every device."""

@@ -53,8 +53,9 @@ def read_own(
         DataError: bad input, or a file of another campaign.
         SettingError: see `apply_settings`.
     """
-    table = columns, stations_file, guess, columns_file
-    raw = apply_settings(read_file_or_table(path, *table), **settings)
+    raw = apply_settings(
+        read_file_or_table(path, columns, stations_file, guess, columns_file), **settings
+    )
     campaign = dataset_by_arrays(raw)
     if campaign is not None:
         raise DataError(

@@ -32,17 +32,14 @@ def draw_confidences(
     if any.
     """
     records: list[Row] = own_rows(rows).to_dict("records")  # type: ignore[assignment]
-    runs = [row for row in records if _states(row)]
+    confidences = (row["run"].samples.get("confidence", np.array([np.nan])) for row in records)
+    runs = [row for row, sure in zip(records, confidences, strict=True) if np.isfinite(sure).all()]
     for name in names if runs else ():
         # Powers have no ratio to an error.
         if name != "snr_brackets" or not lower_is_better(OF_KIND[runs[0]["kind"]].of_sample):
             figure = PICTURES[name](runs)
             figure.suptitle(title, fontsize=9)
             save(figure, folder / f"{name}{end}.png")
-
-
-def _states(row: Row) -> bool:
-    return bool(np.isfinite(row["run"].samples.get("confidence", np.zeros(1) * np.nan)).all())
 
 
 def _label(row: Row) -> str:
@@ -86,11 +83,12 @@ def _draw_over_loss(runs: list[Row]) -> Figure:
         spectra = "ssim_gauss" in row["run"].samples
         error = row["run"].samples["mae"][finite] if spectra else loss
         scatter.plot(error, sure, ".", markersize=4, alpha=0.5, color=PALETTE[0])
-        scatter.set(
-            xlabel="MAE of a test row" if spectra else "loss of a test row", ylabel="confidence C"
-        )
         alike = rank_correlation(sure, error)
-        scatter.set_title(f"rank correlation {np.nan if alike is None else alike:.2f}")
+        scatter.set(
+            title=f"rank correlation {np.nan if alike is None else alike:.2f}",
+            xlabel="MAE of a test row" if spectra else "loss of a test row",
+            ylabel="confidence C",
+        )
     return figure
 
 
@@ -151,8 +149,9 @@ def _draw_brackets(runs: list[Row]) -> Figure:
             if k.startswith(stem) and k.endswith(end)
         }
         samples = {k: v[np.isfinite(v)] for k, v in {**beside, _label(row): data[name]}.items()}
-        how = {"tick_labels": list(samples), "showfliers": False, "patch_artist": True}
-        boxes = errors_axis.boxplot(list(samples.values()), **how)
+        boxes = errors_axis.boxplot(
+            list(samples.values()), tick_labels=list(samples), showfliers=False, patch_artist=True
+        )
         for box, method in zip(boxes["boxes"], [*beside, row["method"]], strict=True):
             box.set(facecolor=style_of(method).colour, alpha=0.5)
         errors_axis.tick_params(axis="x", labelrotation=30)

@@ -175,8 +175,15 @@ def set_latency_axes(
     for name, ms, value in others:
         look = style_of(name)
         axes.plot([ms], [value], ms=5, **look.marked)
-        where = {"textcoords": "offset points", "fontsize": 7, "color": look.colour}
-        axes.annotate(name, (ms, value), (5, -3), annotation_clip=True, **where)
+        axes.annotate(
+            name,
+            (ms, value),
+            (5, -3),
+            annotation_clip=True,
+            textcoords="offset points",
+            fontsize=7,
+            color=look.colour,
+        )
     set_log_axis(axes)
     axes.set(
         xlabel="one query [ms], median; whisker to the 95th percentile", ylabel=axis_of(figure_name)

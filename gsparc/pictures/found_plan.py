@@ -108,12 +108,13 @@ def _upright(
 
 def _draw_known(axis: Any, known: SceneWalls, height: float) -> None:
     """Known walls where they cut a height, and boxes."""
-    how = {"color": "0.25", "lw": 3.0, "alpha": 0.5, "solid_capstyle": "butt"}
     label: str | None = "known walls"
     for face in known.faces:
         cut = _cut(face, height)
         if len(cut) >= 2:
-            axis.plot(*cut[:2, :2].T, label=label, **how)
+            axis.plot(
+                *cut[:2, :2].T, label=label, color="0.25", lw=3.0, alpha=0.5, solid_capstyle="butt"
+            )
             label = None
     for number, box in enumerate(known.boxes):
         axis.add_patch(

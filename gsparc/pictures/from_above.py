@@ -94,8 +94,9 @@ def map_panels(
     wide = np.clip(tall * sides[:, 0] / sides[:, 1], 0.45 * INCHES, INCHES)
     ratios = [*wide, beside] if beside else [*wide]
     height = max(rows * tall + 1.6, least)
-    how: dict[str, Any] = {"width_ratios": ratios, "grid": False}
-    figure, axes = panels(sum(ratios) + 1.9, height, rows, len(ratios), **how)
+    figure, axes = panels(
+        sum(ratios) + 1.9, height, rows, len(ratios), width_ratios=ratios, grid=False
+    )
     if not beside:
         return figure, axes, None
     place = axes[0, -1].get_gridspec()[:, -1]
@@ -131,12 +132,17 @@ def draw_measured(axis: Any, places: np.ndarray) -> None:
         few = places[evenly_spaced(len(places), MOST_POINTS)]
         # By the root of their number, so that the area that marks hide stays the same.
         size = float(np.clip(60 / np.sqrt(len(few)), 2.5, 6.0))
-        rim = {
-            "markerfacecolor": "black",
-            "markeredgecolor": "white",
-            "markeredgewidth": 0.2 * size,
-        }
-        axis.plot(*few.T, "o", markersize=size, label="measured", zorder=3, linestyle="", **rim)
+        axis.plot(
+            *few.T,
+            "o",
+            markersize=size,
+            label="measured",
+            zorder=3,
+            linestyle="",
+            markerfacecolor="black",
+            markeredgecolor="white",
+            markeredgewidth=0.2 * size,
+        )
 
 
 def draw_values(
@@ -230,5 +236,11 @@ def legend_below(figure: Any, columns: int = 3) -> Any:
             marks.setdefault(label, handle)  # of several panels once
     if not marks:
         return None
-    how = {"loc": "outside lower left", "ncols": columns, "fontsize": "small", "frameon": False}
-    return figure.legend(marks.values(), marks.keys(), **how)
+    return figure.legend(
+        marks.values(),
+        marks.keys(),
+        loc="outside lower left",
+        ncols=columns,
+        fontsize="small",
+        frameon=False,
+    )

@@ -25,15 +25,31 @@ def draw_parts(drive: Drive, rows: Sequence[dict[str, Any]], title: str, path: P
     figure, (axes,), room = map_panels(frames, 1, 4.5, LINE * len(bars) + 2.0)
     error = drive.error_db[np.isfinite(drive.error_db)]
     most = max(LEAST_DB, float(np.quantile(np.abs(error), 0.9)))
-    dots: dict[str, Any] = {"c": drive.error_db, "cmap": "RdBu_r", "vmin": -most, "vmax": most}
     for axis, (low, high) in zip(axes, frames, strict=True):
-        marks = axis.scatter(*drive.place.T, s=5, linewidths=0, **dots)
+        marks = axis.scatter(
+            *drive.place.T,
+            s=5,
+            linewidths=0,
+            c=drive.error_db,
+            cmap="RdBu_r",
+            vmin=-most,
+            vmax=most,
+        )
         set_bounds(axis, low, high)
         for row in areas:
             middle = np.array(row["name"].split(), float)
             colour = marks.cmap(marks.norm(row["bias_db"]))
-            face = {"facecolor": colour, "alpha": 0.5, "edgecolor": "0.6", "zorder": 0}
-            axis.add_patch(Rectangle(tuple(middle - side / 2), side, side, **face))
+            axis.add_patch(
+                Rectangle(
+                    tuple(middle - side / 2),
+                    side,
+                    side,
+                    facecolor=colour,
+                    alpha=0.5,
+                    edgecolor="0.6",
+                    zorder=0,
+                )
+            )
             if (middle > low).all() and (middle < high).all():
                 annotate(axis, f"{row['bias_db']:+.1f}", middle)
         scale_bar(axis)

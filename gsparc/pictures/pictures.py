@@ -122,18 +122,28 @@ def draw_points(
         label = f"{len(many)} places with {MANY} rows or more, {int(count[many].sum())} rows"
         axes[0].plot([], [], color=PALETTE[1], label=label)
         axes[0].legend(loc="upper left", fontsize=7)
-    axes[0].set(xlim=(low - 3, high + 3), ylim=(low - 3, high + 3), aspect="equal")
-    axes[0].set(xlabel=f"measured {quantity} [{unit}]", ylabel=f"predicted [{unit}]")
     # Errors of what lies below the axis would be those of nothing heard.
     heard = np.isfinite(guess_db) & (true_db > low)
     error = np.median(np.abs(guess_db - true_db)[heard]) if heard.any() else np.nan
-    axes[0].set_title(f"{quantity}, median error {error:.1f} dB")
+    axes[0].set(
+        title=f"{quantity}, median error {error:.1f} dB",
+        xlabel=f"measured {quantity} [{unit}]",
+        ylabel=f"predicted [{unit}]",
+        xlim=(low - 3, high + 3),
+        ylim=(low - 3, high + 3),
+        aspect="equal",
+    )
     if channels:
         turn = np.degrees(np.angle(predicted.ravel() * target.ravel().conj()))
         _draw_dense(axes[1], true_db, turn)
-        axes[1].set(xlim=(low - 3, high + 3), ylim=(-180, 180), yticks=range(-180, 181, 90))
-        axes[1].set(xlabel="measured channel gain [dB]", ylabel="phase error [degrees]")
-        axes[1].set_title(f"phase, median error {np.median(np.abs(turn)):.1f} degrees")
+        axes[1].set(
+            title=f"phase, median error {np.median(np.abs(turn)):.1f} degrees",
+            xlabel="measured channel gain [dB]",
+            ylabel="phase error [degrees]",
+            xlim=(low - 3, high + 3),
+            ylim=(-180, 180),
+            yticks=range(-180, 181, 90),
+        )
     figure.suptitle(title)
     save(figure, path)
 
@@ -158,9 +168,16 @@ def draw_spectra(examples: Examples, title: str) -> Figure:
     Under each prediction stand its PSNR and SSIM, and the confidence of the last one.
     """
     predicted, edges = examples.predicted, examples.edges
-    how: dict[str, Any] = {"sharex": True, "sharey": True, "grid": False}
     count, across = len(examples.rows), len(predicted) + 2
-    figure, axes = panels(max(1.75 * across, 8.5), 1.55 * count + 1.2, count, across, **how)
+    figure, axes = panels(
+        max(1.75 * across, 8.5),
+        1.55 * count + 1.2,
+        count,
+        across,
+        sharex=True,
+        sharey=True,
+        grid=False,
+    )
     options: dict[str, Any] = {"origin": "lower", "aspect": "auto", "extent": edges}
     metric = SpectrumMetrics()
     for values in predicted.values():
@@ -225,9 +242,10 @@ def draw_calibration(
     risk = risk_coverage(-loss, loss)
     coverage_axis.plot(coverage, risk, "k:", label=f"knowing the errors, area {risk.mean():.3g}")
     coverage_axis.set(
-        xlabel="share of positions accepted", ylabel="mean error among them (|e|²/|h|², at most 1)"
+        title=title,
+        xlabel="share of positions accepted",
+        ylabel="mean error among them (|e|²/|h|², at most 1)",
     )
-    coverage_axis.set_title(title)
     for trial, colour in zip(trials, PALETTE, strict=False):
         broken = trial.summarise()["broken_of_all"]
         label = f"{trial.how}: broken in {broken:.0%} of {len(trial.realised)} draws"
@@ -240,11 +258,11 @@ def draw_calibration(
     if not any(trial.coverage.any() for trial in trials):
         trials_axis.text(0.5, 0.5 * worst, "no draw accepted anybody", ha="center")
     trials_axis.axhline(guarantee.alpha, color="black", linewidth=1)
-    trials_axis.set_title(
-        f"promise: at most {guarantee.alpha:.0%} bad, broken in at most {guarantee.delta:.0%}"
-    )
     trials_axis.set(
-        xlabel="share of test positions accepted", ylabel="realised share of bad ones among them"
+        title=f"promise: at most {guarantee.alpha:.0%} bad, "
+        f"broken in at most {guarantee.delta:.0%}",
+        xlabel="share of test positions accepted",
+        ylabel="realised share of bad ones among them",
     )
     for axis in (coverage_axis, trials_axis):
         axis.legend(fontsize=8)

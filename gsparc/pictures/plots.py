@@ -37,7 +37,7 @@ from gsparc.pictures.drawing import (
     style_of,
 )
 from gsparc.pictures.report.tables import groups_of, interval_of_figure
-from gsparc.prediction.pareto import pareto_front
+from gsparc.prediction.operating_point import pareto_front
 from gsparc.runs.experiment.table import methods_by_mean_behind, shown
 
 WIDE, TALL = 7.0, 3.8
@@ -227,14 +227,17 @@ def draw_front(points: pd.DataFrame, others: pd.DataFrame, method: str, title: s
     figure, ((axes,),) = panels(7.5, 4.2)
     axes.scatter(beaten.render_ms_p50, beaten.value, s=9, c="0.75", label="beaten")
     reach = [np.zeros(len(best)), best.render_ms_p95 - best.render_ms_p50]
-    how: dict[str, Any] = {
-        "fmt": "o-",
-        "color": style_of(method).colour,
-        "capsize": 2,
-        "lw": 1,
-        "ms": 4,
-    }
-    axes.errorbar(best.render_ms_p50, best.value, xerr=reach, label="not beaten", **how)
+    axes.errorbar(
+        best.render_ms_p50,
+        best.value,
+        xerr=reach,
+        label="not beaten",
+        fmt="o-",
+        color=style_of(method).colour,
+        capsize=2,
+        lw=1,
+        ms=4,
+    )
     beside = zip(others.label, others.render_ms_p50, others.value, strict=True)
     set_latency_axes(axes, best.figure.iloc[0], best.value, beside)
     axes.legend(loc="lower right", fontsize=8)
@@ -254,8 +257,13 @@ def draw_efforts(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] 
     """
     groups = [group for _, group in rows.groupby("dataset", sort=False)]
     columns = max(group.split.nunique() for group in groups) + bool(rows.query_ms.any())
-    size = (max(PANEL * columns, 6.0), 0.9 * PANEL * len(groups) + 0.9)
-    figure, grid = panels(*size, len(groups), columns, sharey="row")
+    figure, grid = panels(
+        max(PANEL * columns, 6.0),
+        0.9 * PANEL * len(groups) + 0.9,
+        len(groups),
+        columns,
+        sharey="row",
+    )
     for line, dataset_rows in zip(grid, groups, strict=True):
         splits = [
             (cells, "train_cpu_s", split)
@@ -313,12 +321,14 @@ def draw_splits(rows: pd.DataFrame, path: Path, also: Sequence[str] = ()) -> Non
                 axis.text(0.02 * most, number, "not possible", va="center", fontsize=8, color="0.5")
                 continue
             row = cells.loc[name]
-            bar = {
-                "color": style_of(name).colour,
-                "alpha": 1.0 if name == best else 0.45,
-                "capsize": 2.5,
-            }
-            axis.barh(number, row.value, xerr=row.value_error, **bar)
+            axis.barh(
+                number,
+                row.value,
+                xerr=row.value_error,
+                color=style_of(name).colour,
+                alpha=1.0 if name == best else 0.45,
+                capsize=2.5,
+            )
             axis.text(
                 min(row.value + row.value_error + 0.02 * most, 1.02 * most),
                 number,
@@ -327,8 +337,11 @@ def draw_splits(rows: pd.DataFrame, path: Path, also: Sequence[str] = ()) -> Non
                 fontsize=7.5,
             )
         draws = int(cells.seeds.max())
-        axis.set(title=f"{split}, {draws} draw{'s' * (draws > 1)}", xlim=(0, 1.5 * most))
-        axis.set_xlabel(axis_of(cells.figure.iloc[0]))
+        axis.set(
+            title=f"{split}, {draws} draw{'s' if draws > 1 else ''}",
+            xlabel=axis_of(cells.figure.iloc[0]),
+            xlim=(0, 1.5 * most),
+        )
         axis.set_yticks(np.arange(len(names)), names)
         axis.grid(axis="y", visible=False)
     grid[0, 0].set_ylim(len(names) - 0.4, -0.6)

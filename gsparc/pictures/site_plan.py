@@ -34,8 +34,7 @@ from gsparc.pictures.from_above import (
     set_bounds,
     split_frame,
 )
-from gsparc.tables.checks.level_steps import LevelStep
-from gsparc.tables.checks.link_levels import LinkLevels
+from gsparc.tables.checks.level_steps import LevelStep, LinkLevels
 from gsparc.tables.checks.plausibility import find_outlier_rows
 
 NAMED = 15  # stations; of more only their number is said
@@ -150,8 +149,15 @@ def draw_site(
     if places.level_db is not None:
         heard = heard & np.isfinite(places.level_db)
         if heard.any():
-            shown = places.place[heard], places.level_db[heard]
-            draw_values(axes[0], *shown, size, 0.01, places.label, extend="both")
+            draw_values(
+                axes[0],
+                places.place[heard],
+                places.level_db[heard],
+                size,
+                0.01,
+                places.label,
+                extend="both",
+            )
     for axis, (low, high) in zip(axes[0], frames, strict=True):
         axis.grid(alpha=0.3)
         _draw_map(axis, data, places, low, high, jumping, size)
@@ -239,9 +245,16 @@ def _draw_stations(axis: Any, data: Measurements, jumping: Sequence[int]) -> Non
 def _draw_suspicious(axis: Any, places: Spots, low: np.ndarray, high: np.ndarray) -> None:
     near, far = np.flatnonzero(places.suspicious & ~places.far), np.flatnonzero(places.far)
     if len(near):
-        marks = {"s": 90, "facecolors": "none", "edgecolors": "red", "linewidths": 1.5}
         label = f"suspicious level ({len(near)} place{'s' * (len(near) > 1)})"
-        axis.scatter(*places.place[near].T, label=label, zorder=3, **marks)
+        axis.scatter(
+            *places.place[near].T,
+            label=label,
+            zorder=3,
+            s=90,
+            facecolors="none",
+            edgecolors="red",
+            linewidths=1.5,
+        )
     if len(far):
         # At the edge, 2 % inside: at its place it would shrink the site to a point.
         edge = np.clip(
@@ -289,6 +302,6 @@ def _draw_level(
         axis.plot(np.searchsorted(rows, row), levels.level_db[row], "o", mec="red", mfc="none")
     axis.set(
         title=f"{levels.names[station]}: steps that the places do not explain",
+        xlabel="place, in the order of measuring",
         ylabel=f"level [{unit}]",
     )
-    axis.set_xlabel("place, in the order of measuring")

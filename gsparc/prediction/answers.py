@@ -265,8 +265,9 @@ def _with_heard(
         answers.said.mean[:, 0].numpy() - raised_db,
         variance.double().sqrt().numpy(),
     )
-    asked = local[answers.place], answers.station, level_db, spread_db, device
-    heard = hearing.given_heard(method, *asked)
+    heard = hearing.given_heard(
+        method, local[answers.place], answers.station, level_db, spread_db, device
+    )
     heard["heard_db"] += raised_db
     return replace(answers, heard=heard)
 

@@ -109,8 +109,7 @@ def read_level_arrays(
             arrays[name] = arrays[name].reshape(1, -1)
         at = np.atleast_2d(at)
         check.row_names = numbered_rows(len(at)).tolist()
-        shapes = [(len(at), count), *[(len(at),)] * (count == 1)]
-        values = check.read_real(name, *shapes)
+        values = check.read_real(name, (len(at), count), *[(len(at),)] * (count == 1))
     if at is not None and values is not None:
         values = values.reshape(len(at), count)
         silent = values == (-np.inf if unit.decibels else 0)

@@ -16,8 +16,6 @@ from gsparc.prediction.answers import ask
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import query_ends
 
-MAPPED: tuple[Kind, ...] = ("rssi", "csi")
-
 
 def predicted_levels(
     prediction: Prediction, kind: Kind, scale: float = 1.0

@@ -31,7 +31,7 @@ from gsparc.models.method import Method
 from gsparc.physics.decibels import to_decibels
 from gsparc.prediction import timing
 from gsparc.prediction.hearing import Hearing
-from gsparc.prediction.refit import forget
+from gsparc.prediction.left_out import forget
 from gsparc.prediction.timing import ClockSettings, query_calls, time_beside_copy, time_interleaved
 from gsparc.runs.baselines import FittedBaseline, baselines_for, fit_baseline
 
@@ -160,8 +160,10 @@ def evaluate(
     # A method that is a baseline (model=gp) has one fit and one row:
     # another would only differ in seconds.
     same = FittedBaseline(methods, scores, tuple(seconds or ()))
-    told = eval_on, learned, hearing
-    fits = {n: same if n == shared else fit_baseline(n, data, split, *told) for n in names}
+    fits = {
+        n: same if n == shared else fit_baseline(n, data, split, eval_on, learned, hearing)
+        for n in names
+    }
     others = {f"baseline/{name}": fit for name, fit in fits.items()}
     facts: dict[str, Any] = {}
     scores_of = {eval_on: scores, **{room: other.scores for room, other in others.items()}}

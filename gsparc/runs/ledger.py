@@ -30,7 +30,7 @@ from gsparc.evaluation.results import read_summary
 from gsparc.evaluation.summary import provenance, run_git
 from gsparc.models.checkpoint import MODEL
 from gsparc.models.fitting import LAST, dotted_settings
-from gsparc.tables.columns_file import edited_beside
+from gsparc.tables.said_columns import edited_beside
 
 log = logging.getLogger(__name__)
 

@@ -30,9 +30,8 @@ from gsparc.prediction.confidence import (
     read_trusted,
     store_trusted,
 )
-from gsparc.prediction.left_out import Evidence, gather_evidence
+from gsparc.prediction.left_out import Evidence, Learned, gather_evidence
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.refit import Learned
 from gsparc.runs.align_site import align_to_site
 from gsparc.runs.evaluate import dataset_facts, split_facts
 from gsparc.runs.experiment.folds import effort_settings

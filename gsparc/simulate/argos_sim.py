@@ -210,5 +210,7 @@ class ArgosStandIn(Checked):
         name = f"{STAND_IN}-{self.count}-{self.seed}{'' if self.offsets else '-aligned'}"
         name += "" if self.scatterers == SCATTERERS else f"-{self.scatterers}"
         offsets = Offsets() if self.offsets else Offsets(0.0, 0.0, 0.0)
-        how = self.count, self.seed, offsets, self.scatterers
-        return make_once(Path(self.root) / name, lambda folder: write_argos_sim(folder, *how))
+        return make_once(
+            Path(self.root) / name,
+            lambda folder: write_argos_sim(folder, self.count, self.seed, offsets, self.scatterers),
+        )

@@ -1,24 +1,108 @@
-"""From the shards of a simulation to one file in the schema of one's own measurements."""
+"""Shards of a simulation on disk, and the one file in the schema of one's own measurements.
+
+HDF5 does not survive a kill, so nothing is appended to: each shard is a file of its own that
+appears by renaming, whole, and the dataset is written from all of them at the end.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
+import shutil
+from collections.abc import Mapping
 from dataclasses import asdict
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from gsparc.base.files import whole_file, write_whole
 from gsparc.data.blocks import allocate, row_blocks
 from gsparc.data.schema import Measurements
 from gsparc.physics.decibels import from_decibels
 from gsparc.simulate.auto import Choice
-from gsparc.simulate.convergence import Convergence
 from gsparc.simulate.paths import ARRAYS, TracedPaths, group_offsets
 from gsparc.simulate.settings import CampaignSettings
-from gsparc.simulate.shards import ROWS, Shards
 from gsparc.simulate.spectrum import render_spectra
 from gsparc.simulate.survey import Survey, TracingEngine
 from gsparc.tables.own import write_own
+
+ROWS = "rows"  # of a shard: which rows of the dataset it holds
+NOTE = "choice.json"
+
+
+class Shards:
+    """The folder `FILE.parts` beside a dataset that is being made.
+
+    Args:
+        out: the dataset's file.
+        plan: everything that decides what the shards hold.
+
+    Raises:
+        ValueError: the folder belongs to another simulation.
+    """
+
+    def __init__(self, out: Path, plan: Mapping[str, Any]) -> None:
+        self.out, self.plan = out, json.dumps(plan, sort_keys=True, indent=1, default=str)
+        self.folder = out.with_name(out.name + ".parts")
+        self._removed = out.with_name(out.name + ".gone")
+        self._sweep()
+        stored = self.folder / "plan.json"
+        if stored.exists() and stored.read_text(encoding="utf-8") != self.plan:
+            raise ValueError(
+                f"{self.folder} holds parts of a different simulation; remove it, or choose "
+                "another out="
+            )
+        if not stored.exists():
+            write_whole(stored, self.plan)
+
+    def write_note(self, content: Mapping[str, Any]) -> None:
+        """Store a decision, so that a resumed run does not decide again."""
+        write_whole(self.folder / NOTE, json.dumps(content, indent=1, default=np.ndarray.tolist))
+
+    def read_note(self) -> dict[str, Any] | None:
+        """Return the stored decision, or None."""
+        path = self.folder / NOTE
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else None
+
+    @property
+    def signature(self) -> dict[str, str]:
+        """Attribute of the dataset that says which plan it was made by."""
+        return {"plan_sha256": hashlib.sha256(self.plan.encode()).hexdigest()}
+
+    def path(self, number: int) -> Path:
+        """Return the file of a shard; it is there once the shard is finished."""
+        return self.folder / f"shard_{number:04d}.npz"
+
+    def write(self, number: int, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write a shard, whole or not at all."""
+        with whole_file(self.path(number)) as partial, partial.open("wb") as file:
+            np.savez(file, allow_pickle=False, **arrays)
+
+    def list_shards(self) -> list[int]:
+        """Return numbers of the shards that are there."""
+        return sorted(
+            int(path.stem.removeprefix("shard_")) for path in self.folder.glob("shard_*.npz")
+        )
+
+    def read(self, number: int, *names: str) -> dict[str, np.ndarray]:
+        """Return the arrays of a finished shard; `names` alone where given."""
+        with np.load(self.path(number), allow_pickle=False) as file:
+            return {name: file[name] for name in names or file.files}
+
+    def remove(self) -> None:
+        """Remove everything, after the dataset is written."""
+        # Renamed first: a kill amid the removal would leave shards without the plan
+        # that they belong to.
+        self._sweep()
+        os.replace(self.folder, self._removed)
+        self._sweep()
+
+    def _sweep(self) -> None:
+        if self._removed.exists():
+            shutil.rmtree(self._removed)
+
 
 # Arrays of paths in the file
 STORED = ("offsets", "direction", "gain", "delay", "order", "mechanisms")
@@ -53,7 +137,7 @@ def assemble_dataset(
     campaign: CampaignSettings,
     survey: Survey,
     choice: Choice | None,
-    convergence: Convergence | None,
+    convergence: Mapping[str, float],
     seconds: float,
     shards: Shards,
     rows: ShardRows,
@@ -90,11 +174,11 @@ def assemble_dataset(
     about["antennas"] = json.dumps(
         [str(getattr(engine, "antenna", "isotropic")) for engine in survey.engines]
     )
-    if convergence is not None:
-        about |= {"convergence_error": convergence.nmse, **convergence.attributes()}
     if choice is not None:
         about["auto"] = json.dumps(asdict(choice))
-    data = write_own(shards.out, arrays, {**about, **shards.signature, "simulate_s": seconds})
+    data = write_own(
+        shards.out, arrays, {**about, **convergence, **shards.signature, "simulate_s": seconds}
+    )
     # Not before: until the file is there, the shards are all that there is.
     shards.remove()
     return data, facts

@@ -415,8 +415,14 @@ def _collect(solution: Any, receivers: int, ports: int) -> TracedPaths:
     buffer = solution._paths_buffer
     owner = buffer.target_indices.numpy().astype(np.int64)
     if not len(owner):  # nothing is heard anywhere: the solver has made no gains either
-        nothing = np.zeros((0, ports), np.complex64), np.zeros(0), np.zeros((0, 3), np.float32)
-        return TracedPaths.from_unsorted(receivers, owner, *nothing, *np.zeros((2, 0), np.uint8))
+        return TracedPaths.from_unsorted(
+            receivers,
+            owner,
+            np.zeros((0, ports), np.complex64),
+            np.zeros(0),
+            np.zeros((0, 3), np.float32),
+            *np.zeros((2, 0), np.uint8),
+        )
     gain = np.stack([part[0].numpy() for part in buffer.a], axis=1).astype(np.complex64)
     delay = buffer.tau.numpy().astype(np.float64)
     kinds = buffer.interaction_types.numpy().astype(np.uint8).reshape(len(owner), -1)

@@ -62,12 +62,10 @@ def summary_facts(outcome: Outcome) -> dict[str, Any]:
         "effects": str(outcome.effects),
         **{f"scene/{name}": value for name, value in outcome.facts.items()},
         **{f"time/{name}_s": value for name, value in outcome.seconds.items()},
+        **{f"dataset/{name}": value for name, value in outcome.convergence.items()},
         # A resumed run that found all shards has traced nothing, in no time.
         "time/receivers_per_s": len(outcome.survey) / max(outcome.seconds["trace"], 1e-9),
     }
-    if outcome.convergence is not None:
-        facts["dataset/convergence_error"] = outcome.convergence.nmse
-        facts |= {f"dataset/{k}": v for k, v in outcome.convergence.attributes().items()}
     if outcome.decision is not None:
         choice = outcome.decision.choice
         facts |= {f"auto/{k}": getattr(choice, k) for k in STATED}
@@ -88,11 +86,13 @@ def closing_sentences(outcome: Outcome, seconds: float, load: float) -> list[str
         + ", ".join(f"{name} {value:.0f} s" for name, value in outcome.seconds.items()),
         f"{outcome.facts['below_horizon']:.1%} of the power comes from below the horizon, unseen",
     ]
-    if outcome.convergence is not None:
-        error = outcome.convergence
+    if error := outcome.convergence:
         lines.append(
-            f"convergence error between two seeds: channel NMSE {error.nmse:.2g}, "
-            f"spectra {error.spectrum_psnr_db:.1f} dB, SSIM {error.spectrum_ssim:.4f}, "
-            f"received power within {error.power_db:.2g} dB at 95 % of {error.receivers} receivers"
+            "convergence error between two seeds: channel NMSE "
+            f"{error['convergence_error']:.2g}, spectra "
+            f"{error['convergence_spectrum_psnr_db']:.1f} dB, SSIM "
+            f"{error['convergence_spectrum_ssim']:.4f}, received power within "
+            f"{error['convergence_power_db']:.2g} dB at 95 % of "
+            f"{error['convergence_receivers']} receivers"
         )
     return lines

@@ -25,8 +25,7 @@ from gsparc.processes.factor import Factor
 from gsparc.processes.level_field import fit_level_field
 from gsparc.tables.column import Chosen, used_heads
 from gsparc.tables.heads import LISTS, words_of
-from gsparc.tables.roles import say_column
-from gsparc.tables.sheet import Sheet
+from gsparc.tables.sheet import Sheet, say_column
 
 LEAST_ROWS, MOST_ROWS = 60, 480  # links that tell; that are looked at
 CENTRES = 6  # about which those are chosen, so that they stay dense

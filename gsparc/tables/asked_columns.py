@@ -28,8 +28,7 @@ from gsparc.tables.heads import (
     unit_of,
     words_of,
 )
-from gsparc.tables.roles import NONE, Answer, say_column
-from gsparc.tables.sheet import Sheet
+from gsparc.tables.sheet import NONE, Answer, Sheet, say_column
 from gsparc.tables.slots import ranked_names
 
 MEASURED: tuple[tuple[str, ...], ...] = (*((name,) for name in heads.LEVELS), CHANNELS, POLAR)

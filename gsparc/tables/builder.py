@@ -15,7 +15,7 @@ from gsparc.tables.column import JOINED, name_columns
 from gsparc.tables.links.stations import PER_STATION
 from gsparc.tables.measured import Measured
 from gsparc.tables.places import Places
-from gsparc.tables.roles import Answer, say_column
+from gsparc.tables.sheet import Answer, say_column
 from gsparc.tables.station_list import StationList
 from gsparc.tables.times import read_times
 

@@ -19,8 +19,7 @@ from gsparc.tables.heads import (
     unit_suits,
     words_of,
 )
-from gsparc.tables.roles import Sure
-from gsparc.tables.sheet import Sheet
+from gsparc.tables.sheet import Sheet, Sure
 
 BY_ROW = "#"  # in place of a head: the number of the row; before heads: of what they hold together
 

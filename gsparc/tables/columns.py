@@ -42,9 +42,8 @@ from gsparc.tables.heads import (
     unit_of,
     words_of,
 )
-from gsparc.tables.roles import NONE, Answer, Role, Said
 from gsparc.tables.said_columns import columns_of_setting
-from gsparc.tables.sheet import Sheet
+from gsparc.tables.sheet import NONE, Answer, Role, Said, Sheet
 from gsparc.tables.times import find_times
 
 # Of each group one way of saying it: the measurement,

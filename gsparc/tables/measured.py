@@ -12,12 +12,11 @@ import pandas as pd
 from gsparc.base.errors import Caution
 from gsparc.data.units import UNITS
 from gsparc.tables import heads
-from gsparc.tables.amplitudes import join_polar
 from gsparc.tables.array_checks import MOST_DB
 from gsparc.tables.column import Chosen, Column, name_block, name_columns
+from gsparc.tables.other_names import join_polar
 from gsparc.tables.own_checks import LOWEST_HZ
-from gsparc.tables.roles import Answer
-from gsparc.tables.sheet import MEASURED, Sheet
+from gsparc.tables.sheet import MEASURED, Answer, Sheet
 from gsparc.tables.station_list import StationList
 
 # Arbitrary strength units (3GPP TS 27.007, 8.5); LTE counts up to 97

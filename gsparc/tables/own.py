@@ -19,15 +19,14 @@ from gsparc.base.errors import Caution
 from gsparc.base.limits import number, or_null
 from gsparc.data.assemble import centre_positions, check_positions
 from gsparc.data.outliers import check_static_ends
-from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, OTHER, Links, Measurements, Site
+from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, OTHER, Measurements, Site, StaticEnds
 from gsparc.data.selection import WHOLE, Selection
 from gsparc.data.target import TARGETS
 from gsparc.data.units import LINEAR, PowerUnit
-from gsparc.tables.amplitudes import amplitudes_to_levels
 from gsparc.tables.checks.constant import leave_out_unmeasured, mark_constants
 from gsparc.tables.conventions import convert_conventions
 from gsparc.tables.links.expand import expand_links
-from gsparc.tables.other_names import name_arrays
+from gsparc.tables.other_names import amplitudes_to_levels, name_arrays
 from gsparc.tables.own_checks import Checker, are_infinite, rows_with
 from gsparc.tables.own_values import read_directions, read_measured, read_not_negative, scale_values
 from gsparc.tables.raw import Raw, read_raw, write_raw
@@ -287,7 +286,7 @@ def _attributes(check: Checker, stem: str, measured: str | None) -> dict[str, An
     }
 
 
-def _static(check: Checker, links: Links, ends: Mapping[str, Any], rotation: Any) -> None:
+def _static(check: Checker, links: StaticEnds, ends: Mapping[str, Any], rotation: Any) -> None:
     """Refuse ends of which neither moves, a static receiver that turns,
     and static ends far from all rows.
     """

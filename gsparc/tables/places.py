@@ -14,8 +14,7 @@ from gsparc.tables.column import BY_ROW, Chosen
 from gsparc.tables.columns import choose_columns
 from gsparc.tables.heads import AXES, ENDS, LISTS, OTHER_NAMES, words_of
 from gsparc.tables.opening import read_sheet
-from gsparc.tables.roles import say_column
-from gsparc.tables.sheet import Sheet
+from gsparc.tables.sheet import Sheet, say_column
 
 UNKNOWN_HEIGHT = 0.0
 

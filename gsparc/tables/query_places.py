@@ -162,5 +162,14 @@ def _of_sheet(
     chosen.pop("device", None)
     role = {columns[0].head: role for role, columns in chosen.items() if len(columns) == 1}
     table = tuple((head, role.get(head), sheet.words(head)) for head in sheet.heads)
-    of_rows = sheet.rows, station, plain, joined.get("device"), joined.get("row_name")
-    return QueryPlaces(sheet.source, ends, *of_rows, tuple(sheet.notes), table)
+    return QueryPlaces(
+        sheet.source,
+        ends,
+        sheet.rows,
+        station,
+        plain,
+        joined.get("device"),
+        joined.get("row_name"),
+        tuple(sheet.notes),
+        table,
+    )

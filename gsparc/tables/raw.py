@@ -23,10 +23,9 @@ from numpy.lib.format import read_array_header_1_0 as header_1
 from numpy.lib.format import read_array_header_2_0 as header_2
 from scipy.io import loadmat, netcdf_file
 
-from gsparc.base.archives import is_archive
+from gsparc.base.archives import hdf5_text_error, is_archive
 from gsparc.base.errors import DataError, absent, explain_error, readable
 from gsparc.base.files import check_fetched, whole_file
-from gsparc.base.hdf5_text import hdf5_text_error
 from gsparc.data.blocks import is_big, iterate_bytes, map_from_disk
 from gsparc.tables.array_sizes import Stated, check_array_sizes
 
@@ -66,7 +65,7 @@ class Raw:
         explain: what there is to say of the measurements that these became, and (S,) the row of
             each, from 0.
         said: of a table, its columns by quantity, as `dataset.columns` and answers say.
-        roles: of a table's columns (`gsparc.tables.roles`).
+        roles: of a table's columns (`gsparc.tables.sheet`).
         heads: of a table.
     """
 

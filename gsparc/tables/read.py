@@ -14,11 +14,10 @@ from gsparc.tables import heads, places
 from gsparc.tables.advice import advise
 from gsparc.tables.builder import Builder
 from gsparc.tables.columns import choose_columns, list_roles
-from gsparc.tables.columns_file import edited_beside, read_columns
 from gsparc.tables.opening import read_sheet
 from gsparc.tables.raw import Raw
-from gsparc.tables.roles import Role, Said, settle
-from gsparc.tables.sheet import Sheet
+from gsparc.tables.said_columns import edited_beside, read_columns
+from gsparc.tables.sheet import Role, Said, Sheet, settle
 from gsparc.tables.slots import unfold_slots, unfold_tones
 from gsparc.tables.station_list import StationList, read_stations
 
@@ -40,7 +39,7 @@ def parse_table(
         stations_file: a second table: name, x, y, z or latitude, longitude, height of each station.
         stations: names in place of such a list: where heads hold them, no others are levels.
         guess: whether the likeliest reading of what is open is taken, and noted.
-        columns_file: that says what columns are (`columns_file`); None: the one beside the table,
+        columns_file: that says what columns are (`read_columns`); None: the one beside the table,
             if somebody edited it.
 
     Raises:

@@ -21,8 +21,7 @@ from gsparc.tables.heads import (
     unit_of,
     words_of,
 )
-from gsparc.tables.roles import Said
-from gsparc.tables.sheet import Sheet
+from gsparc.tables.sheet import Said, Sheet
 
 HOLDS = meaning_by_word("slots")
 NEEDED, LEAST = ({"PCI", "RSRP"}, {"BSSID", "RSSI"}), 2  # of a slot, either; slots

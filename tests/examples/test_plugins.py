@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 import gsparc
 from gsparc.commands.evaluate import evaluate_files
-from gsparc.commands.shared.plugins import offer_plugins
+from gsparc.commands.shared.cli import offer_plugins
 from gsparc.commands.train import train
 from gsparc.data.splits import Fold
 from gsparc.datasets.load import datamodule

@@ -26,6 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 
 import numpy as np
 from networks import BLOCK_M, NOISE_DB, Network, draw_network
+from quarters import fit, learned
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
@@ -34,21 +35,17 @@ from gsparc.apps.maps import planning
 from gsparc.apps.maps.covered import covered_between
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.planning import coarse_grid
-from gsparc.apps.maps.promise import Promise, PromiseSettings, gather_promise, read_promise
+from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.strongest import outage_probability
-from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.by_station import unlisted_stations
 from gsparc.evaluation.scores import score_methods
 from gsparc.models import checkpoint
-from gsparc.models.gsparc import Gsparc
-from gsparc.models.per_station import wrap_per_station
 from gsparc.models.powers.together import network as network_learning
 from gsparc.models.powers.together.network import check_azimuths
 from gsparc.prediction.levels import joint_levels
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import to_local
-from gsparc.prediction.refit import Learned
 from gsparc.processes.uncertainty import half_width
 from gsparc.runs.align_site import align_to_site
 from gsparc.training.context import FitContext
@@ -67,24 +64,10 @@ def town(seed: int, buildings: bool, stops: np.ndarray | None = None) -> Network
     return draw_network(seed, 0, MOMENTS, np.concatenate([even, stops]), buildings)
 
 
-def learned(data: Measurements, file: Path) -> tuple[Predictor, Promise]:
-    """A model of all rows with its promise, from its file where it is there."""
-    if not file.is_file():
-        method, every = wrap_per_station(Gsparc(), data), np.arange(len(data))
-        fold, context = (
-            Fold(every, every[:0], every[:0]),
-            FitContext(file.parent, stations="together"),
-        )
-        method.fit(data, fold, context)
-        promise = gather_promise(
-            Learned(method, Gsparc(), data, fold, context), PromiseSettings(folds=FOLDS)
-        )
-        checkpoint.save(file, method)
-        promise.store(file)
-    predictor = gsparc.load(file)
-    promise = read_promise(predictor.extra)
-    assert promise is not None
-    return predictor, promise
+def networked(one: Network, file: Path) -> tuple[Predictor, Promise]:
+    """A model of all lists with its promise, from its file where it is there."""
+    data = one.data(LISTED)
+    return learned(data, np.arange(len(data)), file, folds=FOLDS)
 
 
 def covered(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
@@ -92,7 +75,7 @@ def covered(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
     share refused.
     """
     one = town(seed, buildings)
-    predictor, promise = learned(one.data(LISTED), folder / f"{seed}-{buildings}.ckpt")
+    predictor, promise = networked(one, folder / f"{seed}-{buildings}.ckpt")
     low, high = (
         np.maximum(one.moment[:, :2].min(0), AREA[:2]),
         np.minimum(one.moment[:, :2].max(0), AREA[2:]),
@@ -125,7 +108,7 @@ def inside(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
     refused of both.
     """
     one = town(seed, buildings)
-    predictor, promise = learned(one.data(LISTED), folder / f"{seed}-{buildings}.ckpt")
+    predictor, promise = networked(one, folder / f"{seed}-{buildings}.ckpt")
     places, cells = one.asked[:EVEN][~one.indoors[:EVEN]], np.arange(len(one.place))
     truth = one.truth[:EVEN][~one.indoors[:EVEN]]
     level, spread, _ = np.moveaxis(joint_levels(predictor, places, cells), 1, 0)
@@ -161,7 +144,7 @@ def planned(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
     grid = planning.coarse_grid(None, AREA, 1.5)
     stops = planning.walkable_places(streets, grid)[0][:, :2]
     one = town(seed, buildings, stops)
-    predictor, promise = learned(one.data(LISTED), folder / f"{seed}-{buildings}-streets.ckpt")
+    predictor, promise = networked(one, folder / f"{seed}-{buildings}-streets.ckpt")
     rng, out, every = np.random.default_rng(seed), ~one.indoors[:EVEN], np.arange(len(one.place))
     true = one.truth[:EVEN][out]
     level = float(np.quantile(true.max(1), 0.25).round())
@@ -189,8 +172,7 @@ def planned(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
         chosen = np.array(ways[name][:count], int)
         at = np.r_[one.moment, one.asked[EVEN:][chosen]], np.r_[one.measured, heard[chosen]]
         data = replace(one, moment=at[0], measured=at[1]).data(LISTED)
-        method, rows = wrap_per_station(Gsparc(), data), np.arange(len(data))
-        method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext(folder, stations="together"))
+        method = fit(data, np.arange(len(data)), FitContext(folder, stations="together"))
         checkpoint.save(folder / f"again{seed}.ckpt", method)
         said = joint_levels(gsparc.load(folder / f"again{seed}.ckpt"), one.asked[:EVEN][out], every)
         mean, spread, alike = np.moveaxis(said, 1, 0)
@@ -243,8 +225,8 @@ def off(seed: int, buildings: bool, folder: Path) -> Iterator[tuple]:
     one = draw_network(seed, 0, 1000, 10, buildings)
     first, second = (slice(0, 600), slice(600, 1000))
     data = replace(one, moment=one.moment[first], measured=one.measured[first]).data(LISTED)
-    method, every = wrap_per_station(Gsparc(), data), np.arange(len(data))
-    method.fit(data, Fold(every, every[:0], every[:0]), FitContext(folder, stations="together"))
+    every = np.arange(len(data))
+    method = fit(data, every, FitContext(folder, stations="together"))
     taught = Split("all", (Fold(every, every[:0], every[:0]),))
     for site in (None, *range(0, 10, 2)):
         measured, cells = (

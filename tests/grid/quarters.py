@@ -27,7 +27,13 @@ import gsparc
 from gsparc.apps.maps.covered import covered_between
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.planning import plan_measurements
-from gsparc.apps.maps.promise import Promise, PromiseSettings, gather_promise, read_promise
+from gsparc.apps.maps.promise import (
+    Promise,
+    PromiseSettings,
+    gather_promise,
+    number_quarters,
+    read_promise,
+)
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.datasets.own import read_any
@@ -36,10 +42,9 @@ from gsparc.models.fitting import fit_or_resume
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method
 from gsparc.models.per_station import wrap_per_station
-from gsparc.prediction.left_out import predict_rows
+from gsparc.prediction.left_out import Learned, predict_rows
 from gsparc.prediction.levels import measured_levels, predicted_levels
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.refit import Learned
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
@@ -111,28 +116,24 @@ def read(name: str) -> Measurements:
     return made[name]()
 
 
-def quarter_of(places: np.ndarray) -> np.ndarray:
-    """Number of the quarter that each of places (n, 2) lies in, (n,): 0 and 1 in the west."""
-    east = places[:, 0] > np.median(places[:, 0])
-    north = np.zeros(len(places), bool)
-    for side in (east, ~east):
-        north[side] = places[side, 1] > np.median(places[side, 1])
-    return 2 * east + north
-
-
 def fit(data: Measurements, rows: np.ndarray, context: FitContext) -> Method:
     """The default model of rows (n,)."""
     fold = Fold(rows, rows[:0], rows[:0])
     return fit_or_resume(wrap_per_station(Gsparc(), data), data, fold, context)[0]
 
 
-def learned(data: Measurements, rows: np.ndarray, file: Path) -> tuple[Predictor, Promise]:
-    """A model of rows (n,) with its promise, from its file where it is there."""
+def learned(
+    data: Measurements, rows: np.ndarray, file: Path, **how: int
+) -> tuple[Predictor, Promise]:
+    """A model of rows (n,) with its promise, from its file where it is there; `how`: see
+    `PromiseSettings`.
+    """
     if not file.is_file():
         fold = Fold(rows, rows[:0], rows[:0])
         context = FitContext(file.parent, stations="together")
         method = fit(data, rows, context)
-        promise = gather_promise(Learned(method, Gsparc(), data, fold, context), PromiseSettings())
+        model = Learned(method, Gsparc(), data, fold, context)
+        promise = gather_promise(model, PromiseSettings(**how))
         checkpoint.save(file, method)
         promise.store(file)
     predictor = gsparc.load(file)
@@ -145,7 +146,7 @@ def quarters(name: str, folder: Path) -> Iterator[tuple]:
     """Data, and of each quarter its number, what was learned without it and its rows."""
     data = read(name)
     heard = np.flatnonzero((data.censored_side() == 0) & np.isfinite(data.powers()[:, 0]))
-    number = quarter_of(data.moving[:, -3:-1])
+    number = number_quarters(data.moving)
     for quarter in [int(name[4:]) % 4] if name.startswith("town") else range(4):
         rows = np.flatnonzero(number != quarter)
         told = learned(data, rows, folder / f"{name}-{quarter}.ckpt")
@@ -226,7 +227,7 @@ def gains(name: str, folder: Path) -> Iterator[tuple]:
         had = []
         where = cKDTree(local).query(data.moving[rows, -3:-1])[1]
         out = ~np.isin(where, np.concatenate([near, drawn]))
-        base = np.flatnonzero(quarter_of(data.moving[:, -3:-1]) != quarter)
+        base = np.flatnonzero(number_quarters(data.moving) != quarter)
         for stops in (near[:0], near, drawn):
             more = np.sort(np.concatenate([base, rows[np.isin(where, stops)]]))
             method = fit(data, more, FitContext(folder, stations="together"))

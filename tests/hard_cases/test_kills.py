@@ -1,9 +1,9 @@
 """Kills: SIGKILL at random moments of training; tests/simulate/test_campaign.py cuts simulations.
 
-Remedy: every file appears by renaming (gsparc/models/checkpoint.py, gsparc/simulate/shards.py); all
-that a run needs to go on is in its last checkpoint, or in its finished shards. Shown: after any
-kill what is there is whole; going on always works;
-the end is bit-identical to an uninterrupted run's. Tolerance: none.
+Remedy: every file appears by renaming (gsparc/models/checkpoint.py, gsparc/simulate/assembly.py);
+all that a run needs to go on is in its last checkpoint, or in its finished shards. Shown: after
+any kill what is there is whole; going on always works; the end is bit-identical to an
+uninterrupted run's. Tolerance: none.
 """
 
 import json

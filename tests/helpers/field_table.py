@@ -79,10 +79,9 @@ def _section(name: str, rows: pd.DataFrame) -> str:
     several = f"one split; ± deviation over {rows.seeds.max()} seeds, others one seed"
     alone = several if rows.seeds.max() > 1 else "one split, one seed"
     made = f"{rows.seeds.max()} draws (± standard error)" if draws else alone
-    load = f"load {rows.load.min():.1f} to {rows.load.max():.1f} a core"
-    said = f"{made}; {', '.join(sorted(set(rows.cpu)))}, one thread, {load}; {_dates(rows)}."
+    load = f"load {rows.load.min():.1f} to {rows.load.max():.1f}"
     table = Table.from_rows(f"{name}: {WHAT[name]}", columns, rows.to_dict("records"))  # type: ignore[arg-type]
-    return f"{table.markdown()}\n{said}\n"
+    return f"{table.markdown()}\n{made}; {load}.\n"
 
 
 def _named(row: Row) -> str:
@@ -92,14 +91,6 @@ def _named(row: Row) -> str:
 
 def _score(row: Row) -> Interval:
     return Interval(shown(row["figure"], row["score_db"]), error=row["spread_db"])
-
-
-def _dates(rows: pd.DataFrame) -> str:
-    days = sorted({f"{day[:4]}-{day[4:6]}-{day[6:]}" for day in rows.date})
-    return (
-        f"{' to '.join(dict.fromkeys([days[0], days[-1]]))}, commits "
-        f"{', '.join(sorted(set(rows.commit)))}"
-    )
 
 
 def write(rows: pd.DataFrame, page: Path = PAGE) -> None:

@@ -250,10 +250,11 @@ class Tiny:
             words.pop("dataset.root", None)
             words |= {"dataset.file": self.data("city")} if "dataset.file" in words else {}
         if name == "compare":
+            words |= {"beside": str(ROOT / words["beside"])} if "beside" in words else {}
             table = words.get("experiment", "results/rfid").removeprefix("results/")
-            sets = {"ceiling": ("exp005", "exp006"), "halls": ("hall_1", "hall_2")}.get(
-                table, (table,)
-            )
+            words.pop("datasets.wideband.root", None)  # no small data have ten carriers
+            several = {"ceiling": ("exp005", "exp006"), "halls": ("hall_1", "hall_2")}
+            sets = (several | {"table": ("exp005",)}).get(table, (table,))
             own = [f"datasets.{one}.{'root' if one == 'rfid' else 'file'}" for one in sets]
             for key in [key for key in words if re.match(r"datasets\..*(root|file)$", key)] or own:
                 words[key] = self.data(ALIKE.get(key.split(".")[1], key.split(".")[1]))
@@ -309,6 +310,7 @@ ALIKE = {
     "exp005": "techtile",
     "exp006": "techtile",
     "plane": "own",
+    "room": "sionna",
     "hall_1": "ble",
     "hall_2": "ble",
 }

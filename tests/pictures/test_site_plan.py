@@ -11,8 +11,7 @@ from gsparc.data.walls import SceneWalls
 from gsparc.pictures import found_plan, site_plan
 from gsparc.pictures.found_plan import draw_found
 from gsparc.pictures.site_plan import draw_site, find_spots
-from gsparc.tables.checks.level_steps import LevelStep, find_level_steps
-from gsparc.tables.checks.link_levels import link_levels
+from gsparc.tables.checks.level_steps import LevelStep, find_level_steps, link_levels
 from gsparc.tables.own import from_arrays
 
 

@@ -4,7 +4,7 @@ import pandas as pd
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gsparc.prediction.pareto import describe_point, pareto_front
+from gsparc.prediction.operating_point import describe_point, pareto_front
 from gsparc.runs.experiment.tradeoff import find_better
 
 PAIRS = st.lists(st.tuples(st.floats(0.01, 100), st.floats(-50, 50)), min_size=1, max_size=30)

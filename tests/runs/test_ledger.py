@@ -27,7 +27,7 @@ from gsparc.runs.ledger import (
     read_finished,
     run_once,
 )
-from gsparc.tables.columns_file import beside
+from gsparc.tables.said_columns import beside
 
 
 def state(**changes) -> FitInputs:

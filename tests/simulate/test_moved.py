@@ -5,7 +5,7 @@ import pytest
 from refusals import refused
 
 from gsparc.simulate.scenes.conference import conference_room
-from gsparc.simulate.scenes.moved import Move, move_solids
+from gsparc.simulate.scenes.settings import Move, move_solids
 
 
 def test_parts_move_by_the_beginning_of_their_name_and_boxes_are_new():

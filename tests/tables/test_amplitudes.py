@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from gsparc.datasets.own import apply_settings
-from gsparc.tables.amplitudes import amplitudes_to_levels
+from gsparc.tables.other_names import amplitudes_to_levels
 from gsparc.tables.own import from_arrays, interpret
 from gsparc.tables.raw import Raw
 from gsparc.tables.read import parse_table

@@ -7,9 +7,9 @@ from strangers import BAND, CASES, LEVELS, PLACES, ROWS, table
 
 from gsparc.base.errors import DataError
 from gsparc.datasets.own import Own, read_any
-from gsparc.tables.columns_file import beside
 from gsparc.tables.read import parse_table
-from gsparc.tables.roles import are_alike
+from gsparc.tables.said_columns import beside
+from gsparc.tables.sheet import are_alike
 
 TWO = table("x,y,RSRP,RSSI", *PLACES.T, *LEVELS[:, :2].T)
 EQUAL = table("x,y,RSRP,RSSI", *PLACES.T, LEVELS[:, 0], LEVELS[:, 0])

@@ -14,7 +14,7 @@ from gsparc.datasets.own import read_any
 from gsparc.tables.own import interpret
 from gsparc.tables.raw import Raw
 from gsparc.tables.read import parse_table
-from gsparc.tables.roles import say_column
+from gsparc.tables.sheet import say_column
 
 COUNT, LIGHT = 60, 299792458.0
 RNG = np.random.default_rng(7)

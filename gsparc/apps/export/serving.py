@@ -263,8 +263,7 @@ def build_application(
         json.loads(body, object_pairs_hook=refuse_repeated)
         where: dict[str, Any] = site.name_moving(rows.places)
         assert told is not None
-        more = {"rssi": rows.levels, "key": rows.key}
-        found = told.tell(predictor, lock, FILE_S, **where, **more)
+        found = told.tell(predictor, lock, FILE_S, **where, rssi=rows.levels, key=rows.key)
         return {
             "rows": found.rows.tolist(),
             "skipped": found.skipped,

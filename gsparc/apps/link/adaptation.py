@@ -183,5 +183,6 @@ class Adaptation:
     def _of_every_mcs(self, count: int, **arguments: Tensor) -> tuple[Tensor, ...]:
         """Sionna's PHY abstraction of every MCS of the table at `count` positions."""
         indices = torch.arange(28, dtype=torch.int32)[None, :, None].expand(count, -1, -1)
-        table = {"mcs_table_index": 1, "mcs_category": 0, "check_mcs_index_validity": False}
-        return self.abstraction(indices, **arguments, **table)
+        return self.abstraction(
+            indices, **arguments, mcs_table_index=1, mcs_category=0, check_mcs_index_validity=False
+        )

@@ -53,8 +53,9 @@ def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, pat
             axes[0, column].plot(
                 curve.index[curve.errors == 0], limit, "v", color=colour, fillstyle="none"
             )
-            style_above = {**style, "capsize": 2, "label": label, "linewidth": 1.2}
-            axes[0, column].errorbar(curve.index, bler, reach, **style_above)
+            axes[0, column].errorbar(
+                curve.index, bler, reach, **style, capsize=2, label=label, linewidth=1.2
+            )
             axes[1, column].plot(curve.index, curve.ber.where(curve.ber > 0), **style)
         axes[0, column].set_title(f"{modulation.upper()}, one layer, {title}", fontsize=10)
         # 10 % is the target of rate adaptation in 5G NR (TS 38.214, 5.2.2.1).
@@ -78,9 +79,10 @@ def draw_rates(
         mean = [getattr(rate, name).mean() / 1e6 for rate in rates]
         curves.plot([rate.snr_db for rate in rates], mean, style, label=label)
     curves.set(
-        xlabel="median signal-to-noise ratio [dB]", ylabel="mean throughput of one layer [Mbit/s]"
+        title=title,
+        xlabel="median signal-to-noise ratio [dB]",
+        ylabel="mean throughput of one layer [Mbit/s]",
     )
-    curves.set_title(title)
     curves.legend()
     middle = rates[len(rates) // 2]
     # Misses of three and more are rare: one box for them.
@@ -112,7 +114,10 @@ def draw_acceptance(
                 rates.index, rates[name], ".-", color=colour, label=label.removesuffix(", accepted")
             )
         axis.axvline(share, color="grey", linestyle=":", label="accepted")
-        axis.set(xlabel="share of positions accepted, surest first", ylabel="block error rate")
-        axis.set_title(f"{modulation.upper()} at {ebno_db:g} dB")
+        axis.set(
+            title=f"{modulation.upper()} at {ebno_db:g} dB",
+            xlabel="share of positions accepted, surest first",
+            ylabel="block error rate",
+        )
         axis.legend(fontsize=8)
     save(figure, path)

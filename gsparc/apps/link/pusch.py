@@ -58,21 +58,23 @@ class Pusch:
         self.bits, self.rate = int(config.tb.num_bits_per_symbol), float(config.tb.target_coderate)
         self._known: dict[str, tuple[Tensor, Tensor]] = {}
         self._prior: tuple[Tensor, Tensor] | None = None
-        dmrs = (
-            config.dmrs.length,
-            config.dmrs.additional_position,
-            config.dmrs.num_cdm_groups_without_data,
-        )
         estimators: dict[str, Estimator] = {
             "perfect": lambda y, no: self._known["perfect"],
-            "ls": nr.PUSCHLSChannelEstimator(self.grid, *dmrs, interpolation_type="lin"),
+            "ls": nr.PUSCHLSChannelEstimator(
+                self.grid,
+                config.dmrs.length,
+                config.dmrs.additional_position,
+                config.dmrs.num_cdm_groups_without_data,
+                interpolation_type="lin",
+            ),
             "lmmse": _Wiener(self.grid, correlation),
             "predicted": lambda y, no: self._known["predicted"],
             "predicted_pilots": _Wiener(self.grid, correlation, lambda: self._prior),
         }
         decoder = nr.TBDecoder(self.transmitter._tb_encoder, num_bp_iter=iterations)
-        how = {"tb_decoder": decoder, "return_tb_crc_status": True}
-        factory = partial(nr.PUSCHReceiver, self.transmitter, **how)
+        factory = partial(
+            nr.PUSCHReceiver, self.transmitter, tb_decoder=decoder, return_tb_crc_status=True
+        )
         self.receivers = {name: factory(channel_estimator=estimators[name]) for name in names}
 
     @property

@@ -204,13 +204,15 @@ def error_curves(blocks: pd.DataFrame, accepted: np.ndarray) -> dict[str, pd.Dat
         others = parts[pilot][~accepted[parts[pilot].position]]
         parts["fallback"] = pd.concat([parts["predicted@accepted"], others])
     levels, counts = blocks.ebno_db.unique(), {"errors": 0, "blocks": 0}
-    columns = {
-        "bler": ("failed", "mean"),
-        "ber": ("wrong", "mean"),
-        "errors": ("failed", "sum"),
-        "blocks": ("failed", "size"),
+    means = {
+        name: part.groupby("ebno_db").agg(
+            bler=("failed", "mean"),
+            ber=("wrong", "mean"),
+            errors=("failed", "sum"),
+            blocks=("failed", "size"),
+        )
+        for name, part in parts.items()
     }
-    means = {name: part.groupby("ebno_db").agg(**columns) for name, part in parts.items()}
     return {name: mean.reindex(levels).fillna(counts) for name, mean in means.items()}
 
 

@@ -1,5 +1,5 @@
 """Where something was heard: see `locate`."""
 
-from gsparc.apps.locate.locate import locate
+from gsparc.apps.locate.locator import locate
 
 __all__ = ["locate"]

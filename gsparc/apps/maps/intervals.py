@@ -120,15 +120,7 @@ def calibrate(
     station = _of_stations(used, level)
     used = replace(used, spread_db=used.spread_db * station[used.station])
     count = int(np.clip(min(heard.sum() // ROWS_OF_A_BIN, blocks // BLOCKS_OF_A_BIN), 1, MOST_BINS))
-    away = np.sort(used.distance[heard])
-    # Rows of a raster share few distances: no bin is empty.
-    first = sorted({float(part[0]) for part in np.array_split(away, count)} - {float(away[0])})
-    count = len(first) + 1
-    which = np.searchsorted(first, used.distance, side="right")
-    bins = [used.subset(which == number) for number in range(count)]
-    middle, typical = np.array(
-        [(np.median(part.distance), np.median(part.spread_db)) for part in bins]
-    ).T
+    bins, middle, typical = _by_distance(used, used.distance[heard], count)
     scales, weight = (
         np.array([_half_and_rms(part, level) for part in bins]).T,
         [len(part) for part in bins],
@@ -150,13 +142,8 @@ def _with_quarters(near: IntervalScales, quarters: HeldOutLevels) -> IntervalSca
     far = far.subset((far.distance > near.reach) & np.isfinite(far.error))
     if far.heard.sum() < LEAST_ROWS:
         return near
-    away = np.sort(far.distance)
-    parts = np.array_split(away, int(np.clip(len(far) // ROWS_OF_A_BIN, 1, MOST_BINS)))
-    first = np.unique([part[0] for part in parts])
-    which = np.searchsorted(first, far.distance, side="right")
-    bins = [far.subset(which == number) for number in range(1, len(first) + 1)]
-    middle = np.array([np.median(part.distance) for part in bins])
-    typical = np.array([np.median(part.spread_db) for part in bins])
+    count = int(np.clip(len(far) // ROWS_OF_A_BIN, 1, MOST_BINS))
+    bins, middle, typical = _by_distance(far, far.distance, count)
     rms = np.array([_half_and_rms(part, 0.5)[1] for part in bins]) * typical
     # No smaller than where blocks end, as everywhere else.
     least = near.rms[-1] * typical.min()
@@ -169,6 +156,20 @@ def _with_quarters(near: IntervalScales, quarters: HeldOutLevels) -> IntervalSca
         half=np.append(near.half, half * rms / typical),
         reach=float(np.quantile(far.distance, REACH)),
     )
+
+
+def _by_distance(
+    rows: HeldOutLevels, distance: np.ndarray, count: int
+) -> tuple[list[HeldOutLevels], np.ndarray, np.ndarray]:
+    """Rows in at most so many bins of as many distances (m,) each, and their medians (K,) of
+    distance [m] and deviation [dB].
+    """
+    # Rows of a raster share few distances: no bin is empty.
+    first = np.unique([part[0] for part in np.array_split(np.sort(distance), count)])
+    which = np.searchsorted(first[1:], rows.distance, side="right")
+    bins = [rows.subset(which == number) for number in range(len(first))]
+    medians = [(np.median(part.distance), np.median(part.spread_db)) for part in bins]
+    return bins, *np.transpose(medians)
 
 
 def _half_and_rms(part: HeldOutLevels, level: float) -> tuple[float, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -11,13 +12,11 @@ import torch
 from scipy.ndimage import maximum_filter
 
 from gsparc.apps.maps import field_map, strongest
-from gsparc.apps.maps.area import Grid, lay_grid
+from gsparc.apps.maps.area import FloorPlan, Grid, lay_grid
 from gsparc.apps.maps.field_map import FieldMap
-from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.intervals import IntervalScales
 from gsparc.apps.maps.promise import Promise, read_promise
 from gsparc.apps.maps.refining import FIRST, sample_adaptively
-from gsparc.apps.maps.scoring import Scoring
 from gsparc.base import limits
 from gsparc.base.errors import DataError
 from gsparc.base.executor import run_all
@@ -29,7 +28,7 @@ from gsparc.data.station_names import all_names, find_station
 from gsparc.data.units import PowerUnit
 from gsparc.models.powers.together.network import number_sites
 from gsparc.prediction.answers import in_blocks
-from gsparc.prediction.levels import MAPPED, joint_levels, predict_levels
+from gsparc.prediction.levels import joint_levels, predict_levels
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.query import to_local
 from gsparc.processes.uncertainty import half_width
@@ -91,7 +90,7 @@ def predict_map(
         DataError: anything wrong with what is asked for.
     """
     site = predictor.site
-    if site.kind not in MAPPED:
+    if site.target.is_image:
         raise DataError(
             f"this model predicts spectra of {site.name}, which have no received power to map"
         )
@@ -137,16 +136,16 @@ def predict_map(
             "tenth of their deviation"
         )
     bands = about["bands"]
-    carrier = np.unique(bands or ("",) * len(names), return_inverse=True)[1].reshape(-1)
-    scoring = Scoring(
+    score = partial(
+        strongest.score_squares,
         calibration,
-        numbers,
-        load_of,
-        carrier,
-        _hearing_floors(promise, numbers, noise_db),
-        threshold_db,
-        noise_db,
-        loss,
+        numbers=numbers,
+        load=load_of,
+        carrier=np.unique(bands or ("",) * len(names), return_inverse=True)[1].reshape(-1),
+        floor=_hearing_floors(promise, numbers, noise_db),
+        threshold_db=threshold_db,
+        noise_db=noise_db,
+        loss=loss,
     )
     values["overlap"] = np.full(grid.inside.shape, np.nan, np.float32)
     flat = {name: array.reshape(*array.shape[:-2], -1) for name, array in values.items()}
@@ -160,7 +159,7 @@ def predict_map(
             far = np.stack([promise.distance(local, number) for number in numbers])
         indoors = None if grid.indoors is None else grid.indoors.reshape(-1)[cells]
         related = alike.reshape(len(names), -1)[:, cells]
-        for name, layer in scoring.layers(mean, spread, related, far, indoors).items():
+        for name, layer in score(mean, spread, related, far, indoors).items():
             flat[name][..., cells] = layer
     if promise is not None and not np.isfinite(values["power_db"]).any():
         fault = f"every square lies more than {calibration.reach:.3g} m from what was measured"

@@ -1,4 +1,6 @@
-"""A PNG of every layer of a map: floor plan beneath, measured points, stations, scale bar."""
+"""Every layer of a map, plans of measurements and of a station: floor plan beneath, measured
+points, stations, scale bar.
+"""
 
 from __future__ import annotations
 
@@ -10,12 +12,15 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 from matplotlib.transforms import Affine2D
 
-from gsparc.apps.maps.area import Grid
+from gsparc.apps.maps.area import FloorPlan, Grid
 from gsparc.apps.maps.field_map import FieldMap
-from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.layers import MOST_COLOURS, Layer, file_name, label_places
+from gsparc.apps.maps.placing import Placement
+from gsparc.apps.maps.planning import MeasurementPlan
+from gsparc.apps.maps.promise import Promise
 from gsparc.pictures import from_above
-from gsparc.pictures.drawing import colour_bar, save
+from gsparc.pictures.drawing import colour_bar, panels, save
+from gsparc.prediction.predictor import Predictor
 
 NAMED = 15  # stations; of more only their marks are drawn
 MOST_LISTED = 15  # a line for "5 more" would say no less than their names
@@ -40,9 +45,10 @@ def draw_layer(
         nothing = np.where(field.refused, 1.0, np.nan)
         draw_cells(axis, field.grid, nothing, None, cmap=ListedColormap(["0.89"]), zorder=1)
         legend = layer.legend
-        limits = {"vmin": legend.low, "vmax": legend.high}
         colours = ListedColormap(layer.table())
-        image = draw_cells(axis, field.grid, layer.values, plan, cmap=colours, **limits)
+        image = draw_cells(
+            axis, field.grid, layer.values, plan, cmap=colours, vmin=legend.low, vmax=legend.high
+        )
         for line in outlines:
             axis.plot(*line.T, color="0.3", linewidth=0.6, zorder=2.6)
         for cells_of, hatch, why in layer.doubts:
@@ -101,12 +107,15 @@ def _name_areas(axis: Any, grid: Grid, layer: Layer) -> None:
 def _hatch(axis: Any, field: FieldMap, cells: np.ndarray, hatch: str, why: str) -> None:
     """Hatch cells (ny, nx) of a map; a map of a single row or column has no area to hatch."""
     if min(cells.shape) > 1 and cells.any():
-        how: dict[str, Any] = {
-            "hatches": ["", hatch],
-            "levels": [-0.5, 0.5, 1.5],
-            "colors": "none",
-        }
-        hatches = axis.contourf(field.grid.x, field.grid.y, cells.astype(float), zorder=2.5, **how)
+        hatches = axis.contourf(
+            field.grid.x,
+            field.grid.y,
+            cells.astype(float),
+            zorder=2.5,
+            hatches=["", hatch],
+            levels=[-0.5, 0.5, 1.5],
+            colors="none",
+        )
         hatches.set(edgecolor="black", linewidth=0.0)
         axis.fill(
             [], [], facecolor="white", edgecolor="black", linewidth=0.0, hatch=hatch, label=why
@@ -128,8 +137,10 @@ def draw_floor_plan(axis: Any, plan: FloorPlan) -> None:
     """Draw the floor plan, where it lies."""
     height, width = plan.image.shape[:2]
     along, at = plan.scale, plan.shift  # rows go down: their step is -j times that of columns
-    matrix = along.real, along.imag, along.imag, -along.real, at.real, at.imag
-    turn = Affine2D.from_values(*matrix) + axis.transData
+    turn = (
+        Affine2D.from_values(along.real, along.imag, along.imag, -along.real, at.real, at.imag)
+        + axis.transData
+    )
     axis.imshow(plan.image, extent=(0, width, height, 0), transform=turn, zorder=0, clip_on=True)
 
 
@@ -147,3 +158,96 @@ def draw_measured_places(axis: Any, field: FieldMap) -> None:
     if 1 < len(positions) <= NAMED and not faces.any():
         for where, name in zip(positions[inside], np.array(field.stations)[inside], strict=True):
             from_above.annotate(axis, name, where)
+
+
+CURVE = 3.6  # inches of the panel beside maps
+MOST_NUMBERS = 60  # of places that are numbered
+
+
+def draw_measurement_plan(
+    batch: MeasurementPlan,
+    path: Path,
+    promise: Promise | None,
+    predictor: Predictor | None,
+    plan: FloorPlan | None,
+    outlines: Sequence[np.ndarray] = (),
+) -> None:
+    """Draw the expected error before and after, the chosen places, and how it falls."""
+    cells = batch.grid.places()[:, :2]
+    frames = from_above.split_frame(cells, margin=batch.grid.step / 2)
+    figure, axes, room = from_above.map_panels(frames, 2, CURVE, 2 * CURVE)
+    errors = np.concatenate([batch.error_before, batch.error_after])
+    # 99.5 %: a single corner far from all rows would flatten the rest.
+    most = float(np.percentile(errors, 99.5)) + 1e-9
+    done = f"after these {len(batch.places)}"
+    parts = (batch.error_before, "now"), (batch.error_after, done)
+    for row, (values, title) in zip(axes, parts, strict=True):
+        image = np.full(batch.grid.inside.shape, np.nan)
+        image[batch.grid.inside] = values
+        for axis, (low, high) in zip(row, frames, strict=True):
+            mesh = draw_cells(
+                axis,
+                batch.grid,
+                image,
+                plan,
+                cmap="cividis",
+                vmin=float(errors.min()),
+                vmax=most,
+            )
+            for line in outlines:
+                axis.plot(*line.T, color="0.6", linewidth=0.6, zorder=2.6)
+            from_above.set_bounds(axis, low, high, batch.grid.origin, title=title)
+            from_above.scale_bar(axis)
+    if promise is not None and predictor is not None:
+        places = np.unique(promise.known[:, -3:-1], axis=0) + predictor.site.origin[:2]
+        for axis in axes[0]:
+            from_above.draw_measured(axis, places)
+    for axis in axes[1]:
+        axis.plot(*batch.path.T, color="red", linewidth=1, zorder=3)
+        axis.plot(
+            *batch.places[:, :2].T,
+            "o",
+            zorder=3,
+            color="red",
+            markeredgecolor="white",
+            markersize=6,
+        )
+        for number, place in enumerate(batch.places[:MOST_NUMBERS], 1):
+            from_above.annotate(axis, str(number), place[:2])
+    colour_bar(mesh, axes, "expected error [dB]")
+    curve = figure.add_subplot(room)
+    expected = np.append(batch.before_db, batch.expected_db[np.argsort(batch.chosen)])
+    curve.plot(expected, ".-")
+    for number in (0, len(expected) - 1):
+        from_above.annotate(
+            curve, f"{expected[number]:.2f} dB", np.array([number, expected[number]])
+        )
+    # From 0: a fall of a tenth of a decibel is not to look like one to nothing.
+    curve.set(
+        xlabel="places, the most telling first",
+        ylabel="expected error over the area [dB]",
+        ylim=(0, 1.15 * expected.max()),
+    )
+    curve.grid(alpha=0.3)
+    save(figure, path, 100)
+
+
+def draw_placement(placing: Placement, path: Path, threshold_db: float, unit: str = "dB") -> None:
+    """Save the goal at every candidate, the stations that stand, and the best place, as PNG."""
+    west, east, south, north = placing.grid.extent
+    figure, ((axis,),) = panels(
+        8.5, 6.5 * max((north - south) / (east - west), 0.5) + 1.0, grid=False
+    )
+    dots = axis.scatter(
+        *placing.places[:, :2].T, c=placing.coverage, s=60, marker="s", cmap="viridis"
+    )
+    label = f"share of the predicted area with {threshold_db:g} {unit} or more, with a station here"
+    colour_bar(dots, axis, label)
+    from_above.draw_stations(axis, placing.stations)
+    from_above.draw_stations(
+        axis, placing.places[0, :2], "best", marker="*", color="r", markersize=18
+    )
+    from_above.set_bounds(axis, (west, south), (east, north), placing.grid.origin)
+    from_above.scale_bar(axis)
+    from_above.legend_below(figure)
+    save(figure, path, 100)

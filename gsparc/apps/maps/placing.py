@@ -40,11 +40,10 @@ from gsparc.base.limits import (
 from gsparc.data.schema import Site, Stations
 from gsparc.data.splits import Fold
 from gsparc.models.powers.together.network import ONE_BAND, number_sites
-from gsparc.prediction.left_out import HeldOutLevels, leave_out
+from gsparc.prediction.left_out import HeldOutLevels, Learned, leave_out
 from gsparc.prediction.levels import predict_levels
 from gsparc.prediction.placing import to_world
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.refit import Learned
 from gsparc.processes.few_rows import evenly_spaced
 from gsparc.processes.uncertainty import central_interval
 from gsparc.tables.query_places import read_query_places

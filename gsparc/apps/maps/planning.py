@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from gsparc.apps.maps.area import Grid, lay_grid
+from gsparc.apps.maps.area import FloorPlan, Grid, lay_grid
 from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances, prior_covariances
-from gsparc.apps.maps.floor_plan import FloorPlan
 from gsparc.apps.maps.geojson import read_shapes
 from gsparc.apps.maps.making import MOST_DB, choose_stations
 from gsparc.apps.maps.promise import Promise

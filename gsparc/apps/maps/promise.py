@@ -20,8 +20,7 @@ from gsparc.base.executor import run_all
 from gsparc.base.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.splits import Fold, SplitSettings
 from gsparc.models import checkpoint
-from gsparc.prediction.left_out import HeldOutLevels, leave_out, nearest_distances
-from gsparc.prediction.refit import Learned
+from gsparc.prediction.left_out import HeldOutLevels, Learned, leave_out, nearest_distances
 from gsparc.processes.uncertainty import coverage_and_width
 from gsparc.runs.open_runs import OpenRun
 

@@ -7,9 +7,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.special import ndtr, ndtri
 
+from gsparc.apps.maps.intervals import IntervalScales
 from gsparc.base.errors import DataError
 from gsparc.base.limits import finite_array
 from gsparc.physics.decibels import from_decibels, to_decibels
+from gsparc.processes.uncertainty import half_width
 
 REFUSED = -1  # of `best_server`
 OVERLAP_DB = 6.0  # below the strongest, where another disturbs and hands over
@@ -193,3 +195,65 @@ def read_loads(
         fault = f"shares from 0 to 1 are needed: one number, or {len(stations)}, one per station"
         raise DataError(f"load={load}: {fault}")
     return np.broadcast_to(values, (len(stations),))
+
+
+def score_squares(
+    scales: IntervalScales,
+    mean: np.ndarray,
+    spread: np.ndarray,
+    related: np.ndarray,
+    far: np.ndarray,
+    indoors: np.ndarray | None,
+    *,
+    numbers: np.ndarray,
+    load: np.ndarray,
+    carrier: np.ndarray,
+    floor: np.ndarray,
+    threshold_db: float,
+    noise_db: float | None,
+    loss: np.ndarray | None,
+) -> dict[str, np.ndarray]:
+    """Return layers (..., n) of squares by name, from levels of T stations.
+
+    Args:
+        scales: of deviations, as held-out rows tell.
+        mean, spread: (T, n) levels and the model's own deviations [dB].
+        related: (T, n) correlation of their errors with the strongest's.
+        far: (T, n) distances from what was measured [m].
+        indoors: (n,) bool, squares in buildings.
+        numbers: (T,) of the stations in the model.
+        load, carrier: (T,), see `sinr`.
+        floor: (T,) levels below which stations are not heard [dB].
+        threshold_db: of outage.
+        noise_db: see `sinr`.
+        loss: (2,) of squares in buildings, and its deviation [dB]; None: none is mapped there.
+    """
+    half, error = scales.half_and_error(spread, far, numbers[:, None])
+    if loss is not None and indoors is not None:
+        loss_db, doubt = np.outer(loss, indoors)
+        wider, strongest = np.hypot(error, doubt), (mean.argmax(0), np.arange(len(indoors)))
+        # What is not known of the loss is one error of all stations.
+        related = (related * error * error[strongest] + doubt**2) / (wider * wider[strongest])
+        half = np.hypot(half, half_width(scales.share) * doubt)
+        mean, error = mean - loss_db, wider
+    # The strongest before anything is refused, to which `related` is the correlation.
+    first, mean = best_server(mean), np.where(np.isfinite(half), mean, np.nan)
+    error = np.where(np.isfinite(mean), error, np.nan)
+    # To float32 before comparing: what is stored decides the best server.
+    power, error = mean.astype(np.float32), error.astype(np.float32)
+    best = best_server(power)
+    strongest = np.maximum(best, 0), np.arange(len(best))
+    below = scales.probability_below(threshold_db, power[strongest], error[strongest])
+    alike = np.where(first == best, np.nan_to_num(related), 0.0)
+    return {
+        "power_db": power,
+        "lower_db": mean - half,
+        "upper_db": mean + half,
+        "expected_error_db": error,
+        "best_server": best,
+        "sinr_db": sinr(power, load, noise_db, carrier),
+        "server_chance": server_chance(power, error, floor, alike),
+        "heard_chance": heard_chance(power, error, floor),
+        "outage": outage_probability(power, error, threshold_db, alike, below),
+        "overlap": count_overlap(power, carrier),
+    }

@@ -19,7 +19,7 @@ SAME_COSINE = 0.998  # the same of its directions: 3.6 degrees
 
 
 @dataclass(frozen=True)
-class Answer:
+class PlaceAnswer:
     """A prediction at one pair of places.
 
     Attributes:
@@ -56,7 +56,7 @@ class PlacePaths:
     towards: np.ndarray | None
 
 
-def predict_answer(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answer:
+def predict_answer(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> PlaceAnswer:
     """Predict at world places (3,) [m] of the ends that move,
     of one station where there are several.
 
@@ -72,7 +72,7 @@ def predict_answer(predictor: Predictor, ends: Mapping[str, np.ndarray]) -> Answ
     level = spread = None
     if not facts.is_image:
         level, spread = (float(value[0]) for value in predicted_levels(prediction, site.kind))
-    return Answer(
+    return PlaceAnswer(
         {**still, **ends},
         level,
         spread,

@@ -1,16 +1,22 @@
-"""The scene of a model, and the parts of it that follow a dragged end."""
+"""A checkpoint as a viewer needs it: whom to ask, what was measured, the scene, and the parts of it
+that follow a dragged end.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.area import FloorPlan
 from gsparc.apps.maps.layers import Legend
-from gsparc.apps.view.answer import SILENT_DB, Answer
+from gsparc.apps.maps.making import choose_stations
+from gsparc.apps.view.answer import SILENT_DB, PlaceAnswer
 from gsparc.apps.view.scene import (
     EXTENT,
     DrawingFrame,
@@ -22,12 +28,146 @@ from gsparc.apps.view.scene import (
     PlacedPicture,
     Points,
 )
-from gsparc.apps.view.viewed import Measured, Viewed
-from gsparc.data.schema import ENDS, LIGHT, Site
+from gsparc.data.schema import ENDS, LIGHT, End, Measurements, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.walls import box_faces
-from gsparc.prediction.levels import MAPPED
+from gsparc.prediction import levels
+from gsparc.prediction.predictor import Predictor
 from gsparc.processes.few_rows import evenly_spaced
+from gsparc.runs.align_site import align_to_site
+from gsparc.runs.open_runs import open_run
+
+log = logging.getLogger(__name__)
+
+LEAST_HEIGHT_M = 0.5  # of a site, between whose floor and ceiling planes are lifted
+CHUNK = 128  # rows of one call
+
+
+@dataclass(frozen=True)
+class MeasuredValues:
+    """What was measured of one station.
+
+    Attributes:
+        places: (n, 3) world, of the moving end [m].
+        values: (n,) level [dB], or mean of a spectrum; NaN where nothing was heard.
+        label: of the values.
+    """
+
+    places: np.ndarray
+    values: np.ndarray
+    label: str
+
+
+@dataclass(frozen=True)
+class Viewed:
+    """A model, and what is known of its site.
+
+    Attributes:
+        name: of the checkpoint.
+        predictor: as trained.
+        data: in the model's coordinates and units; None where they are gone.
+        stations: that it answers for; one, None, where there is one static end or none.
+        notes: what a reader must know, one line each.
+    """
+
+    name: str
+    predictor: Predictor
+    data: Measurements | None
+    stations: tuple[str | None, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def site(self) -> Site:
+        """Return that of the model."""
+        return self.predictor.site
+
+    @property
+    def moving(self) -> tuple[End, ...]:
+        """Return the ends that can be dragged."""
+        return self.site.moving_ends
+
+    def predictor_of(self, station: str | None) -> Predictor:
+        """Return the predictor of a station."""
+        return self.predictor.select_station(station)
+
+    def static_place(self, station: str | None) -> np.ndarray | None:
+        """Return the world place (3,) [m] of the static end; None where it is unknown or moves."""
+        place = self.predictor_of(station).site.static_position
+        return None if place is None else place + self.site.origin
+
+    def box(self) -> np.ndarray:
+        """Return world corners (2, 3) of where the moving end was [m]."""
+        return np.asarray(self.site.moving_box[:, -3:] + self.site.origin)
+
+    def heights(self) -> tuple[float, float]:
+        """Return the lowest and the highest height of a plane [m], to the centimetre."""
+        low, high = (float(z) for z in (self.site.box + self.site.origin)[:, 2])
+        if high - low <= LEAST_HEIGHT_M:
+            low, high = low - 1.5, high + 1.5
+        # Outwards to the centimetre, so that the slider reaches floor and ceiling.
+        return float(np.floor(100 * low) / 100), float(np.ceil(100 * high) / 100)
+
+    def measured_at(self, station: str | None) -> MeasuredValues | None:
+        """Return values of a station; None without data."""
+        if self.data is None:
+            return None
+        data, number = self.data, self.site.every_station.name.index(station or "")
+        rows = np.flatnonzero(data.stations_of() == number)
+        places = data.moving[rows][:, -3:] + data.site.origin
+        if data.site.target.is_image:
+            chunks = (rows[i : i + CHUNK] for i in range(0, len(rows), CHUNK))
+            values = np.concatenate(
+                [data.targets(part).flatten(1).mean(1).numpy() for part in chunks]
+            )
+            label = "mean of a measured spectrum"
+        else:
+            values, side = levels.measured_levels(data, rows)
+            # What lay below its level was not heard: it has no colour, only a place.
+            values[side > 0] = np.nan
+            quantity = "received power" if data.site.target.is_level else "power of a channel"
+            label = f"measured {quantity} [{self.site.level_unit}]"
+        return MeasuredValues(places, values, label)
+
+
+def open_model(
+    path: str | Path,
+    dataset: Mapping[str, Any] | None = None,
+    station: str | int | None = None,
+    unit: str | None = None,
+) -> Viewed:
+    """Read a checkpoint, and its data where they are still there.
+
+    Args:
+        path: of the checkpoint.
+        dataset: settings that replace those stored.
+        station: the only one to show; None: all that the model answers for.
+        unit: of powers; None: as measured.
+
+    Raises:
+        DataError: no station is called that.
+        ValueError: no checkpoint that can be read.
+    """
+    run, notes, data = open_run(path, dataset or {}), list[str](), None
+    predictor = run.predictor.in_levels(unit)
+    try:
+        opened = run.read()
+        data = align_to_site(opened.data, predictor.site)
+        if opened.foreign is not None:
+            learned = f"the model was trained on {opened.foreign}"
+            notes.append(f"measured points are other data: {learned}")
+    # Data are gone or changed: a model can be looked at without them.
+    except (ValueError, OSError) as error:
+        notes.append(
+            f"measured points are not drawn ({error}); give dataset.file=... or dataset.root=..."
+        )
+    names, missing = choose_stations(
+        predictor, None if station is None else [station], key="station"
+    )
+    for note in missing:
+        log.warning(note)
+    stations = tuple(name or None for name in names)
+    return Viewed(str(path), predictor, data, stations, tuple(notes))
+
 
 MOST_NAMES = 5  # stations that are named at once
 MOST_POINTS = 20_000  # measured places that are drawn
@@ -50,7 +190,7 @@ VALUES, GAUSSIANS, SPHERE, RAYS, SOURCES = "measured", "gaussians", "sphere", "r
 
 
 def build_scene(
-    viewed: Viewed, plan: FloorPlan | None, station: str | None, seen: Measured | None
+    viewed: Viewed, plan: FloorPlan | None, station: str | None, seen: MeasuredValues | None
 ) -> DrawnScene:
     """Build everything that stands still, with the measurements
     and the Gaussians of one station.
@@ -64,11 +204,18 @@ def build_scene(
     parts: list[Part] = []
     legends: dict[str, Legend] = {}
     low = viewed.box()[0, 2]  # of measured places, and of planes where there are any
-    ground = float(min(low, viewed.heights()[0]) if viewed.site.kind in MAPPED else low)
+    ground = float(low if viewed.site.target.is_image else min(low, viewed.heights()[0]))
     if plan is not None:
         corners = np.column_stack([plan.corners(), np.full(4, ground - BENEATH * extent)])
-        edges = corners[1] - corners[0], corners[3] - corners[0]
-        parts.append(PlacedPicture("floor plan", corners[0], *edges, plan.image))
+        parts.append(
+            PlacedPicture(
+                "floor plan",
+                corners[0],
+                corners[1] - corners[0],
+                corners[3] - corners[0],
+                plan.image,
+            )
+        )
     if seen is not None:
         chosen = evenly_spaced(len(seen.places), MOST_POINTS)
         legends[VALUES] = legend = Legend.over(seen.label, seen.values[chosen])
@@ -112,7 +259,7 @@ def cloud_colours(cloud: GaussianCloud) -> tuple[Legend, np.ndarray]:
 
 
 def model_gaussians(
-    viewed: Viewed, station: str | None, measured: Measured | None
+    viewed: Viewed, station: str | None, measured: MeasuredValues | None
 ) -> GaussianCloud | None:
     """Return Gaussians that are rendered, in world coordinates; None: of a model without."""
     low, high = viewed.box()
@@ -182,7 +329,7 @@ class Sphere:
         return Legend("", 0.0, 1.0, "inferno").to_colours(spectrum[self.rows, self.columns])
 
 
-def draw_rays(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
+def draw_rays(answer: PlaceAnswer, extent: float) -> tuple[Lines, Points] | None:
     """Draw paths as lines from the receiver towards where they come from, as long as their delays,
     and the sources
     at the ends of those that are drawn whole.
@@ -200,7 +347,7 @@ def draw_rays(answer: Answer, extent: float) -> tuple[Lines, Points] | None:
     return Lines(RAYS, segments, colours), Points(SOURCES, ends, colours, extent / 80)
 
 
-def start_place(viewed: Viewed, measured: Measured | None) -> np.ndarray:
+def start_place(viewed: Viewed, measured: MeasuredValues | None) -> np.ndarray:
     """Return the world place (3,) [m] where the moving end first stands:
     the measured one nearest to their median.
     """

@@ -83,8 +83,9 @@ class Lines:
     def draw(self, api: Any, frame: DrawingFrame) -> Any:
         """See `Points.draw`."""
         places, colours = frame.to_drawn(self.segments), np.repeat(self.colours[:, None], 2, axis=1)
-        how = {"thickness": THICKNESS, "thickness_units": "screen"}
-        return api.add_line_segments(node_path(self.name), places, colours, **how)
+        return api.add_line_segments(
+            node_path(self.name), places, colours, thickness=THICKNESS, thickness_units="screen"
+        )
 
 
 @dataclass(frozen=True)

@@ -108,9 +108,10 @@ def public_sets() -> dict[str, PublicSet]:
     """Return every public set by its name."""
     sources: dict[str, list[Source]] = {}
     for row in read_shipped_table("gsparc.datasets.public", "sources.csv"):
-        place = row["repository"], row["revision"], row["path"]
         sources.setdefault(row["dataset"], []).append(
-            Source(*place, int(row["bytes"]), row["sha256"])
+            Source(
+                row["repository"], row["revision"], row["path"], int(row["bytes"]), row["sha256"]
+            )
         )
     about = yaml.safe_load(
         files("gsparc.datasets.public").joinpath("sets.yaml").read_text(encoding="utf-8")
@@ -228,8 +229,12 @@ def _fetch_files(wanted: PublicSet, timeout_s: float, retries: int) -> None:
         urls={name: source.url for name, source in files.items()},
         retry_if_failed=retries,
     )
-    columns = TextColumn("{task.description}"), BarColumn(), DownloadColumn()
-    with Progress(*columns, console=Console(stderr=True)) as progress:
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        DownloadColumn(),
+        console=Console(stderr=True),
+    ) as progress:
         task = progress.add_task(wanted.name, total=sum(source.bytes for source in wanted.sources))
         for name, source in files.items():
             try:  # of what is there, only the hash is taken

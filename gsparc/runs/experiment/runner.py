@@ -146,10 +146,6 @@ def _tried(make: Callable[[Piece], Made], piece: Piece) -> tuple[Any, str]:
         )
 
 
-def _fit_once(fit: Fit, job: Job) -> None:
-    run_once(job.folder, job.state, partial(fit, job), reuse=job.reuse)
-
-
 def run_jobs(
     jobs: Sequence[Job], fit: Fit, train: bool = True, limit_s: float | None = None
 ) -> pd.DataFrame:
@@ -190,10 +186,15 @@ def run_jobs(
         return not late
 
     waiting, refused = missing if train else [], list[str]()
-    how: dict[str, Any] = {"cost": lambda one: one.expected_s, "wanted": fits, "refused": refused}
     try:
         for job, _ in run_list(
-            partial(_fit_once, fit), waiting, "cells", name=lambda one: str(one.name), **how
+            lambda job: run_once(job.folder, job.state, partial(fit, job), reuse=job.reuse),
+            waiting,
+            "cells",
+            name=lambda one: str(one.name),
+            cost=lambda one: one.expected_s,
+            wanted=fits,
+            refused=refused,
         ):
             rows[str(job.name)] = row = job.row()
             value = format(row["value"], number_format(row["figure"]))

@@ -20,7 +20,7 @@ from gsparc.evaluation.table import Column, Row
 from gsparc.models.method import Method
 from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import Settings
-from gsparc.prediction.pareto import defined_figure, describe_point, pareto_front
+from gsparc.prediction.operating_point import defined_figure, describe_point, pareto_front
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import FACTS, ClockSettings, time_beside_copy
 from gsparc.runs.baselines import fit_baseline
@@ -76,7 +76,10 @@ def measure_points(
     first = candidates[0], results | {"closeness_db": closeness_db(whole, whole)}
     others = run_list(score, candidates[1:], "points", name=lambda one: describe_point(one[0]))
     for (settings, method), results in chain([first], others):
-        knobs = {f"set/{knob}": _cell(value) for knob, value in settings.items()}
+        knobs = {
+            f"set/{knob}": "+".join(map(str, v)) if isinstance(v, (list, tuple)) else v
+            for knob, v in settings.items()
+        }
         results |= {"front": 0, "kept_with_model": 0}
         for used in threads:
             label = f"{describe_point(settings)}, {used} thread{'s' * (used > 1)}"
@@ -133,10 +136,6 @@ def find_better(point: Row, others: pd.DataFrame) -> str | None:
         (others.render_ms_p50 <= point["render_ms_p50"]) & (others.score >= point["score"])
     ]
     return None if better.empty else str(better.label[better.score.astype(float).idxmax()])
-
-
-def _cell(value: Any) -> Any:
-    return "+".join(map(str, value)) if isinstance(value, (list, tuple)) else value
 
 
 def facts_of(points: pd.DataFrame, others: pd.DataFrame) -> dict[str, Any]:

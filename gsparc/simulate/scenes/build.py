@@ -16,10 +16,16 @@ from gsparc.data.ends import SAME_PLACE_M
 from gsparc.data.georeference import Georeference
 from gsparc.data.walls import SIZE, RoomSettings
 from gsparc.simulate.raytracer import RayTracer, Sampling
-from gsparc.simulate.scenes.moved import move_solids, read_moves
 from gsparc.simulate.scenes.osm import Town, read_town
 from gsparc.simulate.scenes.receivers import Ground, place_receivers, stands_clear_of
-from gsparc.simulate.scenes.settings import BUILDERS, MIN_RECEIVERS, SceneSettings, from_config
+from gsparc.simulate.scenes.settings import (
+    BUILDERS,
+    MIN_RECEIVERS,
+    SceneSettings,
+    from_config,
+    move_solids,
+    read_moves,
+)
 from gsparc.simulate.scenes.solid import box
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Transmitter, place_transmitters
 from gsparc.simulate.shoebox import Room, ShoeboxEngine

@@ -98,8 +98,11 @@ def read_town(path: str | Path, carrier_hz: float) -> Town:
     solids = []
     for material, parts in sorted(meshes.items()):
         whole: Any = trimesh.util.concatenate(parts)
-        arrays = np.array(whole.vertices), np.array(whole.faces)
-        solids.append(Solid(f"buildings_{material}", material, *arrays))
+        solids.append(
+            Solid(
+                f"buildings_{material}", material, np.array(whole.vertices), np.array(whole.faces)
+            )
+        )
     corners = np.concatenate([solid.vertices[:, :2] for solid in solids])
     box = np.stack([corners.min(0), corners.max(0)])
     if np.ptp(box, axis=0).max() > LARGEST_M:

@@ -99,9 +99,15 @@ def _arrayed(data: Measurements) -> tuple[Measurements, np.ndarray]:
     heard = Snapshots.from_rows(data, np.arange(len(data)))
     measured = np.ones(data.target.shape, bool) if data.mask is None else data.mask
     middle, turned = stations.position.mean(axis=0), np.tile(np.eye(3), (len(heard.places), 1, 1))
-    ends = heard.places, np.tile(middle, (len(heard.places), 1)), turned
     site = replace(data.site, array=stations.position[heard.stations] - middle)
-    return Measurements(site, *ends, heard.values, heard.arrange(measured) != 0), heard.run
+    return Measurements(
+        site,
+        heard.places,
+        np.tile(middle, (len(heard.places), 1)),
+        turned,
+        heard.values,
+        heard.arrange(measured) != 0,
+    ), heard.run
 
 
 def _drawn(data: Measurements) -> np.ndarray:

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from gsparc.base.errors import Caution
 from gsparc.base.limits import Limit, choice, number, or_null, or_word
 from gsparc.data.blocks import is_big
-from gsparc.data.schema import OTHER, Links
+from gsparc.data.schema import OTHER, StaticEnds
 from gsparc.data.selection import take_rows
 from gsparc.physics.decibels import to_decibels
 from gsparc.tables.array_checks import MOST_DB
@@ -47,7 +47,9 @@ def check_said(attributes: Mapping[str, Any]) -> None:
         limit.check(f"dataset.{name}", attributes.get(name, default))
 
 
-def censor_rows(check: Checker, measured: str, links: Links, unlisted: int = 0) -> Links | None:
+def censor_rows(
+    check: Checker, measured: str, links: StaticEnds, unlisted: int = 0
+) -> StaticEnds | None:
     """Leave out rows without a value; censored ones hold the level that they lie below or above,
     masked.
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from gsparc.data.schema import ENDS, OTHER, End, Links, Stations
+from gsparc.data.schema import ENDS, OTHER, End, StaticEnds, Stations
 from gsparc.data.spacing import number_places
 from gsparc.tables.own_checks import HIGHEST_HZ, LOWEST_HZ, Checker
 
@@ -28,7 +28,7 @@ FULL_TURN = 360.0
 LINKS_PER_STATION = 8  # fewer rows at each distinct place of an end: that end moves
 
 
-def find_static_end(check: Checker, rx: np.ndarray, tx: np.ndarray) -> Links:
+def find_static_end(check: Checker, rx: np.ndarray, tx: np.ndarray) -> StaticEnds:
     """Find which end stands still, at one place or at few, whose rows are then numbered; None:
     both move.
     """
@@ -37,15 +37,15 @@ def find_static_end(check: Checker, rx: np.ndarray, tx: np.ndarray) -> Links:
     few: End = min(ends, key=lambda end: len(places[end][0]))
     table, which = places[few]
     if len(table) == 1:
-        return Links("rx" if len(places["rx"][0]) == 1 else "tx")
+        return StaticEnds("rx" if len(places["rx"][0]) == 1 else "tx")
     if len(table) * LINKS_PER_STATION > len(rx) or len(table) * 2 > len(places[OTHER[few]][0]):
-        return Links(None)
+        return StaticEnds(None)
     check.notes.append(
         f"the {ENDS[few]} stands at {len(table)} places: taken as {len(table)} stations"
     )
     check.raw.arrays["station"] = which.reshape(-1).astype(np.int64)
     check.raw.arrays["place"] = number_places(ends[OTHER[few]])
-    return Links(few, Stations(table, tuple(str(i) for i in range(len(table)))))
+    return StaticEnds(few, Stations(table, tuple(str(i) for i in range(len(table)))))
 
 
 def read_station_table(check: Checker, may_miss: bool = False) -> Stations | None:

@@ -15,8 +15,8 @@ from names import find_unexplained
 
 from gsparc import load
 from gsparc.apps.link.adaptation import Adaptation, Band, Rates
-from gsparc.apps.link.channels import true_channels
 from gsparc.apps.link.pusch import Pusch, frequency_correlation
+from gsparc.apps.link.run import true_channels
 from gsparc.apps.link.study import (
     beam_gain,
     beam_loss_db,

@@ -6,11 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.apps.locate import calibration
-from gsparc.apps.locate.calibration import calibrate_level, calibrate_trust
-from gsparc.apps.locate.cells import cover_box
-from gsparc.apps.locate.likelihood import Trust, level_misfit
-from gsparc.apps.locate.search import PlaceSearch
+from gsparc.apps.locate import search
+from gsparc.apps.locate.posterior import cover_box
+from gsparc.apps.locate.search import (
+    PlaceSearch,
+    Trust,
+    calibrate_level,
+    calibrate_trust,
+    level_misfit,
+)
 
 STATIONS = np.array([[0.0, 0, 0], [10, 0, 0], [0, 10, 0], [10, 10, 0]])
 CORNERS = np.array([[0.0, 0, 0], [10.0, 10, 0]])
@@ -40,7 +44,7 @@ def looked(values, cells):
 @pytest.mark.slow
 def test_areas_hold_the_promised_share(monkeypatch):
     # Whatever trust is found, its level holds the share
-    monkeypatch.setattr(calibration, "LOOKS", 50)
+    monkeypatch.setattr(search, "LOOKS", 50)
     rng = np.random.default_rng(0)
     cells = cover_box(CORNERS, 400, False)
     (places, values), (others, tested) = (snapshots(count, rng, 3.0) for count in (150, 400))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from gsparc.apps.locate.likelihood import Trust, channel_misfit, level_misfit, spectrum_misfit
+from gsparc.apps.locate.search import Trust, channel_misfit, level_misfit, spectrum_misfit
 
 RNG = np.random.default_rng(0)
 

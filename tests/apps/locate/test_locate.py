@@ -13,8 +13,8 @@ from refusals import refused
 
 import gsparc
 from gsparc.apps.locate import locate
-from gsparc.apps.locate.likelihood import Trust
-from gsparc.apps.locate.site_field import SiteField
+from gsparc.apps.locate.search import Trust
+from gsparc.apps.locate.snapshots import SiteField
 from gsparc.models import checkpoint
 from gsparc.models.method import predict_with_threads
 
@@ -97,8 +97,8 @@ def test_stations_at_one_place_were_asked_in_different_parts(tmp_path, monkeypat
     """What 42 antennas share of a place was computed for each part: 2 times as long."""
     predictor, rows = gsparc.load(towns.town_model()), []
     counted = lambda by, query: rows.append(len(query)) or predict_with_threads(by, query)  # noqa: E731
-    monkeypatch.setattr("gsparc.apps.locate.site_field.predict_with_threads", counted)
-    monkeypatch.setattr("gsparc.apps.locate.site_field.CHUNK", 9)
+    monkeypatch.setattr("gsparc.apps.locate.snapshots.predict_with_threads", counted)
+    monkeypatch.setattr("gsparc.apps.locate.snapshots.CHUNK", 9)
     SiteField(predictor).moments_at(
         torch.from_numpy(np.tile(predictor.site.moving_box[:1, :3], (7, 1)))
     )

@@ -6,8 +6,7 @@ import torch
 from omegaconf import OmegaConf
 from releases import real
 
-from gsparc.apps.locate.fingerprints import fingerprint_snapshots
-from gsparc.apps.locate.judging import report
+from gsparc.apps.locate.judging import fingerprint_snapshots, report
 from gsparc.apps.locate.neighbours import PLAIN, _count, feature_vectors, locate_by_neighbours
 from gsparc.apps.locate.snapshots import Scans
 from gsparc.datasets.fingerprints import read_fingerprints, split_fingerprints

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from refusals import refused
 
-from gsparc.apps.locate.cells import cover_box
-from gsparc.apps.locate.posterior import PlacePosterior, densest_cells
+from gsparc.apps.locate.posterior import PlacePosterior, cover_box, densest_cells
 
 PLACES = np.random.default_rng(0).uniform(0, 1, (200, 3)) * [4.0, 2.0, 0.0] + [0, 0, 1.5]
 

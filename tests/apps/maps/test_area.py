@@ -10,8 +10,7 @@ from PIL import Image
 from pyproj import Transformer
 from refusals import refused
 
-from gsparc.apps.maps.area import lay_grid
-from gsparc.apps.maps.floor_plan import read_floor_plan
+from gsparc.apps.maps.area import lay_grid, read_floor_plan
 from gsparc.apps.maps.geojson import read_shapes
 from gsparc.data.georeference import Georeference
 

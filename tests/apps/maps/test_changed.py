@@ -4,7 +4,7 @@ import numpy as np
 from rooms_later import CABINET, PLACES, RADIUS, draw, levels
 
 import gsparc
-from gsparc.apps.maps.changed import CHANGE, DEVIATION, add_changes, change_layers
+from gsparc.apps.maps.layers import CHANGE, DEVIATION, add_changes, change_layers
 from gsparc.apps.maps.making import predict_map
 
 

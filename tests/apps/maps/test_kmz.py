@@ -9,7 +9,7 @@ import pytest
 from matplotlib.image import imread
 from towns import town_on_earth
 
-from gsparc.apps.maps.kmz import NAMESPACE, write_kmz
+from gsparc.apps.maps.geotiff import NAMESPACE, write_kmz
 from gsparc.apps.maps.layers import list_layers
 from gsparc.apps.maps.making import predict_map
 

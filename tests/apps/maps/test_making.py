@@ -14,7 +14,7 @@ from scipy.stats import norm
 from towns import MASTS, town_model
 
 import gsparc
-from gsparc.apps.maps import layers, pictures, plan_measurements, plan_pictures, strongest
+from gsparc.apps.maps import layers, pictures, plan_measurements, strongest
 from gsparc.apps.maps.layers import Layer, Legend, assign_colours, label_places, list_layers
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.promise import Promise, map_notes
@@ -278,8 +278,7 @@ def test_a_noise_of_a_billion_decibels_overflowed(predictor):
 def drawn(monkeypatch):
     """Figures, which are not written."""
     figures: list[Figure] = []
-    for module in (pictures, plan_pictures):
-        monkeypatch.setattr(module, "save", lambda figure, path, dpi: figures.append(figure))
+    monkeypatch.setattr(pictures, "save", lambda figure, path, dpi: figures.append(figure))
     return figures
 
 
@@ -296,7 +295,7 @@ def test_axes_of_a_map_were_metres_from_an_origin_that_they_did_not_name(
         predictor, "site", replace(predictor.site, georeference=Georeference(47.2, 11.3))
     )
     draw(predict_map(predictor, step_m=4.0), "power")
-    plan_pictures.draw_measurement_plan(
+    pictures.draw_measurement_plan(
         plan_measurements(predictor, 2), "unused.png", None, predictor, None
     )
     said = [figure.axes[0].get_xlabel() for figure in drawn]
@@ -320,7 +319,7 @@ def test_a_legend_of_ten_cells_did_not_say_that_others_serve_less(drawn, predict
 def test_a_fall_of_a_tenth_of_a_decibel_looked_like_one_to_nothing(drawn, predictor):
     """The curve of a plan began at its own least; its ends are written beside it."""
     plan = plan_measurements(predictor, 4)
-    plan_pictures.draw_measurement_plan(plan, "unused.png", None, predictor, None)
+    pictures.draw_measurement_plan(plan, "unused.png", None, predictor, None)
     curve = drawn[0].axes[-1]
     assert curve.get_ylim()[0] == 0 and curve.get_ylim()[1] > plan.before_db
     assert f"{plan.after_db:.2f} dB" in [text.get_text() for text in curve.texts]

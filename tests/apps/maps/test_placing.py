@@ -29,9 +29,8 @@ from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
-from gsparc.prediction.left_out import HeldOutLevels, held_out_levels
+from gsparc.prediction.left_out import HeldOutLevels, Learned, held_out_levels
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.refit import Learned
 from gsparc.tables.own import load_own
 from gsparc.training.context import FitContext
 

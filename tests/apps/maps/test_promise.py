@@ -9,8 +9,7 @@ from gsparc.apps.maps.intervals import cross_validate
 from gsparc.apps.maps.promise import PromiseSettings, gather_promise
 from gsparc.data.splits import Fold, SplitSettings, make_split
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.prediction.left_out import held_out_levels
-from gsparc.prediction.refit import Learned
+from gsparc.prediction.left_out import Learned, held_out_levels
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 

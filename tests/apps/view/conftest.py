@@ -10,8 +10,8 @@ import pytest
 from campaigns import brief, compose, spectra
 from towns import town_model
 
+from gsparc.apps.view.building import open_model
 from gsparc.apps.view.site_view import SiteView, lay_power_plane
-from gsparc.apps.view.viewed import open_model
 from gsparc.commands.train import train
 
 

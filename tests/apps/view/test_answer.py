@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsparc.apps.view.answer import Answer, PlacePaths, merge_paths
+from gsparc.apps.view.answer import PlaceAnswer, PlacePaths, merge_paths
 from gsparc.apps.view.building import BOX, MIRROR
 from gsparc.apps.view.reasons import explain_level, legend_html
 from gsparc.apps.view.scene import Faces
@@ -12,9 +12,13 @@ HERE = np.zeros(3)
 
 def test_a_fade_is_said_to_be_one():
     paths = PlacePaths(np.array([-40.0, -40.5]), np.array([10.0, 20]), None)
-    said = " | ".join(explain_level(Answer({"rx": HERE}, level_db=-60.0, paths=paths), "rx", None))
+    said = " | ".join(
+        explain_level(PlaceAnswer({"rx": HERE}, level_db=-60.0, paths=paths), "rx", None)
+    )
     assert "they cancel each other: 22.8 dB less than their powers" in said
-    said = " | ".join(explain_level(Answer({"rx": HERE}, level_db=-37.5, paths=paths), "rx", None))
+    said = " | ".join(
+        explain_level(PlaceAnswer({"rx": HERE}, level_db=-37.5, paths=paths), "rx", None)
+    )
     assert "their powers" not in said
 
 

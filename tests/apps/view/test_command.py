@@ -7,8 +7,7 @@ import pytest
 from campaigns import compose
 from towns import town_model
 
-from gsparc.apps.view.building import GAUSSIANS, build_scene
-from gsparc.apps.view.viewed import open_model
+from gsparc.apps.view.building import GAUSSIANS, build_scene, open_model
 from gsparc.base.errors import DataError
 from gsparc.commands import view as command
 from gsparc.models import checkpoint

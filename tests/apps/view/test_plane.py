@@ -5,9 +5,8 @@ from campaigns import channels
 from towns import trained
 
 from gsparc.apps.view.answer import predict_answer
-from gsparc.apps.view.plane import refine_plane, weakest_place
-from gsparc.apps.view.site_view import lay_power_plane
-from gsparc.apps.view.viewed import open_model
+from gsparc.apps.view.building import open_model
+from gsparc.apps.view.site_view import lay_power_plane, refine_plane, weakest_place
 
 
 def test_the_last_plane_is_what_the_model_says_of_every_cell(power_view):

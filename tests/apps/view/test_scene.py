@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsparc.apps.maps.floor_plan import FloorPlan
+from gsparc.apps.maps.area import FloorPlan
 from gsparc.apps.view.building import build_scene
 from gsparc.apps.view.scene import EXTENT, DrawingFrame
 

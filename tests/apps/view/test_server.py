@@ -19,8 +19,7 @@ from websockets.sync.client import connect  # noqa: E402
 
 from gsparc.apps.view.latest_job import LatestJobQueue  # noqa: E402
 from gsparc.apps.view.server.page import render_page  # noqa: E402
-from gsparc.apps.view.server.serve import PageServer  # noqa: E402
-from gsparc.apps.view.server.session import Session  # noqa: E402
+from gsparc.apps.view.server.session import PageServer, Session  # noqa: E402
 
 
 @pytest.fixture

@@ -1,7 +1,7 @@
 """Files whose bytes are damaged: cut short, overwritten,
 made to hang or crash the library that reads them.
 
-Remedy: gsparc/base/hdf5_text.py; text of variable length is first read by a program of its own, for
+Remedy: gsparc/base/archives.py; text of variable length is first read by a program of its own, for
 a bounded time. Found: damage in a global heap of HDF5 that hangs or crashes libhdf5.
 """
 
@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
-from gsparc.base import hdf5_text
+from gsparc.base import archives
 from gsparc.base.errors import DataError
 from gsparc.tables.own import load_own
 
@@ -42,7 +42,7 @@ def test_variable_length_text_is_read(tmp_path):
 )
 def test_damaged_heaps_are_read_or_refused_in_bounded_time(tmp_path, count):
     good = users_file(tmp_path / "good.h5").read_bytes()
-    heap = good.index(hdf5_text.HEAP)
+    heap = good.index(archives.HEAP)
     for seed in range(count):
         draw, spoilt = random.Random(seed), bytearray(good)
         for _ in range(3):
@@ -57,11 +57,9 @@ def test_damaged_heaps_are_read_or_refused_in_bounded_time(tmp_path, count):
 
 def test_a_reader_that_hangs_or_crashes_is_told_apart(tmp_path, monkeypatch):
     path = users_file(tmp_path / "mine.h5")
-    monkeypatch.setattr(hdf5_text, "READ", "import time; time.sleep(60)")
-    assert "cannot be read in 0.5 s" in str(hdf5_text.hdf5_text_error(path, seconds=0.5))
-    monkeypatch.setattr(
-        hdf5_text, "READ", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)"
-    )
+    monkeypatch.setattr(archives, "READ", "import time; time.sleep(60)")
+    assert "cannot be read in 0.5 s" in str(archives.hdf5_text_error(path, seconds=0.5))
+    monkeypatch.setattr(archives, "READ", "import os, signal; os.kill(os.getpid(), signal.SIGSEGV)")
     with pytest.raises(DataError, match=r"mine\.h5: damaged \(its text crashes the HDF5 library\)"):
         load_own(path)
 
@@ -69,9 +67,9 @@ def test_a_reader_that_hangs_or_crashes_is_told_apart(tmp_path, monkeypatch):
 def test_a_heap_that_makes_libhdf5_loop_is_refused(tmp_path, monkeypatch):
     """Found by fuzzing: an object that says it is 2 kB larger is walked past for ever."""
     spoilt = bytearray(users_file(tmp_path / "good.h5").read_bytes())
-    spoilt[spoilt.index(hdf5_text.HEAP) + 25] = 8  # second byte of the first object's size
+    spoilt[spoilt.index(archives.HEAP) + 25] = 8  # second byte of the first object's size
     path = tmp_path / "loops.h5"
     path.write_bytes(spoilt)
-    monkeypatch.setattr(hdf5_text.hdf5_text_error, "__defaults__", (1.0,))
+    monkeypatch.setattr(archives.hdf5_text_error, "__defaults__", (1.0,))
     with pytest.raises(DataError, match=r"loops\.h5: damaged \(its text cannot be read in 1 s\)"):
         load_own(path)

@@ -9,8 +9,8 @@ from level_fields import fields, flight
 from networks import network
 
 from gsparc.tables.advice import run_warnings
-from gsparc.tables.checks.link_levels import LinkLevels, link_levels
-from gsparc.tables.checks.misplaced import misplaced_warnings
+from gsparc.tables.checks.level_steps import LinkLevels, link_levels
+from gsparc.tables.checks.plausibility import misplaced_warnings
 from gsparc.tables.own import from_arrays
 
 CITIES = {seed: link_levels(network(seed).data(6)) for seed in range(3)}

@@ -10,8 +10,13 @@ from scipy.spatial.distance import cdist
 
 from gsparc.datasets.own import read_any
 from gsparc.tables.checks import plausibility
-from gsparc.tables.checks.level_steps import detect_level_steps, find_level_steps, step_warnings
-from gsparc.tables.checks.link_levels import LinkLevels, link_levels
+from gsparc.tables.checks.level_steps import (
+    LinkLevels,
+    detect_level_steps,
+    find_level_steps,
+    link_levels,
+    step_warnings,
+)
 from gsparc.tables.checks.unit_warnings import unit_warnings
 from gsparc.tables.own import from_arrays
 

@@ -189,8 +189,15 @@ def fit_taps(
     if not total.all():
         at = places[int(np.argmin(total))].round(2).tolist()
         raise ValueError(f"the model predicts no power at {at} m, far from every measurement")
-    residual = float(error.sum() / total.sum()), float((error / total).max())
-    return TappedDelayLine(time_s, np.concatenate(gains), first, rate_hz, carrier, *residual)
+    return TappedDelayLine(
+        time_s,
+        np.concatenate(gains),
+        first,
+        rate_hz,
+        carrier,
+        float(error.sum() / total.sum()),
+        float((error / total).max()),
+    )
 
 
 def _atoms(turns: np.ndarray, first: int, taps: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,9 +10,8 @@ import numpy as np
 import torch
 
 from gsparc.apps.export.compiled.blob import Form
-from gsparc.apps.export.compiled.channels import compile_sources
 from gsparc.apps.export.compiled.powers import compile_powers
-from gsparc.apps.export.compiled.spectra import compile_array, compile_view
+from gsparc.apps.export.compiled.spectra import compile_array, compile_sources, compile_view
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.target import Kind
 from gsparc.field.frozen import FrozenArray, FrozenView

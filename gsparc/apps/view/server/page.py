@@ -16,12 +16,10 @@ import viser
 from gsparc.apps.maps.layers import Legend
 from gsparc.apps.view.answer import predict_answer
 from gsparc.apps.view.building import PATHS, SPHERE, draw_rays
-from gsparc.apps.view.panel import panel_image
-from gsparc.apps.view.plane import plane_sheet
-from gsparc.apps.view.reasons import legend_html, summarise_answer
+from gsparc.apps.view.reasons import legend_html, panel_image, summarise_answer
 from gsparc.apps.view.scene import EXTENT, DrawnScene, Part, PlacedPicture, Points
 from gsparc.apps.view.server.draw import draw_floor, draw_scene, set_first_view
-from gsparc.apps.view.site_view import SiteView, walk_places
+from gsparc.apps.view.site_view import SiteView, plane_sheet, walk_places
 from gsparc.data.schema import ENDS
 
 STEPS = 24  # places of the walk, of all stations together

@@ -1,7 +1,11 @@
-"""One client: what it sees, what it may drag, and the answers that follow its hand."""
+"""A server for any number of clients: what each sees, the ends that it may drag, and the answers
+that follow its hand.
+"""
 
 from __future__ import annotations
 
+import logging
+import threading
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -9,19 +13,19 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import viser
 from numpy.typing import ArrayLike
 
 from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.layers import Legend
-from gsparc.apps.view.answer import Answer, predict_answer
+from gsparc.apps.view.answer import PlaceAnswer, predict_answer
 from gsparc.apps.view.building import GAUSSIANS, PATHS, RAYS, SPHERE, VALUES, draw_rays
 from gsparc.apps.view.latest_job import LatestJobQueue
-from gsparc.apps.view.panel import panel_image
-from gsparc.apps.view.plane import Plane, plane_sheet, refine_plane, weakest_place
-from gsparc.apps.view.reasons import answer_markdown, explain_level, legend_html
+from gsparc.apps.view.reasons import answer_markdown, explain_level, legend_html, panel_image
 from gsparc.apps.view.scene import EXTENT, Points
 from gsparc.apps.view.server.draw import draw_floor, draw_scene, set_first_view
-from gsparc.apps.view.site_view import SiteView
+from gsparc.apps.view.site_view import Plane, SiteView, plane_sheet, refine_plane, weakest_place
+from gsparc.base.errors import DataError
 from gsparc.data.schema import ENDS
 
 FIRST_PLACE, WEAKEST = "first place", "next weak place"
@@ -83,8 +87,9 @@ class Session:
             self.client.scene.add_icosphere(
                 f"/{end}/dot", radius=0.014 * EXTENT, color=(214, 39, 40)
             )
-            above: Any = {"position": (0, 0, 0.03 * EXTENT), "anchor": "bottom-center"}
-            self.client.scene.add_label(f"/{end}/name", ENDS[end], **above)
+            self.client.scene.add_label(
+                f"/{end}/name", ENDS[end], position=(0, 0, 0.03 * EXTENT), anchor="bottom-center"
+            )
             gizmo.on_update(self._dragged(end))
             self.gizmos[end] = gizmo
 
@@ -231,7 +236,7 @@ class Session:
         self.work.put((self.client.client_id, "panel"), partial(self._panel_of, answer))
         yield
 
-    def _show(self, answer: Answer) -> None:
+    def _show(self, answer: PlaceAnswer) -> None:
         why = explain_level(answer, self.view.viewed.moving[-1], self.one.tree)
         rays, first = (
             draw_rays(answer, self.view.extent(self.station)) or (),
@@ -251,7 +256,7 @@ class Session:
         if rays and first:
             self._legends()
 
-    def _panel_of(self, answer: Answer) -> Iterator[None]:
+    def _panel_of(self, answer: PlaceAnswer) -> Iterator[None]:
         """The picture of an answer, which takes longer than the answer:
         a drag does not wait for it.
         """
@@ -303,3 +308,75 @@ class Session:
         entries += [PATHS] if RAYS in self.nodes else []
         entries += [self.power] if PLANE in self.nodes and self.power is not None else []
         self.legend.content = legend_html(entries, self.scene.parts)
+
+
+log = logging.getLogger(__name__)
+
+
+class PageServer:
+    """Serves a model until it is stopped.
+
+    Args:
+        view: the model.
+        host: address to listen at; 127.0.0.1 lets nobody else in.
+        port: the next free one is taken where it is in use; 0: any.
+
+    Raises:
+        DataError: no such address here.
+    """
+
+    def __init__(self, view: SiteView, host: str = "127.0.0.1", port: int = 8080) -> None:
+        self.view, self.work = view, LatestJobQueue()
+        self.sessions: dict[int, Session] = {}
+        self._lock = threading.Lock()
+        self._gone: set[int] = set()  # clients that left before their session was there
+        view.station(view.viewed.stations[0])  # made before anyone waits for it
+        try:
+            self.server = viser.ViserServer(host=host, port=port, label="gsparc", verbose=False)
+        except OSError as error:
+            self.work.close()
+            raise DataError(
+                f"host={host} port={port}: cannot listen there ({error.strerror})"
+            ) from None
+        self.server.scene.set_up_direction("+z")
+        self.server.on_client_connect(self._came)
+        self.server.on_client_disconnect(self._went)
+
+    @property
+    def address(self) -> str:
+        """Where a browser finds it."""
+        return f"http://{self.server.get_host()}:{self.server.get_port()}"
+
+    def _came(self, client: Any) -> None:
+        session = Session(client, self.view, self.work)
+        with self._lock:
+            gone = client.client_id in self._gone  # while its session was made
+            self._gone.discard(client.client_id)
+            if not gone:
+                self.sessions[client.client_id] = session
+        if gone:
+            self.work.drop_client(client.client_id)
+            return
+        log.info("client %d connected, %d in all", client.client_id, len(self.sessions))
+
+    def _went(self, client: Any) -> None:
+        with self._lock:
+            if self.sessions.pop(client.client_id, None) is None:
+                self._gone.add(client.client_id)
+        self.work.drop_client(client.client_id)
+        log.info("client %d left, %d in all", client.client_id, len(self.sessions))
+
+    def run(self) -> None:
+        """Serve until Ctrl-C."""
+        try:
+            while True:
+                time.sleep(0.5)
+        except KeyboardInterrupt:
+            pass
+        finally:
+            self.stop()
+
+    def stop(self) -> None:
+        """Let all clients go."""
+        self.work.close()
+        self.server.stop()
