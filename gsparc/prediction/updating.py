@@ -14,22 +14,25 @@ import torch
 from gsparc.base.errors import DataError
 from gsparc.base.limits import POSITIVE, check_arguments, switch, whole
 from gsparc.base.limits import number as limit_number
+from gsparc.data.ends import NOBODY, SAME_PLACE_M
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.station_names import find_station
 from gsparc.data.units import PowerUnit
 from gsparc.models.method import Method, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
-from gsparc.models.station_views import OneStationView
+from gsparc.models.station_views import AnywhereView, OneStationView
 from gsparc.models.updated import (
     STORED,
     Changes,
     Level,
     Updated,
+    known_only,
     map_level,
     sound_updates,
     stored_changes,
     with_changes,
+    with_links,
 )
 from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.drift import ROWS, Alarm, Watch
@@ -41,6 +44,7 @@ from gsparc.prediction.later_rows import (
 )
 from gsparc.prediction.query import Asked
 from gsparc.processes.changes import Belief, LaterRows, learn, refit_scale
+from gsparc.processes.powers import PowerRows
 from gsparc.processes.stored import Stored, from_plain, to_plain
 from gsparc.tables.array_checks import MOST_DB
 
@@ -140,8 +144,9 @@ class UpdateMixin(Asked):
         Args:
             rows: measurements in the model's coordinates (`align_to_site`); None: the arrays that
                 follow.
-            tx, rx: (n, 3) places of the end that moves, world [m].
-            rssi: (n,) or (n, T) powers; NaN is not measured, minus infinity (a power of 0) tells
+            tx, rx: (n, 3) places of the end that moves, world [m]; of both ends, where stations
+                stand at several places, and then at any.
+            rssi: (n,) or (n, T) powers, of both ends (n,); NaN is not measured, minus infinity (a power of 0) tells
                 nothing.
             unit: of `rssi`; None: that of the measurements.
             window: later rows of a station that are kept, at least 1; the first ones are dropped.
@@ -166,13 +171,12 @@ class UpdateMixin(Asked):
             raise ToldBefore(f"update: {key} was told before")
         if rows is None:
             places = tx if self.site.moving_end == "tx" else rx
-            rows, silent = read_level_arrays(self.site, places, rssi, self._answer_unit(unit))
+            still = (rx if self.site.moving_end == "tx" else tx) if self.site.several else None
+            levels = self.site, places, rssi, self._answer_unit(unit), still
+            rows, silent = read_level_arrays(*levels)
         rows = read_level_rows(rows, self.site) if isinstance(rows, Measurements) else rows
-        changes, belief, stations = (
-            version.changes,
-            version.changes.belief,
-            version.changes.stations,
-        )
+        rows, changes = self._number_new(rows, version.changes)
+        belief, stations = changes.belief, changes.stations
         extent = belief.extent
         new = self._read_rows(rows, changes)
         for name, later in new.items():
@@ -181,10 +185,16 @@ class UpdateMixin(Asked):
         # The test believes what earlier rows said of a station's noise.
         noisy = {
             name: replace(station, noise=station.noise + belief.of(name)[1])
-            for name, station in stations.items()
+            for name, station in known_only(stations).items()
         }
-        watch, deviations = version.watch.look(noisy, first, extent, false_alarm)
+        watch, surprises = version.watch.look(noisy, first, extent, false_alarm)
         numbers = np.arange(first, first + sum(map(len, new.values())))
+        deviations, is_known = np.empty(len(numbers)), np.ones(len(numbers), bool)
+        for name in new.keys() - known_only(new).keys():  # nothing was expected of them to change
+            later, of = new[name], new[name].number.numpy() - first
+            deviations[of] = later.missed / (later.doubt + later.noise).sqrt()
+            is_known[of] = False
+        deviations[is_known] = surprises
         alarms, skipped = (
             watch.alarms[len(version.watch.alarms) :],
             silent + len(rows) - len(numbers),
@@ -340,7 +350,7 @@ class UpdateMixin(Asked):
         """Learn from stations' rows together, and answer by it."""
         now = self._current
         changes = changes or now.changes
-        belief = learn(stations, changes.belief.extent, changes.belief.scale)
+        belief = learn(known_only(stations), changes.belief.extent, changes.belief.scale)
         changes = replace(changes, rows=tuple(sorted(stations.items())), belief=belief)
         told = now.told if key is None else (*now.told, key)[-JOURNAL:]
         version = Version(changes, watch or now.watch, (*now.journal, said)[-JOURNAL:], told)
@@ -354,6 +364,40 @@ class UpdateMixin(Asked):
         self._prepared = []
 
     # -- rows --------------------------------------------------------------------------------------
+
+    def _number_new(self, rows: LevelRows, changes: Changes) -> tuple[LevelRows, Changes]:
+        """Rows with the numbers of `Changes.new`, which holds stations at new places from now on.
+
+        Raises:
+            ValueError: such rows, and a model that learns from none.
+        """
+        unknown = (rows.station < 0) | (rows.station >= len(self._model_site.every_station))
+        if not unknown.any():
+            return rows, changes
+        if not self.learns_new_stations:
+            raise ValueError(
+                "update: rows of a transmitter at a new place; a model of many places learns them "
+                "by links (`stations left out` in its notes): train again on all rows"
+            )
+        places, of = np.unique(rows.still[unknown], axis=0, return_inverse=True)
+        new, number = [*changes.new], []
+        for place in torch.from_numpy(places):
+            known = torch.tensor(new, dtype=torch.float64).reshape(-1, 3)
+            near = torch.linalg.vector_norm(known - place, dim=1) <= SAME_PLACE_M
+            number.append(int(near.nonzero()[0]) if near.any() else len(new))
+            if not near.any():
+                new.append(tuple(place.tolist()))
+        station = rows.station.copy()
+        station[unknown] = NOBODY - 1 - np.array(number)[of.reshape(-1)]
+        return replace(rows, station=station), replace(changes, new=tuple(new))
+
+    @property
+    def learns_new_stations(self) -> bool:
+        """Whether rows of stations at new places can be told to it."""
+        none = PowerRows(np.zeros((0, 6)), np.zeros(0), np.zeros(0, np.int8))
+        method = with_changes(self.method, None)
+        parts = [part for _, part in method] if isinstance(method, PerStation) else [method]
+        return all(with_links(part, none, torch.zeros(0)) is not None for part in parts)
 
     def _read_rows(self, rows: LevelRows, changes: Changes) -> dict[int, LaterRows]:
         """New rows of each station that has a map, as they miss it."""
@@ -370,9 +414,14 @@ class UpdateMixin(Asked):
             index = np.flatnonzero(rows.station == name)
             try:
                 answers = method.station_method(name) if isinstance(method, PerStation) else method
+                if name < NOBODY:
+                    answers = AnywhereView(method)
             except ValueError:  # it had too few rows to be learned
                 continue
             there = station_site(site, name) if isinstance(method, PerStation) else site
+            if name < NOBODY:
+                place = np.array(changes.new[NOBODY - 1 - name])
+                there = replace(site, stations=None, static_position=place)
             query = Query.from_places(there, torch.from_numpy(rows.places[index]).float())
             level = map_level(answers, predict_with_threads(answers, query), site)
             missed = rows.decibels[index] - level.mean.numpy() - changes.shift(name)

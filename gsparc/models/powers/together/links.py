@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -32,8 +32,9 @@ from gsparc.processes.nearest import (
     choose_kernel_by_nearest,
     condition_on_nearest,
 )
-from gsparc.processes.neighbourhood import NEIGHBOURS
+from gsparc.processes.neighbourhood import NEIGHBOURS, Neighbourhood
 from gsparc.processes.places import first_end, other_end
+from gsparc.processes.powers import PowerRows
 from gsparc.processes.prior import Prior
 from gsparc.processes.stored import Stored
 from gsparc.processes.trend import Trend
@@ -86,6 +87,19 @@ class Links(Stored):
     heard: Nearest | None
     unheard: Nearest
     index: Tensor
+
+    def add(self, rows: PowerRows, faded: Tensor) -> Links:
+        """Return the same given further rows (n,) that were heard, at settings as they are.
+
+        Args:
+            rows: `places` (n, 6).
+            faded: (n,) variances on top of their noise [dB^2].
+        """
+        values = link_values(rows, self.law)
+        heard = None if self.heard is None else _add_values(self.heard, values, faded)
+        unknown = torch.full((len(faded),), -1, dtype=self.index.dtype)
+        index = torch.cat([self.index, unknown])
+        return Links(self.law, heard, _add_values(self.unheard, values, faded), index)
 
     def of_station(self, heard: bool) -> Nearest | None:
         """Return what tells of a station; None: its own process does."""
@@ -172,9 +186,21 @@ def errors_of_heard(rows: StationRows, priors: LinkPriors, seed: int) -> np.ndar
     return (heard.left_out().mean - values)[:, 0].numpy()
 
 
-def link_values(rows: StationRows, law: Trend) -> PlaceValues:
+def _add_values(process: Nearest, values: PlaceValues, faded: Tensor) -> Nearest:
+    """The process given further values, among its densest, of noise that `faded` (n,) adds to."""
+    kernel, near = process.prior.kernel, process.near
+    level = np.full(len(faded), near.level.max(), np.int8)
+    places = np.concatenate([near.places, values.places])
+    noise = torch.cat([process.noise, kernel.noise + faded / kernel.amplitude])
+    rest = torch.cat([process.rest, values.values])
+    near = Neighbourhood(places, np.concatenate([near.level, level]))
+    return replace(process, near=near, rest=rest, noise=noise)
+
+
+def link_values(rows: PowerRows, law: Trend) -> PlaceValues:
     """Return levels less the law over scaled places of both ends, one for each row."""
-    places, once = torch.from_numpy(rows.places), torch.ones(len(rows.index), dtype=torch.float64)
+    places = torch.from_numpy(rows.places)
+    once = torch.ones(len(places), dtype=torch.float64)
     rest = torch.from_numpy(rows.decibels) - law.mean(places)
     return PlaceValues(scaled(places).numpy(), rest[:, None], once)
 
