@@ -79,6 +79,10 @@ class HasJoint(Protocol):
 class AddsLinks(Protocol):
     """It learns from rows of stations at new places, with its settings as they are."""
 
+    @property
+    def linked_stations(self) -> list[int] | None:
+        """Numbers of stations with rows; None: of others it cannot learn."""
+
     def add_links(self, rows: PowerRows, faded: Tensor) -> Any:
         """See `gsparc.models.powers.together.field.JointPowerField.add_links`."""
 

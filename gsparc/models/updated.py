@@ -8,7 +8,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -151,7 +151,7 @@ class Updated(View):
         super().__init__(inner)
         self.changes, self.own, self.site = changes, own, inner.fitted_site
         links = changes.links
-        self.told = inner if links is None else with_links(inner, *links) or inner
+        self.told = inner if links is None else _with_links(inner, *links)
 
     @property
     def stored_class(self) -> type[MethodFactory]:
@@ -241,12 +241,19 @@ def stored_changes(extra: Mapping[str, Any], path: Path | str = "the checkpoint"
     return changes[-1] if changes else None
 
 
-def with_links(method: Method, rows: PowerRows, faded: Tensor) -> Method | None:
-    """Return a method with rows of new stations; None where it learns of none, see `AddsLinks`."""
+def linked_stations(method: Method) -> list[int] | None:
+    """Return `AddsLinks.linked_stations` of a method, or of the only one that it holds."""
+    member = next(iter(method))[1] if isinstance(method, PerStation) else method
+    member = getattr(member, "member", member)
+    return member.linked_stations if isinstance(member, AddsLinks) else None
+
+
+def _with_links(method: Method, rows: PowerRows, faded: Tensor) -> Method:
+    """A method with rows of new stations."""
     member = getattr(method, "member", method)
-    learned = member.add_links(rows, faded) if isinstance(member, AddsLinks) else None
-    if learned is None or member is method:
-        return learned
+    learned = member.add_links(rows, faded)
+    if member is method:
+        return cast(Method, learned)
     result = copy(method)
     result.members = [learned]  # type: ignore[attr-defined]
     return result

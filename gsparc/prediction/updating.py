@@ -28,11 +28,11 @@ from gsparc.models.updated import (
     Level,
     Updated,
     known_only,
+    linked_stations,
     map_level,
     sound_updates,
     stored_changes,
     with_changes,
-    with_links,
 )
 from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.drift import ROWS, Alarm, Watch
@@ -44,7 +44,6 @@ from gsparc.prediction.later_rows import (
 )
 from gsparc.prediction.query import Asked
 from gsparc.processes.changes import Belief, LaterRows, learn, refit_scale
-from gsparc.processes.powers import PowerRows
 from gsparc.processes.stored import Stored, from_plain, to_plain
 from gsparc.tables.array_checks import MOST_DB
 
@@ -146,8 +145,8 @@ class UpdateMixin(Asked):
                 follow.
             tx, rx: (n, 3) places of the end that moves, world [m]; of both ends, where stations
                 stand at several places, and then at any.
-            rssi: (n,) or (n, T) powers, of both ends (n,); NaN is not measured, minus infinity (a power of 0) tells
-                nothing.
+            rssi: (n,) or (n, T) powers, of both ends (n,); NaN is not measured, minus infinity (a
+                power of 0) tells nothing.
             unit: of `rssi`; None: that of the measurements.
             window: later rows of a station that are kept, at least 1; the first ones are dropped.
             fade_db: deviation that a hundred later rows of a station add to one that came before
@@ -371,10 +370,11 @@ class UpdateMixin(Asked):
         Raises:
             ValueError: such rows, and a model that learns from none.
         """
-        unknown = (rows.station < 0) | (rows.station >= len(self._model_site.every_station))
+        linked, count = self.linked_stations, len(self._model_site.every_station)
+        unknown = ~np.isin(rows.station, np.arange(count) if linked is None else linked)
         if not unknown.any():
             return rows, changes
-        if not self.learns_new_stations:
+        if linked is None:
             raise ValueError(
                 "update: rows of a transmitter at a new place; a model of many places learns them "
                 "by links (`stations left out` in its notes): train again on all rows"
@@ -392,12 +392,13 @@ class UpdateMixin(Asked):
         return replace(rows, station=station), replace(changes, new=tuple(new))
 
     @property
-    def learns_new_stations(self) -> bool:
-        """Whether rows of stations at new places can be told to it."""
-        none = PowerRows(np.zeros((0, 6)), np.zeros(0), np.zeros(0, np.int8))
-        method = with_changes(self.method, None)
-        parts = [part for _, part in method] if isinstance(method, PerStation) else [method]
-        return all(with_links(part, none, torch.zeros(0)) is not None for part in parts)
+    def linked_stations(self) -> list[int] | None:
+        """Numbers of stations with rows, where rows of others can be told, too; None: they cannot.
+
+        Asked about one station it learns of no other.
+        """
+        alone = self._own_station is not None
+        return None if alone else linked_stations(with_changes(self.method, None))
 
     def _read_rows(self, rows: LevelRows, changes: Changes) -> dict[int, LaterRows]:
         """New rows of each station that has a map, as they miss it."""

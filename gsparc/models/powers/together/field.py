@@ -376,19 +376,27 @@ class JointPowerField(ClosedForm):
         result.elsewhere = result._unheard_posterior((elsewhere.factor, elsewhere.mean))
         return result
 
-    def add_links(self, rows: PowerRows, faded: Tensor) -> JointPowerField | None:
-        """Return one that knows rows of stations at new places, too; None where it has no links.
+    @property
+    def linked_stations(self) -> list[int] | None:
+        """Numbers of stations with rows; None where it has no links."""
+        return None if self.links is None else [*self.rows]
+
+    def add_links(self, rows: PowerRows, faded: Tensor) -> JointPowerField:
+        """Return one that knows rows of stations without any, too, listed or not.
 
         Args:
             rows, faded: see `Links.add`.
+
+        Raises:
+            ValueError: it has no links.
         """
-        if self.links is None:
-            return None
-        result, new = copy(self), np.unique(rows.places[:, 3:], axis=0)
-        numbers = range(len(self.places), len(self.places) + len(new))
-        result.places = np.concatenate([self.places, new])
-        result.rows = self.rows | dict.fromkeys(numbers, self.links.index[:0])
-        result.links = self.links.add(rows, faded)
+        links = self.require_fitted(self.links)
+        result, new = copy(self), torch.from_numpy(np.unique(rows.places[:, 3:], axis=0))
+        listed = stations_at(torch.from_numpy(self.places), new) != NOBODY
+        result.places = np.concatenate([self.places, new[~listed]])
+        numbers = stations_at(torch.from_numpy(result.places), new).tolist()
+        result.rows = self.rows | dict.fromkeys(numbers, links.index[:0])
+        result.links = links.add(rows, faded)
         return result
 
     @property
