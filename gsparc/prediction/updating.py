@@ -14,7 +14,7 @@ import torch
 from gsparc.base.errors import DataError
 from gsparc.base.limits import POSITIVE, check_arguments, switch, whole
 from gsparc.base.limits import number as limit_number
-from gsparc.data.ends import NOBODY, SAME_PLACE_M
+from gsparc.data.ends import NOBODY, SAME_PLACE_M, stations_at
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.station_names import find_station
@@ -188,12 +188,12 @@ class UpdateMixin(Asked):
         }
         watch, surprises = version.watch.look(noisy, first, extent, false_alarm)
         numbers = np.arange(first, first + sum(map(len, new.values())))
-        deviations, is_known = np.empty(len(numbers)), np.ones(len(numbers), bool)
-        for name in new.keys() - known_only(new).keys():  # nothing was expected of them to change
-            later, of = new[name], new[name].number.numpy() - first
-            deviations[of] = later.missed / (later.doubt + later.noise).sqrt()
-            is_known[of] = False
-        deviations[is_known] = surprises
+        # Of a station that had no map nothing is expected that could change.
+        kept = reduce(LaterRows.join, stations.values(), LaterRows.empty())
+        kept = kept[kept.number >= first][kept.number[kept.number >= first].argsort()]
+        deviations = (kept.missed / (kept.doubt + kept.noise).sqrt()).numpy()
+        was_known = torch.cat([kept.number[:0], *(rows.number for rows in noisy.values())])
+        deviations[torch.isin(kept.number, was_known).numpy()] = surprises
         alarms, skipped = (
             watch.alarms[len(version.watch.alarms) :],
             silent + len(rows) - len(numbers),
@@ -379,17 +379,14 @@ class UpdateMixin(Asked):
                 "update: rows of a transmitter at a new place; a model of many places learns them "
                 "by links (`stations left out` in its notes): train again on all rows"
             )
-        places, of = np.unique(rows.still[unknown], axis=0, return_inverse=True)
-        new, number = [*changes.new], []
-        for place in torch.from_numpy(places):
-            known = torch.tensor(new, dtype=torch.float64).reshape(-1, 3)
-            near = torch.linalg.vector_norm(known - place, dim=1) <= SAME_PLACE_M
-            number.append(int(near.nonzero()[0]) if near.any() else len(new))
-            if not near.any():
-                new.append(tuple(place.tolist()))
-        station = rows.station.copy()
-        station[unknown] = NOBODY - 1 - np.array(number)[of.reshape(-1)]
-        return replace(rows, station=station), replace(changes, new=tuple(new))
+        told = torch.tensor(changes.new, dtype=torch.float64).reshape(-1, 3)
+        places = torch.from_numpy(np.unique(rows.still[unknown], axis=0))
+        before = (torch.cdist(places, told) <= SAME_PLACE_M).any(1)
+        new, station = torch.cat([told, places[~before]]), rows.station.copy()
+        number = stations_at(new, torch.from_numpy(rows.still[unknown]))
+        station[unknown] = NOBODY - 1 - number.numpy()
+        changes = replace(changes, new=tuple(map(tuple, new.tolist())))
+        return replace(rows, station=station), changes
 
     @property
     def linked_stations(self) -> list[int] | None:
@@ -415,14 +412,13 @@ class UpdateMixin(Asked):
             index = np.flatnonzero(rows.station == name)
             try:
                 answers = method.station_method(name) if isinstance(method, PerStation) else method
-                if name < NOBODY:
-                    answers = AnywhereView(method)
             except ValueError:  # it had too few rows to be learned
                 continue
             there = station_site(site, name) if isinstance(method, PerStation) else site
             if name < NOBODY:
                 place = np.array(changes.new[NOBODY - 1 - name])
                 there = replace(site, stations=None, static_position=place)
+                answers = AnywhereView(method)
             query = Query.from_places(there, torch.from_numpy(rows.places[index]).float())
             level = map_level(answers, predict_with_threads(answers, query), site)
             missed = rows.decibels[index] - level.mean.numpy() - changes.shift(name)
