@@ -380,10 +380,11 @@ def _whole(
         raise DataError(f"split={name}: {count} {name}; {remain} to learn from and to choose on")
     draw = np.random.default_rng(settings.seed).permutation(count)
     test_units = [draw[:together]] if together else [np.array([t]) for t in range(count)]
-    rows, is_known, is_new = np.arange(len(unit)), True, True
+    rows = np.arange(len(unit))
+    is_known = is_new = np.ones(len(unit), bool)
     if settings.end == "both":
-        new_rows = block_rows(positions, rows, settings, settings.share, [settings.seed])
-        is_new = np.isin(rows, new_rows)
+        squares = block_rows(positions, rows, settings, settings.share, [settings.seed])
+        is_new = np.isin(rows, squares)
         is_known = ~is_new
     folds = []
     for fold, test in enumerate(test_units):

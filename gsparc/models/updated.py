@@ -250,7 +250,7 @@ def linked_stations(method: Method) -> list[int] | None:
 
 def _with_links(method: Method, rows: PowerRows, faded: Tensor) -> Method:
     """A method with rows of new stations."""
-    member = getattr(method, "member", method)
+    member: Any = getattr(method, "member", method)
     learned = member.add_links(rows, faded)
     if member is method:
         return cast(Method, learned)
