@@ -19,7 +19,7 @@ from gsparc.models.gsparc import Gsparc
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.powers.together.field import JointPowerField
-from gsparc.models.powers.together.links import links_of_others
+from gsparc.models.powers.together.links import LinkPriors, links_of_others
 from gsparc.models.powers.together.terms import places_and_notes, rows_of_stations
 from gsparc.ops import Pose
 from gsparc.prediction.answers import predict_file
@@ -237,11 +237,16 @@ def test_known_stations_of_many_gains_were_told_by_their_neighbours():
     order = rng.permutation(len(data))
     known, asked = np.sort(order[288:]), order[:288]
     method, _ = fitted_to(JointPowerField(), data, known)
-    mean, links = method.predict(data.batch(asked)).mean, method.links
-    assert links is not None and links.heard is None
-    method.links = None
+    assert method.links is None or method.links.heard is None
+    # Also where stations left out would have chosen links
+    rows, prior = rows_of_stations(data, known, method.places), method.own.never
+    chosen = LinkPriors(prior.known_trend, prior.kernel, prior.kernel)
+    assert not method._links_tell_heard(rows, chosen)
+    assert method.link_priors is not None and method.link_priors.heard is None
     own = method.predict(data.batch(asked)).mean
-    assert torch.allclose(mean, own)
+    method.condition(data, known)
+    assert method.links is not None
+    assert torch.allclose(method.predict(data.batch(asked)).mean, own)
 
 
 def test_links_of_an_earlier_fit_stayed():
