@@ -82,7 +82,7 @@ def test_a_file_of_a_new_transmitter_was_refused(tmp_path):
             np.abs(p.rssi(tx=told["tx_position"], rx=told["rx_position"])[:, 0] - told["rssi_db"])
             for p in (gsparc.load(file), gsparc.load(out))
         ]
-        assert error[1].mean() < 0.6 * error[0].mean()
+        assert error[1].mean() < 0.8 * error[0].mean()
 
 
 def test_a_file_that_is_told_twice_is_taken_once_unless_it_is_said(before, tmp_path):
