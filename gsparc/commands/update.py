@@ -75,7 +75,8 @@ def _add_rows(
     given: Mapping[str, Any],
 ) -> tuple[int, int]:
     """Tell the rows of a file; return how many are kept, and how many were skipped."""
-    data, placed = read_like_stored(stored, given["data"])
+    keep_new = predictor.linked_stations is not None
+    data, placed = read_like_stored(stored, given["data"], keep_new=keep_new)
     if not placed:
         raise DataError(f"{given['data']}: has no places; later rows need them")
     how = {name: given[name] for name in ("window", "fade_db", "false_alarm")}

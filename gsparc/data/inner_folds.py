@@ -147,6 +147,7 @@ def _inside(positions: np.ndarray, fold: Fold, split: AnySplit | None) -> SplitS
         "train_count": None,
         "spacing_m": None,
         "redraw": False,
+        "end": None,
     }
     if split.name != "stations":
         whole["leave_out"] = ()

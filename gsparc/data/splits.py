@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -140,8 +140,8 @@ class SplitSettings(Checked):
         redraw: `random` ignores the release's own files and draws anew.
         folds: number of folds of `grouped`.
         stretches_per_fold: `grouped` cuts the path into folds x this many stretches.
-        side_m: of the squares of floor that `blocks` holds out whole [m]; None: a tenth of the
-            longer side.
+        side_m: of the squares of floor that `blocks` holds out whole [m], or `stations` of both
+            ends; None: a tenth of the longer side.
         share: of the places, that `blocks` holds out at least.
         buffer_m: `grouped` and `corner` drop training rows this close to a test row [m].
         corner: of `corner`, lower or upper end in x and y as `--`, `-+`, `+-` or `++`.
@@ -153,6 +153,8 @@ class SplitSettings(Checked):
             keeps all.
         leave_out: rows neither learned from nor tested on, `outliers` or `foreign`; of `stations`
             and `carriers`, how many are held out together, drawn by seed (0: each one in its turn).
+        end: of `stations`, which end is new, `tx` or `rx`: whole stations, or squares of the end
+            that moves; `both`: test rows have both ends new, training rows neither. None: stations.
     """
 
     name: str = setting("random", KNOWN)
@@ -171,9 +173,12 @@ class SplitSettings(Checked):
     thin: float = setting(1.0, number(0, 1, open_low=True))
     spacing_m: float | None = setting(None, or_null(POSITIVE))
     leave_out: LeaveOut | int = ()
+    end: str | None = setting(None, or_null(choice("tx", "rx", "both")))
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if self.end is not None and self.name != "stations":
+            raise DataError(f"split.end={self.end}: split=stations takes it, not {self.name}")
         # These take a number of stations, or carriers, there; everything else a list of rows.
         if (
             self.name not in ("stations", "carriers")
@@ -181,6 +186,11 @@ class SplitSettings(Checked):
             or self.leave_out < 0
         ):
             ROWS.check("leave_out", self.leave_out)
+
+    def for_moving_end(self, moving: str) -> SplitSettings:
+        """Return the same of a site whose end `moving` moves: squares of it where it is asked."""
+        new_places = self.end == moving
+        return replace(self, name="blocks", end=None, leave_out=()) if new_places else self
 
     def held_out_count(self, count: int) -> int:
         """Return how many of `count` stations, or runs, are held out together; 0:
@@ -260,7 +270,8 @@ def make_split(
     # `first`: the row that stands for each place; `which`: the place of each row.
     first = which = np.arange(len(rows_left))
     if settings.name in WHOLE:
-        local_folds = _whole(None if station is None else station[rows_left], settings)
+        unit = None if station is None else station[rows_left]
+        local_folds = _whole(unit, positions[rows_left], settings)
     else:
         if named is not None:
             # Rows were renumbered when some were left out:
@@ -345,12 +356,15 @@ def hash_indices(folds: tuple[Fold, ...], parts: Sequence[str] = ("train", "val"
     return digest.hexdigest()
 
 
-def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]:
+def _whole(
+    unit: np.ndarray | None, positions: np.ndarray, settings: SplitSettings
+) -> tuple[Fold, ...]:
     """Folds that each hold out a station, or one that holds out `leave_out` of them,
     or a share of the runs.
 
     Args:
         unit: (S,) int64 number of each row's station, carrier or run.
+        positions: (S, 3) [m] of the other end.
     """
     name = settings.name
     if unit is None:
@@ -366,14 +380,20 @@ def _whole(unit: np.ndarray | None, settings: SplitSettings) -> tuple[Fold, ...]
         raise DataError(f"split={name}: {count} {name}; {remain} to learn from and to choose on")
     draw = np.random.default_rng(settings.seed).permutation(count)
     test_units = [draw[:together]] if together else [np.array([t]) for t in range(count)]
+    rows = np.arange(len(unit))
+    is_known = is_new = np.ones(len(unit), bool)
+    if settings.end == "both":
+        squares = block_rows(positions, rows, settings, settings.share, [settings.seed])
+        is_new = np.isin(rows, squares)
+        is_known = ~is_new
     folds = []
     for fold, test in enumerate(test_units):
         rest = np.setdiff1d(np.arange(count), test)
         rest = np.random.default_rng([settings.seed, fold, 2]).permutation(rest)
         # At least one to choose on, and one to learn from.
         chosen = rest[: min(max(round(settings.val_fraction * len(rest)), 1), len(rest) - 1)]
-        parts = (np.setdiff1d(rest, chosen), chosen, test)
-        folds.append(Fold(*(np.flatnonzero(np.isin(unit, part)) for part in parts)))
+        learned = (np.isin(unit, part) & is_known for part in (np.setdiff1d(rest, chosen), chosen))
+        folds.append(Fold(*map(np.flatnonzero, (*learned, np.isin(unit, test) & is_new))))
     return tuple(folds)
 
 

@@ -109,6 +109,7 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
         split = read_split(settings.path, len(data), data.site.sha256)
         absent = rows_to_leave_out(settings.leave_out, wrong, len(data))
         return answerable(remove_rows(split, absent) if len(absent) else split, data)
+    settings = settings.for_moving_end(data.site.moving_end)
     carriers = (
         None if data.carrier_hz is None else np.unique(data.carrier_hz, return_inverse=True)[1]
     )

@@ -14,7 +14,7 @@ from gsparc.data.site_objects import GaussianCloud
 
 if TYPE_CHECKING:
     from gsparc.models.method import Method
-    from gsparc.processes.powers import PowerProcess
+    from gsparc.processes.powers import PowerProcess, PowerRows
 
 
 @runtime_checkable
@@ -73,6 +73,18 @@ class HasJoint(Protocol):
     def add_station(self, place: np.ndarray, sectors: Tensor, like: int | None = None) -> HasJoint:
         """See `gsparc.models.powers.together.field.JointPowerField.add_station`."""
         ...
+
+
+@runtime_checkable
+class AddsLinks(Protocol):
+    """It learns from rows of stations at new places, with its settings as they are."""
+
+    @property
+    def linked_stations(self) -> list[int] | None:
+        """Numbers of stations with rows; None: of others it cannot learn."""
+
+    def add_links(self, rows: PowerRows, faded: Tensor) -> Any:
+        """See `gsparc.models.powers.together.field.JointPowerField.add_links`."""
 
 
 @runtime_checkable

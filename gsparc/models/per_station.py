@@ -371,7 +371,8 @@ class PerStation(Method):
             )
         for row in (~near.any(1)).nonzero()[:1, 0].tolist() if UNHEARD not in self._copies else ():
             raise ValueError(
-                f"{self.name}: no station stands within {SAME_PLACE_M:g} m of row {row}"
+                f"{self.name}: no station stands within {SAME_PLACE_M:g} m of row {row}, and each "
+                "was learned alone; stations=together learns what they share, for new places"
             )
         return ends.station
 

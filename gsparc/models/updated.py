@@ -6,8 +6,9 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -16,7 +17,7 @@ from torch import Tensor
 from gsparc.data.ends import NOBODY, Ends
 from gsparc.data.query import Query
 from gsparc.data.schema import Site
-from gsparc.models.abilities import HasProcess
+from gsparc.models.abilities import AddsLinks, HasProcess
 from gsparc.models.checkpoint import CheckpointError, find_non_finite
 from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.per_station import PerStation
@@ -25,6 +26,7 @@ from gsparc.models.station_views import OneStationView
 from gsparc.models.target_rows import linear_moments
 from gsparc.processes.averages import MeanVariance
 from gsparc.processes.changes import TINY, Belief, LaterRows, correct
+from gsparc.processes.powers import PowerRows
 from gsparc.processes.stored import Stored, from_plain
 
 NOW = 2**62  # number after those of all rows
@@ -32,6 +34,11 @@ STORED = "updates"  # in what a checkpoint holds besides
 UNSAID = 1.0  # variance of powers, of their square, where a method states none
 # Share of a stated variance that counts as the map's own error where nothing tells it apart
 SIGNAL = 0.2
+
+
+def known_only(stations: Mapping[int, LaterRows]) -> dict[int, LaterRows]:
+    """Return rows of stations that the map knows, by number; see `Changes.new` for the others."""
+    return {number: rows for number, rows in stations.items() if number > NOBODY}
 
 
 @dataclass(frozen=True)
@@ -42,6 +49,8 @@ class Changes(Stored):
         belief: see there.
         rows: later rows, a pair of station and rows each; 0 stands for a site with one station.
         shifts: (station, dB, number of the row that comes next) that were said, not measured.
+        new: local places of stations that came later [m], whose rows stand under `NOBODY` - 1, - 2,
+            and so on.
         next_number, next_batch: of the row and of the update that come next.
     """
 
@@ -50,6 +59,21 @@ class Changes(Stored):
     shifts: tuple[tuple[int, float, int], ...] = ()
     next_number: int = 0
     next_batch: int = 0
+    new: tuple[tuple[float, float, float], ...] = ()
+
+    @property
+    def links(self) -> tuple[PowerRows, Tensor] | None:
+        """Rows of new stations that were heard, at places (n, 6) of both ends, and variances (n,)
+        by which they faded since [dB^2]; None: there are none.
+        """
+        parts = [(n, rows[~rows.silent]) for n, rows in self.rows if n < NOBODY]
+        rows = reduce(LaterRows.join, (rows for _, rows in parts), LaterRows.empty())
+        if not len(rows):
+            return None
+        number = np.repeat([NOBODY - 1 - n for n, _ in parts], [len(part) for _, part in parts])
+        places = np.concatenate([rows.places.numpy(), np.array(self.new)[number]], 1)
+        level = (rows.level + rows.missed).numpy()
+        return PowerRows(places, level, np.zeros(len(rows), np.int8)), rows.faded
 
     @property
     def stations(self) -> dict[int, LaterRows]:
@@ -60,7 +84,8 @@ class Changes(Stored):
         """Raise `ValueError` where parts do not go together, as in a damaged file."""
         for station, rows in self.rows:
             sizes = {name: len(part) for name, part in vars(rows).items()}
-            if len(set(sizes.values())) > 1 or rows.places.shape[1:] != (3,):
+            unknown = NOBODY - 1 - station >= len(self.new)
+            if unknown or len(set(sizes.values())) > 1 or rows.places.shape[1:] != (3,):
                 raise ValueError(f"rows of station {station}: {sizes}")
         if self.belief.names and len(self.belief.weight) != len(self.belief.names):
             raise ValueError(
@@ -125,6 +150,8 @@ class Updated(View):
     def __init__(self, inner: Method, changes: Changes, own: int | None) -> None:
         super().__init__(inner)
         self.changes, self.own, self.site = changes, own, inner.fitted_site
+        links = changes.links
+        self.told = inner if links is None else _with_links(inner, *links)
 
     @property
     def stored_class(self) -> type[MethodFactory]:
@@ -138,8 +165,8 @@ class Updated(View):
 
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
-        prediction = self.inner.predict(query)
-        before = map_level(self.inner, prediction, self.fitted_site)
+        prediction = self.told.predict(query)
+        before = map_level(self.told, prediction, self.fitted_site)
         now = self._level_now(query, before)
         unknown = None
         if prediction.unknown is not None:
@@ -153,9 +180,12 @@ class Updated(View):
         """Return what changed since the map was learned: mean (B,) [dB] and variance (B,)
         [dB^2].
         """
-        before = map_level(self.inner, self.inner.predict(query), self.fitted_site)
+        before, told = (
+            map_level(method, method.predict(query), self.fitted_site)
+            for method in (self.inner, self.told)
+        )
         # Of a map that is taken for true only a change is not known.
-        now = self._level_now(query, replace(before, doubt=0 * before.doubt))
+        now = self._level_now(query, replace(told, doubt=0 * told.doubt))
         return MeanVariance(now.mean - before.mean, now.doubt)
 
     def _level_now(self, query: Query, before: Level) -> Level:
@@ -209,6 +239,24 @@ def stored_changes(extra: Mapping[str, Any], path: Path | str = "the checkpoint"
         for version in changes:
             version.check()
     return changes[-1] if changes else None
+
+
+def linked_stations(method: Method) -> list[int] | None:
+    """Return `AddsLinks.linked_stations` of a method, or of the only one that it holds."""
+    member = next(iter(method))[1] if isinstance(method, PerStation) else method
+    member = getattr(member, "member", member)
+    return member.linked_stations if isinstance(member, AddsLinks) else None
+
+
+def _with_links(method: Method, rows: PowerRows, faded: Tensor) -> Method:
+    """A method with rows of new stations."""
+    member: Any = getattr(method, "member", method)
+    learned = member.add_links(rows, faded)
+    if member is method:
+        return cast(Method, learned)
+    result = copy(method)
+    result.members = [learned]  # type: ignore[attr-defined]
+    return result
 
 
 def with_changes(method: Method, changes: Changes | None, own: int | None = None) -> Method:

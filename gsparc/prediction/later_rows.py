@@ -13,12 +13,14 @@ import torch
 
 from gsparc.base.errors import DataError, name_row_ranges
 from gsparc.data.assemble import content_hash
+from gsparc.data.ends import stations_at
 from gsparc.data.outliers import are_kilometres, far_from_box
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.units import PowerUnit
 from gsparc.models.device_offsets import without_devices
 from gsparc.ops.transforms import to_numpy
 from gsparc.physics.decibels import to_decibels
+from gsparc.prediction.query import read_places
 from gsparc.processes.powers import PowerRows
 from gsparc.tables.links.strongest import strongest_lists
 from gsparc.tables.own_checks import Checker
@@ -33,19 +35,22 @@ class LevelRows(PowerRows):
     at local places of the end that moves.
 
     Attributes:
-        station: (n,) int64.
+        station: (n,) int64; of one that the model does not know any other number.
         name: (n,) text, what messages call each.
+        still: (n, 3) local places of the stations [m].
     """
 
     station: np.ndarray
     name: np.ndarray
+    still: np.ndarray
 
     def __len__(self) -> int:
         return len(self.station)
 
     def content(self) -> str:
         """Return the SHA-256 of places, levels and stations, in their order."""
-        return content_hash({name: part for name, part in vars(self).items() if name != "name"})
+        told = {name: part for name, part in vars(self).items() if name not in ("name", "still")}
+        return content_hash(told)
 
 
 def check_updatable(site: Site) -> None:
@@ -78,13 +83,14 @@ def read_level_rows(data: Measurements, site: Site) -> LevelRows:
         rows = rows[data.mask[rows].reshape(len(rows)) | (data.censored_side(rows) != 0)]
     level = data.site.target.to_real(data.target[rows])[:, 0].astype(np.float64)
     station, name = data.stations_of(rows), np.array(data.row_names)[rows]
+    still = data.site.every_station.position[station]
     return _checked(
-        LevelRows(data.moving[rows], level, data.censored_side(rows), station, name), site
+        LevelRows(data.moving[rows], level, data.censored_side(rows), station, name, still), site
     )
 
 
 def read_level_arrays(
-    site: Site, places: Any, levels: Any, unit: PowerUnit
+    site: Site, places: Any, levels: Any, unit: PowerUnit, still: Any = None
 ) -> tuple[LevelRows, int]:
     """Return rows of arrays, NaN of which is not measured, and how many were not heard at all.
 
@@ -93,6 +99,7 @@ def read_level_arrays(
         places: (n, 3) or (3,) of the end that moves, world [m].
         levels: (n,) of one station, or (n, T), in `unit`; of one place (T,), too.
         unit: of `levels`.
+        still: (n, 3) or (3,) of the other end, of which `levels` are then alone; None: of stations.
 
     Raises:
         DataError: not such arrays, or what no row of this model can be; rows are numbered from 0.
@@ -101,7 +108,8 @@ def read_level_arrays(
     if places is None or levels is None:
         raise DataError(f"update: {site.moving_end}= and rssi= are needed")
     arrays = {position: _numbers(position, places), name: _numbers(name, levels)}
-    check, count = Checker(Raw(arrays), "update"), len(site.every_station)
+    known = site.every_station.position
+    check, count = Checker(Raw(arrays), "update"), len(known) if still is None else 1
     at = check.read_positions(position, None)
     values = None
     if at is not None:
@@ -121,8 +129,13 @@ def read_level_arrays(
         raise DataError(f"{first} (and {len(others)} more)" if others else first)
     row, station = np.nonzero(~np.isnan(values) & ~silent)
     level = to_decibels(unit.stored(torch.from_numpy(values)).numpy()[row, station])
-    names = np.array(check.row_names)[row]
-    result = LevelRows(at[row] - site.origin, level, np.zeros(len(row), np.int8), station, names)
+    names, here = np.array(check.row_names)[row], known[station]
+    if still is not None:
+        here = np.broadcast_to(read_places("update, the other end", still), at.shape)[row]
+        here = here - site.origin
+        station = stations_at(torch.from_numpy(known), torch.from_numpy(here)).numpy()
+    heard = np.zeros(len(row), np.int8)
+    result = LevelRows(at[row] - site.origin, level, heard, station, names, here)
     return _checked(result, site), int(silent.sum())
 
 

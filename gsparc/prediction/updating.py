@@ -14,18 +14,21 @@ import torch
 from gsparc.base.errors import DataError
 from gsparc.base.limits import POSITIVE, check_arguments, switch, whole
 from gsparc.base.limits import number as limit_number
+from gsparc.data.ends import NOBODY, SAME_PLACE_M, stations_at
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.station_names import find_station
 from gsparc.data.units import PowerUnit
 from gsparc.models.method import Method, predict_with_threads
 from gsparc.models.per_station import PerStation, station_site
-from gsparc.models.station_views import OneStationView
+from gsparc.models.station_views import AnywhereView, OneStationView
 from gsparc.models.updated import (
     STORED,
     Changes,
     Level,
     Updated,
+    known_only,
+    linked_stations,
     map_level,
     sound_updates,
     stored_changes,
@@ -140,9 +143,10 @@ class UpdateMixin(Asked):
         Args:
             rows: measurements in the model's coordinates (`align_to_site`); None: the arrays that
                 follow.
-            tx, rx: (n, 3) places of the end that moves, world [m].
-            rssi: (n,) or (n, T) powers; NaN is not measured, minus infinity (a power of 0) tells
-                nothing.
+            tx, rx: (n, 3) places of the end that moves, world [m]; of both ends, where stations
+                stand at several places, and then at any.
+            rssi: (n,) or (n, T) powers, of both ends (n,); NaN is not measured, minus infinity (a
+                power of 0) tells nothing.
             unit: of `rssi`; None: that of the measurements.
             window: later rows of a station that are kept, at least 1; the first ones are dropped.
             fade_db: deviation that a hundred later rows of a station add to one that came before
@@ -166,13 +170,12 @@ class UpdateMixin(Asked):
             raise ToldBefore(f"update: {key} was told before")
         if rows is None:
             places = tx if self.site.moving_end == "tx" else rx
-            rows, silent = read_level_arrays(self.site, places, rssi, self._answer_unit(unit))
+            still = (rx if self.site.moving_end == "tx" else tx) if self.site.several else None
+            levels = self.site, places, rssi, self._answer_unit(unit), still
+            rows, silent = read_level_arrays(*levels)
         rows = read_level_rows(rows, self.site) if isinstance(rows, Measurements) else rows
-        changes, belief, stations = (
-            version.changes,
-            version.changes.belief,
-            version.changes.stations,
-        )
+        rows, changes = self._number_new(rows, version.changes)
+        belief, stations = changes.belief, changes.stations
         extent = belief.extent
         new = self._read_rows(rows, changes)
         for name, later in new.items():
@@ -181,10 +184,16 @@ class UpdateMixin(Asked):
         # The test believes what earlier rows said of a station's noise.
         noisy = {
             name: replace(station, noise=station.noise + belief.of(name)[1])
-            for name, station in stations.items()
+            for name, station in known_only(stations).items()
         }
-        watch, deviations = version.watch.look(noisy, first, extent, false_alarm)
+        watch, surprises = version.watch.look(noisy, first, extent, false_alarm)
         numbers = np.arange(first, first + sum(map(len, new.values())))
+        # Of a station that had no map nothing is expected that could change.
+        kept = reduce(LaterRows.join, stations.values(), LaterRows.empty())
+        kept = kept[kept.number >= first][kept.number[kept.number >= first].argsort()]
+        deviations = (kept.missed / (kept.doubt + kept.noise).sqrt()).numpy()
+        was_known = torch.cat([kept.number[:0], *(rows.number for rows in noisy.values())])
+        deviations[torch.isin(kept.number, was_known).numpy()] = surprises
         alarms, skipped = (
             watch.alarms[len(version.watch.alarms) :],
             silent + len(rows) - len(numbers),
@@ -340,7 +349,7 @@ class UpdateMixin(Asked):
         """Learn from stations' rows together, and answer by it."""
         now = self._current
         changes = changes or now.changes
-        belief = learn(stations, changes.belief.extent, changes.belief.scale)
+        belief = learn(known_only(stations), changes.belief.extent, changes.belief.scale)
         changes = replace(changes, rows=tuple(sorted(stations.items())), belief=belief)
         told = now.told if key is None else (*now.told, key)[-JOURNAL:]
         version = Version(changes, watch or now.watch, (*now.journal, said)[-JOURNAL:], told)
@@ -354,6 +363,39 @@ class UpdateMixin(Asked):
         self._prepared = []
 
     # -- rows --------------------------------------------------------------------------------------
+
+    def _number_new(self, rows: LevelRows, changes: Changes) -> tuple[LevelRows, Changes]:
+        """Rows with the numbers of `Changes.new`, which holds stations at new places from now on.
+
+        Raises:
+            ValueError: such rows, and a model that learns from none.
+        """
+        linked, count = self.linked_stations, len(self._model_site.every_station)
+        unknown = ~np.isin(rows.station, np.arange(count) if linked is None else linked)
+        if not unknown.any():
+            return rows, changes
+        if linked is None:
+            raise ValueError(
+                "update: rows of a transmitter at a new place; a model of many places learns them "
+                "by links (`stations left out` in its notes): train again on all rows"
+            )
+        told = torch.tensor(changes.new, dtype=torch.float64).reshape(-1, 3)
+        places = torch.from_numpy(np.unique(rows.still[unknown], axis=0))
+        before = (torch.cdist(places, told) <= SAME_PLACE_M).any(1)
+        new, station = torch.cat([told, places[~before]]), rows.station.copy()
+        number = stations_at(new, torch.from_numpy(rows.still[unknown]))
+        station[unknown] = NOBODY - 1 - number.numpy()
+        changes = replace(changes, new=tuple(map(tuple, new.tolist())))
+        return replace(rows, station=station), changes
+
+    @property
+    def linked_stations(self) -> list[int] | None:
+        """Numbers of stations with rows, where rows of others can be told, too; None: they cannot.
+
+        Asked about one station it learns of no other.
+        """
+        alone = self._own_station is not None
+        return None if alone else linked_stations(with_changes(self.method, None))
 
     def _read_rows(self, rows: LevelRows, changes: Changes) -> dict[int, LaterRows]:
         """New rows of each station that has a map, as they miss it."""
@@ -373,6 +415,10 @@ class UpdateMixin(Asked):
             except ValueError:  # it had too few rows to be learned
                 continue
             there = station_site(site, name) if isinstance(method, PerStation) else site
+            if name < NOBODY:
+                place = np.array(changes.new[NOBODY - 1 - name])
+                there = replace(site, stations=None, static_position=place)
+                answers = AnywhereView(method)
             query = Query.from_places(there, torch.from_numpy(rows.places[index]).float())
             level = map_level(answers, predict_with_threads(answers, query), site)
             missed = rows.decibels[index] - level.mean.numpy() - changes.shift(name)

@@ -345,7 +345,6 @@ def choose_kernel_by_nearest(
     prior: Prior,
     values: PlaceValues,
     seed: int,
-    looked_at: np.ndarray | None = None,
     sparsest: int = FEWEST,
 ) -> tuple[Kernel, str]:
     """Choose the kernel most likely by rows that cover the site, and say on what it was chosen.
@@ -357,7 +356,6 @@ def choose_kernel_by_nearest(
         prior: mean law, and a kernel chosen on few rows.
         values: where something was heard.
         seed: of what is drawn.
-        looked_at: (T, 1 + k) rows, each before those that it is given; None: its nearest ones.
         sparsest: places of a set at least: neighbours in it show long lengths.
     """
     count, start = len(values.places), prior.kernel
@@ -371,8 +369,8 @@ def choose_kernel_by_nearest(
     rest = rest - prior.columns(places) @ about
     level = Neighbourhood.from_places(values.places, seed, sparsest).level
     sets = [np.flatnonzero(level <= number) for number in range(int(level.max()) + 1)]
-    parts = [] if looked_at is None else [looked_at]
-    for members in sets if looked_at is None else ():
+    parts = []
+    for members in sets:
         row = covering_rows(values.places[members], LOOKED_AT // len(sets), seed)
         parts.append(members[rows_with_nearest(values.places[members], row, LOOKED_BY)])
     rows = np.concatenate(parts)
@@ -384,9 +382,11 @@ def choose_kernel_by_nearest(
     if len(start.lengths) == 2:
         starts.append(start)
     given = rows.shape[1] - 1
-    note = f"settings chosen on {len(rows)} of {count} places, each given its nearest {given}"
-    if looked_at is None:
-        note += f" among {' and '.join(str(len(members)) for members in sets)}"
+    among = " and ".join(str(len(members)) for members in sets)
+    note = (
+        f"settings chosen on {len(rows)} of {count} places, each given its nearest {given} among "
+        f"{among}"
+    )
     bounds = starts[0].bounds(torch.from_numpy(scale))
     search = starts, bounds, LOOKS, SETTLED / len(rows)
     return fit_kernel(lambda kernel: nearest_density(kernel, sample), *search)[1], note

@@ -20,12 +20,14 @@ log = logging.getLogger(__name__)
 ANOTHER = "give data with as many, or another ckpt"
 
 
-def align_to_site(data: Measurements, site: Site, *, whole: bool = False) -> Measurements:
+def align_to_site(
+    data: Measurements, site: Site, *, whole: bool = False, keep_new: bool = False
+) -> Measurements:
     """Return `data` in the local coordinates and target units (watts, milliwatts)
     of a model's training.
 
     Rows of stations that the model does not know are left out, which is logged; `whole`:
-    they are refused.
+    they are refused; `keep_new`: those at other places follow the model's own.
 
     Raises:
         ValueError: another kind, grid, moving end or static place, or no station that the model
@@ -50,7 +52,7 @@ def align_to_site(data: Measurements, site: Site, *, whole: bool = False) -> Mea
             raise ValueError(
                 f"the static {ours.static_end} of {ours.name} is {gap:.3g} m from the model's"
             )
-    data = _renumbered(data, site, shift, whole)
+    data = _renumbered(data, site, shift, whole, keep_new)
     ours = data.site
     units, rescale = (ours.level_unit, site.level_unit), ours.target_scale / site.target_scale
     if set(units) <= set(WATTS):  # what is called dB may be either
@@ -144,7 +146,9 @@ def _about(data: Measurements, site: Site) -> Measurements:
     return replace(data, site=facts, tx=moved(data.tx), rx_position=moved(data.rx_position))
 
 
-def _renumbered(data: Measurements, site: Site, shift: np.ndarray, whole: bool) -> Measurements:
+def _renumbered(
+    data: Measurements, site: Site, shift: np.ndarray, whole: bool, keep_new: bool
+) -> Measurements:
     """`data` with the numbers that a model of `site` has for its stations; `shift` (3,)
     [m] leads there.
 
@@ -152,6 +156,8 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray, whole: bool) 
     and where several stand at one, by their names.
     """
     ours, theirs = data.site.stations, site.stations
+    if ours is None and keep_new and data.site.static_position is not None:
+        ours = data.site.every_station
     if ours is None or theirs is None:
         if ours is theirs or (
             data.site.static_position is not None and site.static_position is not None
@@ -174,6 +180,11 @@ def _renumbered(data: Measurements, site: Site, shift: np.ndarray, whole: bool) 
         near = np.flatnonzero(gap[t] <= SAME_PLACE_M).tolist()
         if alike or len(near) == 1:
             number[t] = (alike or near)[0]
+    new = np.flatnonzero((number < 0) & keep_new & np.isfinite(ours.position).all(1))
+    if len(new):
+        number[new] = len(theirs) + np.arange(len(new))
+        places = np.concatenate([theirs.position, ours.position[new] + shift])
+        theirs = Stations(places, (*theirs.name, *(ours.name[t] for t in new)))
     is_known = number[data.stations_of()] >= 0
     if not is_known.all():
         fault = _explain_unknown(data.site.name, ours, theirs, number < 0)

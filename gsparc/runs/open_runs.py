@@ -183,8 +183,12 @@ def open_run(paths: str | Path | Sequence[str | Path], dataset: Mapping[str, Any
     return OpenRun(methods, stored, dataset)
 
 
-def read_like_stored(stored: checkpoint.StoredModel, path: str | Path) -> tuple[Measurements, bool]:
+def read_like_stored(
+    stored: checkpoint.StoredModel, path: str | Path, *, keep_new: bool = False
+) -> tuple[Measurements, bool]:
     """Return the measurements of another file, read as a model's data were, in its coordinates.
+
+    `keep_new`: see `align_to_site`.
 
     Returns:
         They, and whether the file has places; without, rows lie apart at arbitrary ones.
@@ -201,13 +205,14 @@ def read_like_stored(stored: checkpoint.StoredModel, path: str | Path) -> tuple[
             low, high = site.moving_box + site.origin
             # A diagonal, so that no two are one.
             raw.arrays[place] = np.linspace(low, high, count)
-        return align_to_site(interpret_and_log(raw, path), site), placed
+        return align_to_site(interpret_and_log(raw, path), site, keep_new=keep_new), placed
     from gsparc.tables.places import place_by_row  # here, as pandas takes half a second
 
     before = stored.configuration.get("dataset") or {}
     row_columns = place_by_row(path, before.get("columns") or {}, site.moving_end)
     settings = {"file": str(path)} | ({"columns": row_columns} if row_columns else {})
-    return align_to_site(module_of(stored, settings).measurements, site), not row_columns
+    data = module_of(stored, settings).measurements
+    return align_to_site(data, site, keep_new=keep_new), not row_columns
 
 
 def module_of(stored: checkpoint.StoredModel, dataset: Mapping[str, Any] | None) -> DataModule:

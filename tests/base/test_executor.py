@@ -169,3 +169,18 @@ def test_threads_ended_in_compiled_code_at_an_interrupt():
     before = list(ended)
     time.sleep(0.1)
     assert ended == before
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("nodes", [2, pytest.param(4, marks=pytest.mark.rare)])
+def test_a_node_of_ray_is_lost_half_way(tmp_path, nodes, elsewhere):
+    cluster = elsewhere("ray", nodes=nodes)
+    found, lost = {}, None
+    for number, value in run_each(Stored(tmp_path), range(4 * COUNT)):
+        found[number] = value
+        if len(found) == COUNT:
+            lost = cluster.list_all_nodes()[-1]
+            cluster.remove_node(lost, allow_graceful=False)
+    assert found == {n: n * n for n in range(4 * COUNT)} and lost is not None
+    begun = [len(file.read_text().split()) for file in tmp_path.glob("*.begun")]
+    assert sum(begun) <= 4 * COUNT + 1  # what the lost node was at

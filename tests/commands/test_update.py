@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 import torch
+from both_ends import walled_floor
 from doors import knock
 from rooms_later import PLACES, SCREENED, levels, room_file
 from told import CLIENTS, Soak
@@ -60,6 +61,28 @@ def test_rows_of_a_file_are_told_and_taken_back(before, tmp_path):
     assert update(tmp_path / "back", f"ckpt={out}", "undo=4")[0].status == 0
     again = gsparc.load(out)
     assert np.array_equal(again.rssi(rx=at), old.rssi(rx=at))
+
+
+def test_a_file_of_a_new_transmitter_was_refused(tmp_path):
+    """`has one static end, the model 24 stations`; of several its rows were left out."""
+    arrays, file = walled_floor(1_500, 30), tmp_path / "model.ckpt"
+    number = np.arange(1_500) % 30
+    rows = {name: part[number < 24] for name, part in arrays.items() if part.ndim}
+    ends = {"rx": rows["rx_position"], "tx": rows["tx_position"]}
+    gsparc.fit(**ends, rssi=rows["rssi_db"], save=file)
+    for new, count in (([27], 50), ([2, 28, 29], 150)):
+        chosen, out = np.isin(number, new), tmp_path / f"{count}.ckpt"
+        told = {name: part[chosen] if part.ndim else part for name, part in arrays.items()}
+        np.savez(tmp_path / f"{count}.npz", **told)
+        data = f"data={tmp_path}/{count}.npz"
+        answer, facts = update(tmp_path / str(count), f"ckpt={file}", data, f"out={out}")
+        assert answer.status == 0, answer.err
+        assert facts["update/rows_kept"] == count
+        error = [
+            np.abs(p.rssi(tx=told["tx_position"], rx=told["rx_position"])[:, 0] - told["rssi_db"])
+            for p in (gsparc.load(file), gsparc.load(out))
+        ]
+        assert error[1].mean() < 0.8 * error[0].mean()
 
 
 def test_a_file_that_is_told_twice_is_taken_once_unless_it_is_said(before, tmp_path):

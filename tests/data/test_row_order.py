@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
-from layouts import KINDS, rows_of
+from layouts import KINDS, POSTS, rows_of
 
+import gsparc
 from gsparc.data.row_order import merge_fixes, order_rows
 from gsparc.data.splits import Fold
 from gsparc.datasets.describe import describe
+from gsparc.models import device_offsets
 from gsparc.tables.heads import KINDS as TABLE_KINDS
 from gsparc.tables.own import from_arrays, interpret
 from gsparc.tables.raw import Raw
@@ -153,3 +155,22 @@ def test_rows_of_a_table_shuffled_with_any_columns_are_one_order(write, options,
             assert np.array_equal(getattr(first, name), getattr(other, name)), name
         stations_of_other = np.array(other.site.every_station.name)[other.stations_of()]
         assert np.array_equal(names[first.stations_of()], stations_of_other)
+
+
+def test_answers_of_devices_at_visits_of_places_did_not_stay_the_same_when_shuffled(monkeypatch):
+    """They moved by .1 dB: other rows told the offsets of devices."""
+    monkeypatch.setattr(device_offsets, "MOST_ROWS", 100)
+    rng = np.random.default_rng(1)
+    place = np.c_[rng.uniform(0, 100, (60, 2)), np.full(60, 1.5)].repeat(9, axis=0)
+    station, device = np.tile([0, 1, 2], 180), np.tile(np.repeat([0, 1, 2], 3), 60)
+    level = -40 - 30 * np.log10(np.linalg.norm(place - POSTS[station], axis=1)) + 4 * device
+    level = (level + rng.normal(0, 1, 540)).round(1)
+    kept = np.flatnonzero(rng.random(540) > 0.15)
+    rows = {"rx": place, "rssi": level, "station": station, "device": np.array(list("abc"))[device]}
+    answers = []
+    for order in (kept, rng.permutation(kept)):
+        model = gsparc.fit(
+            **{k: v[order] for k, v in rows.items()}, station_position=POSTS, model="gp"
+        )
+        answers.append(model.rssi(rx=place[::9]))
+    assert np.abs(answers[0] - answers[1]).max() < 1e-3

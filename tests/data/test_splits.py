@@ -380,3 +380,43 @@ def test_later_tests_on_the_rows_that_were_taken_last_at_any_place():
     assert len(fold.train) + len(fold.val) == 79
     (fold,) = make_split(positions, SplitSettings("later", test_fraction=0.1)).folds
     assert fold.test.tolist() == [*range(90, 100)]  # as they stand in the file
+
+
+def _links(rows=600, stations=12):
+    rng = np.random.default_rng(3)
+    arrays = {
+        "rx_position": rng.uniform(0, 10, (rows, 3)),
+        "station_position": rng.uniform(0, 10, (stations, 3)),
+        "station": np.arange(rows) % stations,
+        "rssi_db": rng.normal(-60, 5, rows),
+    }
+    return from_arrays(arrays, {"name": "links"})
+
+
+def test_no_training_row_has_an_end_that_is_new():
+    data, settings = _links(), {"name": "stations", "leave_out": 3, "side_m": 2.0}
+    (alone,), (fold,) = (split_for({**settings, "end": e}, data).folds for e in (None, "both"))
+    assert set(fold.test) < set(alone.test) and set(fold.learned()) < set(alone.learned())
+    assert set(data.station[fold.test]).isdisjoint(data.station[fold.learned()])
+    shifted = data.moving - data.moving.min(0)
+    square = np.unique(shifted[:, :2] // 2, axis=0, return_inverse=True)[1].reshape(-1)
+    assert set(square[fold.test]).isdisjoint(square[fold.learned()])
+
+
+def test_an_end_that_is_new_is_a_station_or_a_square():
+    data, settings = _links(), {"name": "stations", "leave_out": 3}
+    still = split_for({**settings, "end": "tx"}, data)
+    assert still.sha256 == split_for(settings, data).sha256
+    moving = split_for({**settings, "end": "rx"}, data)
+    assert moving.sha256 == split_for({"name": "blocks"}, data).sha256
+    with pytest.raises(DataError, match="split=stations takes it"):
+        SplitSettings("random", end="both")
+
+
+def test_folds_inside_know_both_ends():
+    data = _links()
+    settings = SplitSettings("stations", leave_out=3, end="both")
+    fold = split_for({"name": "stations", "leave_out": 3, "end": "both"}, data).folds[0]
+    inner = inner_folds(data.moving, fold, settings, 2, seed=0, station=data.station)
+    assert all(len(part.train) and len(part.test) for part in inner.folds)
+    assert inner.name == "stations"

@@ -156,3 +156,27 @@ def test_silent_rows_alone_do_not_make_powers_spread_beyond_any_site():
     process, _ = process_and_notes(rows, data.site)
     assert process.kernel.amplitude < 1001
     assert process.answer(torch.from_numpy(data.moving))[0].min() > level - 100
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", MODELS)
+def test_noise_was_learned_as_signal(model):
+    """Half of the powers lie below a receiver's noise, which it reports:
+    levels below that were refused.
+    """
+    ratios, inside = [], []
+    for seed in range(2):
+        data, true, _ = town(seed=seed)
+        level, rng = float(np.median(true)), np.random.default_rng(seed)
+        noise = level + 0.7 * rng.standard_normal(len(true))
+        shown = 10 * np.log10(10 ** (true / 10) + 10 ** (noise / 10))
+        arrays = {"rx_position": data.rx_position + data.site.origin, "tx_position": STATION}
+        arrays |= {"rssi_db": shown, "carrier_hz": np.array(9e8)}
+        errors = []
+        for more in ({}, {"sensitivity_db": level + 2.0}):
+            read = from_arrays(arrays | more)
+            found, deviation, _ = predicted(model, read, fold_of(read).train, np.arange(len(read)))
+            errors.append(np.abs(found - true))
+            inside.append((errors[-1] < 1.645 * deviation).mean())
+        ratios.append(np.sqrt((errors[1] ** 2).mean() / (errors[0] ** 2).mean()))
+    assert max(ratios) < 0.95 and np.mean(ratios) < 0.92, ratios

@@ -191,3 +191,15 @@ def test_heads_that_say_which_of_a_list_were_stations(write):
     path = write(table("x,y,rsrp_serving,rsrp_best_neighbour,rsrp_gap", *PLACES.T, *LEVELS.T))
     with pytest.raises(DataError, match=r"rssi_db=rsrp_serving \(.*=rsrp_best_neighbour"):
         Own(path).load()
+
+
+SELDOM = np.where(np.arange(ROWS)[:, None] % 40 == 0, LEVELS[:, :1], 100).astype(int)
+
+
+@pytest.mark.parametrize("name", ["MAC", "spot "])
+def test_rarely_heard_stations_of_a_block_were_dropped(write, name):
+    levels = np.c_[LEVELS.astype(int), np.repeat(SELDOM, 3, axis=1)]
+    heads = ",".join(f"{name}{number}" for number in range(1, 7))
+    path = write(table(f"x,y,{heads}", *PLACES.T, *levels.T))
+    names = read_any(path, guess=True).data.site.stations.name
+    assert len(names) == 6 and names[0] == f"{name}1"

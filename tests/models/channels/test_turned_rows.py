@@ -4,11 +4,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import packets
 import pytest
 import torch
 
-from gsparc.data.splits import Fold
+from gsparc.data.splits import Fold, SplitSettings
+from gsparc.models.aligned_rows import align_phases
+from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.turned_rows import TurnedNeighbours
+from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import factors_to_measured
 from gsparc.physics.row_factors import align_factors
 from gsparc.tables.own import from_arrays
@@ -61,3 +65,23 @@ def test_neighbours_are_told_whatever_phases_their_rows_have():
     turned = said.mean * factors_to_measured(said.mean, data, test)
     squared = (turned - torch.from_numpy(data.target[test])).abs().square().flatten(1).mean(1)
     assert 0.3 < float(squared.mean() / said.variance.mean()) < 3
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("transmitter", [0, 1])
+def test_the_default_lost_to_its_nearest_rows_out_of_sight(transmitter):
+    """In squares of 50 cm the process missed .65 and .41 of the power,
+    eight rows turned .51 and .23.
+    """
+    given, channel = packets.robot(transmitter, 0, "nlos")
+    logged = packets.logged(channel, given["frequency_hz"], 0)
+    data = packets.measurements(given, logged)
+    data = replace(data, site=replace(data.site, unknown_factor="phase+delay"))
+    fold = packets.shares(data, 0, 0.5)
+    turned, known = align_phases(data, fold)
+    split = SplitSettings(name="blocks", side_m=0.5)
+    default = fit(Gsparc().create_for(turned), turned, known.train, fold.test, split)
+    plain = fit(ComplexGP(), turned, known.train, fold.test)
+    near = fit(TurnedNeighbours(), turned, known.train, fold.test)
+    assert error(default, data, fold.test) < 0.95 * error(plain, data, fold.test)
+    assert error(default, data, fold.test) < 1.2 * error(near, data, fold.test)

@@ -213,3 +213,17 @@ def test_the_log_counted_the_sources_of_a_fit_before_the_last(pillar, caplog, mo
     found.fit(data, fold, FitContext())
     assert said_before and not any(said_before)
     assert f"{found.count_gaussians} Gaussians from init=rays" in caplog.text
+
+
+def test_rows_left_out_were_told_by_other_sources_than_answer():
+    """Each group was triangulated anew: three fits more, whose errors were not those of this."""
+    data, fold, _ = directed(100)
+    method, _ = fitted(data, fold)
+    places, kernel = method.posterior.positions.points, method.posterior.kernel
+    part = np.sort(fold.learned())[::2]
+    method.condition(data, part)
+    assert method.posterior.positions.points is places and method.posterior.kernel is kernel
+    assert set(method.left_out().rows.tolist()) == set(part.tolist())
+    assert error(method, data, fold.test) < 0.1
+    method.condition(data, np.sort(np.r_[part, fold.test[:1]]))
+    assert method.posterior.positions.points is not places, "rays that nobody looked at"

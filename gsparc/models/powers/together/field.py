@@ -54,7 +54,7 @@ from gsparc.processes.factor import Factor
 from gsparc.processes.neighbourhood import nearest_distance
 from gsparc.processes.places import first_end
 from gsparc.processes.posterior import Exact
-from gsparc.processes.powers import MOST_ROWS, REACH
+from gsparc.processes.powers import MOST_ROWS, REACH, PowerRows
 from gsparc.processes.prior import Prior
 from gsparc.processes.sectors import NO_AZIMUTH, ROUND, Sectors
 from gsparc.processes.shared import SharedTermsPosterior
@@ -220,7 +220,7 @@ class JointPowerField(ClosedForm):
         places, number = self._process_places(*self._places_and_stations(query))
         mean = torch.zeros(len(places), dtype=torch.float64)
         spread, share = torch.zeros_like(mean), torch.zeros_like(mean)
-        heard = torch.isin(number, torch.tensor([*posterior.processes]))
+        heard = torch.isin(number, torch.tensor(self._heard))
         exact = query.tx.dtype == torch.float64
         for of, inflation, chosen in ((posterior, 1.0, heard), (elsewhere, self.inflation, ~heard)):
             links = self.links
@@ -375,6 +375,36 @@ class JointPowerField(ClosedForm):
             result.own = replace(self.own, never=never)
         result.elsewhere = result._unheard_posterior((elsewhere.factor, elsewhere.mean))
         return result
+
+    @property
+    def linked_stations(self) -> list[int] | None:
+        """Numbers of stations with rows; None where it has no links."""
+        return None if self.links is None else [*self.rows]
+
+    def add_links(self, rows: PowerRows, faded: Tensor) -> JointPowerField:
+        """Return one that knows rows of stations without any, too, listed or not.
+
+        Args:
+            rows, faded: see `Links.add`.
+
+        Raises:
+            ValueError: it has no links.
+        """
+        links = self.require_fitted(self.links)
+        result, new = copy(self), torch.from_numpy(np.unique(rows.places[:, 3:], axis=0))
+        listed = stations_at(torch.from_numpy(self.places), new) != NOBODY
+        result.places = np.concatenate([self.places, new[~listed]])
+        numbers = stations_at(torch.from_numpy(result.places), new).tolist()
+        result.rows = self.rows | dict.fromkeys(numbers, links.index[:0])
+        result.links = links.add(rows, faded)
+        return result
+
+    @property
+    def _heard(self) -> list[int]:
+        """Numbers of stations that answer by rows of their own."""
+        posterior, _ = self._require_posteriors()
+        by_links = self.links is not None and self.links.heard is not None
+        return [*(self.rows if by_links else posterior.processes)]
 
     def _require_posteriors(self) -> tuple[SharedTermsPosterior, SharedTermsPosterior]:
         return self.require_fitted(self.posterior), self.require_fitted(self.elsewhere)

@@ -6,6 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from both_ends import walled_floor, walled_measurements
 from closed import fitted_to, read_back
 from releases import real
 
@@ -18,7 +19,7 @@ from gsparc.models.gsparc import Gsparc
 from gsparc.models.mixture.methods import Powers
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.powers.together.field import JointPowerField
-from gsparc.models.powers.together.links import links_of_others
+from gsparc.models.powers.together.links import LinkPriors, links_of_others
 from gsparc.models.powers.together.terms import places_and_notes, rows_of_stations
 from gsparc.ops import Pose
 from gsparc.prediction.answers import predict_file
@@ -153,6 +154,74 @@ def test_an_end_may_stand_anywhere():
         alone.stand_at(place)
 
 
+@cache
+def walls() -> Predictor:
+    """Of a floor with walls, the same either way: rows of 24 of 30 transmitter's places."""
+    data = walled_measurements(1_500, 30)
+    method = wrap_per_station(Gsparc(), data).create_for(data)
+    known = np.flatnonzero(data.stations_of() < 24)
+    method.fit(data, Fold(known, known[:0], known[:0]), FitContext())
+    return Predictor(method, data.site)
+
+
+def rows_of_a_new_place(start: int, stop: int) -> dict[str, np.ndarray]:
+    """Some rows of one of the other six."""
+    arrays, data = walled_floor(1_500, 30), walled_measurements(1_500, 30)
+    rows = np.flatnonzero(data.stations_of() == 27)[start:stop]
+    return {end: arrays[f"{end}_position"][rows] for end in ("tx", "rx")} | {
+        "rssi": arrays["rssi_db"][rows]
+    }
+
+
+def missed_db(predictor: Predictor, asked: dict[str, np.ndarray]) -> float:
+    level = predictor.rssi(tx=asked["tx"], rx=asked["rx"])[:, 0]
+    return float(np.sqrt(((level - asked["rssi"]) ** 2).mean()))
+
+
+def test_links_tell_either_way_where_stations_left_out_say_so():
+    by_walls = dict(walls().method)[-1].member.link_priors
+    assert by_walls.reciprocal and not field().link_priors.reciprocal
+
+
+def test_rows_of_a_transmitter_at_a_new_place_were_refused():
+    predictor, told, asked = walls(), rows_of_a_new_place(0, 30), rows_of_a_new_place(30, 50)
+    before = missed_db(predictor, asked)
+    beside = {"tx": asked["tx"][0] + [0.5, 0, 0], "rx": asked["rx"]}
+    levels = predictor.rssi(**beside)
+    found = predictor.update(**told)
+    assert len(found.rows) == len(found.deviations) == 30 and not found.alarms
+    assert missed_db(predictor, asked) < 0.95 * before
+    assert np.abs(predictor.rssi(**beside) - levels).mean() > 0.2  # its neighbours follow
+    at = predictor.stand_at(asked["tx"][0])
+    assert np.allclose(at.rssi(rx=asked["rx"]), predictor.rssi(tx=asked["tx"], rx=asked["rx"]))
+    assert np.allclose(predictor.measured["level"], told["rssi"], atol=1e-3)
+    predictor.forget(found.rows)
+    assert missed_db(predictor, asked) == pytest.approx(before)
+    predictor.undo(2)
+    assert np.array_equal(predictor.rssi(**beside), levels)
+
+
+def test_known_and_new_places_are_told_in_several_calls():
+    predictor, known = walls(), walled_floor(1_500, 30)
+    old = {"tx": known["tx_position"][:1], "rx": known["rx_position"][:1]}
+    told = rows_of_a_new_place(0, 4)
+    for row in range(4):
+        both = {end: np.concatenate([old[end], told[end][row : row + 1]]) for end in old}
+        predictor.update(**both, rssi=np.array([known["rssi_db"][0], told["rssi"][row]]))
+    number = predictor.measured["station"]
+    assert len(np.unique(number)) == 2 and (np.sort(number)[:4] == -2).all()
+    predictor.undo(4)
+
+
+def test_a_model_without_links_says_that_a_place_is_new():
+    data = walled_measurements(400, 8)
+    method = wrap_per_station(Gsparc(), data).create_for(data)
+    every = np.arange(len(data))
+    method.fit(data, Fold(every, every[:0], every[:0]), FitContext())
+    with pytest.raises(ValueError, match="a transmitter at a new place"):
+        Predictor(method, data.site).update(**rows_of_a_new_place(0, 4))
+
+
 def test_known_stations_of_many_gains_were_told_by_their_neighbours():
     """Another draw's 3.64 dB became 4.15: stations left out chose for known ones, too."""
     rng = np.random.default_rng(2)
@@ -168,11 +237,16 @@ def test_known_stations_of_many_gains_were_told_by_their_neighbours():
     order = rng.permutation(len(data))
     known, asked = np.sort(order[288:]), order[:288]
     method, _ = fitted_to(JointPowerField(), data, known)
-    mean, links = method.predict(data.batch(asked)).mean, method.links
-    assert links is not None and links.heard is None
-    method.links = None
+    assert method.links is None or method.links.heard is None
+    # Also where stations left out would have chosen links
+    rows, prior = rows_of_stations(data, known, method.places), method.own.never
+    chosen = LinkPriors(prior.known_trend, prior.kernel, prior.kernel)
+    assert not method._links_tell_heard(rows, chosen)
+    assert method.link_priors is not None and method.link_priors.heard is None
     own = method.predict(data.batch(asked)).mean
-    assert torch.allclose(mean, own)
+    method.condition(data, known)
+    assert method.links is not None
+    assert torch.allclose(method.predict(data.batch(asked)).mean, own)
 
 
 def test_links_of_an_earlier_fit_stayed():
