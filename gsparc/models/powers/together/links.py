@@ -257,7 +257,7 @@ def _learn_others(
 
 def _likeliest(start: Kernel, sample: NeighbourSample) -> Kernel:
     """The kernel of largest density of rows given those that each is given."""
-    far, noise = start.lengths[-1], WhiteNoise(start.noise)
+    far, noise = max(start.lengths), WhiteNoise(start.noise)
     starts = [Kernel((LinkShadowing(far, other=ratio * far), noise)) for ratio in RATIOS]
     bounds, settled = starts[0].bounds(sample.apart[:, 0]), SETTLED / len(sample.apart)
     return fit_kernel(lambda k: nearest_density(k, sample), starts, bounds, settled=settled)[1]
