@@ -121,7 +121,7 @@ CASES = {
     "minutes": (
         table("lat,lon,rssi", *MINUTES, LEVELS[:, 0]),
         {},
-        "north of latitude 48.20",
+        "north of latitude 48.2,",
         "refused",
     ),
     "NMEA": (
@@ -297,7 +297,7 @@ CASES = {
     "seconds": (
         table("lat,lon,rssi", *SECONDS, LEVELS[:, 0]),
         {},
-        "north of latitude 48.20",
+        "north of latitude 48.2,",
         "refused",
     ),
     "a gateway without a fix": (

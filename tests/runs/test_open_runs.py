@@ -127,7 +127,7 @@ def test_stations_of_equal_names_were_unknown_where_one_had_no_places(lost):
 
 def test_degrees_about_another_origin_were_taken_for_the_same_metres():
     """Another part of a drive has another origin: its places were hundreds of metres off."""
-    latitude, longitude = 48 + RNG.uniform(0, 0.02, 80), 179.99 + RNG.uniform(0, 0.02, 80)
+    latitude, longitude = 48 + np.linspace(0, 0.06, 80), 179.99 + RNG.uniform(0, 0.02, 80)
     levels_db = np.linspace(-90, -50, 80)
 
     def drive(rows):
