@@ -10,8 +10,7 @@ from pyproj import Proj
 
 from gsparc.base.errors import DataError
 
-# Of an origin's degrees: 1.1 km, so that the same campaign with a few rows more keeps its origin
-DIGITS = 2
+DIGITS = 4  # of an origin's degrees: 11 m
 # Latitude and longitude [deg]; both customs of longitude are taken: -180 to 180, and 0 to 360.
 ON_EARTH = ((-90, 90), (-180, 360))
 
@@ -37,8 +36,10 @@ class Georeference:
         _refuse_invalid(self.latitude, self.longitude, "origin: ")
 
     @classmethod
-    def from_coordinates(cls, latitude: np.ndarray, longitude: np.ndarray) -> Self:
-        """Place the origin of (n,) [deg] at the median of different ones, rounded to 1e-2 degrees.
+    def from_coordinates(
+        cls, latitude: np.ndarray, longitude: np.ndarray, digits: int = DIGITS
+    ) -> Self:
+        """Place the origin of (n,) [deg] at their median, rounded to so many digits.
 
         Raises:
             DataError: no places, or a value is not in range.
@@ -49,11 +50,10 @@ class Georeference:
         if not latitude.size:
             raise DataError("origin: no places")
         _refuse_invalid(latitude, longitude, "origin: ")
-        latitude, longitude = np.unique([latitude, longitude], axis=1)
         # Relative to one of them: 179.9 and -179.9 are neighbours, their median is not 0.
         turned = np.median((longitude - longitude[0] + 180) % 360 - 180) + longitude[0]
-        east = (round(float(turned), DIGITS) + 180) % 360 - 180
-        return cls(round(float(np.median(latitude)), DIGITS), round(east, DIGITS))
+        east = (round(float(turned), digits) + 180) % 360 - 180
+        return cls(round(float(np.median(latitude)), digits), round(east, digits))
 
     def from_degrees(self, latitude: np.ndarray, longitude: np.ndarray) -> np.ndarray:
         """Return local coordinates (n, 2) [m], east and north, of places (n,) [deg].

@@ -85,3 +85,18 @@ def test_a_refused_file_is_not_written(tmp_path, csi_arrays, refused):
     csi_arrays["csi"][0, 0, 0] = np.inf
     refused("row 0", write_own, tmp_path / "bad.h5", csi_arrays)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_rows_that_were_logged_twice_moved_the_origin():
+    """Places were others by the bits then, and what was drawn of them another sample."""
+    rng = np.random.default_rng(0)
+    rows, twice = np.arange(80), np.r_[0:80, 60:80, 60:80]
+    latitude, longitude = 48 + np.sort(rng.uniform(0, 0.02, 80)), rng.uniform(2, 2.02, 80)
+
+    def drive(part):
+        degrees = {"latitude": latitude[part], "longitude": longitude[part], "rx_height": 1.5}
+        return from_arrays({**degrees, "rssi_db": np.linspace(-90, -50, 80)[part]})
+
+    whole, copied = drive(rows), drive(twice)
+    assert copied.site.georeference == whole.site.georeference
+    assert np.array_equal(copied.site.origin, whole.site.origin)

@@ -15,6 +15,7 @@ from gsparc.tables.checks.plausibility import degree_warnings
 from gsparc.tables.own_checks import Checker
 from gsparc.tables.raw import numbered_rows
 
+DIGITS = 2  # of an origin's degrees, 1.1 km: drives with a few rows more or less have one
 NO_FIX_DEG, NO_FIX_M = 1.0, 1e4  # from 0, 0 to the median of all other rows, at least
 
 
@@ -148,7 +149,8 @@ def _in_metres(check: Checker) -> Georeference | None:
     if len(check.problems) > before:
         return None
     # About the rows rather than the stations: a distant station must not distort the site.
-    origin = Georeference.from_coordinates(*places[""])
+    # Of different ones, so that copies or a few rows more leave it, and all that is drawn, alone.
+    origin = Georeference.from_coordinates(*np.unique(places[""], axis=1), digits=DIGITS)
     # Of the end with a height, or the one without a position; else of the receiver.
     end = "tx" if check.present("tx_height", "rx_position") else "rx"
     for prefix, name in (("", end), ("station_", "station")):
