@@ -172,20 +172,15 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """Return remarks on a table: rows that are not unseen, stand-ins, a busy machine,
     a baseline that is better.
     """
-    whole = facts.get("split/name") == "none"  # `run_conditions` says what was scored
-    seen = (
-        {}
-        if whole
-        else {
-            "train": [
-                "these are training rows: eval_on=test scores rows that were not learned from"
-            ],
-            "val": [
-                "methods, but not baselines, used these validation rows: compare methods with "
-                "eval_on=test"
-            ],
-        }
-    )
+    seen = {
+        "train": ["these are training rows: eval_on=test scores rows that were not learned from"],
+        "val": [
+            "methods, but not baselines, used these validation rows: compare methods with "
+            "eval_on=test"
+        ],
+    }
+    # Of a last fit `run_conditions` says what was scored.
+    used = [] if facts.get("split/name") == "none" else seen.get(prefix, [])
     stated = [key.split("/") for key in facts if key.endswith(f"/{CALIBRATION}")]
     chi2 = {key[1]: facts["/".join(key)] for key in stated if key[0] == "baseline"}
     chi2[str(facts.get("model/label"))] = facts.get(f"{prefix}/{CALIBRATION}")
@@ -213,7 +208,7 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
         rest.append(f"new cells, which earlier lists should have held: {new}")
     folds = f" of all {facts['split/folds']} folds" if facts.get("split/folds", 1) > 1 else ""
     cost = [LINE.format(of_what=folds, cost=facts["time/cost"])] if facts.get("time/cost") else []
-    lines = [*seen.get(prefix, []), *run_conditions(facts), *rest, *describe_model(facts), *cost]
+    lines = [*used, *run_conditions(facts), *rest, *describe_model(facts), *cost]
     # The candidate's name, as stored summaries have it, is no word for users.
     return [line.replace("joint_powers", "powers of all stations") for line in lines]
 
