@@ -12,7 +12,7 @@ import pandas as pd
 from gsparc.commands.compare import compare
 from gsparc.evaluation.results import PROBLEM as PROBLEM
 from gsparc.models.registry import plain_methods
-from gsparc.runs.output import RunSettings, to_dict
+from gsparc.runs.settings import RunSettings, to_dict
 
 
 def compare_with_plain(

@@ -13,8 +13,9 @@ from gsparc.base.instantiate import from_settings
 from gsparc.evaluation.console import open_console
 from gsparc.pictures import simulated
 from gsparc.prediction.timing import machine_facts
-from gsparc.runs.output import CommandCall, Result, command, to_dict
+from gsparc.runs.output import CommandCall, Result, command
 from gsparc.runs.run_lock import locked
+from gsparc.runs.settings import to_dict
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import Effects

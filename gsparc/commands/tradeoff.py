@@ -23,8 +23,9 @@ from gsparc.prediction.timing import BLOCKS, peak_memory
 from gsparc.runs.experiment import tradeoff
 from gsparc.runs.ledger import FitInputs, measurements_hash, run_once
 from gsparc.runs.open_runs import Opened, open_run
-from gsparc.runs.output import Result, in_multirun, run_directory, to_dict
+from gsparc.runs.output import Result, in_multirun, run_directory
 from gsparc.runs.run_lock import locked
+from gsparc.runs.settings import to_dict
 from gsparc.training import tracking
 
 log = logging.getLogger(__name__)

@@ -28,8 +28,9 @@ from gsparc.models.registry import build, fill_defaults
 from gsparc.runs.align_site import align_to_site
 from gsparc.runs.experiment.disturb import Disturbance
 from gsparc.runs.ledger import FitInputs, measurements_hash, read_finished, run_once
-from gsparc.runs.output import RunSettings, in_multirun, run_directory, to_dict
+from gsparc.runs.output import in_multirun, run_directory
 from gsparc.runs.run_lock import locked
+from gsparc.runs.settings import RunSettings, to_dict
 from gsparc.tables.sheet import say_quantity
 from gsparc.training import tracking
 from gsparc.training.effort import Effort

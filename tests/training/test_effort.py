@@ -12,7 +12,7 @@ from refusals import refused
 import gsparc
 from gsparc.commands.listing import COMMANDS
 from gsparc.runs.continued import add_settings_of_run
-from gsparc.runs.output import RunSettings
+from gsparc.runs.settings import RunSettings
 from gsparc.training.context import FitContext
 from gsparc.training.effort import INSTEAD, Effort
 from gsparc.training.stopwatch import Stopwatch

@@ -150,7 +150,8 @@ def _in_metres(check: Checker) -> Georeference | None:
         return None
     # About the rows rather than the stations: a distant station must not distort the site.
     # Of different ones, so that copies or a few rows more leave it, and all that is drawn, alone.
-    origin = Georeference.from_coordinates(*np.unique(places[""], axis=1), digits=DIGITS)
+    latitude, longitude = np.unique(places[""], axis=1)
+    origin = Georeference.from_coordinates(latitude, longitude, DIGITS)
     # Of the end with a height, or the one without a position; else of the receiver.
     end = "tx" if check.present("tx_height", "rx_position") else "rx"
     for prefix, name in (("", end), ("station_", "station")):

@@ -9,7 +9,7 @@ from refusals import refused
 from releases import real
 
 from gsparc.runs.experiment.cells import load_every_problem
-from gsparc.runs.output import to_dict
+from gsparc.runs.settings import to_dict
 
 ROOM = "dataset_conference_ch1_rt_image_fc.pkl"
 
