@@ -356,6 +356,14 @@ class Site:
         return tuple(end for end in ENDS_OF_PLACES if end != self.static_end)
 
     @property
+    def antenna_end(self) -> End:
+        """The end whose antennas a channel's are: receivers' where an array is named, else of what
+        stands.
+        """
+        named = self.array is not None or self.every_station.array is not None
+        return "rx" if named else self.static_end or "rx"
+
+    @property
     def query_box(self) -> np.ndarray:
         """The box for each end that moves, (2, 3) or (2, 6) [m]: of what `moving` gives."""
         return np.tile(self.box, len(self.moving_ends))

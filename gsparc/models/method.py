@@ -74,19 +74,14 @@ class Prediction:
         """Return what devices (B,), or one, would read, where this is the mean one's;
         variances add.
 
-        Stations (B,), or one, are those of the rows; None: of each column, or the mean of all.
+        Stations (B,), or one, are those of the rows; None: the mean of all.
         """
         if site.device_levels is None:
             return self
         table, device = torch.from_numpy(site.device_levels), torch.as_tensor(device)
         table = table.reshape(-1, *table.shape[-2:])  # stored before stations had their own
-        columns = self.mean.shape[1:] == (len(table),) and len(table) > 1
-        axes: tuple[int, ...] = (-1, *[1] * (self.mean.ndim - 1))
-        if columns and station is None and device.ndim == 0:
-            levels, axes = table[:, device], (1, -1)
-        else:
-            levels = table.mean(0)[device] if station is None else table[station, device]
-            levels = levels.reshape(-1, 2)
+        levels = table.mean(0)[device] if station is None else table[station, device]
+        levels, axes = levels.reshape(-1, 2), (-1, *[1] * (self.mean.ndim - 1))
         factor = from_decibels(levels[:, 0]).to(self.mean.dtype)
         spread = levels[:, 1].to(self.mean.dtype)
         many = factor.reshape(axes)
@@ -94,12 +89,16 @@ class Prediction:
         if variance is not None:
             device_variance = (mean / RELATIVE_DB).square() * spread.reshape(many.shape)
             # One of all entries, or each its own
-            alone = axes if axes[0] == 1 else (-1, *[1] * (variance.ndim - 1))
-            scale = factor.square().reshape(alone)
+            scale = factor.square().reshape(-1, *[1] * (variance.ndim - 1))
             variance = variance * scale + device_variance.reshape(variance.shape)
         return Prediction(
             mean, variance, self.unknown, None if explained is None else explained * many
         )
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Prediction:
+        """Return the same, each of its parts changed."""
+        parts = (getattr(self, field.name) for field in fields(self))
+        return Prediction(*(None if part is None else change(part) for part in parts))  # type: ignore[arg-type]
 
     @staticmethod
     def joined(parts: Sequence[Prediction], order: Tensor | None = None) -> Prediction:

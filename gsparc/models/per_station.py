@@ -33,7 +33,7 @@ from gsparc.models.fitting import common_label
 from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.powers.own_terms import pool_station_weights
 from gsparc.models.sanity import make_stored
-from gsparc.models.station_views import AllStationsView, OneStationView
+from gsparc.models.station_views import OneStationView
 from gsparc.models.target_rows import heard_rows
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
@@ -323,18 +323,9 @@ class PerStation(Method):
             )
         return OneStationView(copy, number) if self._shared else copy
 
-    def all_stations(self) -> AllStationsView | None:
-        """Return one that answers for all stations at once (B, T); None:
-        each has a copy of its own.
-        """
-        if not self._shared:
-            return None
-        return AllStationsView(self._copies[UNHEARD], len(self.fitted_site.every_station))
-
     def joint_method(self) -> HasJoint | None:
-        """See `Method.joint_method`."""
-        shared = self.all_stations()
-        return None if shared is None else shared.joint_method()
+        """See `Method.joint_method`; None: each has a copy of its own."""
+        return OneStationView(self._copies[UNHEARD], NOBODY).joint_method() if self._shared else None
 
     def add_carrier(self, frequency_hz: float) -> PerStation:
         """See `AddsCarriers`."""

@@ -44,19 +44,3 @@ class AnywhereView(View):
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`."""
         return self.inner.predict(replace(query, station=None))
-
-
-class AllStationsView(OneStationView):
-    """A method that knows all stations of powers, asked about each of them at every place."""
-
-    def __init__(self, inner: Method, count: int) -> None:
-        super().__init__(inner, NOBODY)
-        self.count = count
-
-    def predict(self, query: Query) -> Prediction:
-        """Return the mean and variance (B, T); the ends that stand are not read."""
-        rows = torch.arange(len(query)).repeat_interleave(self.count)
-        station = torch.arange(self.count).repeat(len(query))
-        prediction = self.inner.predict(replace(query.rows(rows), station=station))
-        variance = None if prediction.variance is None else prediction.variance.view(-1, self.count)
-        return Prediction(prediction.mean.view(-1, self.count), variance)

@@ -76,21 +76,20 @@ def interpolate_tones(channel: Tensor, tones_hz: np.ndarray, wanted_hz: np.ndarr
     return (straight @ matrix) * back
 
 
-def resource_grid(channel: Tensor, symbols: int, moving_end: str) -> Tensor:
-    """Return channels (B, A, K) as Sionna's [rx, rx_ant, tx, tx_ant, symbols, K],
-    constant within a slot.
+def resource_grid(channel: Tensor, symbols: int, site: Site) -> Tensor:
+    """Return channels (B, A, K), or (B, T, A, K) of T stations, constant within a slot, as Sionna's
+    `[batch, rx, rx_ant, tx, tx_ant, symbols, K]`.
 
-    B receivers hear one transmitter of A antennas where the receiver moves; else one receiver of A
-    antennas hears B transmitters.
+    Places are on `batch`, stations on the end that stands, antennas on `site.antenna_end`.
 
-    >>> channels = torch.ones(5, 4, 12, dtype=torch.complex64)
-    >>> resource_grid(channels, symbols=14, moving_end="rx").shape
-    torch.Size([5, 1, 1, 4, 14, 12])
+    >>> channels = torch.ones(5, 1, 12, dtype=torch.complex64)
+    >>> resource_grid(channels, 14, predictor.site).shape
+    torch.Size([5, 1, 1, 1, 1, 14, 12])
     """
-    slots = channel.unsqueeze(-2).expand(*channel.shape[:2], symbols, channel.shape[2])
-    if moving_end == "rx":
-        return slots[:, None, None]  # (B, 1, 1, A, symbols, K)
-    return slots.transpose(0, 1)[None, :, :, None]  # (1, A, B, 1, symbols, K)
+    stations = channel if channel.ndim == 4 else channel[:, None]
+    slots = stations[:, :, :, None, None, None].expand(-1, -1, -1, -1, -1, symbols, -1)
+    of_stations, of_antennas = {"rx": 1, "tx": 3}[site.still_end], {"rx": 2, "tx": 4}[site.antenna_end]
+    return slots.movedim((1, 2), (of_stations, of_antennas))
 
 
 WITH_PATHS = "(model=image_source_gp and directional_gp are, or uplink with uplink=)"
@@ -101,7 +100,7 @@ class Paths:
     """Plane waves at the array: N for each of B snapshots or positions.
 
     The channel at f is the sum of `gain exp(-j 2 pi (f - reference_hz) delay_s)`, at positions
-    times `reference_hz / f`.
+    times `reference_hz / f`: `channel` sums them so, and `csi` is that and what is no path.
 
     Attributes:
         gain: complex64, physical units, at `reference_hz`: (B, N) at the array's middle for
@@ -182,7 +181,8 @@ def paths_at(method: Method, site: Site, query: Query) -> Paths:
 
 
 def to_resource_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: int | None) -> Tensor:
-    """Return channels (B, A, K) at other frequencies, and with `symbols` as `resource_grid` does.
+    """Return channels (B, A, K) or (B, T, A, K) at other frequencies, and with `symbols` as
+    `resource_grid` does.
 
     Raises:
         ValueError: the model does not know its own frequencies, or those wanted lie outside its
@@ -200,7 +200,7 @@ def to_resource_grid(channel: Tensor, site: Site, frequency_hz: Any, symbols: in
                 "gains and delays"
             )
         channel = interpolate_tones(channel, site.subcarriers_hz, wanted)
-    return channel if symbols is None else resource_grid(channel, symbols, site.moving_end)
+    return channel if symbols is None else resource_grid(channel, symbols, site)
 
 
 def _require_paths(method: Method) -> SeparatesPaths:

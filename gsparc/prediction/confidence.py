@@ -22,7 +22,7 @@ from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import kernel_of_targets
 from gsparc.models.method import Prediction, predict_with_threads
 from gsparc.physics.decibels import from_decibels
-from gsparc.prediction.query import Asked, match_input
+from gsparc.prediction.query import Asked, PlacedQuery
 from gsparc.processes.factor import Factor
 from gsparc.processes.few_rows import draw_rows
 from gsparc.processes.kernel import Kernel
@@ -219,7 +219,8 @@ class ConfidenceMixin(Asked):
     kind: str | None
 
     def confidence(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
-        """Return how sure the model is, (B,) float32 in [0, 1], larger is surer.
+        """Return how sure the model is, (B,) float32 in [0, 1], larger is surer; (B, T) of several
+        stations.
 
         Of the kind that `gsparc.load(confidence=...)` was asked for, else the one that
         `gsparc calibrate` found best, else the model's own.
@@ -231,7 +232,8 @@ class ConfidenceMixin(Asked):
         Raises:
             ValueError: the method has no confidence of that kind.
         """
-        return match_input(*self._query_confidence(tx, rx, uplink))
+        placed, sure = self._query_confidence(tx, rx, uplink)
+        return placed.match(placed.by_station(sure))
 
     def accepts(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
         """Tell whether predictions (B,) bool are among those of which
@@ -258,29 +260,29 @@ class ConfidenceMixin(Asked):
             raise ValueError(
                 f"accepts: the threshold is one of confidence={self.trusted.kind}, not {self.kind}"
             )
-        sure, single, as_torch = self._query_confidence(tx, rx, uplink)
+        placed, sure = self._query_confidence(tx, rx, uplink)
         good = sure >= self.trusted.threshold
         if uplink is None:  # an uplink has no place
-            places = self.queries.query(tx, rx).query.places(self.site).numpy()
+            places = placed.query.places(self.site).numpy()
             good &= torch.from_numpy(self.trusted.covers(places))
-        good = match_input(good, single, as_torch)
-        return bool(good) if single and not as_torch else good
+        good = placed.match(placed.by_station(good))
+        return bool(good) if isinstance(good, float) else good
 
-    def _query_confidence(self, tx: Any, rx: Any, uplink: Any) -> tuple[Tensor, bool, bool]:
-        """Confidences (B,), whether one was wanted, and whether torch was given."""
+    def _query_confidence(self, tx: Any, rx: Any, uplink: Any) -> tuple[PlacedQuery, Tensor]:
+        """What was asked, and confidences of all its rows."""
         if uplink is not None:
             from gsparc.prediction import channels
 
-            sure = self._method_confidence(
-                self.method.predict(channels.uplink_query(self.method, self.site, uplink)), None
-            )
-            single, as_torch = np.ndim(uplink) == 2, isinstance(uplink, Tensor)
+            query = channels.uplink_query(self.method, self.site, uplink)
+            placed = PlacedQuery(query, np.ndim(uplink) == 2, isinstance(uplink, Tensor))
+            sure = self._method_confidence(self.method.predict(query), None)
         else:
-            query, single, as_torch = self.queries.query(tx, rx)
-            sure = self._method_confidence(predict_with_threads(self._whole, query), query)
+            placed = self.queries.query(tx, rx)
+            prediction = predict_with_threads(self._whole, placed.query)
+            sure = self._method_confidence(prediction, placed.query)
         if sure is None:
             raise ValueError(f"{self.method.name} has no confidence")
-        return sure, single, as_torch
+        return placed, sure
 
     def _method_confidence(self, prediction: Prediction, query: Query | None) -> Tensor | None:
         """Of the method's own predictions (B,), of the kind that is wanted;

@@ -12,17 +12,15 @@ from gsparc.data.schema import End
 from gsparc.models.method import Method, Prediction, suitable_threads
 from gsparc.ops import Pose
 from gsparc.ops.transforms import needs_reference
-from gsparc.prediction.query import Queries
+from gsparc.prediction.query import PlacedQuery, Queries
 
 
 class FollowedPrediction(NamedTuple):
-    """Moments in stored units, in float64, the precision of the positions,
-    and whether one was given.
-    """
+    """Moments in stored units, in float64, the precision of the positions, and what was asked."""
 
     moments: Prediction
     dtype: torch.dtype
-    single: bool
+    placed: PlacedQuery
 
 
 def predict_with_gradients(
@@ -60,11 +58,12 @@ def predict_with_gradients(
         )
     if any(isinstance(value, Tensor) and value.requires_grad for value in fixed):
         raise ValueError(f"grad=True: gradients are by the position of {' and '.join(ends)} alone")
-    query, single, _ = queries.query(tx, rx, torch.float64)
+    placed = queries.query(tx, rx, torch.float64)
+    query = placed.query
     origin = torch.from_numpy(np.asarray(site.origin, np.float64))
     # The origin goes in float64: in UTM coordinates float32 has no centimetres.
     local = {
-        end: (value.cpu().double() - origin).expand(len(query), 3) for end, value in ends.items()
+        end: placed.at_stations(value.cpu().double() - origin) for end, value in ends.items()
     }
     with suitable_threads(method, len(query)):
         moments = method.predict(query.with_ends(local))
@@ -72,4 +71,4 @@ def predict_with_gradients(
     for value in ends.values():
         # Computed in float64, answered as precisely as the positions were given.
         dtype = torch.promote_types(dtype, value.dtype)
-    return FollowedPrediction(moments, dtype, single)
+    return FollowedPrediction(moments, dtype, placed)

@@ -110,7 +110,7 @@ class JointMixin(Asked):
         Raises:
             ValueError: the model states none.
         """
-        query = self.queries.query(tx, rx, torch.float64).query
+        query = self.queries.query(tx, rx, torch.float64).of_one()
         places = query.places(self.site)
         joint_method = self.method.joint_method()
         if isinstance(self.method, OneStationView) and joint_method is not None:

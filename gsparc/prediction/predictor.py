@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from copy import copy
 from dataclasses import replace
@@ -27,7 +27,7 @@ from gsparc.physics.row_factors import describe_factor
 from gsparc.prediction.confidence import ConfidenceMixin, Trusted
 from gsparc.prediction.gradients import predict_with_gradients
 from gsparc.prediction.jointly import JointMixin
-from gsparc.prediction.query import DegreesMixin, Queries, match_input, read_place
+from gsparc.prediction.query import DegreesMixin, PlacedQuery, Queries, read_place
 from gsparc.prediction.timing import Call
 from gsparc.prediction.updating import UpdateMixin, read_versions
 
@@ -95,7 +95,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         # or confidence asks the whole one.
         self._whole = whole or method
         self.versions = read_versions(self.extra)
-        self.queries = Queries(site)
+        self.queries = Queries(site, None, _answered(method, site))
         self._unit = unit
         self.unit = self._answer_unit(None).name  # "1" of channels and spectra
         self._device = MEAN_DEVICE
@@ -230,7 +230,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         view = copy(self)
         view.method, view._whole, view.site, view._unit = method, whole or method, site, unit
         view.unit = view._answer_unit(None).name
-        view.queries, view._prepared = Queries(site, self.queries.station), []
+        view.queries = Queries(site, self.queries.station, _answered(method, site))
+        view._prepared = []
         return view
 
     def select_device(self, device: str) -> Predictor:
@@ -282,15 +283,14 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         Raises:
             ValueError: `grad` of a model without gradients, or of positions that are no tensors.
         """
-        wanted = self._answer_unit(unit)
         if grad:
-            return self._predict_grad(self._whole, tx, rx, wanted)[0]
-        query = self.queries.query(tx, rx).query
-        prediction = predict_with_threads(self._whole, query)
-        sure = self._method_confidence(prediction, query)
-        return replace(
-            self._in_unit(prediction, wanted), unknown=None if sure is None else 1 - sure
-        )
+            placed, said = self._moments(self._whole, tx, rx, unit, grad)
+            return said.map(placed.by_station)
+        wanted, placed = self._answer_unit(unit), self.queries.query(tx, rx)
+        stored = predict_with_threads(self._whole, placed.query)
+        sure = self._method_confidence(stored, placed.query)
+        said = self._in_unit(stored, wanted, placed.query)
+        return replace(said, unknown=None if sure is None else 1 - sure).map(placed.by_station)
 
     def std(self, tx: Any = None, rx: Any = None, *, unit: str | None = None) -> Any:
         """Return the expected root mean square error of an entry,
@@ -298,7 +298,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
 
         Far from all data it is that of knowing nothing: about 1 of spectra, whose pixels are from 0
         to 1. Its shape goes with theirs: (B, 1) of powers, (B, T) of several stations, (B, 1, 1)
-        of other kinds.
+        of other kinds, (B, T, 1, 1) of several stations.
 
         >>> predictor.std(rx=[[2.0, 1.0, 1.5], [900.0, 1.0, 1.5]]).shape  # [dB]
         (2, 1)
@@ -306,53 +306,13 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         Raises:
             ValueError: the method knows none, or as in `rssi`.
         """
-
-        def ask(asked: Predictor) -> Any:
-            query, single, as_torch = asked.queries.query(tx, rx)
-            prediction = asked._in_unit(
-                predict_with_threads(asked._whole, query), asked._answer_unit(unit)
-            )
-            if prediction.variance is None:
-                raise ValueError(f"{self.method.name} states no deviations")
-            spread = prediction.variance.sqrt().float()
-            # As many axes as the answers have, so that both broadcast.
-            spread = spread.reshape(len(spread), -1, *[1] * (prediction.mean.ndim - 2))
-            return match_input(spread, single, as_torch)
-
-        return self._ask_stations(ask, tx, rx)
-
-    def _ask_stations(self, ask: Callable[[Predictor], Any], tx: Any, rx: Any) -> Any:
-        """What one is asked, (B, 1); of several stations, if neither end says which, of all (B, T).
-
-        Stations that the model has no answer for, as they had too few training rows, are NaN.
-        """
-        # 0 where both ends move: then there is no station that a query could leave out.
-        has_station = {"tx": tx, "rx": rx}.get(self.site.static_end or "", 0) is not None
-        if has_station or not self.site.target.is_level or self.site.stations is None:
-            return ask(self)
-        # One call for all stations where the method has one, else a call for each.
-        shared = self.method.all_stations() if isinstance(self.method, PerStation) else None
-        if shared is not None:
-            return ask(self._view(shared, None, station_site(self.site, 0), self._unit))
-        stations = self._each_station()
-        answers = [None if predictor is None else ask(predictor) for predictor in stations]
-        answer = next(present for present in answers if present is not None)
-        # A station without an answer: NaN in the shape of the others', NumPy or torch alike.
-        columns = [answer * np.nan if own_answer is None else own_answer for own_answer in answers]
-        return (
-            torch.cat(columns, dim=-1)
-            if isinstance(answer, Tensor)
-            else np.concatenate(columns, axis=-1)
-        )
-
-    def _each_station(self) -> list[Predictor | None]:
-        """The same model asked about each station; None where that had too few training rows."""
-        stations: list[Predictor | None] = []
-        for number in range(len(self.site.every_station)):
-            stations.append(None)
-            with suppress(ValueError):
-                stations[-1] = self.ask_station(number)
-        return stations
+        placed, said = self._moments(self._whole, tx, rx, unit)
+        if said.variance is None:
+            raise ValueError(f"{self.method.name} states no deviations")
+        spread = said.variance.sqrt().float()
+        # As many axes as the answers have, so that both broadcast.
+        spread = spread.reshape(len(spread), *[1] * (said.mean.ndim - 1))
+        return placed.match(placed.by_station(spread))
 
     def cycle_places(self, places: np.ndarray) -> Call:
         """Return a function for a clock, which asks about one of the places each time it is called.
@@ -360,7 +320,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         Places are (n, 3), of both ends (n, 6) [m], local: less `site.origin`. Of several stations
         the first that the model answers for is asked.
         """
-        predictor = next(filter(None, self._each_station()))
+        predictor = self.ask_station(next(iter(self.queries.answered.tolist()), 0))
         ask = getattr(predictor, self.site.kind)
         return lambda number: ask(**self.site.world_ends(places[number % len(places)]))
 
@@ -395,7 +355,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
                 `grad` as in `predict`.
         """
         predictor = self if frequency_hz is None else self.select_carrier(frequency_hz)
-        return predictor._predict_mean("spectrum", tx, rx, grad)
+        placed, mean = predictor._mean("spectrum", tx, rx, grad)
+        return placed.match(mean)
 
     def csi(
         self,
@@ -428,7 +389,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
             grad: as in `predict`; at the measured tones alone.
         """
         if uplink is None and frequency_hz is None and symbols is None:
-            return self.site.in_shape_of_file(self._predict_mean("csi", tx, rx, grad))
+            placed, mean = self._mean("csi", tx, rx, grad)
+            return placed.match(self.site.in_shape_of_file(mean))
         if grad:
             raise ValueError(
                 "grad=True: channels have gradients at positions and the measured tones alone"
@@ -439,11 +401,9 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
             channel = channels.uplink_channels(self.method, self.site, uplink, frequency_hz)
             answer = channels.to_resource_grid(channel, self.site, None, symbols)
             return answer if isinstance(uplink, Tensor) else answer.numpy()
-        channel = torch.as_tensor(self._predict_mean("csi", tx, rx))
-        # A single position comes back without its leading axis.
-        channel = channel[None] if channel.ndim == 2 else channel
-        answer = channels.to_resource_grid(channel, self.site, frequency_hz, symbols)
-        return answer if any(isinstance(end, Tensor) for end in (tx, rx)) else answer.numpy()
+        placed, mean = self._mean("csi", tx, rx)
+        answer = channels.to_resource_grid(mean, self.site, frequency_hz, symbols)
+        return answer if placed.as_torch else answer.numpy()
 
     def paths(self, uplink: Any = None, *, tx: Any = None, rx: Any = None) -> Paths:
         """Return gains, delays [s], directions: of what an uplink (B, U, L)
@@ -459,7 +419,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
 
         if uplink is not None:
             return channels.uplink_paths(self.method, self.site, uplink)
-        return channels.paths_at(self._whole, self.site, self.queries.query(tx, rx).query)
+        return channels.paths_at(self._whole, self.site, self.queries.query(tx, rx).of_one())
 
     def gaussians(self, tx: Any = None, rx: Any = None) -> GaussianCloud:
         """Return the N Gaussians that are rendered, with what they emit for these positions.
@@ -473,7 +433,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         """
         if not isinstance(self.method, HasGaussians):
             raise ValueError(f"gaussians: {self.method.name} renders none")
-        cloud = self.method.gaussians(self.queries.query(tx, rx).query)
+        cloud = self.method.gaussians(self.queries.query(tx, rx).of_one())
         return replace(cloud, means=cloud.means + self.site.origin)
 
     def rssi(
@@ -497,43 +457,41 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         Raises:
             ValueError: no unit that these powers can be turned into, or as in `spectrum`.
         """
-        return self._ask_stations(lambda one: one._predict_mean("rssi", tx, rx, grad, unit), tx, rx)
+        placed, mean = self._mean("rssi", tx, rx, grad, unit)
+        return placed.match(mean)
 
-    def _predict_mean(
+    def _mean(
         self, kind: Kind, tx: Any, rx: Any, grad: bool = False, unit: str | None = None
-    ) -> Any:
+    ) -> tuple[PlacedQuery, Tensor]:
+        """Answers (B, ...), (B, T, ...) of several stations, in the precision of the method."""
         if self.site.kind != kind:
             raise ValueError(
                 f"this model predicts {self.site.kind} (dataset {self.site.name}), not {kind}: "
                 f"call .{self.site.kind}(...)"
             )
-        wanted = self._answer_unit(unit)
-        if grad:
-            moments, single = self._predict_grad(self.method, tx, rx, wanted)
-            return moments.mean[0] if single else moments.mean
-        query, single, as_torch = self.queries.query(tx, rx)
-        stored = predict_with_threads(self.method, query)
-        mean = self._in_unit(stored, wanted).mean.to(stored.mean.dtype)
-        return match_input(mean, single, as_torch)
+        placed, said = self._moments(self.method, tx, rx, unit, grad)
+        mean = said.mean if grad or said.mean.is_complex() else said.mean.float()
+        return placed, placed.by_station(mean)
 
-    def _predict_grad(
-        self, method: Method, tx: Any, rx: Any, wanted: PowerUnit
-    ) -> tuple[Prediction, bool]:
-        """Moments in a unit that autograd follows, and whether one position was given;
-        see the class.
-        """
-        moments, dtype, single = predict_with_gradients(method, self.queries, tx, rx)
-        result, is_own = (
-            self._in_unit(moments, wanted),
-            (self.kind or self.trusted.kind) in (None, "learned"),
-        )
+    def _moments(
+        self, method: Method, tx: Any, rx: Any, unit: str | None, grad: bool = False
+    ) -> tuple[PlacedQuery, Prediction]:
+        """Answers of every row that is asked, which autograd follows if wanted, in a unit."""
+        wanted = self._answer_unit(unit)
+        if not grad:
+            placed = self.queries.query(tx, rx)
+            stored = predict_with_threads(method, placed.query)
+            return placed, self._in_unit(stored, wanted, placed.query)
+        stored, dtype, placed = predict_with_gradients(method, self.queries, tx, rx)
+        result = self._in_unit(stored, wanted, placed.query)
+        is_own = (self.kind or self.trusted.kind) in (None, "learned")
         mean = result.mean.to(dtype.to_complex() if result.mean.is_complex() else dtype)
         unknown = None if result.unknown is None or not is_own else result.unknown.to(dtype)
-        return Prediction(mean, result.variance, unknown), single
+        return placed._replace(as_torch=True), Prediction(mean, result.variance, unknown)
 
-    def _in_unit(self, stored: Prediction, unit: PowerUnit) -> Prediction:
+    def _in_unit(self, stored: Prediction, unit: PowerUnit, query: Query) -> Prediction:
         """Of stored targets, as the chosen device reads them, in a unit."""
-        stored = stored.of_devices(self.site, self._device, self.queries.station)
+        stored = stored.of_devices(self.site, self._device, query.station)
         # In decibels a variance depends on the mean too.
         variance = None if stored.variance is None else unit.variance(stored.mean, stored.variance)
         explained = (
@@ -543,3 +501,15 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         )
         mean = unit.values(stored.mean)  # in float64, as levels of -100 dB in float32 lose 1e-5 dB
         return Prediction(mean, variance, stored.unknown, explained)
+
+
+def _answered(method: Method, site: Site) -> list[int]:
+    """Numbers of the stations that had training rows enough; none where there is one end."""
+
+    def has_answer(number: int) -> bool:
+        with suppress(ValueError):
+            method.station_method(number)
+            return True
+        return False
+
+    return [] if site.stations is None else [*filter(has_answer, range(len(site.stations)))]

@@ -27,11 +27,58 @@ COARSE_M = 0.01
 
 
 class PlacedQuery(NamedTuple):
-    """A query, whether one position was given, and whether torch was."""
+    """A query, and in which form its answers are wanted.
+
+    Attributes:
+        query: of B places, or of each of `asked` at every place in turn.
+        single: whether one position was given.
+        as_torch: whether tensors were.
+        asked: (t,) numbers of the stations that all places are asked of; None where the query says
+            which, or there is one.
+        stations: names of all T.
+    """
 
     query: Query
     single: bool
     as_torch: bool
+    asked: Tensor | None = None
+    stations: tuple[str, ...] = ()
+
+    def of_one(self) -> Query:
+        """Return the query of one station; `ValueError` where it is of several."""
+        if self.asked is not None:
+            raise ValueError(f"use select_station(name): one of {', '.join(self.stations)}")
+        return self.query
+
+    def at_stations(self, places: Tensor) -> Tensor:
+        """Return places (B, 3) or (3,) of one end as those of all rows (B t, 3)."""
+        each = 1 if self.asked is None else len(self.asked)
+        places = places.expand(len(self.query) // each, 3)
+        return places if self.asked is None else places.repeat_interleave(each, 0)
+
+    def by_station(self, values: Tensor) -> Tensor:
+        """Return answers (B t, ...) as (B, T, ...), powers (B, T); NaN, or no, of stations without
+        an answer.
+        """
+        if self.asked is None:
+            return values
+        rest = () if values.shape[1:] == (1,) else values.shape[1:]
+        values = values.reshape(-1, len(self.asked), *rest)
+        if len(self.asked) == len(self.stations):
+            return values
+        absent = False if values.dtype == torch.bool else torch.nan
+        whole = values.new_full((len(values), len(self.stations), *rest), absent)
+        whole[:, self.asked] = values
+        return whole
+
+    def match(self, values: Tensor) -> Any:
+        """Return answers (B, ...) as they were asked for: of one place, as tensors or NumPy
+        arrays.
+        """
+        values = values[0] if self.single else values
+        if self.as_torch:
+            return values
+        return values.numpy() if values.ndim else float(values)
 
 
 class Queries:
@@ -40,10 +87,14 @@ class Queries:
     Args:
         site: of the model, or what one of its stations sees.
         station: its number, where a model of all is asked: two may stand at one place.
+        answered: numbers of stations that have an answer, which places are asked of where neither
+            end says which; empty: that is refused.
     """
 
-    def __init__(self, site: Site, station: int | None = None) -> None:
-        self.station = station
+    def __init__(
+        self, site: Site, station: int | None = None, answered: Sequence[int] = ()
+    ) -> None:
+        self.station, self.answered = station, torch.tensor(answered, dtype=torch.long)
         self.site, still = site, site.static_position if site.static_end == "rx" else None
         # The pose of a receiver that never moved, made once.
         self._still = (
@@ -76,8 +127,16 @@ class Queries:
         for end, place in local.items():
             if len(place) not in (1, count):
                 raise ValueError(f"{end}= holds {len(place)} positions, the other end {count}")
+        asked, rotation = self._asked(static in local), self._rx_rotation(rx, count)
+        number = self._stations(count)
+        if asked is not None:
+            number = asked.repeat(count)
+            row = np.arange(count).repeat(len(asked))
+            local = {moving: np.broadcast_to(local[moving], (count, 3))[row]}
+            rotation = self._turned(rotation, number.numpy(), row)
+            local[static] = self.site.every_station.position[number.numpy()]
+            count = len(row)
         ends = {moving: local[moving], static: self._static_place(local.get(static))}
-        rotation = self._rx_rotation(rx, count)
         if static == "rx" and rotation.ndim == 2 and ends["rx"].ndim == 1:
             pose = Pose(_float(ends["rx"], dtype), _float(rotation, dtype))
         else:
@@ -85,8 +144,21 @@ class Queries:
             turned = np.broadcast_to(rotation, (count, 3, 3))
             pose = Pose(_float(positions, dtype), _float(turned, dtype))
         sender = _float(np.broadcast_to(ends["tx"], (count, 3)), dtype)
-        query = Query(sender, pose, self._stations(len(sender)))
-        return PlacedQuery(query, single, any(isinstance(v, Tensor) for v in (tx, receiver)))
+        as_torch = any(isinstance(v, Tensor) for v in (tx, receiver))
+        names = self.site.every_station.shown
+        return PlacedQuery(Query(sender, pose, number), single, as_torch, asked, names)
+
+    def _asked(self, stands: bool) -> Tensor | None:
+        """Numbers (t,) of the stations that places are asked of; None where a query says which."""
+        said = stands or self.station is not None or self.site.static_position is not None
+        return None if said or self.site.stations is None or not len(self.answered) else self.answered
+
+    def _turned(self, rotation: np.ndarray, number: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """Rotations (n, 3, 3) or (3, 3) of receivers: stations have their own."""
+        stations = self.site.every_station.rotation
+        if self.site.static_end == "rx" and stations is not None:
+            return stations[number]
+        return rotation[row % len(rotation)] if rotation.ndim == 3 else rotation
 
     def _stations(self, count: int) -> Tensor | None:
         return None if self.station is None else torch.full((count,), self.station)
@@ -171,14 +243,6 @@ def read_places(end: str, value: Any) -> np.ndarray:
             f"{end}= is float32, which moves in steps of {step:.2g} m there; give float64"
         )
     return array
-
-
-def match_input(value: Tensor, single: bool, as_torch: bool) -> Any:
-    """Return answers (B, ...) as they were asked for: of one place, as tensors or NumPy arrays."""
-    value = value[0] if single else value
-    if as_torch:
-        return value
-    return value.numpy() if value.ndim else float(value)
 
 
 class Asked:

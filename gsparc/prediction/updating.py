@@ -268,14 +268,15 @@ class UpdateMixin(Asked):
         >>> bool(change < 0), predictor.undo()
         (True, None)
         """
-        query, method = self.queries.query(tx, rx).query, self.method
+        placed, method = self.queries.query(tx, rx), self.method
+        query = placed.query
         if isinstance(method, OneStationView):
             query = method.of_station(query)
             method = method.inner
         if not isinstance(method, Updated):
             return np.zeros(len(query)), np.zeros(len(query))
         mean, variance = method.change(query)
-        return mean.numpy(), variance.sqrt().numpy()
+        return placed.by_station(mean).numpy(), placed.by_station(variance.sqrt()).numpy()
 
     @property
     def rows(self) -> np.ndarray:

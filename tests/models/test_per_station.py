@@ -78,7 +78,8 @@ def test_checkpoints_hold_all_copies(town, fold, tmp_path):
         float(method.predict(town.batch(fold.test[:1])).mean) * town.site.target_scale
     )
     assert predictor.rssi(tx=place, unit="linear")[number] == one
-    refused(r"use select_station\(name\)", predictor.confidence, tx=place)
+    sure = predictor.confidence(tx=place)
+    assert sure[number] == predictor.select_station(number).confidence(tx=place)
     refused("no station 'roof'; there are 0, 1", predictor.select_station, "roof")
 
 

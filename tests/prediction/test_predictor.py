@@ -226,6 +226,30 @@ def test_all_at_once_is_what_is_asked_one_by_one(abroad):
     assert (np.abs(one.std(rx=places) - 1) < 0.5).all()  # a decibel, as the powers were drawn
 
 
+@pytest.mark.parametrize("model", ["complex_gp", "nearest"])
+def test_channels_of_all_stations_took_a_call_each(model):
+    """42 antennas that stand said `use select_station`, and 42 calls made equal matrices anew."""
+    draw = np.random.default_rng(0)
+    places, stations = draw.uniform(0, 2, (60, 3)), draw.uniform(0, 2, (3, 3)) + [0, 0, 3]
+    far = np.linalg.norm(places[:, None] - stations, axis=2)
+    known = {"station_position": stations, "csi": np.exp(-1j * 20 * far) / far, "frequency_hz": [955e6]}
+    predictor = gsparc.fit(tx=places, model=model, align="none", **known)
+    each = [predictor.select_station(name) for name in predictor.stations]
+    where = {"tx": places[:4] + 0.01}
+    channels = predictor.csi(**where)
+    assert channels.shape == (4, 3, 1, 1)
+    assert np.array_equal(channels, np.stack([one.csi(**where) for one in each], 1))
+    assert predictor.csi(tx=places[0]).shape == (3, 1, 1)
+    assert predictor.csi(**where, symbols=14).shape == (4, 3, 1, 1, 1, 14, 1)
+    said = predictor.predict(**where)
+    assert np.array_equal(said.mean.numpy(), channels)
+    if said.variance is not None:
+        spread = predictor.std(**where)
+        assert spread.shape == (4, 3, 1, 1) and np.allclose(said.variance.sqrt(), spread[..., 0, 0])
+        assert np.allclose(spread, np.stack([one.std(**where) for one in each], 1))
+    refused(r"use select_station\(name\): one of", predictor.paths, **where)
+
+
 STORED = Path(__file__).parents[1] / "oracle" / "stored"
 PLACES = np.array([[5.0, 6.0, 1.5], [6.0, 6.0, 1.5], [30.0, 20.0, 1.5]])
 

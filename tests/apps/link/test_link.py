@@ -78,12 +78,25 @@ def test_one_tone_is_flat() -> None:
     )
 
 
-def test_grid_is_sionna_s_order() -> None:
-    channel = torch.arange(12.0).reshape(2, 3, 2)
-    down = resource_grid(channel, 14, "rx")
-    assert down.shape == (2, 1, 1, 3, 14, 2) and torch.equal(down[1, 0, 0, 2, 5], channel[1, 2])
-    up = resource_grid(channel, 14, "tx")
-    assert up.shape == (1, 3, 2, 1, 14, 2) and torch.equal(up[0, 2, 1, 0, 5], channel[1, 2])
+@needs_sionna
+@pytest.mark.parametrize("antennas", ["rx", "tx"])
+@pytest.mark.parametrize("moves", ["rx", "tx"])
+def test_sionna_applies_a_grid_of_arrays_at_either_end(moves: str, antennas: str) -> None:
+    """A receiver's antennas landed on the transmitter's axis, and Sionna summed over them."""
+    from sionna.phy.channel import ApplyOFDMChannel
+
+    still = "tx" if moves == "rx" else "rx"
+    site = SimpleNamespace(still_end=still, antenna_end=antennas)
+    channel = drawn()(5, 2, 3, 6)  # places, stations, antennas, tones
+    grid = resource_grid(channel, 14, site)  # type: ignore[arg-type]
+    ends = {still: 2, moves: 1}
+    sent = torch.ones(5, ends["tx"], 3 if antennas == "tx" else 1, 14, 6, dtype=torch.complex64)
+    heard = ApplyOFDMChannel()(sent, grid)
+    # Each receiver hears the sum over all that transmit
+    sums = channel.sum(1, keepdim=True) if still == "tx" else channel
+    sums = sums.sum(2, keepdim=True) if antennas == "tx" else sums
+    assert heard.shape == (5, ends["rx"], 3 if antennas == "rx" else 1, 14, 6)
+    assert torch.allclose(heard[:, :, :, 7], sums, atol=1e-5)
 
 
 def test_beams_gain_the_number_of_antennas_and_lose_what_is_wrong() -> None:
@@ -135,11 +148,11 @@ def test_export_on_any_grid(trained) -> None:
     heard = data.uplink[rows] * data.site.target_scale
     wanted = centred_grid(float(data.site.subcarriers_hz.mean()), 30e3, 48)
     slot = predictor.csi(uplink=heard, frequency_hz=wanted, symbols=14)
-    assert slot.shape == (2, 1, 1, 64, 14, 48) and slot.dtype == np.complex64
+    assert slot.shape == (2, 1, 1, 1, 64, 14, 48) and slot.dtype == np.complex64
     tones = predictor.csi(uplink=heard)
     assert tones.shape == (2, 64, 26)
     exact, _ = true_channels(data, rows, wanted)
-    miss = np.abs(slot[:, 0, 0, :, 0] - exact.numpy() * data.site.target_scale) ** 2
+    miss = np.abs(slot[:, 0, 0, 0, :, 0] - exact.numpy() * data.site.target_scale) ** 2
     assert miss.mean() < 0.3 * np.mean(np.abs(exact.numpy() * data.site.target_scale) ** 2)
     found = predictor.paths(heard)
     assert found.gain.shape == found.delay_s.shape == (2, 16) and found.cosines.shape == (2, 16, 2)
