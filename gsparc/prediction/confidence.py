@@ -24,7 +24,7 @@ from gsparc.models.method import Prediction, predict_with_threads
 from gsparc.physics.decibels import from_decibels
 from gsparc.prediction.query import Asked, PlacedQuery
 from gsparc.processes.factor import Factor
-from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.few_rows import covering_rows, draw_rows
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.stored import Stored, from_plain, to_plain
 from gsparc.processes.uncertainty import Threshold
@@ -33,6 +33,7 @@ RIVALS = ("distance", "gp_variance")
 KINDS = ("learned", "expected", *RIVALS)
 # That length and noise are chosen on; the variance rests on all rows
 KERNEL_ROWS, COMPONENTS = 600, 64
+MOST_PLACES = 2_000  # that a rival's process knows: its matrix has their square
 MARGIN = 0.1  # of the longest side, around the places that a threshold is for
 
 
@@ -51,14 +52,14 @@ def calibrated_box(*places: np.ndarray) -> np.ndarray:
 
 def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Return what a process of positions `known` (n, 3) leaves unknown of (B, 3),
-    share of the prior.
+    share of the prior; of at most `MOST_PLACES` that cover them.
     """
-    rows = torch.from_numpy(known)
-    white = Factor.from_gram(kernel.gram(rows)).whiten(
-        kernel.correlations(rows, torch.from_numpy(places))
-    )
+    rows = torch.from_numpy(known[covering_rows(known, MOST_PLACES, 0)])
+    factor = Factor.from_gram(kernel.gram(rows))
     # Predictive variance by the whitened covariances (Rasmussen and Williams 2006, eq. 2.26).
-    return (1 + kernel.noise - white.square().sum(0)).numpy()
+    parts = torch.from_numpy(places).split(MOST_PLACES)
+    removed = [factor.whiten(kernel.correlations(rows, at)).square().sum(0) for at in parts]
+    return (1 + kernel.noise - torch.cat(removed)).numpy()
 
 
 KEY = "confidence"
@@ -116,7 +117,8 @@ class Trusted(Stored):
         rows = fold.learned()
         # A fixed seed: a checkpoint has the same rival whenever it is calibrated.
         kernel = kernel_of_targets(data, rows[draw_rows(len(rows), KERNEL_ROWS, 0)], COMPONENTS)
-        return Trusted(known=data.moving[rows], kernel=kernel)
+        # Stations share places: each is known once
+        return Trusted(known=np.unique(data.moving[rows], axis=0), kernel=kernel)
 
     def covers(self, places: np.ndarray) -> np.ndarray:
         """Tell whether local places (B, 3) [m] lie in the box, (B,) bool;

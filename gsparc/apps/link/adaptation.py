@@ -143,12 +143,8 @@ class Adaptation:
 
     def _effective_db(self, sinr: Tensor) -> Tensor:
         """Effective SINR [dB] (n, 28) under every MCS, from the SINR of the tones (n, K)."""
-        parts = []
-        # Sionna copies the tones for every MCS: positions in parts bound the memory.
-        for some in sinr.split(CHUNK):
-            tones = some[:, None, None, :, None, None].expand(-1, 28, 1, -1, 1, 1)
-            parts.append(self._of_every_mcs(len(some), sinr=tones)[2][..., 0])
-        return to_decibels(torch.cat(parts).cpu())
+        tones = sinr[:, None, None, :, None, None].expand(-1, 28, 1, -1, 1, 1)
+        return to_decibels(self._of_every_mcs(2, sinr=tones))
 
     def _fails(self, effective_db: Tensor) -> Tensor:
         """Transport-block error rates (n, 28); infinite where there is no such MCS."""
@@ -156,8 +152,7 @@ class Adaptation:
             (len(effective_db), 28, 1), SYMBOLS * self.subcarriers, dtype=torch.int32
         )
         effective = from_decibels(effective_db)[..., None]
-        rates = self._of_every_mcs(len(effective), sinr_eff=effective, num_allocated_re=allocated)
-        return rates[3][..., 0].cpu().double()
+        return self._of_every_mcs(3, sinr_eff=effective, num_allocated_re=allocated).double()
 
     def _highest(self, fails: Tensor) -> Tensor:
         """The highest MCS (n,) that meets the target; the lowest there is where none does."""
@@ -180,9 +175,17 @@ class Adaptation:
         best = carried.max(1)
         return torch.where(best.values > 0, best.indices, lowest)
 
-    def _of_every_mcs(self, count: int, **arguments: Tensor) -> tuple[Tensor, ...]:
-        """Sionna's PHY abstraction of every MCS of the table at `count` positions."""
-        indices = torch.arange(28, dtype=torch.int32)[None, :, None].expand(count, -1, -1)
-        return self.abstraction(
-            indices, **arguments, mcs_table_index=1, mcs_category=0, check_mcs_index_validity=False
-        )
+    def _of_every_mcs(self, answer: int, **arguments: Tensor) -> Tensor:
+        """One of Sionna's answers (n, 28) for every MCS of the table at n positions."""
+        # Sionna copies the tones, and grids of tables, for every MCS: parts bound the memory.
+        parts = []
+        for some in zip(*(values.split(CHUNK) for values in arguments.values()), strict=True):
+            said = self.abstraction(
+                torch.arange(28, dtype=torch.int32)[None, :, None].expand(len(some[0]), -1, -1),
+                **dict(zip(arguments, some, strict=True)),
+                mcs_table_index=1,
+                mcs_category=0,
+                check_mcs_index_validity=False,
+            )
+            parts.append(said[answer][..., 0].cpu())
+        return torch.cat(parts)

@@ -30,6 +30,7 @@ from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred_grid, inte
 from gsparc.prediction.confidence import Guarantee, Trusted, as_confidence, confidence_threshold
 from gsparc.prediction.left_out import Evidence, score_answers
 from gsparc.prediction.risk import calibrate_threshold
+from gsparc.processes.few_rows import draw_rows
 from gsparc.runs.open_runs import Opened
 
 if TYPE_CHECKING:
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
 
 # 32 positions x antennas x fine tones bound what is held at once.
 CHUNK = 32
+BEAM_ENTRIES = 1 << 24  # of true and of predicted channels of beams: .5 GB with what is made of them
 
 
 @dataclass(frozen=True)
@@ -202,6 +204,12 @@ class LinkStudy:
                 f"gsparc link needs complex channels with their frequencies, not {site.kind}"
             )
         site.need_phase("gsparc link")
+        if len(site.subcarriers_hz) == 1 and not settings["flat"]:
+            raise ValueError(
+                f"gsparc link: {site.name} has one tone, which says nothing of the other "
+                f"{settings['mcs']['subcarriers'] - 1} subcarriers of a link; flat=true takes its "
+                "channel for all of them, and measuring two tones or more tells how they differ"
+            )
         RULES.check("rule", settings["rule"])
         for name in (receivers := list(settings["receivers"])):
             RECEIVERS.check("receivers", name)
@@ -269,9 +277,13 @@ class LinkStudy:
         """
         if self.data.target.shape[1] == 1:
             return {}
-        channels = predict_channels(self.method, self.data, self.fold.test, self.tones)
+        entries = self.data.target.shape[1] * len(self.tones)
+        some = draw_rows(len(self.fold.test), max(BEAM_ENTRIES // entries, 1), self.facts["seed"])
+        if len(some) < len(self.fold.test):
+            log.info("beams of %d drawn test positions: the channels of all fill memory", len(some))
+        channels = predict_channels(self.method, self.data, self.fold.test[some], self.tones)
         # `test` are numbers into the fold's test rows, as `accepted` are into `test`.
-        accepted = np.isin(np.arange(len(self.fold.test)), self.test[self.accepted])
+        accepted = np.isin(some, self.test[self.accepted])
         return study.beam_facts(channels.true, channels.predicted, accepted)
 
     def rates(self) -> tuple[list[Rates], dict[str, Any]]:

@@ -14,7 +14,7 @@ from doors import knock
 from names import find_unexplained
 
 from gsparc import load
-from gsparc.apps.link.adaptation import Adaptation, Band, Rates
+from gsparc.apps.link.adaptation import CHUNK, Adaptation, Band, Rates
 from gsparc.apps.link.pusch import Pusch, frequency_correlation
 from gsparc.apps.link.run import true_channels
 from gsparc.apps.link.study import (
@@ -175,6 +175,22 @@ def test_without_doubt_the_choice_carries_most() -> None:
     assert found.oracle_bps.mean() > 5e6 and (found.best_bps >= found.oracle_bps).all()
     deaf = loop.rates(known, 1e4, 1.0)
     assert deaf.outage.all() and deaf.oracle_bps.max() < 1e6
+
+
+@needs_sionna
+def test_memory_of_rates_grew_with_the_positions(monkeypatch) -> None:
+    """8,000 test rows of 42 antennas took all memory: error rates were of all at once."""
+    draw, loop, sizes = drawn(), Adaptation(), list[int]()
+    abstraction = loop.abstraction
+
+    def watched(index, **arguments):
+        sizes.append(len(index))
+        return abstraction(index, **arguments)
+
+    monkeypatch.setattr(loop, "abstraction", watched)
+    true = draw(CHUNK + 3, 2)
+    rates = loop.rates(Band(true, true, torch.full((len(true),), 0.1)), 0.03, 1.0)
+    assert max(sizes) == CHUNK and len(rates.chosen) == len(true)
 
 
 @needs_sionna
