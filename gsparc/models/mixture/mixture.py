@@ -26,15 +26,16 @@ from gsparc.models.abilities import HasPaths, HasProcess, QueryPaths
 from gsparc.models.channels.initial import estimate_run_factors
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, method_from_state, method_state
 from gsparc.models.image_sources.frame import merge_equal_paths
-from gsparc.models.method import Method, Prediction
+from gsparc.models.method import Method, Prediction, factors_to_measured
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.each_or_together import LearnsTogether
 from gsparc.models.reduced import View
 from gsparc.models.refined_places import move_rows, position_errors, refine_places
 from gsparc.models.run_factors import RunFactors
-from gsparc.models.stack import explained_variance
+from gsparc.models.stack import explained_variance, to_real_entries
 from gsparc.models.terms import EffectSettings
+from gsparc.physics.decibels import TINY_POWER
 from gsparc.processes.averages import mixture_moments
 from gsparc.processes.powers import PowerProcess
 from gsparc.training.context import FitContext, FitReport
@@ -42,6 +43,7 @@ from gsparc.training.cost import Cost
 from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
+BELIEVED = 10  # rows that a variance as stated counts as, where others tell how wrong it is
 QUERY_CHUNK = 1024  # memory; stations at one place share most of their work, see `ChannelField`
 # Of fields, in words.
 PARTS = {"power": "a trend over distance", "residual": "a Gaussian process of the rest"}
@@ -78,6 +80,7 @@ class Mixture(LearnsTogether, ClosedForm):
         self.members: list[ClosedForm] = []
         self.weights: tuple[float, ...] = ()  # (M,) of the mean, of sum 1
         self.started = ""  # names of members
+        self.doubt = 1.0  # times the members' variances, as validation rows of channels say
         # Share of the variance of validation rows, by Gaussians
         self.explained: float | None = None
         self.init_s: float | None = None
@@ -186,6 +189,7 @@ class Mixture(LearnsTogether, ClosedForm):
         self.members, self.weights = [fitted[name] for name in chosen], tuple(chosen.values())
         self.started = "+".join(chosen)
         self.site, self.init_s = data.site, watch.seconds
+        self.doubt = self._measure_doubt(data, fold.val) if several else 1.0
         self.explained = self._explained_share(data, fold, several)
         if several or self.explained is not None:  # else it is of these rows already
             self.condition(data, fit_rows)
@@ -200,6 +204,20 @@ class Mixture(LearnsTogether, ClosedForm):
         }
         notes = [note for name in chosen for note in reports[name].notes]
         return FitReport(seconds, tuple(notes)).with_cost(Cost(stages, unused))
+
+    def _measure_doubt(self, data: Measurements, val: np.ndarray) -> float:
+        """What variances of channels are to be multiplied by, from rows that members left out."""
+        if not (data.site.target.is_complex and len(val)):
+            return 1.0
+        batch = data.batch(val)
+        said = self._mix_predictions(batch)
+        mean = said.mean
+        if data.site.unknown_factor != "none":
+            mean = mean * factors_to_measured(mean, data, val)
+        missed = to_real_entries(mean - batch.target).square().sum(1) / mean[0].numel()
+        ratios = missed / cast(Tensor, said.variance).double().clamp_min(TINY_POWER)
+        # As if few rows more had been what was expected
+        return float((ratios.sum() + BELIEVED) / (len(val) + BELIEVED))
 
     def _explained_share(
         self, data: Measurements, fold: Fold, is_conditioned: bool
@@ -254,13 +272,16 @@ class Mixture(LearnsTogether, ClosedForm):
     def predict(self, query: Query) -> Prediction:
         """See `Method.predict`; what members disagree about is added to their variances."""
         self.require_fitted(self.members or None)
-        prediction = Prediction.joined(
-            [self._mix_predictions(part) for part in query.split(QUERY_CHUNK)]
-        )
+        prediction = self._mix_predictions(query)
+        if prediction.variance is not None and self.doubt != 1:
+            prediction = replace(prediction, variance=prediction.variance * self.doubt)
         return self.runs.apply_factors(prediction, query.run)
 
     def _mix_predictions(self, query: Query) -> Prediction:
-        """In the phase and level of the largest run."""
+        """In the phase and level of the largest run, with the members' own variances."""
+        return Prediction.joined([self._mix_part(part) for part in query.split(QUERY_CHUNK)])
+
+    def _mix_part(self, query: Query) -> Prediction:
         result = [member.predict(query) for member in self.members]
         if len(result) == 1:
             return result[0]
@@ -293,7 +314,8 @@ class Mixture(LearnsTogether, ClosedForm):
             (weight, answers.mean, answers.variance)
             for weight, answers in zip(self.weights, result, strict=True)
         ]
-        return LeftOutRows(result[0].rows, *mixture_moments(parts))
+        mean, variance = mixture_moments(parts)
+        return LeftOutRows(result[0].rows, mean, variance * self.doubt)
 
     def process(self) -> PowerProcess | None:
         """See `HasProcess`."""
@@ -401,6 +423,7 @@ class Mixture(LearnsTogether, ClosedForm):
             "weights": list(self.weights),
             "started": self.started,
             "explained": self.explained,
+            "doubt": self.doubt,
             "runs": self.runs.state(),
         }
 
@@ -409,6 +432,7 @@ class Mixture(LearnsTogether, ClosedForm):
         self.site, self.started, self.explained = site, str(state["started"]), state["explained"]
         self.members = [method_from_state(site, member) for member in state["members"]]
         self.weights, self.runs = tuple(state["weights"]), RunFactors.read(state["runs"])
+        self.doubt = float(state.get("doubt", 1.0))
 
 
 def _estimate_run_factors(data: Measurements, known: np.ndarray, context: FitContext) -> RunFactors:
