@@ -71,9 +71,9 @@ def read_cbrs(path: str | Path, phone: str | None = None, pixel_m: float | None 
     cells = np.array([CELLS[name] for name in names.tolist()])
     place = np.array(MASTS)[cells[:, 0]]
     phones, number = np.unique(device[kept], return_inverse=True)
-    rows = latitude, longitude, level, station, number
+    rows: tuple[np.ndarray, ...] = latitude, longitude, level, station, number
     if pixel_m is not None:
-        rows = average_pixels(*rows, cells[:, 0], pixel_m)
+        rows = average_pixels(rows, cells[:, 0], pixel_m)
     arrays = dict(zip(("latitude", "longitude", "rssi_db", "station"), rows[:4], strict=True))
     arrays |= {"device": phones[rows[4]]} if len(phones) > 1 else {}
     about = {
@@ -90,30 +90,25 @@ def read_cbrs(path: str | Path, phone: str | None = None, pixel_m: float | None 
 
 
 def average_pixels(
-    latitude: np.ndarray,
-    longitude: np.ndarray,
-    level_db: np.ndarray,
-    station: np.ndarray,
-    device: np.ndarray,
-    mast: np.ndarray,
-    pixel_m: float,
+    rows: tuple[np.ndarray, ...], mast: np.ndarray, pixel_m: float
 ) -> tuple[np.ndarray, ...]:
-    """Return the first five of pixels in the masts' boxes: levels are means of milliwatts.
+    """Return the same of pixels in the masts' boxes: levels are means of milliwatts.
 
     Args:
-        latitude, longitude, level_db, station, device: (S,) of rows.
+        rows: latitude, longitude [deg], level [dBm], numbers of station and device, (S,) each.
         mast: (T,) of stations.
         pixel_m: side of a pixel [m].
     """
+    latitude, longitude, level_db, station, device = rows
     parts = list[tuple[np.ndarray, ...]]()
     for number, corner in enumerate(CORNERS):
-        origin, rows = Georeference(*corner), np.flatnonzero(mast[station] == number)
-        east_north = origin.from_degrees(latitude[rows], longitude[rows])
+        origin, own = Georeference(*corner), np.flatnonzero(mast[station] == number)
+        east_north = origin.from_degrees(latitude[own], longitude[own])
         pixel = np.floor((east_north + np.array([0, BOX_M])) / pixel_m)
         inside = ((pixel >= 0) & (pixel < BOX_M / pixel_m)).all(1)
-        rows, key = rows[inside], np.c_[pixel, station[rows], device[rows]][inside].astype(int)
+        own, key = own[inside], np.c_[pixel, station[own], device[own]][inside].astype(int)
         keys, group = np.unique(key, axis=0, return_inverse=True)
-        power = np.bincount(group, from_decibels(level_db[rows])) / np.bincount(group)
+        power = np.bincount(group, from_decibels(level_db[own])) / np.bincount(group)
         degrees = origin.to_degrees((keys[:, :2] + 0.5) * pixel_m - np.array([0, BOX_M]))
         parts += [(*degrees, to_decibels(power), keys[:, 2], keys[:, 3])]
     return tuple(np.concatenate(columns) for columns in zip(*parts, strict=True))

@@ -71,9 +71,10 @@ def read_prior_maps(
     own = [names_of_station(shown) for shown in stations]
     known = {name for names in own for name in names if name}
     maps, faults = dict[str, Levels](), list[DataError]()
-    single = isinstance(path, str | Path | Mapping)
-    several = not single or (isinstance(path, str | Path) and Path(path).is_dir())
-    sources = [_settings_of(source) for source in ([path] if single else path)]
+    several = not isinstance(path, str | Path | Mapping)
+    several |= isinstance(path, str | Path) and Path(path).is_dir()
+    listed: Sequence[Any] = [path] if isinstance(path, str | Path | Mapping) else path
+    sources = [_settings_of(source) for source in listed]
     if several and len(sources) == 1 and (folder := Path(sources[0].get("file", ""))).is_dir():
         kinds = (*GRIDS, OVERLAY)
         sources = [{"file": file} for file in sorted(folder.iterdir()) if file.suffix in kinds]
@@ -190,7 +191,8 @@ def _near_rows(path: Path, data: Measurements, points: np.ndarray, level: np.nda
             f"model.prior={path}: {near.sum():,} levels about the rows; {MOST:,} at most are kept"
         )
     points, level = points[near], level[near]
-    marks = find_marks(level)
+    # A legend states all levels of an overlay, each of which repeats apart from the others.
+    marks = [] if path.suffix.lower() == OVERLAY else find_marks(level)
     marked = np.isin(level, marks)
     _say_marks(path, int(marked.sum()), f"exactly {list_first([f'{mark:g}' for mark in marks])}")
     return points[~marked], level[~marked]

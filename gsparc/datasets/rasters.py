@@ -136,8 +136,10 @@ def _read_overlay(path: Path, legend: Sequence[str] | None) -> Raster:
     matches = [COLOUR.fullmatch(str(entry)) for entry in legend]
     if len(legend) < 2 or not all(matches):
         raise DataError(f"model.prior={path}: legend: two colours at least like ff0000=-70")
-    known = np.array([[*bytes.fromhex(m[1])] for m in matches if m], float)
-    level = np.array([float(m[2]) for m in matches if m])
+    entries = sorted((float(match[2]), bytes.fromhex(match[1])) for match in matches if match)
+    level, known = np.array([db for db, _ in entries]), np.array([[*c] for _, c in entries], float)
+    step = np.linalg.norm(np.diff(known, axis=0), axis=1)  # from one to the next stronger
+    reach = np.maximum(np.r_[0, step], np.r_[step, 0]) / 2 + 1  # and one of rounding
     with readable(f"model.prior={path}", "no ground overlay", (ElementTree.ParseError, ValueError)):
         root = ElementTree.fromstring(read_text(path, "missing"))
         text = {node.tag.rpartition("}")[2]: (node.text or "").strip() for node in root.iter()}
@@ -155,8 +157,7 @@ def _read_overlay(path: Path, legend: Sequence[str] | None) -> Raster:
     shades, shade = np.unique(np.frombuffer(pixels, "<u4"), return_inverse=True)
     colours = shades.view(np.uint8).reshape(-1, 4).astype(float)
     away = np.linalg.norm(colours[:, None, :3] - known, axis=2)
-    step = np.linalg.norm(known[:, None] - known, axis=2) + np.diag(np.full(len(known), np.inf))
     nearest = away.argmin(1)
-    told = (away.min(1) <= step.min(1)[nearest] / 2) & (colours[:, 3] > 0)
+    told = (away.min(1) <= reach[nearest]) & (colours[:, 3] > 0)
     bands = np.where(told, level[nearest], np.nan)[shade.reshape(1, -1)]
     return Raster(np.c_[x, y], DEGREES, ("",), ("",), bands)

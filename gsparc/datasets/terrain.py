@@ -65,23 +65,18 @@ def terrain_levels(
     stood, moved = (tx_m, rx_m) if site.moving_end == "rx" else (rx_m, tx_m)
     moved = float(np.median(data.moving[:, 2]) + origin[2]) if moved is None else moved
     for number, still in enumerate(site.every_station.position + origin):
-        carrier = site.carrier_hz if carriers is None else carriers[number]
-        if not np.isfinite(still).all() or (mhz is None and carrier is None):
-            name = site.every_station.shown[number]
+        carrier = site.carrier_hz if carriers is None else float(carriers[number])
+        carrier = carrier if mhz is None else mhz * 1e6
+        if not np.isfinite(still).all() or carrier is None:
             raise DataError(
-                f"model.prior=itm:{path}: the place of {name} and the carrier are needed (mhz: "
-                "NUMBER beside itm)"
+                f"model.prior=itm:{path}: the place of {site.every_station.shown[number]} and the "
+                "carrier are needed (mhz: NUMBER beside itm)"
             )
-        heights = float(still[2]) if stood is None else stood, moved
-        level = np.array(
-            [
-                -longley_rice_loss(
-                    *_profile(tree, ground, still[:2], end, spacing), heights, mhz or carrier / 1e6
-                )
-                for end in squares
-            ]
-        )
-        yield site.every_station.shown[number] if site.several else "", squares, level
+        heights, level = (float(still[2]) if stood is None else stood, moved), list[float]()
+        for end in squares:
+            profile = _profile(tree, ground, still[:2], end, spacing)
+            level.append(-longley_rice_loss(*profile, heights, carrier / 1e6))
+        yield site.every_station.shown[number] if site.several else "", squares, np.array(level)
 
 
 def _profile(
