@@ -78,9 +78,9 @@ def read_prior_maps(
     if several and len(sources) == 1 and (folder := Path(sources[0].get("file", ""))).is_dir():
         kinds = (*GRIDS, OVERLAY)
         sources = [{"file": file} for file in sorted(folder.iterdir()) if file.suffix in kinds]
-    for said in sources:
-        file = Path(said.get("file") or said.get("itm", ""))
-        for name, points, level in _read_file(said, data, known):
+    for settings in sources:
+        file = Path(settings.get("file") or settings["itm"])
+        for name, points, level in _read_file(settings, data, known):
             try:
                 named = name or file.stem * several
                 maps[named] = _near_rows(file, data, points, level)
@@ -132,19 +132,19 @@ def names_of_station(shown: str) -> tuple[str, ...]:
 def _settings_of(source: Any) -> dict[str, Any]:
     """Settings of one file, of which a name alone is short."""
     if isinstance(source, Mapping):
-        kind = "itm" if "itm" in source else "file"
-        if kind not in source or {*source} - {kind, *BESIDE[kind]}:
-            raise DataError(f"model.prior={source}: takes {kind}, {', '.join(BESIDE[kind])}")
+        key = "itm" if "itm" in source else "file"
+        if key not in source or {*source} - {key, *BESIDE[key]}:
+            raise DataError(f"model.prior={source}: takes {key}, {', '.join(BESIDE[key])}")
         return {name: value for name, value in source.items() if value is not None}
     terrain = str(source).removeprefix("itm:")
     return {"file" if terrain == str(source) else "itm": terrain}
 
 
 def _read_file(
-    said: Mapping[str, Any], data: Measurements, stations: Collection[str]
+    settings: Mapping[str, Any], data: Measurements, stations: Collection[str]
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield name, places and levels of each map in one file."""
-    path = Path(said.get("file") or said["itm"])
+    path = Path(settings.get("file") or settings["itm"])
     if path.suffix == ".ckpt":
         raise DataError(
             f"model.prior={path}: draw it first, gsparc map ckpt={path}, and give its map.tif"
@@ -154,10 +154,10 @@ def _read_file(
             f"model.prior={path}: no such file; a raster, such as a GeoTIFF, is needed, or a table "
             "of places and powers"
         )
-    beside = {name: value for name, value in said.items() if name not in BESIDE}
-    if "itm" in said:
+    beside = {name: value for name, value in settings.items() if name not in BESIDE}
+    if "itm" in settings:
         yield from terrain_levels(path, data, **beside)
-    elif is_raster(path, said):
+    elif is_raster(path, settings):
         yield from _read_raster(path, data, stations, **beside)
     else:
         yield from _read_rows(path, data, stations)
@@ -212,12 +212,12 @@ def _extent(points: np.ndarray) -> np.ndarray:
 
 
 def _read_raster(
-    path: Path, data: Measurements, stations: Collection[str], **said: Any
+    path: Path, data: Measurements, stations: Collection[str], **settings: Any
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield name, centres of squares and their levels, of named bands,
     else of `BAND` or of the first.
     """
-    raster = read_raster(path, **said)
+    raster = read_raster(path, **settings)
     titles = raster.names
     single = {"": titles.index(BAND) if BAND in titles else 0}
     known = {*stations, *map(site_name, stations)}

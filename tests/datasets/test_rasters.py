@@ -78,6 +78,8 @@ def test_a_list_asks_for_its_projection_and_its_mark(files, refused):
     refused(asks, read_raster, files / "a.txt", crs=ZONE)
     wrong = {"file": files / "a.txt", "crs": "EPSG:1", "nodata": "none"}
     refused("no such projection", read_prior_levels, wrong, rows())
+    odd = {"file": files / "a.txt", "crs": ZONE, "nodata": "nine"}
+    refused("a.txt: no raster", read_prior_levels, odd, rows())
     refused("takes file, crs, nodata, legend", read_prior_levels, {"map": "a.tif"}, rows())
     assert np.nanmin(read_raster(files / "a.txt", ZONE, "none").bands) == -9999
 
