@@ -16,7 +16,8 @@ from gsparc.data.schema import Measurements
 from gsparc.datasets.rasters import read_raster
 from gsparc.physics.waves import LIGHT
 
-SQUARES = 20_000  # that levels are kept of, about the rows
+SQUARES, LEAST = 20_000, 2_000  # that levels are kept of, about the rows; of each of many stations
+LOWEST_M = 0.5  # antenna above ground that the model is meant for
 STEPS = 150  # of a profile at most
 NEAR = 4  # heights that tell of a place
 AROUND = 0.2  # of the longer side of the rows' box, on each side of it
@@ -46,7 +47,8 @@ def terrain_levels(
         mhz: the carrier; None: of the measurements.
 
     Raises:
-        DataError: no itmlogic, no place of a station, no carrier, or no heights about the rows.
+        DataError: no itmlogic, no carrier, no heights about the rows, or no place of the only
+            station; of several those without are left out.
     """
     site, origin = data.site, data.site.origin
     carriers = site.every_station.carrier_hz
@@ -58,7 +60,8 @@ def terrain_levels(
     about = ((points >= at.min(0) - margin) & (points <= at.max(0) + margin)).all(1)
     if not about.any():
         raise DataError(f"model.prior={path}: no height is known about the rows")
-    side = math.sqrt(float(np.prod(np.ptp(points[about], axis=0))) / SQUARES) or 1.0
+    count = max(SQUARES // len(site.every_station), LEAST)
+    side = math.sqrt(float(np.prod(np.ptp(points[about], axis=0))) / count) or 1.0
     chosen = np.unique(np.round(points[about] / side), axis=0, return_index=True)[1]
     squares = points[about][chosen]
     spacing = float(np.median(tree.query(squares, 2)[0][:, 1]))
@@ -67,12 +70,16 @@ def terrain_levels(
     for number, still in enumerate(site.every_station.position + origin):
         carrier = site.carrier_hz if carriers is None else float(carriers[number])
         carrier = carrier if mhz is None else mhz * 1e6
-        if not np.isfinite(still).all() or carrier is None:
+        known = np.isfinite(still).all()
+        if carrier is None or not (known or site.several):
             raise DataError(
                 f"model.prior=itm:{path}: the place of {site.every_station.shown[number]} and the "
                 "carrier are needed (mhz: NUMBER beside itm)"
             )
-        heights, level = (float(still[2]) if stood is None else stood, moved), list[float]()
+        if not known:
+            continue
+        above = float(still[2]) if stood is None else stood
+        heights, level = (max(above, LOWEST_M), max(moved, LOWEST_M)), list[float]()
         for end in squares:
             profile = _profile(tree, ground, still[:2], end, spacing)
             level.append(-longley_rice_loss(*profile, heights, carrier / 1e6))

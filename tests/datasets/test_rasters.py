@@ -7,7 +7,7 @@ from PIL import Image
 import gsparc
 from gsparc.base.errors import DataError
 from gsparc.data.georeference import Georeference
-from gsparc.datasets.prior_levels import read_prior_levels
+from gsparc.datasets.prior_levels import read_prior_levels, read_prior_maps
 from gsparc.datasets.rasters import read_raster
 from gsparc.tables.own import from_arrays
 
@@ -158,6 +158,19 @@ def test_a_terrain_shadows_what_lies_behind_its_hills(tmp_path, refused, monkeyp
     refused("no height is known about the rows", read_prior_levels, f"itm:{dem}", far)
     monkeypatch.setitem(__import__("sys").modules, "itmlogic.preparatory_subroutines.qlrpfl", None)
     refused(r"needs itmlogic; pip install 'gsparc\[itm\]'", read_prior_levels, f"itm:{dem}", data)
+
+
+def test_each_station_of_a_network_has_its_own_shadow(tmp_path):
+    """Antennas on the ground, of which the model takes logarithms, and a mast of no known place."""
+    pytest.importorskip("itmlogic", reason="pip install 'gsparc[itm]'")
+    at = np.c_[np.random.default_rng(0).uniform(50, 950, (30, 2)), np.zeros(30)]
+    masts = np.array([[20.0, 500, 0], [980, 500, 0], [np.nan, np.nan, np.nan]])
+    network = {"station_position": masts, "station": np.arange(30) % 3, "carrier_hz": np.array(8e8)}
+    data = from_arrays({"rx_position": at, "rssi_db": np.linspace(-90, -60, 30), **network})
+    dem, shown = hills(tmp_path / "dem.tif"), data.site.every_station.shown
+    (_, _, (places, west)), (_, _, (_, east)) = read_prior_maps(f"itm:{dem}", data, shown)
+    behind = places[:, 0] > 420
+    assert (east - west)[behind].mean() > 10 > (east - west)[~behind].mean()
 
 
 def test_a_terrain_is_a_prior_of_a_fit(tmp_path):
