@@ -37,7 +37,7 @@ $(MODULES): $(VENV)/.python
 $(VENV)/.installed: $(VENV)/.python pyproject.toml constraints.txt $(SOURCES) $(MODULES)
 	@echo "Installing what gsparc needs into $(VENV) (a few minutes the first time)"
 	$(VENV)/bin/pip install --quiet -c constraints.txt torch
-	$(VENV)/bin/pip install --quiet -c constraints.txt -e '.[cluster,dev,hub,maps,ray,serve,sweep,tables,viewer,wifi]'
+	$(VENV)/bin/pip install --quiet -c constraints.txt -e '.[cluster,dev,hub,itm,maps,ray,serve,sweep,tables,viewer,wifi]'
 	@touch $@
 
 sionna: $(VENV)/.sionna ## what `gsparc simulate` needs: Sionna, an LLVM that works with it, without root, readers of maps

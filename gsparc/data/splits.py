@@ -145,7 +145,7 @@ class SplitSettings(Checked):
         share: of the places, that `blocks` holds out at least.
         buffer_m: `grouped` and `corner` drop training rows this close to a test row [m].
         corner: of `corner`, lower or upper end in x and y as `--`, `-+`, `+-` or `++`.
-        train_fraction: share of the rows that `sparse` trains on.
+        train_fraction: share of the rows that `sparse` trains on; from 1 on how many.
         train_count: thin each fold's training rows to this many (validation included); None keeps
             all.
         thin: the same as a share in (0, 1]; smaller sets are subsets of larger ones.
@@ -168,7 +168,7 @@ class SplitSettings(Checked):
     share: float = setting(0.2, SHARE)
     buffer_m: float = setting(0.03, number(0))
     corner: str = setting("++", choice(*CORNERS))
-    train_fraction: float = setting(0.1, SHARE)
+    train_fraction: float = setting(0.1, number(0, open_low=True))
     train_count: int | None = setting(None, or_null(whole(1)))
     thin: float = setting(1.0, number(0, 1, open_low=True))
     spacing_m: float | None = setting(None, or_null(POSITIVE))
@@ -307,7 +307,11 @@ def _pairs(positions: np.ndarray, taken: np.ndarray, settings: SplitSettings) ->
         case "random":
             return [last_rows(rng.permutation(rows), settings.test_fraction)]
         case "sparse":
-            return [last_rows(rng.permutation(rows), 1 - settings.train_fraction)]
+            learned = settings.train_fraction
+            share = learned if learned < 1 else learned / len(rows)
+            if share >= 1:
+                raise DataError(f"split.train_fraction={learned:g}: there are {len(rows)} rows")
+            return [last_rows(rng.permutation(rows), 1 - share)]
         case "later":
             return [last_rows(taken, settings.test_fraction)]
         case "none":

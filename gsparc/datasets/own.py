@@ -16,6 +16,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.selection import Selection, take_selection
 from gsparc.datasets.ble import BLE
 from gsparc.datasets.campaign import Campaign
+from gsparc.datasets.cbrs import Cbrs
 from gsparc.datasets.newrf import NeWRF
 from gsparc.datasets.powder import Powder
 from gsparc.datasets.rfid import load_rfid
@@ -138,7 +139,9 @@ class Own(Campaign):
 
 
 TABLE = ("columns", "stations_file", "guess", "columns_file")  # settings of tables
-CAMPAIGNS: tuple[type[Campaign], ...] = (Techtile, Powder, BLE, NeWRF, TechtilePower, WSR, WifiCsi)
+CAMPAIGNS: tuple[type[Campaign], ...] = (
+    *(Techtile, Powder, BLE, NeWRF, TechtilePower, WSR, WifiCsi, Cbrs),
+)
 
 
 def dataset_by_arrays(raw: Raw) -> type[Campaign] | None:

@@ -1,11 +1,14 @@
-"""Levels that a file states of a site before any row: a GeoTIFF, or places and powers."""
+"""Levels that a file states of a site before any row: a raster, places and powers, or what a
+terrain lets through.
+"""
 
 from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +17,8 @@ from gsparc.data.schema import Measurements
 from gsparc.data.station_names import site_name
 from gsparc.data.units import UNITS
 from gsparc.datasets.own import read_own
+from gsparc.datasets.rasters import GRIDS, OVERLAY, is_raster, read_raster
+from gsparc.datasets.terrain import terrain_levels
 from gsparc.physics.decibels import to_decibels
 from gsparc.tables import is_table
 from gsparc.tables.array_checks import MOST_DB
@@ -22,10 +27,12 @@ from gsparc.tables.own import interpret
 
 log = logging.getLogger(__name__)
 
-Files = str | Path | Sequence[str]
+# One file, settings beside its name, or several of either
+Files = str | Path | Mapping[str, Any] | Sequence[Any]
 Levels = tuple[np.ndarray, np.ndarray]  # places (M, 2) [m], world, and levels (M,) [dB] there
 # Of the strongest station, as `gsparc map` writes; with a name behind it of one of several
 BAND = "power_db"
+BESIDE = {"file": ("crs", "nodata", "legend"), "itm": ("crs", "nodata", "tx_m", "rx_m", "mhz")}
 MOST = 4_000_000  # levels: they are kept with a model
 ABOUT_M = 100.0  # least distance from the box of rows and stations that levels are kept within [m]
 
@@ -35,8 +42,9 @@ def read_prior_levels(path: Files, data: Measurements, station: str = "") -> Lev
     [dB] there.
 
     Args:
-        path: *.tif, or what `dataset=own` reads; several, or a folder of *.tif: each named by its
-            station.
+        path: a raster of `read_raster`, its name or `{file: NAME, crs: ...}` with its settings, or
+            what `dataset=own` reads; several, or a folder of rasters: each named by its station.
+            Of a terrain `itm:NAME`, or `{itm: NAME, ...}`, see `terrain_levels`.
         data: measurements, which the levels must overlap.
         station: whose levels are wanted, as it is shown; empty: the measurements are of one
             station.
@@ -63,11 +71,16 @@ def read_prior_maps(
     own = [names_of_station(shown) for shown in stations]
     known = {name for names in own for name in names if name}
     maps, faults = dict[str, Levels](), list[DataError]()
-    several = not isinstance(path, str | Path) or Path(path).is_dir()
-    files = [Path(file) for file in ([path] if isinstance(path, str | Path) else path)]
-    files = sorted(files[0].glob("*.tif")) if len(files) == 1 and files[0].is_dir() else files
-    for file in files:
-        for name, points, level in _read_file(file, data, known):
+    several = not isinstance(path, str | Path | Mapping)
+    several |= isinstance(path, str | Path) and Path(path).is_dir()
+    listed: Sequence[Any] = [path] if isinstance(path, str | Path | Mapping) else path
+    sources = [_settings_of(source) for source in listed]
+    if several and len(sources) == 1 and (folder := Path(sources[0].get("file", ""))).is_dir():
+        kinds = (*GRIDS, OVERLAY)
+        sources = [{"file": file} for file in sorted(folder.iterdir()) if file.suffix in kinds]
+    for settings in sources:
+        file = Path(settings.get("file") or settings["itm"])
+        for name, points, level in _read_file(settings, data, known):
             try:
                 named = name or file.stem * several
                 maps[named] = _near_rows(file, data, points, level)
@@ -116,21 +129,38 @@ def names_of_station(shown: str) -> tuple[str, ...]:
     return (shown, *both.groups()) if both else (shown,)
 
 
+def _settings_of(source: Any) -> dict[str, Any]:
+    """Settings of one file, of which a name alone is short."""
+    if isinstance(source, Mapping):
+        key = "itm" if "itm" in source else "file"
+        if key not in source or {*source} - {key, *BESIDE[key]}:
+            raise DataError(f"model.prior={source}: takes {key}, {', '.join(BESIDE[key])}")
+        return {name: value for name, value in source.items() if value is not None}
+    terrain = str(source).removeprefix("itm:")
+    return {"file" if terrain == str(source) else "itm": terrain}
+
+
 def _read_file(
-    path: Path, data: Measurements, stations: Collection[str]
+    settings: Mapping[str, Any], data: Measurements, stations: Collection[str]
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield name, places and levels of each map in one file."""
+    path = Path(settings.get("file") or settings["itm"])
     if path.suffix == ".ckpt":
         raise DataError(
             f"model.prior={path}: draw it first, gsparc map ckpt={path}, and give its map.tif"
         )
     if not path.is_file():
         raise DataError(
-            f"model.prior={path}: no such file; a GeoTIFF is needed, or a table of places and "
-            "powers"
+            f"model.prior={path}: no such file; a raster, such as a GeoTIFF, is needed, or a table "
+            "of places and powers"
         )
-    read = _read_raster if path.suffix in (".tif", ".tiff") else _read_rows
-    yield from read(path, data, stations)
+    beside = {name: value for name, value in settings.items() if name not in BESIDE}
+    if "itm" in settings:
+        yield from terrain_levels(path, data, **beside)
+    elif is_raster(path, settings):
+        yield from _read_raster(path, data, stations, **beside)
+    else:
+        yield from _read_rows(path, data, stations)
 
 
 def _near_rows(path: Path, data: Measurements, points: np.ndarray, level: np.ndarray) -> Levels:
@@ -161,7 +191,8 @@ def _near_rows(path: Path, data: Measurements, points: np.ndarray, level: np.nda
             f"model.prior={path}: {near.sum():,} levels about the rows; {MOST:,} at most are kept"
         )
     points, level = points[near], level[near]
-    marks = find_marks(level)
+    # A legend states all levels of an overlay, each of which repeats apart from the others.
+    marks = [] if path.suffix.lower() == OVERLAY else find_marks(level)
     marked = np.isin(level, marks)
     _say_marks(path, int(marked.sum()), f"exactly {list_first([f'{mark:g}' for mark in marks])}")
     return points[~marked], level[~marked]
@@ -181,45 +212,27 @@ def _extent(points: np.ndarray) -> np.ndarray:
 
 
 def _read_raster(
-    path: Path, data: Measurements, stations: Collection[str]
+    path: Path, data: Measurements, stations: Collection[str], **settings: Any
 ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
     """Yield name, centres of squares and their levels, of named bands,
     else of `BAND` or of the first.
     """
-    try:
-        import rasterio
-        from rasterio.warp import transform
-    except ImportError:
-        raise DataError(f"model.prior={path}: needs rasterio; pip install 'gsparc[maps]'") from None
-    with rasterio.open(path) as file:
-        titles = [str(title or "") for title in file.descriptions]
-        single = {"": titles.index(BAND) if BAND in titles else 0}
-        known = {*stations, *map(site_name, stations)}
-        named = [t.removeprefix(f"{BAND} ") for t in titles]
-        bands = {t: k for k, t in enumerate(named) if t != titles[k] or t in known}
-        if not bands and file.count > 1 and BAND not in titles:
-            # Of others: as a station alone is asked for, none of them is known
-            if stations and all(titles):
-                bands = {t: k for k, t in enumerate(named)}
-            else:
-                shown = list_first([title or f"{k}" for k, title in enumerate(titles, 1)])
-                log.warning("model.prior=%s: the first of its bands %s is taken", path, shown)
-        row, column = np.mgrid[: file.height, : file.width]
-        x, y = file.transform @ (column.ravel() + 0.5, row.ravel() + 0.5)
-        points, crs, origin = np.c_[x, y], file.crs, data.site.georeference
-        if crs is not None and origin is None:
-            raise DataError(
-                f"model.prior={path}: it has a place on Earth, which the measurements do not state"
-            )
-        if crs is not None and origin is not None:
-            longitude, latitude = (
-                np.asarray(degrees) for degrees in transform(crs, "EPSG:4326", x, y)
-            )
-            points = origin.from_degrees(latitude, longitude)
-        for name, band in (bands or single).items():
-            stored = file.read(band + 1, masked=True).astype(float).filled(np.nan).ravel()
-            values = stored * file.scales[band] + file.offsets[band]
-            yield name, points, _to_decibels(path, values, str(file.units[band] or ""))
+    raster = read_raster(path, **settings)
+    titles = raster.names
+    single = {"": titles.index(BAND) if BAND in titles else 0}
+    known = {*stations, *map(site_name, stations)}
+    named = [t.removeprefix(f"{BAND} ") for t in titles]
+    bands = {t: k for k, t in enumerate(named) if t != titles[k] or t in known}
+    if not bands and len(titles) > 1 and BAND not in titles:
+        # Of others: as a station alone is asked for, none of them is known
+        if stations and all(titles):
+            bands = {t: k for k, t in enumerate(named)}
+        else:
+            shown = list_first([title or f"{k}" for k, title in enumerate(titles, 1)])
+            log.warning("model.prior=%s: the first of its bands %s is taken", path, shown)
+    points = raster.locate(data.site.georeference, path)
+    for name, band in (bands or single).items():
+        yield name, points, _to_decibels(path, raster.bands[band], raster.units[band])
 
 
 def _to_decibels(path: Path, values: np.ndarray, name: str) -> np.ndarray:

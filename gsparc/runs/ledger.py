@@ -276,6 +276,7 @@ def _named(value: Any) -> str:
         return ""
     if os.path.isdir(value):
         return _joined(_files_under(value), Path(value))
+    value = value.removeprefix("itm:")  # of `model.prior`, before the name of a terrain
     return _hash_of(Path(value)) if os.path.isfile(value) else ""
 
 

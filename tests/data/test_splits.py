@@ -28,6 +28,14 @@ def _disjoint(fold, rows):
     return len(np.unique(every)) == len(every) and every.min() >= 0 and every.max() < rows
 
 
+def test_few_rows_may_be_counted(refused):
+    """A protocol of 200 pixels could be drawn as a share of the rows alone."""
+    (fold,) = make_split(_walk(), SplitSettings("sparse", train_fraction=20)).folds
+    assert len(fold.train) + len(fold.val) == 20 and len(fold.test) == 380
+    asked = SplitSettings("sparse", train_fraction=400)
+    refused("split.train_fraction=400: there are 400 rows", make_split, _walk(), asked)
+
+
 @pytest.mark.parametrize("name", ["random", "grouped", "corner", "sparse"])
 def test_a_split_is_a_pure_function_of_positions_and_settings(name):
     positions = _walk()

@@ -34,7 +34,9 @@ SLOWEST, PATIENCE = 20e3, 10
 
 @dataclass(frozen=True)
 class Source:
-    """One file of a set: where it is pinned, its size and its SHA-256."""
+    """One file of a set: where it is pinned, its size and its SHA-256, empty where the revision
+    and the size alone pin it.
+    """
 
     repository: str
     revision: str
@@ -184,8 +186,9 @@ def fetch(name: str, accept: bool = False, timeout_s: float = STALLED_S, retries
             if wanted.hub is not None:
                 return fetch_from_hub(wanted.hub, wanted.strip, wanted.folder)
             # Of a fetch that was killed: nobody else holds the lock.
-            for stray in {*wanted.folder.rglob("tmp*")} - wanted.files().keys():
-                stray.unlink()
+            strays = {*wanted.folder.rglob("tmp*")} - wanted.files().keys()
+            for stray in strays.union(wanted.missing()):
+                stray.unlink(missing_ok=True)
             _fetch_files(wanted, timeout_s, retries)
     except OSError as error:
         why = error.strerror or explain_error(error)
@@ -198,7 +201,7 @@ def _is_right(path: Path, source: Source) -> bool:
     import pooch  # here, as it brings requests, which only a fetch needs
 
     same_size = path.is_file() and path.stat().st_size == source.bytes
-    return same_size and pooch.file_hash(str(path)) == source.sha256
+    return same_size and source.sha256 in ("", pooch.file_hash(str(path)))
 
 
 def _licence(wanted: PublicSet, accept: bool) -> None:
@@ -225,7 +228,10 @@ def _fetch_files(wanted: PublicSet, timeout_s: float, retries: int) -> None:
     store = pooch.create(
         wanted.folder,
         base_url="",
-        registry={name: f"sha256:{source.sha256}" for name, source in files.items()},
+        registry={
+            name: f"sha256:{source.sha256}" if source.sha256 else None
+            for name, source in files.items()
+        },
         urls={name: source.url for name, source in files.items()},
         retry_if_failed=retries,
     )
@@ -267,6 +273,8 @@ def _download(url: str, output_file: Any, _: Any, source: Source, timeout_s: flo
                 if time.monotonic() > end:
                     raise requests.Timeout(f"timed out after {size:,} bytes")
                 file.write(part)
+            if size < source.bytes:
+                raise ValueError("less than the pinned file holds")
         except HTTPError as error:
             raise requests.exceptions.ChunkedEncodingError(error) from None
 

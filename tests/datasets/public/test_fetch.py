@@ -4,6 +4,7 @@ import csv
 import os
 import threading
 import time
+from dataclasses import replace
 
 import pytest
 from filelock import FileLock
@@ -199,7 +200,8 @@ def test_data_without_files_say_in_one_line_how_to_get_them(monkeypatch, tmp_pat
 def test_every_pinned_file_is_listed_as_it_was_published():
     text = real("releases/sources.csv").read_text()
     rows = list(csv.DictReader(text.splitlines()))
-    pinned = {(s.path, s.bytes, s.sha256) for each in public_sets().values() for s in each.sources}
+    sources = [source for each in public_sets().values() for source in each.sources]
+    pinned = {(s.path, s.bytes, s.sha256) for s in sources if s.sha256}
     assert pinned == {(r["path"], int(r["bytes"]), r["sha256"]) for r in rows} and len(rows) == 422
     for one in public_sets().values():
         assert (one.licence is None) == any(
@@ -219,6 +221,15 @@ def test_the_list_tells_size_licence_and_source(capsys):
     assert (
         "github.com/wenchaozheng/WRF-GSplus at e564f31844"
     ) in listed and "no licence stated" in listed
+
+
+def test_a_file_without_a_known_sum_is_pinned_by_its_size(mirror, monkeypatch, tmp_path, refused):
+    source = replace(mirror.serve("release/2.csv", TWO, short), sha256="")
+    folder = offer(monkeypatch, tmp_path, source).folder
+    refused("not the 1,200 bytes of the pinned revision", fetch, "room", retries=0)
+    (folder / "2.csv").write_bytes(TWO[:-1])
+    assert (fetch("room") / "2.csv").read_bytes() == TWO and fetch("room") == folder
+    assert mirror.asked["/makers/data/0123abc/release/2.csv"] == 2
 
 
 def test_who_waits_for_another_fetch_is_told(mirror, monkeypatch, tmp_path, caplog):
