@@ -325,7 +325,9 @@ class PerStation(Method):
 
     def joint_method(self) -> HasJoint | None:
         """See `Method.joint_method`; None: each has a copy of its own."""
-        return OneStationView(self._copies[UNHEARD], NOBODY).joint_method() if self._shared else None
+        return (
+            OneStationView(self._copies[UNHEARD], NOBODY).joint_method() if self._shared else None
+        )
 
     def add_carrier(self, frequency_hz: float) -> PerStation:
         """See `AddsCarriers`."""

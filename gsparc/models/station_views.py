@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import torch
 
-from gsparc.data.ends import NOBODY
 from gsparc.data.query import Query
 from gsparc.models.abilities import HasJoint
 from gsparc.models.method import Method, Prediction

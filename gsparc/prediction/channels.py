@@ -88,7 +88,10 @@ def resource_grid(channel: Tensor, symbols: int, site: Site) -> Tensor:
     """
     stations = channel if channel.ndim == 4 else channel[:, None]
     slots = stations[:, :, :, None, None, None].expand(-1, -1, -1, -1, -1, symbols, -1)
-    of_stations, of_antennas = {"rx": 1, "tx": 3}[site.still_end], {"rx": 2, "tx": 4}[site.antenna_end]
+    of_stations, of_antennas = (
+        {"rx": 1, "tx": 3}[site.still_end],
+        {"rx": 2, "tx": 4}[site.antenna_end],
+    )
     return slots.movedim((1, 2), (of_stations, of_antennas))
 
 

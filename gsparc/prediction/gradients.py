@@ -62,9 +62,7 @@ def predict_with_gradients(
     query = placed.query
     origin = torch.from_numpy(np.asarray(site.origin, np.float64))
     # The origin goes in float64: in UTM coordinates float32 has no centimetres.
-    local = {
-        end: placed.at_stations(value.cpu().double() - origin) for end, value in ends.items()
-    }
+    local = {end: placed.at_stations(value.cpu().double() - origin) for end, value in ends.items()}
     with suitable_threads(method, len(query)):
         moments = method.predict(query.with_ends(local))
     dtype = torch.float32

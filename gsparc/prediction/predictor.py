@@ -10,10 +10,10 @@ from hashlib import sha256
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from gsparc.base.errors import DataError
+from gsparc.data.query import Query
 from gsparc.data.schema import Site
 from gsparc.data.station_names import find_station
 from gsparc.data.target import Kind

@@ -151,7 +151,9 @@ class Queries:
     def _asked(self, stands: bool) -> Tensor | None:
         """Numbers (t,) of the stations that places are asked of; None where a query says which."""
         said = stands or self.station is not None or self.site.static_position is not None
-        return None if said or self.site.stations is None or not len(self.answered) else self.answered
+        return (
+            None if said or self.site.stations is None or not len(self.answered) else self.answered
+        )
 
     def _turned(self, rotation: np.ndarray, number: np.ndarray, row: np.ndarray) -> np.ndarray:
         """Rotations (n, 3, 3) or (3, 3) of receivers: stations have their own."""

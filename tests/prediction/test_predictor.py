@@ -230,9 +230,13 @@ def test_all_at_once_is_what_is_asked_one_by_one(abroad):
 def test_channels_of_all_stations_took_a_call_each(model):
     """42 antennas that stand said `use select_station`, and 42 calls made equal matrices anew."""
     draw = np.random.default_rng(0)
-    places, stations = draw.uniform(0, 2, (60, 3)), draw.uniform(0, 2, (3, 3)) + [0, 0, 3]
+    places, stations = draw.uniform(0, 2, (60, 3)), draw.uniform([0, 0, 3], [2, 2, 5], (3, 3))
     far = np.linalg.norm(places[:, None] - stations, axis=2)
-    known = {"station_position": stations, "csi": np.exp(-1j * 20 * far) / far, "frequency_hz": [955e6]}
+    known = {
+        "station_position": stations,
+        "csi": np.exp(-1j * 20 * far) / far,
+        "frequency_hz": [955e6],
+    }
     predictor = gsparc.fit(tx=places, model=model, align="none", **known)
     each = [predictor.select_station(name) for name in predictor.stations]
     where = {"tx": places[:4] + 0.01}
