@@ -17,7 +17,7 @@ from gsparc.data.assemble import FARTHEST
 from gsparc.data.schema import MEASUREMENTS, OTHER, End, StaticEnds, Stations
 from gsparc.data.selection import Selection, select, take_rows
 from gsparc.data.spacing import number_places
-from gsparc.tables.checks.plausibility import find_marks
+from gsparc.tables.checks.piles import find_marks
 from gsparc.tables.links.hearing import POWERS, censor_rows, check_said, forget_unknown
 from gsparc.tables.links.positions import positions_in_metres
 from gsparc.tables.links.stations import (
