@@ -285,12 +285,23 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
         wanted = self._answer_unit(unit)
         if grad:
             return self._predict_grad(self._whole, tx, rx, wanted)[0]
+        still = {"tx": tx, "rx": rx}.get(self.site.static_end or "", 0)
+        if still is None and self.site.stations is not None and self.site.target.is_level:
+            # Of all stations, (B, T)
+            mean, spread = self._ask_stations(lambda one: one._moments(tx, rx, unit), tx, rx)
+            return Prediction(mean, None if spread.isnan().all() else spread)
         query = self.queries.query(tx, rx).query
         prediction = predict_with_threads(self._whole, query)
         sure = self._method_confidence(prediction, query)
         return replace(
             self._in_unit(prediction, wanted), unknown=None if sure is None else 1 - sure
         )
+
+    def _moments(self, tx: Any, rx: Any, unit: str | None) -> Tensor:
+        """Means and variances (2, B, 1) of one station, NaN where there are none."""
+        said = self.predict(tx, rx, unit=unit)
+        variance = said.mean * torch.nan if said.variance is None else said.variance
+        return torch.stack([said.mean, variance.reshape(said.mean.shape)])
 
     def std(self, tx: Any = None, rx: Any = None, *, unit: str | None = None) -> Any:
         """Return the expected root mean square error of an entry,
