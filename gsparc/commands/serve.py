@@ -27,6 +27,8 @@ from gsparc.runs.output import CommandCall, command
 if TYPE_CHECKING:
     from starlette.types import ASGIApp
 
+    from gsparc.apps.export.serving import Limits
+
 NEEDED = ("fastapi", "uvicorn", "prometheus_client")  # of the extra `serve`
 
 
@@ -51,12 +53,11 @@ def take_port(host: str, port: int) -> socket.socket:
     try:
         listening.bind((host, port))
     except OSError as error:
-        listening.close()
         raise DataError(f"port={port} of host={host}: {error.strerror}; say another") from error
     return listening
 
 
-def make_application(given: Mapping[str, Any], threads: int) -> tuple[ASGIApp, Predictor]:
+def make_application(given: Mapping[str, Any], threads: int) -> tuple[Predictor, ASGIApp, Limits]:
     """Read the model, and return what answers for it, with so many threads.
 
     Args:
@@ -67,7 +68,7 @@ def make_application(given: Mapping[str, Any], threads: int) -> tuple[ASGIApp, P
         DataError: a model of what cannot be served.
     """
     # Of an extra, which the command says where it lacks.
-    from gsparc.apps.export.serving import build_application
+    from gsparc.apps.export.serving import Limits, build_application
     from gsparc.apps.export.told_file import ToldFile
 
     torch.set_num_threads(threads)
@@ -82,21 +83,15 @@ def make_application(given: Mapping[str, Any], threads: int) -> tuple[ASGIApp, P
     told = ToldFile(stored, as_stored) if given["updates"] else None
     if told is not None and (given["station"] is not None or not powers):
         raise DataError("updates=true: is of powers, and of all stations of the model")
-    app = build_application(predictor, read_limits(given), given["token"], told)
+    limits = Limits(**{field.name: given[field.name] for field in fields(Limits)})
+    app = build_application(predictor, limits, given["token"], told)
     gc.freeze()  # going through all that was loaded held up answers by half a second
-    return app, predictor
-
-
-def read_limits(given: Mapping[str, Any]) -> Any:
-    """Return a server's limits, as the settings say."""
-    from gsparc.apps.export.serving import Limits  # of an extra
-
-    return Limits(**{field.name: given[field.name] for field in fields(Limits)})
+    return predictor, app, limits
 
 
 def make_worker(given: Mapping[str, Any], threads: int) -> ASGIApp:
     """Return what answers in a process of its own."""
-    return make_application(given, threads)[0]
+    return make_application(given, threads)[1]
 
 
 @command(port=whole(0, 65535), workers=whole(1))
@@ -117,15 +112,15 @@ def task(call: CommandCall) -> None:
 
     with take_port(host, given["port"]) as listening:
         threads = max(torch.get_num_threads() // workers, 1)
-        app, predictor = make_application(given, threads)  # also says what is wrong, before others
+        # Of several workers, too: it says what is wrong before they begin.
+        predictor, app, limits = make_application(given, threads)
         place = f"http://{host}:{listening.getsockname()[1]}"
         open_console().print(f"{predictor} at {place}", highlight=False, markup=False)
         with suppress(KeyboardInterrupt), tempfile.TemporaryDirectory() as counts:
             if workers == 1:
-                make_server(app, read_limits(given)).run([listening])
-                return
+                return make_server(app, limits).run([listening])
             os.environ[WORKERS] = counts
             make = partial(make_worker, given, threads)
-            config = make_config(make, read_limits(given), factory=True, workers=workers)
-            del app, predictor
-            Multiprocess(config, [listening]).run()
+            Multiprocess(
+                make_config(make, limits, factory=True, workers=workers), [listening]
+            ).run()

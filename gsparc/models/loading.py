@@ -81,7 +81,7 @@ def load_module(path: str | Path) -> GaussianModule:
         CheckpointError: unreadable, or another method's.
     """
     # Here, as it imports Lightning: two seconds, which `load` does without.
-    from gsparc.models.splat.steps import make_module
+    from gsparc.models.gradient import make_module
 
     method, stored = load(path)
     if not isinstance(method, LearnedField):

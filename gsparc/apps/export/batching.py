@@ -30,12 +30,14 @@ class Batcher:
     Args:
         predictor: of one end that moves, and one station or powers of several.
         delay_s: that the first request of a batch waits for others [s].
-        most: places of a batch, beside those of the request that waits longest.
         lock: held while the model is asked.
+
+    Attributes:
+        most: places of a batch, beside those of the request that waits longest.
     """
 
-    def __init__(self, predictor: Predictor, delay_s: float, most: int, lock: Lock) -> None:
-        self.predictor, self.delay_s, self.most, self.lock = predictor, delay_s, most, lock
+    def __init__(self, predictor: Predictor, delay_s: float, lock: Lock) -> None:
+        self.predictor, self.delay_s, self.lock, self.most = predictor, delay_s, lock, 1
         self.waiting: list[WaitingRequest] = []
         self.some = asyncio.Event()
 
@@ -80,18 +82,13 @@ class Batcher:
         """Of each request, or its own fault."""
         try:
             end = self.predictor.site.moving_end
-            asked = [parse_query(end, request.body, request.raw) for request in batch]
-            wanted = [r.std or std for r, (_, std) in zip(batch, asked, strict=True)]
-            with self.lock:
-                joint = _ask(self.predictor, np.concatenate([p for p, _ in asked]), any(wanted))
-            counts = np.cumsum([len(places) for places, _ in asked])[:-1]
-            # Copies: a view would keep the others' answers.
-            values = [part.copy() for part in np.split(joint.values, counts)]
-            spreads: list[np.ndarray | None] = [None] * len(batch)
-            if joint.std is not None:
-                spreads = [part.copy() for part in np.split(joint.std, counts)]
-            rows = zip(values, spreads, wanted, strict=True)
-            return [Answer(part, spread if flag else None) for part, spread, flag in rows]
+            asked = [parse_query(end, each.body, each.raw, each.std) for each in batch]
+            joint = self.compute(np.concatenate([places for places, _ in asked]))
+            stops = np.cumsum([len(places) for places, _ in asked])
+            return [
+                joint.part(slice(stop - len(places), stop), std)
+                for (places, std), stop in zip(asked, stops, strict=True)
+            ]
         except Exception as error:
             if len(batch) == 1:
                 return [error]
@@ -99,20 +96,15 @@ class Batcher:
             # to find whose fault it is.
             return [self._answers([request])[0] for request in batch]
 
-
-def _ask(predictor: Predictor, places: np.ndarray, std: bool) -> Answer:
-    """Answers at world places (n, 3) [m], and deviations of the same computation."""
-    site, spread = predictor.site, None
-    ends = site.name_moving(places)
-    if std:
-        said = predictor.predict(**ends)
-        if said.variance is None:
-            raise ValueError(f"{predictor.method.name} states no deviations")
-        mean = site.in_shape_of_file(said.mean) if said.mean.is_complex() else said.mean
-        # As many axes as the answers have.
-        axes = len(mean), -1, *[1] * (mean.ndim - 2)
-        values, spread = mean.numpy(), said.variance.sqrt().reshape(axes).numpy().astype("<f4")
-    else:
-        values = getattr(predictor, site.kind)(**ends)
-    values = np.stack([values.real, values.imag], -1) if np.iscomplexobj(values) else values
-    return Answer(values.astype("<f4"), spread)
+    def compute(self, places: np.ndarray) -> Answer:
+        """Answers at world places (n, 3) [m], and deviations where they are known."""
+        site = self.predictor.site
+        with self.lock:
+            said = self.predictor.predict(**site.name_moving(places))
+        values, std = said.mean.numpy(), said.variance
+        if np.iscomplexobj(values):  # real and imaginary part
+            values = site.in_shape_of_file(values)
+            values = np.stack([values.real, values.imag], -1)
+        if std is not None:  # as many axes as the answers have
+            std = std.sqrt().reshape(len(std), -1, *[1] * (said.mean.ndim - 2)).numpy()
+        return Answer(values.astype("<f4"), None if std is None else std.astype("<f4"))

@@ -14,7 +14,6 @@ from time import perf_counter
 from typing import Any
 from urllib.parse import quote
 
-import numpy as np
 import uvicorn
 from fastapi import FastAPI, HTTPException, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
@@ -34,12 +33,12 @@ from gsparc.apps.export.batching import Batcher
 from gsparc.apps.export.told_file import ToldFile
 from gsparc.apps.export.wire import (
     PLACE,
+    QUERY_BODY,
     RAW,
+    UPDATE_BODY,
     AnswerBody,
     FaultBody,
-    QueryBody,
     RowsBody,
-    describe_body,
     draw_page,
     parse,
 )
@@ -153,18 +152,14 @@ def build_application(
             "updates=true: whoever reaches it changes the model; set GSPARC_TOKEN, or say "
             "token=WORD"
         )
-    middle = getattr(predictor, site.kind)(
-        **site.name_moving(site.moving_box.mean(0) + site.origin)
-    )
-    # Real and imaginary part count as two numbers.
-    each = np.size(middle) * (2 if np.iscomplexobj(middle) else 1)
+    batcher = Batcher(predictor, limits.delay_ms / 1e3, lock)
+    each = batcher.compute(site.moving_box.mean(0)[None] + site.origin).values.size
     if each > limits.numbers:
         raise SettingError(
             f"numbers={limits.numbers}: one place's answer holds {each}; say {each} or more"
         )
     # Both limits hold: of places, and of numbers in the answer.
-    most = min(limits.most, limits.numbers // each)
-    batcher = Batcher(predictor, limits.delay_ms / 1e3, most, lock)
+    batcher.most = most = min(limits.most, limits.numbers // each)
 
     @asynccontextmanager
     async def life(app: FastAPI) -> AsyncIterator[None]:
@@ -262,11 +257,15 @@ def build_application(
 
     if told is not None:
         twice = {409: {"description": "rows of this `key` were taken before", "model": FaultBody}}
-        app.post("/update", openapi_extra=describe_body(RowsBody, False), responses=twice)(update)
+        app.post(
+            "/update",
+            openapi_extra={"requestBody": {"content": UPDATE_BODY, "required": True}},
+            responses=twice,
+        )(update)
 
     @app.post(
         "/predict",
-        openapi_extra=describe_body(QueryBody, True),
+        openapi_extra={"requestBody": {"content": QUERY_BODY, "required": True}},
         responses={200: {"model": AnswerBody, "content": {RAW: {}}}},
     )
     async def predict(request: Request) -> Response:

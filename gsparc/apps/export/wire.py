@@ -64,22 +64,28 @@ class FaultBody(BaseModel):
 
 
 class Answer(NamedTuple):
-    """Values (n, ...) float32, and their deviations where they are wanted."""
+    """Values (n, ...) float32, and their deviations where they are known, or wanted."""
 
     values: np.ndarray
     std: np.ndarray | None
 
+    def part(self, rows: slice, std: bool) -> Answer:
+        """Return that of some rows, with deviations if wanted; `ValueError` where none is known."""
+        if std and self.std is None:
+            raise ValueError("the model states no deviations")
+        # Copies: a view would keep the others' answers.
+        return Answer(self.values[rows].copy(), self.std[rows].copy() if std else None)  # type: ignore[index]
+
     def to_json(self, unit: str) -> bytes:
         """Return an `AnswerBody` as text."""
-        answer: dict[str, Any] = {"shape": self.values.shape, "unit": unit}
-        answer |= {"values": self.values.tolist()}
-        answer |= {} if self.std is None else {"std": self.std.tolist()}
+        answer = {"shape": self.values.shape, "unit": unit, "values": self.values.tolist()}
+        std = {} if self.std is None else {"std": self.std.tolist()}
         # JSON has no word for the level of silence.
-        return to_json(answer, inf_nan_mode="null")
+        return to_json(answer | std, inf_nan_mode="null")
 
     def to_raw(self) -> bytes:
         """Return values, then deviations."""
-        return self.values.tobytes() + (b"" if self.std is None else self.std.tobytes())
+        return b"".join(part.tobytes() for part in self if part is not None)
 
 
 def parse(text: bytes, body: type[Body]) -> Body:
@@ -96,37 +102,34 @@ def parse(text: bytes, body: type[Body]) -> Body:
     return parsed
 
 
-def parse_query(end: str, text: bytes, raw: bool) -> tuple[np.ndarray, bool]:
-    """Return world places (n, 3) float64 [m], and whether deviations are wanted; `ValueError`."""
+def parse_query(end: str, text: bytes, raw: bool, std: bool) -> tuple[np.ndarray, bool]:
+    """Return world places (n, 3) float64 [m], and whether deviations are wanted, as the address
+    says or the body; `ValueError`.
+    """
     if not raw:
         body = parse(text, QueryBody)
-        return read_places(end, body.places), body.std
+        return read_places(end, body.places), std or body.std
     if len(text) % PLACE:
         raise ValueError("expected little-endian float32, three a place")
-    return read_places(end, np.frombuffer(text, "<f4").reshape(-1, 3)), False
+    return read_places(end, np.frombuffer(text, "<f4").reshape(-1, 3)), std
 
 
-def describe_body(body: type[BaseModel], raw: bool) -> dict[str, Any]:
-    """Return what OpenAPI says of a request's body that the route reads itself."""
-    content: dict[str, Any] = {"application/json": {"schema": body.model_json_schema()}}
-    if raw:
-        floats = "float32, little-endian, three a place; ?std=true for deviations"
-        content[RAW] = {"schema": {"type": "string", "format": "binary", "description": floats}}
-    return {"requestBody": {"required": True, "content": content}}
+# What OpenAPI says of bodies that routes read themselves
+_FLOATS = "float32, little-endian, three a place; ?std=true for deviations"
+UPDATE_BODY = {"application/json": {"schema": RowsBody.model_json_schema()}}
+QUERY_BODY = {
+    "application/json": {"schema": QueryBody.model_json_schema()},
+    RAW: {"schema": {"type": "string", "format": "binary", "description": _FLOATS}},
+}
 
 
 def draw_page(openapi: Mapping[str, Any]) -> str:
     """Return a page about all routes that needs nothing else."""
-    parts = [f"<h1>{openapi['info']['title']}</h1>", f"<p>{openapi['info']['description']}</p>"]
+    page = f"<!doctype html><meta charset=utf-8><title>gsparc</title><h1>{openapi['info']['title']}"
+    page += f"</h1><p>{html.escape(openapi['info']['description'])}"
     for path, methods in openapi["paths"].items():
         for method, route in methods.items():
-            parts.append(f"<h2>{method.upper()} {path}</h2><p>{html.escape(route['description'])}")
-            bodies = route.get("requestBody", {}).get("content", {})
-            for kind, about in bodies.items():
-                schema = html.escape(json.dumps(about["schema"], indent=1))
-                parts.append(f"<h3>{kind}</h3><pre>{schema}</pre>")
-            codes = ((code, answer["description"]) for code, answer in route["responses"].items())
-            parts.append(
-                "<p>" + "<br>".join(f"{code}: {html.escape(words)}" for code, words in codes)
-            )
-    return "<!doctype html><meta charset=utf-8><title>gsparc</title>" + "\n".join(parts)
+            about = {name: route[name] for name in ("requestBody", "responses") if name in route}
+            page += f"<h2>{method.upper()} {path}</h2><p>{html.escape(route['description'])}"
+            page += f"<pre>{html.escape(json.dumps(about, indent=1))}</pre>"
+    return page

@@ -175,7 +175,9 @@ class LearnedField(Method):
         together, because the baselines learn from all of them, with the confidence of the first.
         """
         # Here, as Lightning takes two seconds to import, and answers need none of it.
-        from gsparc.models.splat import steps
+        from lightning.pytorch import seed_everything
+
+        from gsparc.models.gradient import take_steps
 
         origin = Origin.from_fit(data, fold, context)
         stored_model = None if context.resume is None else read_interrupted(context.resume)
@@ -185,11 +187,11 @@ class LearnedField(Method):
         watch = Stopwatch(*(float(marks.get(name, 0.0)) for name in ("spent_s", "spent_cpu_s")))
         self._begin_fit(data, fold, marks)
         for stage in self._plan_stages(data, fold, context, stored_model):
-            steps.seed_everything(stage.context.seed, verbose=False)
+            seed_everything(stage.context.seed, verbose=False)
             if not self._start_stage(stage, data, watch):
                 continue
             began, marks = watch.seconds, self._extra(stage, watch, origin)
-            result = steps.take_steps(self, stage, data, watch, marks)
+            result = take_steps(self, stage, data, watch, marks)
             self._end_stage(stage, result, watch.seconds - began)
         self.frozen = self._doubled = None
         label, count = (

@@ -170,7 +170,7 @@ def test_channels_with_deviations_have_as_many_axes():
 def test_a_method_without_deviations_says_so():
     with Served(gsparc.fit(rx=np.eye(3), tx=TX, rssi=[-40, -50, -60], model="zero")) as served:
         status, body, _ = served.post(as_json([[5, 5, 1]], std=True))
-    assert status == 422 and json.loads(body)["detail"] == "zero states no deviations"
+    assert status == 422 and json.loads(body)["detail"] == "the model states no deviations"
 
 
 def test_all_stations_in_the_unit_asked_for():
@@ -202,9 +202,9 @@ def test_32_clients_get_their_own_answers_computed_together(powers, monkeypatch)
     given = [rng.uniform(0, 10, (1 + i % 3, 3)) for i in range(32 * 8)]
     expected = [powers.rssi(rx=places) for places in given]
     calls = []
-    own = powers.rssi
+    own = powers.predict
     with Served(powers) as served, ThreadPoolExecutor(32) as clients:
-        monkeypatch.setattr(powers, "rssi", lambda rx: calls.append(len(rx)) or own(rx=rx))
+        monkeypatch.setattr(powers, "predict", lambda rx: calls.append(len(rx)) or own(rx=rx))
         found = list(clients.map(lambda places: served.post(as_json(places)), given))
     for (status, body, _), wanted in zip(found, expected, strict=True):
         assert status == 200

@@ -85,8 +85,8 @@ def write_scenario(folder: Path, predictor: Predictor, place: np.ndarray) -> tup
     corners = [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]
     ground = np.c_[corners, np.full(4, low[2])]
     np.savez_compressed(folder / "vertices.npz", vertices=ground)
-    plane = {"name": "ground", "label": "terrain", "id": 0}
-    plane |= {"face_vertex_idxs": [[0, 1, 2, 3]], "face_material_idxs": [0]}
+    faces = {"face_vertex_idxs": [[0, 1, 2, 3]], "face_material_idxs": [0]}
+    plane = {"name": "ground", "label": "terrain", "id": 0, **faces}
     (folder / "objects.json").write_text(json.dumps([plane]))
     heard = (strongest > 0).any(2).sum(1).tolist()
     (folder / "params.json").write_text(
@@ -133,15 +133,19 @@ def _parameters(
         "max_scattering": 0,
         "max_transmissions": 0,
     }
-    stands = [1, 1] if moves else [len(heard)] * 2
-    ends = [end(0, *stands)]
-    for number, places in enumerate(heard if moves else [max(heard)], 1):
-        ends.append(end(number, len(place), places))
-    sets = {f"txrx_set_{number}": about for number, about in enumerate(ends)}
+    senders, receivers = (1, heard) if moves else (len(heard), [max(heard)])
+    counts = [(senders, senders), *((len(place), count) for count in receivers)]
+    sets = {f"txrx_set_{number}": end(number, *both) for number, both in enumerate(counts)}
     # Printing a data set asks for names of materials.
-    material = {"id": 0, "name": "ground", "permittivity": 1.0, "conductivity": 0.0}
-    material |= {"scattering_model": "none", "scattering_coefficient": 0.0}
-    material |= {"cross_polarization_coefficient": 0.0}
+    material = {
+        "id": 0,
+        "name": "ground",
+        "permittivity": 1.0,
+        "conductivity": 0.0,
+        "scattering_model": "none",
+        "scattering_coefficient": 0.0,
+        "cross_polarization_coefficient": 0.0,
+    }
     scene = {
         "num_scenes": 1,
         "n_objects": 1,
