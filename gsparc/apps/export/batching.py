@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from threading import Lock
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -99,12 +99,14 @@ class Batcher:
     def compute(self, places: np.ndarray) -> Answer:
         """Answers at world places (n, 3) [m], and deviations where they are known."""
         site = self.predictor.site
+        ends: dict[str, Any] = site.name_moving(places)
         with self.lock:
-            said = self.predictor.predict(**site.name_moving(places))
-        values, std = said.mean.numpy(), said.variance
+            said = self.predictor.predict(**ends)
+        values, std = said.mean.numpy(), None
         if np.iscomplexobj(values):  # real and imaginary part
             values = site.in_shape_of_file(values)
             values = np.stack([values.real, values.imag], -1)
-        if std is not None:  # as many axes as the answers have
-            std = std.sqrt().reshape(len(std), -1, *[1] * (said.mean.ndim - 2)).numpy()
-        return Answer(values.astype("<f4"), None if std is None else std.astype("<f4"))
+        if said.variance is not None:  # as many axes as the answers have
+            axes = len(values), -1, *[1] * (said.mean.ndim - 2)
+            std = said.variance.sqrt().reshape(axes).numpy().astype("<f4")
+        return Answer(values.astype("<f4"), std)

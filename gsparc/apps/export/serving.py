@@ -59,6 +59,7 @@ STEPS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 5.0)  # of the hi
 WORKERS = "PROMETHEUS_MULTIPROC_DIR"  # where several processes leave their counts
 FAULTS: dict[int | str, dict[str, Any]] = {
     401: {"description": "the token is needed, Authorization: Bearer TOKEN"},
+    409: {"description": "/update: rows of this `key` were taken before"},
     413: {"description": "more places or numbers than the server's limits"},
     422: {"description": "the body is wrong: `detail` says where"},
     503: {"description": "too many connections, or another process writes the file: try again"},
@@ -256,11 +257,9 @@ def build_application(
             raise HTTPException(422, str(error)) from error
 
     if told is not None:
-        twice = {409: {"description": "rows of this `key` were taken before", "model": FaultBody}}
         app.post(
             "/update",
             openapi_extra={"requestBody": {"content": UPDATE_BODY, "required": True}},
-            responses=twice,
         )(update)
 
     @app.post(
