@@ -317,9 +317,11 @@ def _guarded(app: ASGIApp, wanted: bytes | None, metrics: Metrics) -> ASGIApp:
             await send(message)
 
         fault, status = _fault(scope, wanted)
-        refused = JSONResponse({"detail": fault}, status, {"connection": "close"})
+        answering = (
+            JSONResponse({"detail": fault}, status, {"connection": "close"}) if fault else app
+        )
         try:
-            await (refused if fault else app)(scope, receive, answer)
+            await answering(scope, receive, answer)
         finally:
             path = scope["path"] if scope["path"] in PATHS else "other"
             metrics.seconds.labels(path, codes[-1]).observe(perf_counter() - began)
