@@ -11,7 +11,7 @@ import math
 import os
 import shutil
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from importlib.resources import files
@@ -26,6 +26,8 @@ from gsparc.base.errors import DataError, readable
 from gsparc.base.limits import DEEPEST, LEAST_CONTENT, LEAST_NODES, LONGEST_LINE, MOST_GROWTH
 
 SUMMARY = "summary.json"  # of a finished run, written last
+# One, settings beside its name, or several of either
+Files = str | Path | Mapping[str, Any] | Sequence[Any]
 POINTER = b"version https://git-lfs"
 
 

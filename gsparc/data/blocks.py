@@ -7,10 +7,12 @@ import os
 import tempfile
 from collections.abc import Callable, Iterator
 from multiprocessing import context, reduction
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
+
+if TYPE_CHECKING:
+    import h5py  # opened by who reads files
 
 BIG = 2**28  # bytes of a measurement that stays on disk
 BLOCK = 2**24  # bytes that are in memory at a time

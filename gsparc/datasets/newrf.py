@@ -17,7 +17,8 @@ import numpy as np
 from gsparc.base.errors import DataError, readable
 from gsparc.base.pickles import read_pickled_frame
 from gsparc.datasets.campaign import Campaign
-from gsparc.tables.raw import Raw, read_raw, rename_arrays
+from gsparc.tables.arrays import Raw, rename_arrays
+from gsparc.tables.raw import read_raw
 
 NAMES = {"tx_pos": "tx_position", "rx_pos": "rx_position"}
 COLUMNS = ("TxPos", "RxPos", "CSI", "Frequency", "LastXPts", "RxChanPerRay", "LineOfSight")

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.base.errors import Caution, DataError, list_first
+from gsparc.base.files import Files
 from gsparc.data.schema import Measurements
 from gsparc.data.station_names import site_name
 from gsparc.data.units import UNITS
@@ -22,13 +23,12 @@ from gsparc.datasets.terrain import terrain_levels
 from gsparc.physics.decibels import to_decibels
 from gsparc.tables import is_table
 from gsparc.tables.array_checks import MOST_DB
-from gsparc.tables.checks.plausibility import find_marks
+from gsparc.tables.checks.piles import find_marks
 from gsparc.tables.own import interpret
+from gsparc.tables.read import parse_table
 
 log = logging.getLogger(__name__)
 
-# One file, settings beside its name, or several of either
-Files = str | Path | Mapping[str, Any] | Sequence[Any]
 Levels = tuple[np.ndarray, np.ndarray]  # places (M, 2) [m], world, and levels (M,) [dB] there
 # Of the strongest station, as `gsparc map` writes; with a name behind it of one of several
 BAND = "power_db"
@@ -259,8 +259,6 @@ def _read_rows(
     or an npz.
     """
     if is_table(path):
-        from gsparc.tables.read import parse_table  # here, as pandas takes half a second to import
-
         raw = parse_table(path, stations=stations)
         for note in [
             note for note in raw.notes if isinstance(note, Caution) and "not used" in note

@@ -15,8 +15,9 @@ from gsparc.base.errors import DataError
 from gsparc.data.schema import Measurements
 from gsparc.datasets.datamodule import DataModule
 from gsparc.physics.decibels import to_decibels
+from gsparc.tables.arrays import Raw, rename_arrays
 from gsparc.tables.own import interpret_and_log
-from gsparc.tables.raw import Raw, read_raw, rename_arrays
+from gsparc.tables.raw import read_raw
 
 TARGETS = ("spectrum", "csi", "rssi")
 # Array that a target is read from

@@ -62,38 +62,6 @@ class TrainerResult:
     notes: tuple[str, ...]
 
 
-def requested_steps(context: FitContext, rows: int, model_steps: int | None = None) -> int | None:
-    """Return the number of steps that the Trainer is given, else the model's own;
-    None where neither is.
-
-    Args:
-        context: of the fit; `trainer.max_steps` and `trainer.max_epochs` win over all others.
-        rows: that are learned from, for epochs.
-        model_steps: as the model is configured.
-
-    Raises:
-        ValueError: the Trainer is given what is no number of steps.
-    """
-    options = (context.trainer or DEFAULTS).keywords
-    steps, epochs = (
-        None if options.get(n) == -1 else options.get(n) for n in ("max_steps", "max_epochs")
-    )
-    for name, value in (("max_steps", steps), ("max_epochs", epochs)):
-        if value is not None and (type(value) is not int or value < 0):
-            raise ValueError(
-                f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or -1"
-            )
-    if model_steps == 0 or (steps is None and epochs is None):  # 0 of either is the start alone
-        return model_steps
-    if model_steps is not None:
-        log.warning(
-            "model.steps=%d gives way to the Trainer's max_steps or max_epochs", model_steps
-        )
-    size = context.batch_size if context.datamodule is None else context.datamodule.batch_size
-    of_epochs = None if epochs is None else epochs * -(-rows // size)
-    return min(limit for limit in (steps, of_epochs) if limit is not None)
-
-
 class ReportSteps(L.Callback):
     """Steps and seconds of training as metrics: of all attributes, only these leave a process.
 

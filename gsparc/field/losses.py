@@ -207,3 +207,13 @@ def _error_up_to_phase(
     power = ((prediction.abs().square() + target.abs().square()) * weights).flatten(1).sum(1)
     alike = torch.view_as_real(product.sum(1)).square().sum(1).clamp_min(1e-20).sqrt()
     return (power - 2 * alike) / weights.flatten(1).sum(1).clamp_min(1)
+
+
+def squared_error(mean: Tensor, batch: Batch, target: Target) -> Tensor:
+    """Return the squared error of each row (B,) of what was measured: per entry,
+    of powers [dB^2].
+    """
+    square = (target.in_error_unit(mean) - target.in_error_unit(batch.target)).abs().square()
+    if batch.mask is not None:
+        square = torch.where(batch.mask, square, 0)
+    return square.flatten(1).mean(1)

@@ -13,11 +13,10 @@ from torch import Tensor
 
 from gsparc.data.query import Batch
 from gsparc.data.schema import Site
-from gsparc.data.target import Target
 from gsparc.field import edit
 from gsparc.field.confidence import weighted_loss
 from gsparc.field.distributed import process_count
-from gsparc.field.losses import LossSettings, fits_ssim_window, ssim, task_loss
+from gsparc.field.losses import LossSettings, fits_ssim_window, squared_error, ssim, task_loss
 from gsparc.field.model import GaussianModel, Rendered
 from gsparc.field.optimizer import OptimizerSettings, RateOf, optimizer_for, scheduler_for
 from gsparc.ops import UnsoundGaussian
@@ -280,13 +279,3 @@ class GaussianModule(NetworkModule):
             return name
         bad = ~torch.isfinite(self.model.get_parameter(name))
         return f"Gaussian id {int(self.model.gaussians.ids[int(bad.nonzero()[0, 0])])}, {name}"
-
-
-def squared_error(mean: Tensor, batch: Batch, target: Target) -> Tensor:
-    """Return the squared error of each row (B,) of what was measured: per entry,
-    of powers [dB^2].
-    """
-    square = (target.in_error_unit(mean) - target.in_error_unit(batch.target)).abs().square()
-    if batch.mask is not None:
-        square = torch.where(batch.mask, square, 0)
-    return square.flatten(1).mean(1)

@@ -231,6 +231,27 @@ def read(path: str | Path) -> StoredModel:
     return _stored_from_content(_read_content(path), path)
 
 
+def read_interrupted(path: Path) -> StoredModel:
+    """Return what an interrupted training left.
+
+    Raises:
+        ValueError: when the file holds a finished model without a trainer's state, or one that is
+            not finite.
+    """
+    stored = read(path)
+    if "trainer" not in stored.extra:
+        raise ValueError(
+            f"{path} holds a finished model, not a training state: resume from last.ckpt instead"
+        )
+    trainer = {**stored.extra["trainer"], "earlier_s": stored.extra.get("earlier_s")}
+    callbacks = trainer.pop("callbacks", None)  # whose best score begins at infinity
+    wrong = find_non_finite(trainer, "trainer")
+    wrong = wrong or find_non_finite(callbacks, "trainer.callbacks", infinite=True)
+    if wrong is not None:
+        raise CheckpointError(f"{path}: {wrong} is NaN or infinite; resume from an earlier file")
+    return stored
+
+
 def _content_digest(content: Mapping[str, Any]) -> str:
     """SHA-256 of all that a checkpoint holds, of tensors type, shape and bytes."""
     digest, stack = (

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from gsparc.base.files import Files
 from gsparc.base.limits import check_arguments, number, or_null
 from gsparc.data.schema import Measurements, Site
-from gsparc.datasets.prior_levels import Files
 from gsparc.models.carriers.array import carriers_obstacle
 from gsparc.models.carriers.method import CarrierField
 from gsparc.models.method import Method, import_path

@@ -5,10 +5,10 @@ or as a module of Lightning's.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hydra.utils import get_class
 
-from gsparc.field.module import GaussianModule
 from gsparc.models import checkpoint
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method, MethodFactory, import_path
@@ -17,6 +17,9 @@ from gsparc.models.registry import all_methods, build
 from gsparc.models.sanity import make_stored
 from gsparc.models.splat.method import LearnedField
 from gsparc.models.updated import stored_changes, with_changes
+
+if TYPE_CHECKING:
+    from gsparc.field.module import GaussianModule
 
 
 def method_from_checkpoint(stored: checkpoint.StoredModel) -> Method:
@@ -77,7 +80,10 @@ def load_module(path: str | Path) -> GaussianModule:
     Raises:
         CheckpointError: unreadable, or another method's.
     """
+    # Here, as it imports Lightning: two seconds, which `load` does without.
+    from gsparc.models.gradient import make_module
+
     method, stored = load(path)
     if not isinstance(method, LearnedField):
         raise checkpoint.CheckpointError(f"{path}: {stored.method} holds no Gaussian field")
-    return method.module()
+    return make_module(method)

@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from sklearn.linear_model import RidgeCV
 from torch import Tensor
 
 from gsparc.processes.stored import Stored
@@ -59,6 +58,8 @@ class RelativeErrorRegression(Stored):
     @classmethod
     def from_rows(cls, columns: Tensor, relative_error: Tensor) -> RelativeErrorRegression:
         """Fit to columns (n, S) float32, and errors (n,) of rows that a fit did not see; n > 1."""
+        from sklearn.linear_model import RidgeCV  # here, as it takes a second to import
+
         centre, scale = columns.mean(0), columns.std(0, correction=0).clamp_min(LEAST_SCALE)
         terms = _add_products((columns - centre) / scale).double().numpy()
         target = relative_error.clamp_min(LEAST_ERROR).log().double().numpy()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -52,6 +53,8 @@ def fit(
 ) -> Predictor:
     """Fit a model to all rows, ready to be asked;
     checks and messages are those of a file of one's own.
+
+    Where no handler of `logging` shows them, stages are shown on stderr as they end.
 
     >>> predictor = gsparc.fit(rx=places, tx=[12.0, 30.0, 2.6], rssi=powers_dbm)
     >>> predictor.rssi(rx=[[3.0, 4.0, 1.5]]).shape
@@ -110,7 +113,14 @@ def fit(
     factory = wrap_per_station(kind(**options), data)
     fold = _split_validation(data, VALIDATED if factory.takes_effort else 0.0, seed)
     context = FitContext(seed=seed, effort=effort)
-    method, report = fitting.fit_or_resume(factory, data, fold, context)
+    with ExitStack() as before:
+        if not log.hasHandlers():  # nobody shows what is logged, and a fit may take minutes
+            shown, handler = logging.getLogger("gsparc"), logging.StreamHandler()
+            before.callback(shown.setLevel, shown.level)
+            before.callback(shown.removeHandler, handler)
+            shown.addHandler(handler)
+            shown.setLevel(logging.INFO)
+        method, report = fitting.fit_or_resume(factory, data, fold, context)
     for note in report.notes:
         log.log(logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s", note)
     extra = {"train_s": report.seconds, **Hearing.from_learned(data, fold.learned()).to_extra()}

@@ -22,9 +22,9 @@ from gsparc.ops.transforms import to_numpy
 from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.query import read_places
 from gsparc.processes.powers import PowerRows
+from gsparc.tables.arrays import Raw, numbered_rows
 from gsparc.tables.links.strongest import strongest_lists
 from gsparc.tables.own_checks import Checker
-from gsparc.tables.raw import Raw, numbered_rows
 
 ABOVE_DB = 120.0  # over the mean power of a site: more than receivers' levels span
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gsparc.tables.raw import ARRAY_SUFFIXES
+from gsparc.tables.arrays import ARRAY_SUFFIXES
 
 
 def is_table(path: str | Path) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 
 from gsparc.base.errors import Problems
 from gsparc.data.schema import FIELDS, HOLDS, POWER
-from gsparc.tables.raw import Raw
+from gsparc.tables.arrays import Raw
 
 MOST_DB = 400  # of any level
 

@@ -24,8 +24,8 @@ from gsparc.base.errors import DataError, Problems, absent, list_first, readable
 from gsparc.base.files import check_content, check_depth, check_fetched, refuse_repeated
 from gsparc.base.limits import MOST_VALUES, most_text
 from gsparc.tables import is_table
+from gsparc.tables.arrays import ARRAY_SUFFIXES
 from gsparc.tables.heads import AXIS_WORDS, LISTS, SHEET, parse_head, words_of
-from gsparc.tables.raw import ARRAY_SUFFIXES
 from gsparc.tables.sheet import Sheet
 from gsparc.tables.text import check_bytes, read_text
 

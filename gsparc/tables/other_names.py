@@ -13,8 +13,8 @@ import numpy as np
 from gsparc.base.errors import Caution
 from gsparc.data.schema import FIELDS
 from gsparc.data.units import UNITS, Unit
+from gsparc.tables.arrays import Raw, rename_arrays
 from gsparc.tables.heads import CHANNELS, LISTS, PARTS, POLAR, words_of
-from gsparc.tables.raw import Raw, rename_arrays
 
 # What powers do not have
 PHASED = ("csi", "frequency_hz", "mask", "noise_variance", "array_position")

@@ -17,7 +17,7 @@ from gsparc.data.schema import FIELDS, MEASUREMENTS, Stations, TrainTest
 from gsparc.data.target import TARGETS, Kind
 from gsparc.ops import SphereGrid
 from gsparc.tables.array_checks import MOST_DB, ArrayChecker
-from gsparc.tables.raw import numbered_rows
+from gsparc.tables.arrays import numbered_rows
 from gsparc.tables.rotations import is_rotation, is_unit, quaternion_to_matrix
 
 # From long wave (100 kHz) to the far infrared: what lies outside was mostly given in MHz or GHz.

@@ -9,9 +9,8 @@ import re
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any
@@ -28,10 +27,8 @@ from gsparc.base.errors import DataError, absent, explain_error, readable
 from gsparc.base.files import check_fetched, whole_file
 from gsparc.data.blocks import is_big, iterate_bytes, map_from_disk
 from gsparc.tables.array_sizes import Stated, check_array_sizes
+from gsparc.tables.arrays import HDF5_SUFFIXES, NETCDF_SUFFIXES, Raw
 
-HDF5_SUFFIXES = (".h5", ".hdf5")
-NETCDF_SUFFIXES = (".nc", ".nc3", ".nc4", ".cdf")
-ARRAY_SUFFIXES = (".npz", ".mat", *HDF5_SUFFIXES, *NETCDF_SUFFIXES)
 UNREADABLE = (SyntaxError, TokenError)  # of a header that is no Python literal
 COMPLEX = ("real imag", "re im", "r i")  # fields of compounds that MATLAB, Octave and others write
 DIGEST = "content_sha256"  # attribute of HDF5 files that gsparc wrote
@@ -51,32 +48,6 @@ DAMAGED = (
     TokenError,  # of a header that ends within a quotation, from Python 3.12 on
     *(RuntimeError, ArithmeticError, MemoryError),  # the first includes NotImplementedError
 )
-
-
-@dataclass(frozen=True)
-class Raw:
-    """What a file holds.
-
-    Attributes:
-        arrays: by name.
-        attributes: numbers and strings about the whole file.
-        units: unit of an array where the file gives one.
-        notes: how it was understood and what of it was left out, for the user, one line each.
-        explain: what there is to say of the measurements that these became, and (S,) the row of
-            each, from 0.
-        said: of a table, its columns by quantity, as `dataset.columns` and answers say.
-        roles: of a table's columns (`gsparc.tables.sheet`).
-        heads: of a table.
-    """
-
-    arrays: dict[str, np.ndarray]
-    attributes: dict[str, Any] = field(default_factory=dict)
-    units: dict[str, str] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
-    explain: Callable[[Any, np.ndarray], list[str]] = lambda data, file_row: []
-    said: Mapping[str, object] = field(default_factory=dict)
-    roles: tuple[Any, ...] = ()
-    heads: tuple[str, ...] = ()
 
 
 def read_raw(path: str | Path) -> Raw:
@@ -303,19 +274,6 @@ def _plain(value: Any) -> Any:
     if isinstance(value, bytes):
         return value.decode("utf-8", errors="replace")
     return value.item() if isinstance(value, np.generic) else value
-
-
-def numbered_rows(count: int) -> np.ndarray:
-    """Return what rows (count,) are called that their file does not name."""
-    return np.array([f"row {i}" for i in range(count)])
-
-
-def rename_arrays(raw: Raw, names: Mapping[str, str]) -> Raw:
-    """Return the same content with arrays and their units renamed from the keys
-    to the values of `names`.
-    """
-    arrays = {names.get(k, k): v for k, v in raw.arrays.items()}
-    return replace(raw, arrays=arrays, units={names.get(k, k): v for k, v in raw.units.items()})
 
 
 NEVER_WRITTEN = 9e36  # default fill value of NetCDF's floating point numbers is 9.97e36

@@ -140,3 +140,33 @@ class FitContext(Checked):
     def counts(self) -> Effort:
         """What a fit counts before it ends."""
         return Effort().scale_by(self.effort)
+
+    def requested_steps(self, rows: int, model_steps: int | None = None) -> int | None:
+        """Return the number of steps that the Trainer is given, else the model's own;
+        None where neither is.
+
+        Args:
+            rows: that are learned from, for epochs.
+            model_steps: as the model is configured; gives way to the Trainer's.
+
+        Raises:
+            ValueError: the Trainer is given what is no number of steps.
+        """
+        options = {} if self.trainer is None else self.trainer.keywords
+        steps, epochs = (
+            None if options.get(n) == -1 else options.get(n) for n in ("max_steps", "max_epochs")
+        )
+        for name, value in (("max_steps", steps), ("max_epochs", epochs)):
+            if value is not None and (type(value) is not int or value < 0):
+                raise ValueError(
+                    f"trainer.{name}={value!r}: a whole number of at least 0 is needed, or -1"
+                )
+        if model_steps == 0 or (steps is None and epochs is None):  # 0 of either is the start alone
+            return model_steps
+        if model_steps is not None:
+            log.warning(
+                "model.steps=%d gives way to the Trainer's max_steps or max_epochs", model_steps
+            )
+        size = self.batch_size if self.datamodule is None else self.datamodule.batch_size
+        of_epochs = None if epochs is None else epochs * -(-rows // size)
+        return min(limit for limit in (steps, of_epochs) if limit is not None)

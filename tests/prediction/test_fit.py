@@ -1,5 +1,7 @@
 """`gsparc.fit`: three lines do what a file and a command do."""
 
+import logging
+
 import numpy as np
 import pytest
 from campaigns import plain
@@ -221,3 +223,15 @@ def test_nan_of_a_station_with_too_few_rows_left_without_a_word(caplog):
     found = gsparc.fit(rx=PLACES, station_position=ends, rssi=powers, model="gp")
     assert np.isnan(found.rssi(rx=PLACES[0])).tolist() == [False, True]
     assert "answers are NaN, of fewer than 4 rows: station 1" in caplog.text
+
+
+def test_a_fit_of_minutes_said_nothing(monkeypatch, capsys):
+    """Who shows the log sees each line once; who does not, as long as the fit takes."""
+    known = {"rx": PLACES, "tx": END, "rssi": POWERS, "model": "gsparc", "effort": 0.1}
+    gsparc.fit(**known)
+    assert not capsys.readouterr().err
+    monkeypatch.setattr(logging.getLogger(), "handlers", [])
+    shown = logging.getLogger("gsparc")
+    before = shown.level, [*shown.handlers]
+    gsparc.fit(**known)
+    assert "cost: " in capsys.readouterr().err and before == (shown.level, shown.handlers)

@@ -4,6 +4,8 @@ levels with covariances of their errors.
 
 import dataclasses
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -290,3 +292,22 @@ def test_a_plan_of_stations_learned_together_was_an_error_of_shapes(tmp_path):
     one = Predictor(method, data.site).select_station(data.site.stations.name[0])
     covariance, noise = one.covariance(**{data.site.moving_end: PLACES})
     assert covariance.shape == (3, 3) and covariance[0, 1] > covariance[0, 2] and noise > 0
+
+
+LEARNING = "lightning torch._dynamo torchmetrics matplotlib pandas sklearn scipy.stats"
+ASK = """import sys, gsparc
+gsparc.load(sys.argv[1]).predict(tx=[[3.0, 2, 1]])
+print(*(name for name in sys.argv[2:] if name in sys.modules))"""
+
+
+@pytest.mark.parametrize("name, settings", [("gp", {}), ("splat", {"steps": 0})])
+def test_what_trains_and_reads_tables_was_loaded_to_answer(
+    name, settings, campaign, folds, tmp_path
+):
+    """Five seconds and 580 MB, most of them Lightning's, pandas' and scikit-learn's."""
+    method = method_class(name)(**settings)
+    method.fit(campaign("spectrum", 40), folds(40).folds[0], FitContext(tmp_path))
+    checkpoint.save(tmp_path / "model.ckpt", method)
+    asked = [sys.executable, "-c", ASK, tmp_path / "model.ckpt", *LEARNING.split()]
+    done = subprocess.run(asked, capture_output=True, text=True)
+    assert done.returncode == 0 and not done.stdout.split(), done.stdout + done.stderr

@@ -4,37 +4,66 @@ from __future__ import annotations
 
 import asyncio
 import hmac
-import json
+import os
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import asdict, dataclass
+from importlib.metadata import version
 from threading import Lock
-from typing import Annotated, Any, NamedTuple
+from time import perf_counter
+from typing import Any
 from urllib.parse import quote
 
-import numpy as np
 import uvicorn
 from fastapi import FastAPI, HTTPException, Request, Response
-from fastapi.responses import JSONResponse
-from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
-from pydantic_core import to_json
+from fastapi.responses import HTMLResponse, JSONResponse
+from prometheus_client import (
+    CONTENT_TYPE_LATEST,
+    CollectorRegistry,
+    Counter,
+    Histogram,
+    ProcessCollector,
+    generate_latest,
+)
+from prometheus_client.multiprocess import MultiProcessCollector
 from starlette.requests import ClientDisconnect
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from gsparc.apps.export.batching import Batcher
 from gsparc.apps.export.told_file import ToldFile
-from gsparc.base.files import is_out_of_space, list_causes, refuse_repeated
+from gsparc.apps.export.wire import (
+    PLACE,
+    QUERY_BODY,
+    RAW,
+    UPDATE_BODY,
+    AnswerBody,
+    FaultBody,
+    RowsBody,
+    draw_page,
+    parse,
+)
+from gsparc.base.files import is_out_of_space, list_causes
 from gsparc.base.limits import Checked, SettingError, number, setting, whole
 from gsparc.models.checkpoint import CheckpointError
 from gsparc.prediction.predictor import Predictor
-from gsparc.prediction.query import read_places
 from gsparc.prediction.updating import ToldBefore
 
-RAW = "application/octet-stream"
-# Bytes of a place, raw and at most as JSON, and of what is around places
-PLACE, BYTES, MORE = 12, 64, 8192
+# Bytes of a place as JSON at most, and of what is around places
+BYTES, MORE = 64, 8192
 # That an answered connection stays, that requests have when the server stops
 KEEP_S, STOP_S = 5, 10
 FILE_S = 5.0  # that an update waits for another process that writes the file
+FREE = ("/healthz", "/readyz")  # of the token, for whoever watches the process
+PATHS = (*FREE, "/predict", "/update", "/metrics", "/docs", "/openapi.json")
+STEPS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 5.0)  # of the histogram
+WORKERS = "PROMETHEUS_MULTIPROC_DIR"  # where several processes leave their counts
+FAULTS: dict[int | str, dict[str, Any]] = {
+    401: {"description": "the token is needed, Authorization: Bearer TOKEN"},
+    409: {"description": "/update: rows of this `key` were taken before"},
+    413: {"description": "more places or numbers than the server's limits"},
+    422: {"description": "the body is wrong: `detail` says where"},
+    503: {"description": "too many connections, or another process writes the file: try again"},
+}
 
 
 @dataclass(frozen=True)
@@ -53,184 +82,105 @@ class Limits(Checked):
     delay_ms: float = setting(2.0, number(0, 1000))
 
 
-class PlacesBody(BaseModel):
-    """A request's body: world places of what moves [m]."""
+class Metrics:
+    """What Prometheus scrapes: of this process, or of all that share a folder (`WORKERS`)."""
 
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
-    places: Annotated[list[tuple[float, float, float]], FailFast()]
-
-
-class RowsBody(PlacesBody):
-    """A request's body: the same, and levels there of each station; null is not measured.
-
-    Rows of a `key` are taken once; without one as often as they come,
-    as a sensor that stands still repeats.
-    """
-
-    levels: Annotated[list[list[float | None]], FailFast()]
-    key: Annotated[str | None, Field(min_length=1, max_length=100)] = None
-
-
-def make_server(app: ASGIApp, limits: Limits, **listen: Any) -> uvicorn.Server:
-    """Return a server within limits that logs no request: the log is the command's, and open."""
-    return uvicorn.Server(
-        uvicorn.Config(
-            app,
-            http="h11",
-            ws="none",
-            log_config=None,
-            log_level="error",
-            access_log=False,
-            # uvicorn counts the connection that asks, and refuses at the limit itself
-            limit_concurrency=limits.connections + 1,
-            timeout_keep_alive=KEEP_S,
-            timeout_graceful_shutdown=STOP_S,
-            h11_max_incomplete_event_size=MORE,
-            **listen,
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        self.seconds = Histogram(
+            "gsparc_request_seconds",
+            "From a request's head to the end of its answer.",
+            ["path", "status"],
+            registry=self.registry,
+            buckets=STEPS_S,
         )
+        self.places = Counter("gsparc_places", "Places answered.", registry=self.registry)
+        ProcessCollector(registry=self.registry)
+
+    def text(self) -> bytes:
+        """Return the figures in Prometheus' text format."""
+        if WORKERS not in os.environ:
+            return generate_latest(self.registry)
+        joint = CollectorRegistry()
+        MultiProcessCollector(joint)  # type: ignore[no-untyped-call]
+        return generate_latest(joint)
+
+
+def make_config(app: Any, limits: Limits, **listen: Any) -> uvicorn.Config:
+    """Return a server's settings within limits; no request is logged:
+    the log is the command's, and open.
+    """
+    return uvicorn.Config(
+        app,
+        http="h11",
+        ws="none",
+        log_config=None,
+        log_level="error",
+        access_log=False,
+        # uvicorn counts the connection that asks, and refuses at the limit itself
+        limit_concurrency=limits.connections + 1,
+        timeout_keep_alive=KEEP_S,
+        timeout_graceful_shutdown=STOP_S,
+        h11_max_incomplete_event_size=MORE,
+        **listen,
     )
 
 
-class WaitingRequest(NamedTuple):
-    """A request that waits: how many places its body holds if it is sound,
-    and where its answer comes.
-    """
-
-    size: int
-    body: bytes
-    raw: bool
-    answer: asyncio.Future[np.ndarray | Exception]
-
-
-class Batcher:
-    """Asks the model about the places of all requests that come within a delay.
-
-    Args:
-        predictor: of one end that moves, and one station or powers of several.
-        what: is asked, a method of it.
-        delay_s: that the first request of a batch waits for others [s].
-        most: places of a batch, beside those of the request that waits longest.
-        lock: held while the model is asked.
-    """
-
-    def __init__(
-        self, predictor: Predictor, what: str, delay_s: float, most: int, lock: Lock
-    ) -> None:
-        self.predictor, self.delay_s, self.most = predictor, delay_s, most
-        self.what, self.lock = what, lock
-        self.waiting: list[WaitingRequest] = []
-        self.some = asyncio.Event()
-
-    async def ask(self, size: int, body: bytes, raw: bool) -> np.ndarray:
-        """Answers (n, ...) at the world places (n, 3) [m] of a body;
-        raises what reading and the model do.
-        """
-        self.waiting.append(
-            WaitingRequest(size, body, raw, asyncio.get_running_loop().create_future())
-        )
-        self.some.set()
-        answer = await self.waiting[-1].answer
-        if isinstance(answer, Exception):
-            raise answer
-        return answer
-
-    async def run(self) -> None:
-        """Answer until cancelled."""
-        while True:
-            await self.some.wait()
-            # A first request waits 2 ms by default: those
-            # that come meanwhile share its matrix products.
-            await asyncio.sleep(self.delay_s)
-            batch = self._next()
-            # In a thread: while the model computes others can connect and be refused.
-            answers = await asyncio.to_thread(self._answers, batch)
-            for request, answer in zip(batch, answers, strict=True):
-                if not request.answer.done():  # cancelled when the server stops
-                    request.answer.set_result(answer)
-
-    def _next(self) -> list[WaitingRequest]:
-        """The request that waits longest, and the smallest others:
-        few places do not wait for many.
-        """
-        # By size: a request for a thousand places would otherwise delay many for one.
-        others = sorted(self.waiting[1:], key=lambda request: request.size)
-        count = int(np.searchsorted(np.cumsum([each.size for each in others]), self.most, "right"))
-        batch = [self.waiting[0], *others[:count]]
-        self.waiting = [request for request in self.waiting if request not in batch]
-        if not self.waiting:
-            self.some.clear()
-        return batch
-
-    def _answers(self, batch: list[WaitingRequest]) -> list[np.ndarray | Exception]:
-        """Of each request, or its own fault."""
-        site = self.predictor.site
-        try:
-            places = [np.zeros((0, 3)), *(_read(site.moving_end, one) for one in batch)]
-            with self.lock:
-                values = getattr(self.predictor, self.what)(
-                    **site.name_moving(np.concatenate(places))
-                )
-            values = np.stack([values.real, values.imag], -1) if np.iscomplexobj(values) else values
-            parts = np.split(values.astype("<f4"), np.cumsum([len(place) for place in places])[:-1])
-            return [part.copy() for part in parts[1:]]  # a view would keep the others' answers
-        except Exception as error:
-            if len(batch) == 1:
-                return [error]
-            # One faulty request must not spoil a batch: each is asked again alone,
-            # to find whose fault it is.
-            return [self._answers([request])[0] for request in batch]
+def make_server(app: ASGIApp, limits: Limits, **listen: Any) -> uvicorn.Server:
+    """Return a server of this process; see `make_config`."""
+    return uvicorn.Server(make_config(app, limits, **listen))
 
 
 def build_application(
     predictor: Predictor, limits: Limits, token: str | None, told: ToldFile | None = None
 ) -> ASGIApp:
-    """Return the routes: POST /predict, and /std for its deviations, GET /healthz;
-    POST /update where wanted.
+    """Return the routes: POST /predict; POST /update where wanted; GET /healthz, /readyz, /metrics,
+    /docs and /openapi.json.
 
     Args:
         predictor: of one end that moves and one station.
         limits: more places or numbers in one request are refused (413).
-        token: that a request must bear (401) but for /healthz; None: none.
+        token: that a request must bear (401) but for `FREE`; None: none.
         told: the model's file, for updates; None: there are none.
 
     Raises:
         SettingError: updates without a token, or more numbers in the answer at one place than
             `limits` allow.
     """
-    site, lock, telling = predictor.site, Lock(), asyncio.Lock()
+    site, lock, telling, metrics = predictor.site, Lock(), asyncio.Lock(), Metrics()
     if told is not None and token is None:
         raise SettingError(
             "updates=true: whoever reaches it changes the model; set GSPARC_TOKEN, or say "
             "token=WORD"
         )
-    middle = getattr(predictor, site.kind)(
-        **site.name_moving(site.moving_box.mean(0) + site.origin)
-    )
-    # Real and imaginary part count as two numbers.
-    each = np.size(middle) * (2 if np.iscomplexobj(middle) else 1)
+    batcher = Batcher(predictor, limits.delay_ms / 1e3, lock)
+    each = batcher.compute(site.moving_box.mean(0)[None] + site.origin).values.size
     if each > limits.numbers:
         raise SettingError(
             f"numbers={limits.numbers}: one place's answer holds {each}; say {each} or more"
         )
     # Both limits hold: of places, and of numbers in the answer.
-    most = min(limits.most, limits.numbers // each)
-    batchers = {
-        route: Batcher(predictor, method, limits.delay_ms / 1e3, most, lock)
-        for route, method in (("/predict", site.kind), ("/std", "std"))
-    }
+    batcher.most = most = min(limits.most, limits.numbers // each)
 
     @asynccontextmanager
-    async def life(_: FastAPI) -> AsyncIterator[None]:
-        work = [asyncio.create_task(batcher.run()) for batcher in batchers.values()]
+    async def life(app: FastAPI) -> AsyncIterator[None]:
+        app.state.work = asyncio.create_task(batcher.run())
         yield
-        for task in work:
-            task.cancel()
+        app.state.work.cancel()
 
-    # Scripts from elsewhere
-    app = FastAPI(title="gsparc", lifespan=life, docs_url=None, redoc_url=None)
+    app = FastAPI(
+        title="gsparc",
+        version=version("gsparc"),
+        description=f"{site.kind} of {predictor.method.name}, where the {site.moving_end} moves.",
+        lifespan=life,
+        docs_url=None,  # scripts from elsewhere
+        redoc_url=None,
+        responses={code: {"model": FaultBody, **about} for code, about in FAULTS.items()},
+    )
 
     @app.get("/healthz")
     async def healthz() -> dict[str, Any]:
+        """Which model answers."""
         stations = {} if site.stations is None else {"stations": site.stations.name}
         model = {
             "model": predictor.method.name,
@@ -239,6 +189,23 @@ def build_application(
             **stations,
         }
         return {"status": "ok", "kind": site.kind, **model}
+
+    @app.get("/readyz")
+    async def readyz() -> dict[str, str]:
+        """Whether requests are answered: 200, else 503; before the model is read nobody listens."""
+        if app.state.work.done():
+            raise HTTPException(503, "the model is asked no more: start the server again")
+        return {"status": "ready"}
+
+    @app.get("/metrics")
+    async def scrape() -> Response:
+        """Requests and seconds by path and status, and places, in Prometheus' text format."""
+        return Response(metrics.text(), media_type=CONTENT_TYPE_LATEST)
+
+    @app.get("/docs")
+    async def docs() -> HTMLResponse:
+        """This page."""
+        return HTMLResponse(draw_page(app.openapi()))
 
     async def read_body(request: Request, raw: bool, lists: int = 1) -> tuple[bytes, int]:
         body, count = bytearray(), 0
@@ -259,8 +226,7 @@ def build_application(
         return bytes(body), count
 
     def add_rows(body: bytes) -> dict[str, Any]:
-        rows = RowsBody.model_validate_json(body)
-        json.loads(body, object_pairs_hook=refuse_repeated)
+        rows = parse(body, RowsBody)
         where: dict[str, Any] = site.name_moving(rows.places)
         assert told is not None
         found = told.tell(predictor, lock, FILE_S, **where, rssi=rows.levels, key=rows.key)
@@ -271,6 +237,10 @@ def build_application(
         }
 
     async def update(request: Request) -> dict[str, Any]:
+        """Levels that were measured, added to the model and its file.
+
+        Answers numbers of the rows, how many were skipped, and alarms of what changed.
+        """
         body, _ = await read_body(request, False, lists=2)
         try:
             async with telling:  # waiting for the file holds one thread, the others answer
@@ -284,18 +254,25 @@ def build_application(
         except ToldBefore as error:
             raise HTTPException(409, str(error)) from error
         except ValueError as error:  # of a body, too
-            wanted = (
-                '{"places": [[x, y, z], ...], "levels": [[level or null of each station], ...]}'
-            )
-            message = f"expected {wanted}" if isinstance(error, ValidationError) else str(error)
-            raise HTTPException(422, message) from error
+            raise HTTPException(422, str(error)) from error
 
     if told is not None:
-        app.post("/update")(update)
+        app.post(
+            "/update",
+            openapi_extra={"requestBody": {"content": UPDATE_BODY, "required": True}},
+        )(update)
 
-    @app.post("/std")
-    @app.post("/predict")
+    @app.post(
+        "/predict",
+        openapi_extra={"requestBody": {"content": QUERY_BODY, "required": True}},
+        responses={200: {"model": AnswerBody, "content": {RAW: {}}}},
+    )
     async def predict(request: Request) -> Response:
+        """Answers at places, with deviations if `std` is true.
+
+        A raw body is answered raw: values, then deviations, float32, little-endian, their shapes in
+        the headers x-shape and x-std-shape.
+        """
         # Media types are compared without case (RFC 9110, 8.3.1).
         kinds = {
             one.partition(";")[0].strip().lower() for one in request.headers.getlist("content-type")
@@ -305,62 +282,64 @@ def build_application(
         raw = kinds == {RAW}
         body, count = await read_body(request, raw)
         try:
-            values = await batchers[request.url.path].ask(max(count, 1), body, raw)
+            answer = await batcher.ask(
+                max(count, 1), body, raw, bool(request.scope["query_string"])
+            )
         except Exception as error:
             raise HTTPException(
                 422 if isinstance(error, ValueError) else 500, str(error)
             ) from error
-        about = {"x-shape": ",".join(map(str, values.shape)), "x-unit": quote(predictor.unit)}
-        if raw:
-            return Response(values.tobytes(), headers=about, media_type=RAW)
-        answer = {"shape": values.shape, "unit": predictor.unit, "values": values.tolist()}
-        # JSON has no word for the level of silence.
-        text = to_json(answer, inf_nan_mode="null")
-        return Response(text, headers=about, media_type="application/json")
+        metrics.places.inc(len(answer.values))
+        parts = {"x-shape": answer.values, "x-std-shape": answer.std}
+        about = {
+            name: ",".join(map(str, part.shape)) for name, part in parts.items() if part is not None
+        }
+        text, media = (
+            (answer.to_raw(), RAW) if raw else (answer.to_json(predictor.unit), "application/json")
+        )
+        return Response(text, headers={**about, "x-unit": quote(predictor.unit)}, media_type=media)
 
-    return _guarded(app, None if token is None else f"Bearer {token}".encode())
+    return _guarded(app, None if token is None else f"Bearer {token}".encode(), metrics)
 
 
-def _guarded(app: ASGIApp, wanted: bytes | None) -> ASGIApp:
-    """Requests have one end, and whatever is asked, but for /healthz, needs the token,
-    if there is one.
+def _guarded(app: ASGIApp, wanted: bytes | None, metrics: Metrics) -> ASGIApp:
+    """Requests have one end, and whatever is asked, but for `FREE`, needs the token,
+    if there is one; all are counted.
     """
 
     async def guard(scope: Scope, receive: Receive, send: Send) -> None:
-        heads = dict(scope.get("headers", ()))
-        free = wanted is None or scope["type"] == "lifespan" or scope["path"] == "/healthz"
-        fault, status = "", 400
-        # Two ends hide a second request
-        if heads.keys() >= {b"content-length", b"transfer-encoding"}:
-            fault = "Content-Length beside Transfer-Encoding"
-        elif not free and not hmac.compare_digest(heads.get(b"authorization", b""), wanted or b""):
-            fault, status = "Authorization: Bearer TOKEN is needed", 401
-        elif any(
-            k == b"content-encoding" and v.lower() != b"identity"
-            for k, v in scope.get("headers", ())
-        ):
-            fault, status = "Content-Encoding: bodies are read as they come; leave it out", 415
-        elif scope.get("query_string"):
-            fault, status = "nothing is read after ? in the address; leave it out", 422
-        refused = JSONResponse({"detail": fault}, status, {"connection": "close"})
-        await (refused if fault else app)(scope, receive, send)
+        if scope["type"] == "lifespan":
+            return await app(scope, receive, send)
+        began, codes = perf_counter(), [500]
+
+        async def answer(message: Message) -> None:
+            codes.append(message.get("status", codes[-1]))
+            await send(message)
+
+        fault, status = _fault(scope, wanted)
+        answering = (
+            JSONResponse({"detail": fault}, status, {"connection": "close"}) if fault else app
+        )
+        try:
+            await answering(scope, receive, answer)
+        finally:
+            path = scope["path"] if scope["path"] in PATHS else "other"
+            metrics.seconds.labels(path, codes[-1]).observe(perf_counter() - began)
 
     return guard
 
 
-def _read(end: str, asked: WaitingRequest) -> np.ndarray:
-    """World places (n, 3) float64 [m] of a body; raises ValueError."""
-    try:
-        # Of one key: of two alike the last would count
-        if not asked.raw and asked.body.count(b'"') != 2:
-            raise ValueError
-        raw = np.frombuffer(asked.body, "<f4").reshape(-1, 3) if asked.raw else None
-        places = PlacesBody.model_validate_json(asked.body).places if raw is None else raw
-    except (ValidationError, ValueError):
-        wanted = (
-            "little-endian float32, three a place"
-            if asked.raw
-            else ('{"places": [[x, y, z], ...]}')
-        )
-        raise ValueError(f"expected {wanted}, finite metres, and nothing else") from None
-    return read_places(end, places)
+def _fault(scope: Scope, wanted: bytes | None) -> tuple[str, int]:
+    """What is wrong with a request's head, and the status that says so; empty: nothing."""
+    heads, query = dict(scope["headers"]), scope["query_string"]
+    # Two ends hide a second request
+    if heads.keys() >= {b"content-length", b"transfer-encoding"}:
+        return "Content-Length beside Transfer-Encoding", 400
+    bearer = heads.get(b"authorization", b"")
+    if wanted and scope["path"] not in FREE and not hmac.compare_digest(bearer, wanted):
+        return "Authorization: Bearer TOKEN is needed", 401
+    if any(k == b"content-encoding" and v.lower() != b"identity" for k, v in scope["headers"]):
+        return "Content-Encoding: bodies are read as they come; leave it out", 415
+    if query and (scope["path"], query) != ("/predict", b"std=true"):
+        return "nothing is read after ? in the address but std=true of /predict; leave it out", 422
+    return "", 200

@@ -16,18 +16,13 @@ from gsparc.data.query import Batch, Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.splits import Fold
 from gsparc.data.target import Kind
-from gsparc.field.gradient_stage import (
-    interruptible,
-    make_trainer,
-    read_trainer_result,
-    requested_steps,
-)
 from gsparc.field.losses import LossSettings, task_loss
 from gsparc.field.module import NetworkModule
 from gsparc.field.optimizer import OptimizerSettings
+from gsparc.models.checkpoint import read_interrupted
 from gsparc.models.fitting import Origin
+from gsparc.models.gradient import train_module
 from gsparc.models.method import Method, Prediction
-from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, read_interrupted
 from gsparc.ops import Pose
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.effort import Effort
@@ -189,7 +184,7 @@ class TrainedPeer(Method):
             raise ValueError(f"{self.name}: the training set is empty")
         origin = Origin.from_fit(data, fold, context)
         context = replace(context, seed=self.seed, batch_size=self.batch_size, datamodule=None)
-        step_count = requested_steps(context, len(rows), self.max_steps)
+        step_count = context.requested_steps(len(rows), self.max_steps)
         watch = Stopwatch()
         L.seed_everything(self.seed, verbose=False)
         self.site, self.precomputed = data.site, self.precompute(data, rows)
@@ -197,13 +192,9 @@ class TrainedPeer(Method):
         if context.resume is not None:
             origin.require_same(read_interrupted(context.resume))
         module = self.module(self._count_steps(kind, context.counts, step_count), context.run_dir)
-        files = GsparcCheckpointIO(self, context.config_yaml, origin.to_extra())
-        trainer, batches = make_trainer(
-            module, data, replace(split, train=rows), context, files, watch
+        result = train_module(
+            self, module, data, replace(split, train=rows), context, watch, origin.to_extra()
         )
-        with interruptible(trainer, batches):
-            trainer.fit(module, datamodule=batches, ckpt_path=context.resume, weights_only=True)
-        result = read_trainer_result(trainer, watch)
         self.steps = result.taken
         self.network.eval()
         note = f"{self.name}: {self.steps} steps of {min(self.batch_size, len(rows))} samples"

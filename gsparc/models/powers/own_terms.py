@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.base.files import Files
 from gsparc.data.schema import OF_STATION, Measurements, Site
-from gsparc.datasets.prior_levels import Files, read_prior_levels
 from gsparc.models.powers.prior_map import NetworkMaps, PriorMap
 from gsparc.processes.places import has_both_ends
 from gsparc.processes.posterior import Exact
@@ -78,8 +78,8 @@ class OwnTerms:
         station = (
             data.site.name.rpartition(OF_STATION)[2] if OF_STATION in data.site.name else station
         )
-        levels = read_prior_levels(self.prior, data, station)
-        return (*self.terms, PriorMap.from_levels(*levels, still + data.site.origin))
+        still = still + data.site.origin
+        return (*self.terms, PriorMap.from_file(self.prior, data, station, still))
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.base.errors import group_warnings
+from gsparc.base.files import Files
 from gsparc.data.schema import Measurements
-from gsparc.datasets.prior_levels import Files, read_prior_maps
 from gsparc.processes.places import first_end, other_end
 from gsparc.processes.sectors import ROUND, SHARED, Sectors, sector_of
 from gsparc.processes.term import Columns
@@ -64,6 +64,11 @@ class PriorMap(Columns):
     prior_db: Sequence[float] | None = SHARE
     spacing: float = math.inf  # older files say nothing of it
     about: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+
+    @classmethod
+    def from_file(cls, path: Files, data: Measurements, station: str, still: np.ndarray) -> Self:
+        """Read the map of one station as it is shown; see `from_levels` and `read_prior_levels`."""
+        return cls.from_levels(*_read_maps(path, data, (station,))[0][2], still)
 
     @classmethod
     def from_levels(cls, points: np.ndarray, level: np.ndarray, still: np.ndarray) -> Self:
@@ -193,9 +198,7 @@ class NetworkMaps(Columns):
         see there.
         """
         maps = list[tuple[int, bool, PriorMap]]()
-        for number, own, (world, levels) in read_prior_maps(
-            path, data, data.site.every_station.shown
-        ):
+        for number, own, (world, levels) in _read_maps(path, data, data.site.every_station.shown):
             points, level = map(torch.from_numpy, (world - data.site.origin[:2], levels))
             before = maps[-1][2] if maps else None
             # Squares of one raster are stored once.
@@ -251,3 +254,13 @@ class NetworkMaps(Columns):
                 level = inside * (level + usual_loss(first_end(at) - other_end(at)) - self.level)
                 result = result.index_add(0, own, level.to(result))
         return result
+
+
+def _read_maps(
+    path: Files, data: Measurements, stations: Sequence[str]
+) -> list[tuple[int, bool, tuple[np.ndarray, np.ndarray]]]:
+    """See `read_prior_maps`."""
+    # Here, as readers of tables and datasets take three seconds to import: a model keeps its maps.
+    from gsparc.datasets.prior_levels import read_prior_maps
+
+    return read_prior_maps(path, data, stations)

@@ -6,9 +6,8 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import lightning.pytorch as L
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -20,26 +19,23 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.splits import Fold
-from gsparc.field import edit, gradient_stage
+from gsparc.field import edit
 from gsparc.field.confidence import ConfidenceSettings, fit_level_and_power
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import Smoothness
 from gsparc.field.frozen import FrozenArray, FrozenView, freeze_view
 from gsparc.field.gaussians import FieldSettings
 from gsparc.field.initial import InitSettings, InitTask
-from gsparc.field.keep_best import PATIENCE, KeepBest, StopAt
-from gsparc.field.losses import LossSettings
+from gsparc.field.losses import LossSettings, squared_error
 from gsparc.field.model import AttenuationSettings, GaussianModel, ModelSettings, RasterSettings
-from gsparc.field.module import GaussianModule, squared_error
 from gsparc.field.optimizer import OptimizerSettings
 from gsparc.field.response import ResponseSettings
 from gsparc.models import checkpoint
-from gsparc.models.checkpoint import StoredModel
+from gsparc.models.checkpoint import StoredModel, read_interrupted
 from gsparc.models.fitting import Origin
 from gsparc.models.method import Method, Prediction, to_double
 from gsparc.models.splat import reduce
 from gsparc.models.splat.auto_settings import Choices, apply_choices, resolve_auto
-from gsparc.models.splat.checkpoint_io import GsparcCheckpointIO, read_interrupted
 from gsparc.models.splat.closed_form_start import start_in_closed_form
 from gsparc.models.splat.left_out_images import LeftOut
 from gsparc.models.stack import LEAST_HELD
@@ -48,6 +44,9 @@ from gsparc.processes.stored import from_plain, to_plain
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.effort import Effort
 from gsparc.training.stopwatch import Stopwatch
+
+if TYPE_CHECKING:
+    from gsparc.field.gradient_stage import TrainerResult
 
 log = logging.getLogger(__name__)
 
@@ -69,14 +68,14 @@ class Stage:
         fold: whose training rows it learns from.
         context: the fit's, with the stage's folder and the file that it resumes from.
         steps: of gradient, of its schedule.
-        patience: see `KeepBest`.
+        watched: whether steps end early that do not pay, see `KeepBest`.
     """
 
     name: Literal["train", "refit", "final"]
     fold: Fold
     context: FitContext
     steps: int
-    patience: int | None = None
+    watched: bool = False
 
     @property
     def cost_suffix(self) -> str:
@@ -175,6 +174,11 @@ class LearnedField(Method):
         steps are kept, a second stage (`refit`) takes as many on training and validation rows
         together, because the baselines learn from all of them, with the confidence of the first.
         """
+        # Here, as Lightning takes two seconds to import, and answers need none of it.
+        from lightning.pytorch import seed_everything
+
+        from gsparc.models.gradient import take_steps
+
         origin = Origin.from_fit(data, fold, context)
         stored_model = None if context.resume is None else read_interrupted(context.resume)
         if stored_model is not None:
@@ -183,19 +187,11 @@ class LearnedField(Method):
         watch = Stopwatch(*(float(marks.get(name, 0.0)) for name in ("spent_s", "spent_cpu_s")))
         self._begin_fit(data, fold, marks)
         for stage in self._plan_stages(data, fold, context, stored_model):
-            module = self._start_stage(stage, data, watch)
-            if module is None:
+            seed_everything(stage.context.seed, verbose=False)
+            if not self._start_stage(stage, data, watch):
                 continue
-            files = GsparcCheckpointIO(self, context.config_yaml, self._extra(stage, watch, origin))
-            began = watch.seconds
-            trainer, batches = gradient_stage.make_trainer(
-                module, data, stage.fold, stage.context, files, watch, self._stage_callbacks(stage)
-            )
-            with gradient_stage.interruptible(trainer, batches):
-                trainer.fit(
-                    module, datamodule=batches, ckpt_path=stage.context.resume, weights_only=True
-                )
-            result = gradient_stage.read_trainer_result(trainer, watch)
+            began, marks = watch.seconds, self._extra(stage, watch, origin)
+            result = take_steps(self, stage, data, watch, marks)
             self._end_stage(stage, result, watch.seconds - began)
         self.frozen = self._doubled = None
         label, count = (
@@ -272,7 +268,7 @@ class LearnedField(Method):
         assert self.choices is not None
         solved, few = self.choices.closed_form, self.keep_best and len(fold.val) < LEAST_TOLD
         watched = _hold_out_third(data, fold, context) if few else fold
-        step_count = gradient_stage.requested_steps(context, len(watched.train), self.most_steps)
+        step_count = context.requested_steps(len(watched.train), self.most_steps)
         usual = context.counts.steps_after_solving if solved else context.counts.steps
         steps = usual if step_count is None else step_count
         log.info(
@@ -288,9 +284,7 @@ class LearnedField(Method):
             watching = not self.keep_best or len(watched.val) > 0 or not solved
             if steps and watching:
                 # Steps that somebody asks for are all taken.
-                yield Stage(
-                    "train", watched, context, steps, PATIENCE if step_count is None else None
-                )
+                yield Stage("train", watched, context, steps, step_count is None)
             if solved and (few or not watching):
                 self._paying = 0  # by so few rows steps would be chosen by chance
             if solved and (self._paying == 0 or not steps):
@@ -310,16 +304,13 @@ class LearnedField(Method):
                 "refit", _train_on_all(watched), context.for_part("refit", resume=resume), steps
             )
 
-    def _start_stage(
-        self, stage: Stage, data: Measurements, watch: Stopwatch
-    ) -> GaussianModule | None:
-        """Make a fresh model, or read one back; return what trains it, None where no step is taken.
+    def _start_stage(self, stage: Stage, data: Measurements, watch: Stopwatch) -> bool:
+        """Make a fresh model, or read one back; return whether steps are taken.
 
         `refit` keeps the confidence of the stage before:
         the rows that calibrated it are learned from now.
         """
         context, folder = stage.context, stage.context.run_dir
-        L.seed_everything(context.seed, verbose=False)
         started, before = watch.seconds, self.model
         assert self.choices is not None
         if context.init_from is not None and context.resume is None:
@@ -355,15 +346,9 @@ class LearnedField(Method):
         prepared = watch.seconds - started
         self.init_s, self._earlier_s = (self.init_s or 0.0) + prepared, self._earlier_s + prepared
         self.spent["initialiser" + stage.cost_suffix] = prepared
-        if not stage.steps:
-            return None
-        if self._paying == 0:
+        if stage.steps and self._paying == 0:
             self.steps = 0
-            return None
-        module = self.module(stage.steps, folder)
-        module.prepared_seconds, module.solved = self._earlier_s, self.choices.closed_form
-        module.start = f"init={self.choices.init}" + (", closed form" if module.solved else "")
-        return module
+        return stage.steps > 0 and self._paying != 0
 
     def _extra(self, stage: Stage, watch: Stopwatch, origin: Origin) -> dict[str, Any]:
         """What `_begin_fit` reads of a run that is interrupted in a stage."""
@@ -380,15 +365,7 @@ class LearnedField(Method):
             **origin.to_extra(),
         }
 
-    def _stage_callbacks(self, stage: Stage) -> list[L.Callback]:
-        """Callbacks that say which steps are kept."""
-        if stage.name == "train":
-            return [KeepBest(stage.patience)] if self.keep_best else []
-        return [] if self._paying is None else [StopAt(self._paying)]
-
-    def _end_stage(
-        self, stage: Stage, result: gradient_stage.TrainerResult, seconds: float
-    ) -> None:
+    def _end_stage(self, stage: Stage, result: TrainerResult, seconds: float) -> None:
         """Note what the steps of a stage were worth."""
         self._earlier_s += seconds
         self.steps = result.taken if result.kept is None else result.kept
@@ -399,14 +376,6 @@ class LearnedField(Method):
 
     def _weigh_process(self, data: Measurements, fold: Fold) -> None:
         """A hook between the stages: what a process averaged with the field would gain."""
-
-    def module(self, steps: int = 1, run_dir: Path = Path()) -> GaussianModule:
-        """Return what Lightning trains: the model, its loss and its rates,
-        with schedules over `steps`.
-        """
-        solved = self.choices is not None and self.choices.closed_form
-        rates = self.rates.after_closed_form(steps) if solved else self.rates
-        return GaussianModule(self.fitted_model(), self.loss, rates, steps, run_dir)
 
     def _start_from(self, site: Site, path: Path) -> None:
         """Take the weights of another model of this site; what is learned anew are these rows.

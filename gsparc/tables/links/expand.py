@@ -17,7 +17,8 @@ from gsparc.data.assemble import FARTHEST
 from gsparc.data.schema import MEASUREMENTS, OTHER, End, StaticEnds, Stations
 from gsparc.data.selection import Selection, select, take_rows
 from gsparc.data.spacing import number_places
-from gsparc.tables.checks.plausibility import find_marks
+from gsparc.tables.arrays import Raw, numbered_rows
+from gsparc.tables.checks.piles import find_marks
 from gsparc.tables.links.hearing import POWERS, censor_rows, check_said, forget_unknown
 from gsparc.tables.links.positions import positions_in_metres
 from gsparc.tables.links.stations import (
@@ -29,7 +30,6 @@ from gsparc.tables.links.stations import (
 )
 from gsparc.tables.links.strongest import StrongestLists
 from gsparc.tables.own_checks import Checker
-from gsparc.tables.raw import Raw, numbered_rows
 
 LEAST_LISTED = 3  # stations, for a floor
 UNLISTED_EACH = 2  # rows of what is not listed for one that is

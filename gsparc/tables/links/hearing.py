@@ -16,7 +16,7 @@ from gsparc.data.schema import OTHER, StaticEnds
 from gsparc.data.selection import take_rows
 from gsparc.physics.decibels import to_decibels
 from gsparc.tables.array_checks import MOST_DB
-from gsparc.tables.checks.plausibility import APART_DB, find_marks, find_saturation
+from gsparc.tables.checks.piles import APART_DB, find_marks, find_saturation
 from gsparc.tables.own_checks import Checker
 
 POWERS = ("rssi", "rssi_db")

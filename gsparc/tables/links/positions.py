@@ -11,9 +11,9 @@ from gsparc.data.assemble import FARTHEST
 from gsparc.data.georeference import ON_EARTH, Georeference, find_invalid_coordinate
 from gsparc.data.outliers import FEW
 from gsparc.data.selection import take_rows
+from gsparc.tables.arrays import numbered_rows
 from gsparc.tables.checks.plausibility import degree_warnings
 from gsparc.tables.own_checks import Checker
-from gsparc.tables.raw import numbered_rows
 
 DIGITS = 2  # of an origin's degrees, 1.1 km: drives with a few rows more or less have one
 NO_FIX_DEG, NO_FIX_M = 1.0, 1e4  # from 0, 0 to the median of all other rows, at least

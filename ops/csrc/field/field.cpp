@@ -62,6 +62,8 @@ GSPARC_EXPORT gsparc_field* gsparc_open(const void* bytes, size_t size, char* wh
         say(why, room, refused.why);
     } catch (const std::bad_alloc&) {
         say(why, room, "out of memory");
+    } catch (...) {  // a C program could not catch it
+        say(why, room, "an unexpected fault");
     }
     return nullptr;
 }
@@ -78,7 +80,7 @@ GSPARC_EXPORT gsparc_field* gsparc_load(const char* path, char* why, size_t room
             bytes.resize(bytes.size() - step + got);
         }
         return gsparc_open(bytes.data(), bytes.size(), why, room);
-    } catch (const std::bad_alloc&) {
+    } catch (...) {  // of memory alone, by a vector
         return say(why, room, "out of memory"), nullptr;
     }
 }

@@ -48,7 +48,7 @@ struct ImageForm final : Form {
         if (view.starts[0] || view.starts[tiles] != blocks) refuse("blocks beyond the tiles");
         for (int64_t i = 0; i < blocks; ++i)
             if (view.ranks[i] < 0 || view.ranks[i] >= view.seen) refuse("a block of no Gaussian");
-        if (Lanes<float>::n < kBlock) split(across, tiles, blocks);
+        if (Lanes<float>::n < kBlock) split(across, blocks);
         facts.kind = GSPARC_SPECTRUM, facts.axes = process.axes;
         facts.shape[0] = view.height, facts.shape[1] = view.width, facts.values = int64_t(view.height) * view.width;
         facts.scratch = bytes_of<Memory>(*this);
@@ -87,7 +87,7 @@ private:
     }
 
     // Blocks of 4 x 4 pixels as two of 4 x 2 each.
-    void split(int64_t across, int64_t tiles, int64_t blocks) {
+    void split(int64_t across, int64_t blocks) {
         constexpr int n = Lanes<float>::n, columns = kTileColumns<float>, parts = kColumns / columns;
         const int64_t mine = tiles_across<float>(view.width), all = strips_of(view.height) * mine, most = blocks * parts;
         memory = new char[(all + 1) * sizeof(int64_t) + most * (n * sizeof(float) + sizeof(int32_t))];

@@ -28,8 +28,10 @@ from gsparc.prediction.updating import versions_extra
 pytest.importorskip("uvicorn", reason="the extra `serve` is not installed")
 pytest.importorskip("fastapi", reason="the extra `serve` is not installed")
 from gsparc.apps.export import serving
-from gsparc.apps.export.serving import RAW, Limits, build_application, make_server
+from gsparc.apps.export.batching import Batcher
+from gsparc.apps.export.serving import Limits, build_application, make_server
 from gsparc.apps.export.told_file import ToldFile
+from gsparc.apps.export.wire import RAW
 
 TX = np.array([3.0, 2, 2])
 
@@ -92,8 +94,8 @@ class Served:
         return ready()
 
 
-def as_json(places):
-    return json.dumps({"places": np.asarray(places).tolist()})
+def as_json(places, **more):
+    return json.dumps({"places": np.asarray(places).tolist(), **more})
 
 
 @pytest.fixture(scope="module")
@@ -129,20 +131,61 @@ def test_a_media_type_in_capitals_was_taken_for_json(served):
     assert served.post(np.ones((1, 3), "<f4").tobytes(), RAW.title())[0] == 200
 
 
-def test_deviations_and_all_stations_in_the_unit_asked_for(powers, served):
+def test_deviations_took_a_second_request_and_a_second_computation(powers, served, monkeypatch):
+    places, calls = np.random.default_rng(3).uniform(0, 9, (5, 3)), []
+    spread, own = powers.std(rx=places), powers.method.predict
+    monkeypatch.setattr(
+        powers.method, "predict", lambda query: calls.append(len(query)) or own(query)
+    )
+    status, body, _ = served.post(as_json(places, std=True))
+    said = json.loads(body)
+    assert status == 200 and calls == [5]
+    np.testing.assert_allclose(said["std"], spread, rtol=1e-5)
+    np.testing.assert_allclose(said["values"], powers.rssi(rx=places), rtol=1e-5)
+    _, raw, heads = served.post(places.astype("<f4").tobytes(), RAW, "/predict?std=true")
+    assert heads["x-shape"] == heads["x-std-shape"] == "5,1"
+    np.testing.assert_allclose(np.frombuffer(raw, "<f4")[5:], spread[:, 0], rtol=1e-3)
+    assert served.post(as_json(places), path="/std")[0] == 404
+
+
+def test_those_who_ask_for_deviations_are_computed_with_those_who_do_not(powers):
+    places = np.random.default_rng(4).uniform(0, 9, (3, 3))
+    with Served(powers, delay_ms=300) as served, ThreadPoolExecutor(3) as clients:
+        bodies = as_json(places), as_json(places[:1], std=True), as_json(places[:1], std=1)
+        plain, both, wrong = clients.map(served.post, bodies)
+    np.testing.assert_allclose(json.loads(plain[1])["values"], powers.rssi(rx=places), rtol=1e-5)
+    assert "std" not in json.loads(plain[1]) and np.shape(json.loads(both[1])["std"]) == (1, 1)
+    assert wrong[0] == 422 and json.loads(wrong[1])["detail"].startswith("std: ")
+
+
+def test_channels_with_deviations_have_as_many_axes():
+    model, places = fitted("csi"), np.random.default_rng(4).uniform(0, 9, (3, 3))
+    with Served(model) as served:
+        said = json.loads(served.post(as_json(places, std=True))[1])
+    wanted = model.csi(rx=places)
+    np.testing.assert_allclose(np.array(said["values"])[..., 0], wanted.real, atol=1e-5)
+    np.testing.assert_allclose(said["std"], model.std(rx=places), rtol=1e-5)
+
+
+def test_a_method_without_deviations_says_so():
+    with Served(gsparc.fit(rx=np.eye(3), tx=TX, rssi=[-40, -50, -60], model="zero")) as served:
+        status, body, _ = served.post(as_json([[5, 5, 1]], std=True))
+    assert status == 422 and json.loads(body)["detail"] == "the model states no deviations"
+
+
+def test_all_stations_in_the_unit_asked_for():
     """Of several stations none was served but by name, and no deviation at all."""
-    said = json.loads(served.post(as_json([[5, 5, 1]]), path="/std")[1])
-    assert said["unit"] == "dBm" and said["values"] == powers.std(rx=[[5.0, 5, 1]]).tolist()
     level = -40 - np.arange(60)[:, None] / 9 - [0, 10]
     places = np.random.default_rng(0).uniform(0, 20, (60, 3))
     masts = [[0, 0, 9], [9, 9, 9]]
     several = gsparc.fit(rx=places, station_position=masts, rssi=level, unit="dBW", model="gp")
     with Served(gsparc.Predictor(several.method, several.site, unit="mW")) as running:
-        status, body, _ = running.post(as_json(places[:3]))
+        status, body, _ = running.post(as_json(places[:3], std=True))
         _, raw, headers = running.post(places[:3].astype("<f4").tobytes(), RAW)
     said, wanted = json.loads(body), several.rssi(rx=places[:3], unit="mW")
     assert status == 200 and headers["x-unit"] == said["unit"] == "mW" and said["shape"] == [3, 2]
     np.testing.assert_allclose(said["values"], wanted, rtol=1e-5)
+    np.testing.assert_allclose(said["std"], several.std(rx=places[:3], unit="mW"), rtol=1e-5)
     np.testing.assert_allclose(np.frombuffer(raw, "<f4"), wanted.ravel(), rtol=1e-4)
 
 
@@ -159,9 +202,9 @@ def test_32_clients_get_their_own_answers_computed_together(powers, monkeypatch)
     given = [rng.uniform(0, 10, (1 + i % 3, 3)) for i in range(32 * 8)]
     expected = [powers.rssi(rx=places) for places in given]
     calls = []
-    own = powers.rssi
+    own = powers.predict
     with Served(powers) as served, ThreadPoolExecutor(32) as clients:
-        monkeypatch.setattr(powers, "rssi", lambda rx: calls.append(len(rx)) or own(rx=rx))
+        monkeypatch.setattr(powers, "predict", lambda rx: calls.append(len(rx)) or own(rx=rx))
         found = list(clients.map(lambda places: served.post(as_json(places)), given))
     for (status, body, _), wanted in zip(found, expected, strict=True):
         assert status == 200
@@ -326,6 +369,39 @@ def test_the_command_serves_until_it_is_told_to_stop(powers, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_port_in_use_was_told_after_the_model_was_read(powers, tmp_path):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        checkpoint.save(tmp_path / "model.ckpt", powers.method)
+        line = [sys.executable, "-m", "gsparc", "serve", "ckpt=model.ckpt", f"port={port}"]
+        done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True)
+    said = (done.stdout + done.stderr).strip()
+    assert done.returncode == 1 and said.count("\n") == 0
+    assert f"port={port} of host=127.0.0.1: Address already in use" in said
+
+
+@pytest.mark.slow
+def test_several_processes_answer_at_one_port_and_count_together(powers, tmp_path):
+    with commanded(tmp_path, powers, "workers=2") as (served, port):
+        until = time.monotonic() + 60
+        while time.monotonic() < until and asked(port, [[1, 2, 1]])[0] != 200:
+            time.sleep(0.2)
+        for _ in range(20):
+            assert asked(port, [[1, 2, 1]])[0] == 200
+        text = ask_http(port, "GET", "/metrics", None, {})[1].decode()
+        assert "gsparc_places_total 21.0" in text
+        served.send_signal(signal.SIGTERM)
+        assert served.wait(20) in (0, -signal.SIGTERM)
+
+
+def test_several_processes_take_no_rows(powers, tmp_path):
+    checkpoint.save(tmp_path / "model.ckpt", powers.method)
+    line = [sys.executable, "-m", "gsparc", "serve", "ckpt=model.ckpt", "workers=2", "updates=true"]
+    done = subprocess.run(line, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 1 and "updates=true one process" in done.stdout + done.stderr
+
+
+@pytest.mark.slow
 def test_half_sent_requests_took_all_files(powers, tmp_path):
     """And the process ended: it answers again when they are gone."""
     with commanded(tmp_path, powers, files=90) as (served, port):
@@ -358,22 +434,64 @@ def test_a_second_request_hid_in_a_body_of_two_ends(served):
     assert b"Content-Length beside Transfer-Encoding" in answer and b"connection: close" in answer
 
 
-def test_a_repeated_key_answered_the_second(served):
-    body = b'{"places": [[1, 2, 1]], "places": [[9, 9, 1]]}'
-    assert (
-        ask_http(served.port, "POST", "/predict", body, {"Content-Type": "application/json"})[0]
-        == 422
-    )
+@pytest.mark.parametrize(
+    ("body", "where"),
+    [
+        ('{"places": [[1, 2, 3], [1, 2, 3], [1, 2, 3], [1, "2", 3]]}', "places[3][1]: "),
+        ('{"places": [[1, 2, 3], [1, 2]]}', "places[1][2]: "),
+        ('{"places": [[1, 2, 1e300]]}', "places[0][2]: "),
+        ('{"places": [[1, 2, 3]], "unit": "km"}', "unit: "),
+        ("{", "Invalid JSON: "),
+        ('{"places": [[1, 2, 1]], "places": [[9, 9, 1]]}', "'places' is twice"),
+    ],
+)
+def test_a_refusal_said_what_a_body_holds_and_not_where_it_is_wrong(served, body, where):
+    status, answer, _ = served.post(body)
+    assert status == 422 and json.loads(answer)["detail"].startswith(where)
 
 
 def test_no_page_loads_scripts_from_elsewhere(served):
-    assert [ask_http(served.port, "GET", path, None, {})[0] for path in ("/docs", "/redoc")] == [
-        404,
-        404,
-    ]
+    status, page, _ = served.get("/docs")
+    assert status == 200 and b"POST /predict" in page and b"places" in page
+    assert not [word for word in (b"<script", b"http:", b"https:", b"<link") if word in page]
+    assert served.get("/redoc")[0] == 404
 
 
-@pytest.mark.parametrize("path", ["/predict?unit=dBm", "/std?a", "/healthz?verbose=1", "/?="])
+def test_routes_had_no_schema_of_their_bodies(served):
+    paths = json.loads(served.get("/openapi.json")[1])["paths"]
+    content = paths["/predict"]["post"]["requestBody"]["content"]
+    assert {*content} == {"application/json", RAW}
+    assert {*content["application/json"]["schema"]["properties"]} == {"places", "std"}
+    assert {*paths} == {"/predict", "/healthz", "/readyz", "/metrics", "/docs"} - {"/docs"} | {
+        "/docs"
+    }
+
+
+def test_requests_are_counted_by_path_and_status(powers):
+    with Served(powers, token="word") as served:
+        assert served.post(as_json([[1, 2, 1]] * 3), authorization="Bearer word")[0] == 200
+        assert served.post("{", authorization="Bearer word")[0] == 422
+        assert served.get("/a/path/of/a/client")[0] == 401
+        text = served.get("/metrics", authorization="Bearer word")[1].decode()
+    for path, status in (("/predict", 200), ("/predict", 422), ("other", 401)):
+        assert f'gsparc_request_seconds_count{{path="{path}",status="{status}"}} 1.0' in text
+    assert "gsparc_places_total 3.0" in text
+
+
+def test_a_server_whose_model_is_asked_no_more_is_not_ready(powers, monkeypatch):
+    monkeypatch.setattr(Batcher, "_next", lambda self: 1 / 0)
+    with Served(powers) as served, served.send(b"") as client:
+        assert served.get("/readyz")[0] == 200
+        body = as_json([[1, 2, 1]])
+        head = f"POST /predict HTTP/1.1\r\nHost: a\r\nContent-Length: {len(body)}\r\n\r\n"
+        client.sendall((head + body).encode())
+        assert served.within(5, lambda: served.get("/readyz")[0] == 503)
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/predict?unit=dBm", "/predict?std=1", "/healthz?std=true", "/healthz?verbose=1", "/?="],
+)
 def test_what_stands_after_a_question_mark_was_read_nowhere(served, path):
     body = as_json([[1, 2, 1]])
     status, answer = ask_http(

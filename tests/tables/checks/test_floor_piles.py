@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gsparc.tables.checks.plausibility import find_floor_pile
+from gsparc.tables.checks.piles import find_floor_pile
 
 
 def drive(seed: int, count: int = 300) -> np.ndarray:

@@ -43,7 +43,7 @@ from gsparc.processes.sectors import (
     sector_table,
 )
 from gsparc.processes.trend import LEAST_SPREAD
-from gsparc.tables.checks.plausibility import find_noise
+from gsparc.tables.checks.piles import find_noise
 
 SAME_SITE_M = 5.0  # stations closer than this are of one site
 SAME_NAME_M = 100.0  # the same of those whose names differ in their last part alone

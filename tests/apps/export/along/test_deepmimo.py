@@ -107,3 +107,43 @@ def test_a_mirror_is_found_where_it_is(scenario):
     for path, at in ((0, PLACES), (1, point)):
         np.testing.assert_allclose(leaves[:, path], towards(STILL, at), atol=1e-4)
     np.testing.assert_allclose(arrives[:, 1], towards(PLACES, point), atol=1e-4)
+
+
+@pytest.mark.parametrize("end", ["rx", "tx"])
+def test_all_antennas_but_the_first_were_left_out(end, tmp_path, monkeypatch):
+    """Of what stands each is a transmitter, of what moves a set of receivers."""
+    array = np.array([[0.0, 0, 0], [0.1, 0, 0], [0, 0.1, 0]])
+    site = replace(Mirror.site, static_end=end, array=array)
+    monkeypatch.setattr(Mirror, "site", site)
+    turn = np.array([1, 1j, -1])[:, None]
+    one = Mirror().paths(PLACES)
+    every = replace(one, gain=one.gain * turn, delay_s=one.delay_s + np.zeros((3, 1)))
+    monkeypatch.setattr(Mirror, "paths", lambda self, **places: every)
+    deepmimo.write_scenario(tmp_path, Mirror(), PLACES)
+    params = json.loads((tmp_path / "params.json").read_text())
+    labels = {"rx": "t000_tx{}_r001", "tx": "t000_tx000_r{}"}[end]
+    for antenna in range(3):
+        label = labels.format(f"{antenna + (end == 'tx'):03d}")
+        held = {
+            name: np.load(tmp_path / f"{name}_{label}.npz")[name]
+            for name in ("phase", "rx_pos", "tx_pos")
+        }
+        wanted = np.degrees(np.angle(every.gain[:, antenna, :2]))
+        np.testing.assert_allclose(held["phase"][:, :2], wanted, atol=1e-3)
+        still, places = STILL, PLACES
+        still, places = (
+            (still + array[antenna], places) if end == "rx" else (still, places + array[antenna])
+        )
+        np.testing.assert_allclose(held["tx_pos"][0], still)
+        np.testing.assert_allclose(held["rx_pos"], places)
+    points = [about["num_points"] for about in params["txrx_sets"].values()]
+    assert points == ([3, 2] if end == "rx" else [1, 2, 2, 2])
+
+
+def test_a_scenario_without_materials_and_objects_could_not_be_printed(scenario, tmp_path):
+    params, _ = scenario
+    assert [material["name"] for material in params["materials"].values()] == ["ground"]
+    (plane,) = json.loads((tmp_path / "objects.json").read_text())
+    corners = np.load(tmp_path / "vertices.npz")["vertices"][plane["face_vertex_idxs"][0]]
+    assert params["scene"]["n_objects"] == 1 and (corners[:, 2] < PLACES[:, 2].min()).all()
+    assert (corners[:, :2].min(0) < PLACES[:, :2].min(0)).all()
