@@ -45,9 +45,15 @@ def task(call: CommandCall) -> Result:
     few = explain_too_few(len(evidence), promise)
     stored_lines = [] if few is None or config.store else [few]
     if config.store:
+        trial = divisions[-1 if config.spatial else 0].summarise()
+        surely = trial["broken_low"] is not None and trial["broken_low"] > promise.delta
         for unseen in opened:
             stored, bound = unseen.calibrate_and_store(
-                promise, config.confidence, bool(config.spatial), int(config.seed)
+                promise,
+                config.confidence,
+                bool(config.spatial),
+                int(config.seed),
+                trial["broken"] if surely else None,
             )
             # An infinite threshold accepts nobody, and JSON has no infinity.
             threshold = stored.threshold if np.isfinite(stored.threshold) else None

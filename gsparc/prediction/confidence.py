@@ -4,6 +4,7 @@ and from when on.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,6 +29,8 @@ from gsparc.processes.few_rows import covering_rows, draw_rows
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.stored import Stored, from_plain, to_plain
 from gsparc.processes.uncertainty import Threshold
+
+log = logging.getLogger(__name__)
 
 RIVALS = ("distance", "gp_variance")
 KINDS = ("learned", "expected", *RIVALS)
@@ -99,6 +102,8 @@ class Trusted(Stored):
         kernel: of the process whose variance is a rival; None where no rival was stored.
         box: `calibrated_box` of local places that the threshold is for; None (older files): not
             known.
+        failed: share of trials whose threshold accepted some, and failed, where that is surely more
+            than was promised of all trials; else None.
     """
 
     kind: str | None = None
@@ -107,6 +112,7 @@ class Trusted(Stored):
     known: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
     kernel: Kernel | None = field(default=None, repr=False)
     box: np.ndarray | None = field(default=None, repr=False)
+    failed: float | None = field(default=None, repr=False)
 
     @staticmethod
     def from_fold(data: Measurements, fold: Fold) -> Trusted:
@@ -219,6 +225,7 @@ class ConfidenceMixin(Asked):
 
     trusted: Trusted
     kind: str | None
+    _told_of_failures = False
 
     def confidence(self, tx: Any = None, rx: Any = None, *, uplink: Any = None) -> Any:
         """Return how sure the model is, (B,) float32 in [0, 1], larger is surer; (B, T) of several
@@ -243,7 +250,7 @@ class ConfidenceMixin(Asked):
 
         False beyond the places learned from and calibrated on (their box, grown by a tenth of its
         longest side), and where no threshold keeps the promise (`Predictor.trusted.threshold` is
-        infinite).
+        infinite). Where the promise failed in trials this is logged once.
 
         >>> predictor.accepts(rx=[2.0, 1.0, 1.5])  # doctest: +ELLIPSIS
         Traceback (most recent call last):
@@ -262,6 +269,14 @@ class ConfidenceMixin(Asked):
             raise ValueError(
                 f"accepts: the threshold is one of confidence={self.trusted.kind}, not {self.kind}"
             )
+        if self.trusted.failed is not None and not self._told_of_failures:
+            self._told_of_failures = True
+            shares = 100 * self.trusted.failed, 100 * self.trusted.promise.delta
+            text = (
+                "accepts: of thresholds that accepted any, %.0f %% failed in trials; at most %.0f %% "
+                "of all were promised to"
+            )
+            log.warning(text, *shares)
         placed, sure = self._query_confidence(tx, rx, uplink)
         good = sure >= self.trusted.threshold
         if uplink is None:  # an uplink has no place

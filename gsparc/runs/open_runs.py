@@ -405,10 +405,10 @@ class Unseen:
         return Unseen(path, run.facts(), read_trusted(run.stored[0].extra), rivals, evidence)
 
     def calibrate_and_store(
-        self, guarantee: Guarantee, kind: str, spatial: bool, seed: int
+        self, guarantee: Guarantee, kind: str, spatial: bool, seed: int, failed: float | None = None
     ) -> tuple[Trusted, str]:
         """Choose a confidence and its threshold, keep them with the model,
-        return them and how it went.
+        return them and how it went; `failed` as in `Trusted`.
         """
         evidence, how = self.evidence, (kind, spatial, seed)
         kind_used, choice, _, choose_on = risk.calibrate_threshold(
@@ -417,7 +417,12 @@ class Unseen:
         threshold = confidence_threshold(kind_used, choice)
         box = calibrated_box(self.rivals.known, evidence.position)
         stored = replace(
-            self.rivals, kind=kind_used, threshold=threshold, promise=guarantee, box=box
+            self.rivals,
+            kind=kind_used,
+            threshold=threshold,
+            promise=guarantee,
+            box=box,
+            failed=failed,
         )
         before = self.earlier.kind or "the model's own"
         # Programs that read confidences get another number from now on: it is said.

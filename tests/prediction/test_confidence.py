@@ -114,3 +114,15 @@ def test_a_place_outside_of_all_measurements_was_accepted(site) -> None:
     assert gsparc.load(file).accepts(tx=places).all()  # as files of before
     store_trusted(file, replace(trusted, box=calibrated_box(trusted.known)))
     assert gsparc.load(file).accepts(tx=places).tolist() == [True, True, False, False]
+
+
+def test_thresholds_that_failed_in_trials_were_accepted_without_a_word(site, caplog) -> None:
+    """The console said `no promise`, and a program that asked `accepts` never heard of it."""
+    data, fold, file = site
+    trusted = replace(Trusted.from_fold(data, fold), kind="learned", threshold=0.0)
+    store_trusted(file, replace(trusted, promise=Guarantee(), failed=0.26))
+    predictor = gsparc.load(file)
+    for _ in range(2):
+        predictor.accepts(tx=data.tx[fold.train[:2]] + data.site.origin)
+    said = [record.getMessage() for record in caplog.records if "accepts" in record.getMessage()]
+    assert len(said) == 1 and "26 %" in said[0] and "10 %" in said[0]

@@ -24,7 +24,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.datasets.argos import FACTS
 from gsparc.models.method import Method, Prediction
-from gsparc.models.uplink.interface import SeparatesPaths
+from gsparc.models.uplink.interface import SeparatesPaths, UplinkMethod
 from gsparc.physics.row_factors import align_factors
 from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred_grid, interpolate_tones
 from gsparc.prediction.confidence import Guarantee, Trusted, as_confidence, confidence_threshold
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
 
 # 32 positions x antennas x fine tones bound what is held at once.
 CHUNK = 32
+SLOT = 14  # symbols
 BEAM_ENTRIES = (
     1 << 24
 )  # of true and of predicted channels of beams: .5 GB with what is made of them
@@ -331,6 +332,8 @@ class LinkStudy:
             "pilots/share_of_slot": pusch.pilot_share,
             # An accepted position needs no pilots at all.
             "pilots/saved": pusch.pilot_share * float(self.accepted.mean()),
+            # One symbol of sounding that every antenna hears, in each slot
+            "pilots/uplink": 1 / SLOT if isinstance(self.method, UplinkMethod) else 0.0,
             f"time/pusch_{modulation}_s": time.perf_counter() - begun,
         }
         return rates, surest, facts
