@@ -323,6 +323,17 @@ class PerStation(Method):
             )
         return OneStationView(copy, number) if self._shared else copy
 
+    @property
+    def shared_copy(self) -> Method | None:
+        """The copy that knows all stations; None: each has its own."""
+        return self._copies[UNHEARD] if self._shared else None
+
+    def with_shared_copy(self, method: Method) -> PerStation:
+        """Return the same with another copy that knows all stations."""
+        result = PerStation(self.factory)
+        result.site, result._copies, result._shared = self.site, {UNHEARD: method}, True
+        return result
+
     def joint_method(self) -> HasJoint | None:
         """See `Method.joint_method`; None: each has a copy of its own."""
         return (

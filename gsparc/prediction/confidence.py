@@ -273,8 +273,8 @@ class ConfidenceMixin(Asked):
             self._told_of_failures = True
             shares = 100 * self.trusted.failed, 100 * self.trusted.promise.delta
             text = (
-                "accepts: of thresholds that accepted any, %.0f %% failed in trials; at most %.0f %% "
-                "of all were promised to"
+                "accepts: of thresholds that accepted any, %.0f %% failed in trials; at most "
+                "%.0f %% of all were promised to"
             )
             log.warning(text, *shares)
         placed, sure = self._query_confidence(tx, rx, uplink)

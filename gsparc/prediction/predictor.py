@@ -27,6 +27,7 @@ from gsparc.physics.row_factors import describe_factor
 from gsparc.prediction.confidence import ConfidenceMixin, Trusted
 from gsparc.prediction.gradients import predict_with_gradients
 from gsparc.prediction.jointly import JointMixin
+from gsparc.prediction.pilots import PilotsMixin
 from gsparc.prediction.query import DegreesMixin, PlacedQuery, Queries, read_place
 from gsparc.prediction.timing import Call
 from gsparc.prediction.updating import UpdateMixin, read_versions
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from gsparc.prediction.operating_point import Operating
 
 
-class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin):
+class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin, PilotsMixin):
     """A fitted method in world coordinates.
 
     Positions are (3,) or (B, 3) [m]; a single position gives a result without the leading axis.

@@ -221,7 +221,7 @@ class ChannelField(ClosedForm):
                 # Variances are means over all A K entries, of which this slot has so many.
                 total.index_add_(0, rows, part * (values.shape[1] / size))
 
-        for alike in self._group_by_places(ends):
+        for alike in self.group_by_places(ends):
             slot_places = [SlotPlaces(model.group.slot, places) for model, _, places in alike]
             crosses = prior.end_covariances(slot_places, [model.group for model, _, _ in alike])
             for (model, own, _), at, cross in zip(alike, slot_places, crosses, strict=True):
@@ -260,8 +260,8 @@ class ChannelField(ClosedForm):
                 add_slot(slot, own, common[:, None].expand(-1, outputs), posterior_variance, whole)
         return mean, share, after, before
 
-    def _group_by_places(self, ends: Ends) -> list[list[tuple[GroupWeights, Tensor, Tensor]]]:
-        """Weights with the queries (m,) they answer and their places (m, 3),
+    def group_by_places(self, ends: Ends) -> list[list[tuple[GroupWeights, Tensor, Tensor]]]:
+        """Return weights with the queries (m,) they answer and their places (m, 3),
         in lists of equal places.
         """
         alike: dict[tuple[Any, ...], list[tuple[GroupWeights, Tensor, Tensor]]] = {}

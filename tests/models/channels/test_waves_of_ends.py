@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from closed import conditioned, fitted_to
+from ceilings import WAVENUMBER, ceiling, tied
+from closed import fitted_to
 from releases import real
-from rooms import WAVELENGTH
 from scenes import answer_error, fold_of
 
 from gsparc.data.query import Query
@@ -15,63 +15,15 @@ from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.initial import ChannelSettings
 from gsparc.models.channels.kernels import fibonacci_sphere
-from gsparc.models.channels.prior import ChannelPrior
-from gsparc.models.channels.terms import Direct, Directions, Isotropic, Leakage, Noise
+from gsparc.models.channels.terms import Directions
 from gsparc.models.channels.terms.term import Frame
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.image_sources.method import ImageSourceGP
 from gsparc.models.per_station import wrap_per_station
 from gsparc.prediction.predictor import Predictor
-from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
 
-K = 2 * np.pi / WAVELENGTH
 QUICK = ChannelSettings(tied=12, narrow=5.0, knots=4, angles=8, rows=60)
-
-
-def _ceiling(ends=6, count=80, *, seed=0, turned=0.4, shift=(0.0, 0.0, 0.0), runs=None):
-    """A transmitter in a flat patch, antennas above it: direct wave, leakage,
-    waves mostly from the ends.
-    """
-    rng = np.random.default_rng(seed)
-    place = np.c_[rng.uniform(0, 0.7, (count, 2)), np.full(count, 0.2)]
-    end = np.c_[rng.uniform(-1, 2, (ends, 2)), np.full(ends, 1.8)]
-    waves, channel = fibonacci_sphere(150).numpy(), np.empty((count, ends), complex)
-    for number, true in enumerate(end + shift):
-        away = np.linalg.norm(place - true, axis=1)
-        towards = (true - place.mean(0)) / np.linalg.norm(true - place.mean(0))
-        gains = rng.standard_normal((150, 2)) @ [1, 1j] * np.exp(2 * waves @ towards) / 60
-        h = np.exp(-1j * K * away) / away + np.exp(1j * K * place @ waves.T) @ gains
-        gain = np.exp(1j * turned * rng.standard_normal()) * rng.uniform(0.5, 2)
-        channel[:, number] = gain * (h + 0.3 * np.exp(2j * np.pi * rng.random()))
-    channel += 0.05 * (rng.standard_normal((count, ends, 2)) @ [1, 1j])
-    if runs is not None:
-        channel[runs == 1] *= np.exp(0.9j)
-    arrays = {
-        "tx_position": place,
-        "station_position": end,
-        "csi": channel,
-        "carrier_hz": np.array(2.4e9),
-    }
-    run = {} if runs is None else {"run": runs}
-    return from_arrays({**arrays, **run, "frequency_hz": np.array([2.4e9])})
-
-
-def _tied(data, rows):
-    offset = torch.tensor([0.01, -0.02, 0.0]).double()
-    frame = Frame(torch.from_numpy(data.moving).mean(0), 20.0, 0.6, 0.4, offset)
-    power = torch.rand(13, dtype=torch.float64, generator=torch.manual_seed(0)) + 0.2
-    towards = torch.tensor([1.0, 0.2, -0.5, 0.0]).double()
-    prior = ChannelPrior(()).with_terms(
-        Isotropic(frame, power[:1]),
-        Directions(
-            frame, power[1:9], angles=fibonacci_sphere(16)[:8], concentration=5.0, towards=towards
-        ),
-        Leakage(frame, power[9:10]),
-        Direct(frame, power[10:12]),
-        Noise(frame, power[12:]),
-    )
-    return conditioned(prior, data, rows)
 
 
 def test_knots_add_up_and_mirrored_directions_count_alike():
@@ -85,14 +37,14 @@ def test_knots_add_up_and_mirrored_directions_count_alike():
         towards=torch.zeros(5).double(),
     )
     ends = torch.tensor([[1.0, 0.5, 2.0], [1.0, 0.5, -2.0]], dtype=torch.float64)
-    found = term.knot_weights([Slot(0, (0,), (0,), end, zero, K) for end in ends])
+    found = term.knot_weights([Slot(0, (0,), (0,), end, zero, WAVENUMBER) for end in ends])
     torch.testing.assert_close(found.sum(-1), torch.ones(2, len(half)).double())
     torch.testing.assert_close(found[0], found[1], atol=0.05, rtol=0)
 
 
 def test_each_end_has_the_covariance_of_its_own_powers():
-    data = _ceiling()
-    field = _tied(data, np.arange(len(data)))
+    data = ceiling()
+    field = tied(data, np.arange(len(data)))
     term, slots = field.prior[Directions], [one.group.slot for one in field.weights]
     places = field.weights[0].group.places[:10]
     ends = [SlotPlaces(slot, places) for slot in slots]
@@ -106,7 +58,7 @@ def test_each_end_has_the_covariance_of_its_own_powers():
 
 @pytest.mark.slow
 def test_an_end_that_was_never_heard_has_the_direct_wave():
-    data = _ceiling(ends=9, turned=0.2)
+    data = ceiling(ends=9, turned=0.2)
     known, left = np.flatnonzero(data.station < 7), np.flatnonzero(data.station >= 7)
     field, _ = fitted_to(ChannelField(QUICK), data, known)
     batch, same = data.batch(left), data.batch(known)
@@ -123,7 +75,7 @@ def test_an_end_that_was_never_heard_has_the_direct_wave():
 
 @pytest.mark.slow
 def test_stations_together_are_asked_for_any_pair():
-    data = _ceiling(ends=4, count=36)
+    data = ceiling(ends=4, count=36)
     rows = np.flatnonzero(data.station < 3)
     method = wrap_per_station(Gsparc(), data)
     method.fit(data, Fold(rows, rows[:0], rows[:0]), FitContext(stations="together"))
@@ -142,7 +94,7 @@ def test_stations_together_are_asked_for_any_pair():
 
 
 def test_methods_of_one_end_are_refused_as_before():
-    data = _ceiling(ends=3, count=30)
+    data = ceiling(ends=3, count=30)
     rows = np.arange(len(data))
     fold, method = Fold(rows, rows[:0], rows[:0]), wrap_per_station(ImageSourceGP(), data)
     with pytest.raises(ValueError, match="stations=each"):

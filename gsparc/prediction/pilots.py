@@ -1,0 +1,80 @@
+"""Channels that a `Predictor` hears after its fit, as pilots of a run."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from gsparc.data.query import Query
+from gsparc.models.channels.field import ChannelField
+from gsparc.models.channels.pilots import HeardField
+from gsparc.models.method import Method
+from gsparc.models.mixture.mixture import Mixture
+from gsparc.models.per_station import PerStation
+from gsparc.models.station_views import OneStationView
+from gsparc.prediction.query import Asked
+
+
+class PilotsMixin(Asked):
+    """What a `Predictor` of channels learns after its fit, at settings as they are."""
+
+    def hear(self, tx: Any = None, rx: Any = None, *, csi: Any) -> Self:
+        """Return the same model told of channels of one run, whose amplitude and phase it finds.
+
+        Its answers are in the phase and level of that run. The last 200 rows of a station count,
+        those of runs before too, each turned by its own factor; the fit and its parameters stay.
+
+        >>> heard = predictor.hear(tx=[[2.0, 1.0, 1.5]], csi=pilots)  # doctest: +SKIP
+        >>> heard.csi(tx=[2.1, 1.0, 1.5]).shape == predictor.csi(tx=[2.1, 1.0, 1.5]).shape
+        True
+
+        Args:
+            tx, rx: places (B, 3) [m, world], as in `csi`.
+            csi: (B, A, K) complex in physical units, as `csi` answers, (B, T, A, K) of several
+                stations; NaN where nothing was heard.
+
+        Raises:
+            ValueError: no channels, of another shape, or a model whose waves cannot be told more.
+        """
+        if self.site.kind != "csi":
+            raise ValueError(f"hear: this model predicts {self.site.kind}; update() takes powers")
+        placed, known = self.queries.query(tx, rx), self.site.measured
+        one = self.method.predict(placed.query.rows(slice(1))).mean.shape[1:]
+        shape = one if known is None else known.shape
+        count = len(placed.query) // (1 if placed.asked is None else len(placed.asked))
+        ends = () if placed.asked is None else (len(placed.stations),)
+        values = torch.as_tensor(np.asarray(csi)) / self.site.target_scale
+        if values.numel() != math.prod((count, *ends, *shape)):
+            text = ", ".join(map(str, (count, *ends, *shape)))
+            raise ValueError(f"hear: csi is of shape {tuple(values.shape)}, expected ({text})")
+        values = values.reshape(count, *ends, *shape)
+        values = values if placed.asked is None else values[:, placed.asked]
+        values = values if known is None else values[..., torch.from_numpy(known)]
+        values = values.reshape(-1, *one)
+        view: Self = self._view(tell(self.method, placed.query, values), None, self.site, None)
+        return view
+
+
+def tell(method: Method, query: Query, values: Tensor) -> Method:
+    """Return a fitted method that was told of channels (n, A, K), stored units, of one run.
+
+    Raises:
+        ValueError: it is not made of waves that pilots can be added to.
+    """
+    if isinstance(method, OneStationView):
+        return OneStationView(tell(method.inner, method.of_station(query), values), method.number)
+    if isinstance(method, PerStation) and (shared := method.shared_copy) is not None:
+        return method.with_shared_copy(tell(shared, query, values))
+    if isinstance(method, Mixture) and method.member is not None:
+        return tell(method.member, query, values)
+    if isinstance(method, HeardField):
+        return HeardField(method.field, query, values, method)
+    if isinstance(method, ChannelField):
+        return HeardField(method, query, values)
+    raise ValueError(
+        f"hear: {method.name} takes no pilots after its fit; model=gsparc init=diffuse does"
+    )
