@@ -75,16 +75,14 @@ def make_application(given: Mapping[str, Any], threads: int) -> tuple[Predictor,
     stored, as_stored = checkpoint.read(given["ckpt"]), partial(load, unit=given["unit"])
     predictor = as_stored(stored).select_station(given["station"])
     site, powers = predictor.site, predictor.site.target.is_level
-    # Powers of all stations are one answer; channels and spectra are of one station each.
-    if site.paired or (site.stations and not powers):
-        raise DataError(
-            "serve: one end that stands still is needed; of several stations say station=NAME"
-        )
-    told = ToldFile(stored, as_stored) if given["updates"] else None
-    if told is not None and (given["station"] is not None or not powers):
-        raise DataError("updates=true: is of powers, and of all stations of the model")
+    if site.paired:
+        raise DataError("serve: one end that stands still is needed")
+    told = ToldFile(stored, as_stored) if given["updates"] and powers else None
+    hears = given["updates"] and site.kind == "csi"
+    if given["updates"] and not hears and (told is None or given["station"] is not None):
+        raise DataError("updates=true: is of channels, or powers of all stations of the model")
     limits = Limits(**{field.name: given[field.name] for field in fields(Limits)})
-    app = build_application(predictor, limits, given["token"], told)
+    app = build_application(predictor, limits, given["token"], told, hears)
     gc.freeze()  # going through all that was loaded held up answers by half a second
     return predictor, app, limits
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any, Self
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.query import Query
+from gsparc.data.schema import Site
 from gsparc.models.channels.field import ChannelField
 from gsparc.models.channels.pilots import HeardField
 from gsparc.models.method import Method
@@ -21,6 +23,8 @@ from gsparc.prediction.query import Asked
 
 class PilotsMixin(Asked):
     """What a `Predictor` of channels learns after its fit, at settings as they are."""
+
+    _view: Callable[[Method, Method | None, Site, str | None], Any]
 
     def hear(self, tx: Any = None, rx: Any = None, *, csi: Any) -> Self:
         """Return the same model told of channels of one run, whose amplitude and phase it finds.

@@ -14,6 +14,7 @@ from time import perf_counter
 from typing import Any
 from urllib.parse import quote
 
+import numpy as np
 import uvicorn
 from fastapi import FastAPI, HTTPException, Request, Response
 from fastapi.responses import HTMLResponse, JSONResponse
@@ -32,12 +33,14 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from gsparc.apps.export.batching import Batcher
 from gsparc.apps.export.told_file import ToldFile
 from gsparc.apps.export.wire import (
+    HEAR_BODY,
     PLACE,
     QUERY_BODY,
     RAW,
     UPDATE_BODY,
     AnswerBody,
     FaultBody,
+    PilotsBody,
     RowsBody,
     draw_page,
     parse,
@@ -54,7 +57,7 @@ BYTES, MORE = 64, 8192
 KEEP_S, STOP_S = 5, 10
 FILE_S = 5.0  # that an update waits for another process that writes the file
 FREE = ("/healthz", "/readyz")  # of the token, for whoever watches the process
-PATHS = (*FREE, "/predict", "/update", "/metrics", "/docs", "/openapi.json")
+PATHS = (*FREE, "/predict", "/update", "/hear", "/metrics", "/docs", "/openapi.json")
 STEPS_S = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 5.0)  # of the histogram
 WORKERS = "PROMETHEUS_MULTIPROC_DIR"  # where several processes leave their counts
 FAULTS: dict[int | str, dict[str, Any]] = {
@@ -132,23 +135,28 @@ def make_server(app: ASGIApp, limits: Limits, **listen: Any) -> uvicorn.Server:
 
 
 def build_application(
-    predictor: Predictor, limits: Limits, token: str | None, told: ToldFile | None = None
+    predictor: Predictor,
+    limits: Limits,
+    token: str | None,
+    told: ToldFile | None = None,
+    hears: bool = False,
 ) -> ASGIApp:
-    """Return the routes: POST /predict; POST /update where wanted; GET /healthz, /readyz, /metrics,
-    /docs and /openapi.json.
+    """Return the routes: POST /predict; POST /update or /hear where wanted; GET /healthz, /readyz,
+    /metrics, /docs and /openapi.json.
 
     Args:
         predictor: of one end that moves and one station.
         limits: more places or numbers in one request are refused (413).
         token: that a request must bear (401) but for `FREE`; None: none.
         told: the model's file, for updates; None: there are none.
+        hears: whether channels are told of pilots, until the server stops.
 
     Raises:
         SettingError: updates without a token, or more numbers in the answer at one place than
             `limits` allow.
     """
     site, lock, telling, metrics = predictor.site, Lock(), asyncio.Lock(), Metrics()
-    if told is not None and token is None:
+    if (told is not None or hears) and token is None:
         raise SettingError(
             "updates=true: whoever reaches it changes the model; set GSPARC_TOKEN, or say "
             "token=WORD"
@@ -256,6 +264,30 @@ def build_application(
         except ValueError as error:  # of a body, too
             raise HTTPException(422, str(error)) from error
 
+    def add_pilots(body: bytes) -> dict[str, int]:
+        rows = parse(body, PilotsBody)
+        parts = np.array(rows.csi, np.float64)  # None is NaN
+        if parts.shape != (len(rows.places), each):
+            raise ValueError(f"csi: {each} numbers a place are expected")
+        where: dict[str, Any] = site.name_moving(rows.places)
+        with lock:
+            batcher.predictor = batcher.predictor.hear(
+                **where, csi=parts[:, ::2] + 1j * parts[:, 1::2]
+            )
+        return {"rows": len(parts)}
+
+    async def hear(request: Request) -> dict[str, int]:
+        """Channels of one run, which later answers are conditioned on, in its phase and level."""
+        body, _ = await read_body(request, False, lists=2)
+        try:
+            return await asyncio.to_thread(add_pilots, body)
+        except ValueError as error:
+            raise HTTPException(422, str(error)) from error
+
+    if hears:
+        app.post("/hear", openapi_extra={"requestBody": {"content": HEAR_BODY, "required": True}})(
+            hear
+        )
     if told is not None:
         app.post(
             "/update",

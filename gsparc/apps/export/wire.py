@@ -46,6 +46,14 @@ class RowsBody(PlacesBody):
     key: Annotated[str | None, Field(min_length=1, max_length=100)] = None
 
 
+class PilotsBody(PlacesBody):
+    """World places of what moves [m], and channels of one run there: real and imaginary parts by
+    turns, in the order of an answer's values; null is not heard.
+    """
+
+    csi: Annotated[list[list[float | None]], FailFast()]
+
+
 class AnswerBody(BaseModel):
     """Values of the shape in the unit, the last axis of channels real and imaginary part; null is a
     level of silence. Deviations have as many axes.
@@ -117,6 +125,7 @@ def parse_query(end: str, text: bytes, raw: bool, std: bool) -> tuple[np.ndarray
 # What OpenAPI says of bodies that routes read themselves
 _FLOATS = "float32, little-endian, three a place; ?std=true for deviations"
 UPDATE_BODY = {"application/json": {"schema": RowsBody.model_json_schema()}}
+HEAR_BODY = {"application/json": {"schema": PilotsBody.model_json_schema()}}
 QUERY_BODY = {
     "application/json": {"schema": QueryBody.model_json_schema()},
     RAW: {"schema": {"type": "string", "format": "binary", "description": _FLOATS}},

@@ -96,12 +96,12 @@ class HeardField(View):
             pairs = zip(vars(before.ends).values(), vars(ends).values(), strict=True)
             ends, values = Ends(*map(torch.cat, pairs)), torch.cat([before.values, values])
         last = _last_rows(ends.station, KEPT)
-        self.ends, self.values = ends.rows(last), values[last]
-        if len(last) > len(query):  # with what was told before
-            told = self._told_slots(self.ends, self.values)
+        self.ends: Ends = ends.rows(last)
+        self.values: Tensor = values[last]
+        if before is None and len(last) == len(query):
+            self.told = {key: slot.divided(self.run_factor) for key, slot in told.items()}
         else:
-            told = {key: slot.divided(self.run_factor) for key, slot in told.items()}
-        self.told = told
+            self.told = self._told_slots(self.ends, self.values)
 
     def _known(self, ends: Ends) -> Iterator[list[_Known]]:
         """What is known at places, in lists of slots with equal ones."""
@@ -141,8 +141,8 @@ class HeardField(View):
 
     def _predict_part(self, query: Query) -> Prediction:
         said, ends = self.field.predict(query), Ends.from_query(self.field.site, query)
-        mean, variance, level = said.mean.clone(), said.variance, abs(self.run_factor) ** 2
-        assert variance is not None
+        mean, level = said.mean.clone(), abs(self.run_factor) ** 2
+        assert said.variance is not None
         removed = torch.zeros(len(query), dtype=torch.float64)
         for known in chain.from_iterable(self._known(ends)):
             told, slot = self.told.get(id(known.model)), known.at.slot
@@ -156,7 +156,7 @@ class HeardField(View):
             share = len(slot.antennas) * len(slot.tones) / mean[0].numel()
             gained = told.factor.whiten(cross.mH).abs().square().sum(0)
             removed.index_add_(0, known.own, known.model.scale * share * gained)
-        variance = (variance.double() - removed).clamp_min(0) * level
+        variance = (said.variance.double() - removed).clamp_min(0) * level
         return replace(said, mean=mean * self.run_factor, variance=variance.to(said.variance.dtype))
 
 

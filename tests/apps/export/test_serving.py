@@ -19,6 +19,7 @@ from functools import partial
 
 import numpy as np
 import pytest
+from refusals import refused_as
 
 import gsparc
 from gsparc.base.limits import SettingError
@@ -57,9 +58,9 @@ def ask_http(port, method, path, body, headers):
 
 
 class Served:
-    def __init__(self, predictor, token=None, told=None, **limits):
+    def __init__(self, predictor, token=None, told=None, hears=False, **limits):
         limits = Limits(**{"most": 64, **limits})
-        app = build_application(predictor, limits, token, told)
+        app = build_application(predictor, limits, token, told, hears)
         self.server = make_server(app, limits, port=0)
         self.thread = threading.Thread(target=self.server.run, daemon=True)
 
@@ -187,6 +188,37 @@ def test_all_stations_in_the_unit_asked_for():
     np.testing.assert_allclose(said["values"], wanted, rtol=1e-5)
     np.testing.assert_allclose(said["std"], several.std(rx=places[:3], unit="mW"), rtol=1e-5)
     np.testing.assert_allclose(np.frombuffer(raw, "<f4"), wanted.ravel(), rtol=1e-4)
+
+
+def test_channels_of_all_stations_hear_pilots_of_a_run():
+    """Channels were served by station alone, and never told of anything."""
+    draw = np.random.default_rng(0)
+    places, stations = draw.uniform(0, 2, (60, 3)), draw.uniform([0, 0, 3], [2, 2, 5], (3, 3))
+    far = np.linalg.norm(places[:, None] - stations, axis=2)
+    heard = np.exp(-2j * np.pi * 5 * far) / far
+    known = {"station_position": stations, "frequency_hz": [1.5e9], "align": "none"}
+    model = gsparc.fit(tx=places[:40], csi=heard[:40], **known)
+    limits = Limits()
+    refused_as(
+        SettingError, "whoever reaches it", build_application, model, limits, None, hears=True
+    )
+    turned = 2j * heard[40:, :]
+    parts = np.stack([turned.real, turned.imag], -1).reshape(20, -1).tolist()
+    parts[0][:2] = [None, None]
+    pilots = json.dumps({"places": places[40:].tolist(), "csi": parts})
+    query = json.dumps({"places": places[40:].tolist()})
+    head = {"authorization": "Bearer word"}
+    with Served(model, "word", hears=True) as served:
+        before = json.loads(ask_http(served.port, "POST", "/predict", query, head)[1])
+        assert before["shape"] == [20, 3, 1, 1, 2]
+        status, body, _ = ask_http(served.port, "POST", "/hear", pilots, head)
+        assert (status, json.loads(body)) == (200, {"rows": 20})
+        short = json.dumps({"places": [[0, 0, 0]], "csi": [[1.0]]})
+        assert ask_http(served.port, "POST", "/hear", short, head)[0] == 422
+        after = json.loads(ask_http(served.port, "POST", "/predict", query, head)[1])
+    answers = (np.array(said["values"])[..., 0, 0, :] @ [1, 1j] for said in (before, after))
+    missed = [np.abs(said - turned).mean() for said in answers]
+    assert missed[1] < 0.3 * missed[0]
 
 
 def test_the_level_of_silence_is_null(monkeypatch):

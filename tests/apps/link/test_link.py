@@ -1,8 +1,12 @@
 """Grids, beams, statistics and the export; with Sionna itself in the slow part."""
 
 import json
+import re
+import subprocess
+import sys
 from functools import partial
 from importlib.util import find_spec
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -97,6 +101,19 @@ def test_sionna_applies_a_grid_of_arrays_at_either_end(moves: str, antennas: str
     sums = sums.sum(2, keepdim=True) if antennas == "tx" else sums
     assert heard.shape == (5, ends["rx"], 3 if antennas == "rx" else 1, 14, 6)
     assert torch.allclose(heard[:, :, :, 7], sums, atol=1e-5)
+
+
+@needs_sionna
+@pytest.mark.slow
+def test_a_prediction_as_prior_is_worth_more_than_pilots_alone() -> None:
+    """What examples/receiver.py prints: at 0 dB the place tells more, at 10 dB both together."""
+    example = Path(__file__).parents[3] / "examples" / "receiver.py"
+    done = subprocess.run([sys.executable, example], capture_output=True, text=True, check=True)
+    lines = re.findall(r"(\d+) dB  (\S.*?) +(-?[\d.]+) dB", done.stdout)
+    error = {(int(snr), name): float(decibels) for snr, name, decibels in lines}
+    both, alone = "prediction, then pilots", "pilots alone"
+    assert error[0, both] < error[0, alone] - 5 and error[10, both] < error[10, alone] - 0.3
+    assert error[10, both] < error[10, "prediction alone"] - 1
 
 
 def test_beams_gain_the_number_of_antennas_and_lose_what_is_wrong() -> None:

@@ -60,6 +60,7 @@ def test_runs_that_come_later_keep_their_own_factors():
     _check_like_rows(both, data, before, later, later)
     many = HeardField(field, data.batch(np.tile(later, 20)), _values(data, np.tile(later, 20)))
     assert torch.bincount(many.ends.station).max() == KEPT
+    assert max(len(slot.heard) for slot in many.told.values()) == KEPT
 
 
 @pytest.fixture(scope="module")

@@ -5,7 +5,7 @@ each slot Sionna's OFDM channel carries pilots in one symbol and QPSK in thirtee
 estimated from the pilots, from the prediction, and from both, weighed by their variances.
 
     pip install 'gsparc[sionna]'
-    python examples/receiver/receiver.py
+    python examples/receiver.py
 
 Less than three minutes on two cores.
 """
