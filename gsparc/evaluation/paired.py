@@ -133,12 +133,14 @@ def gains_of_rows(
     return b - a if lower_is_better(figure) else a - b
 
 
-def lead_over_rows(one: Mapping[str, Any], other: Mapping[str, Any], figure: str) -> Lead | None:
-    """Return what the score of `one` has more than that of `other`, over rows;
+def lead_over_rows(
+    one: Mapping[str, Any], other: Mapping[str, Any], figure: str, of: str = "test rows"
+) -> Lead | None:
+    """Return what the score of `one` has more than that of `other`, over rows that are `of`;
     see `gains_of_rows`.
     """
     gains = gains_of_rows(one, other, figure)
-    return None if gains is None else Lead.from_gains(gains[np.isfinite(gains)], "test rows")
+    return None if gains is None else Lead.from_gains(gains[np.isfinite(gains)], of)
 
 
 def lead_over_runs(own: Sequence[Row], others: Sequence[Row]) -> Lead | None:

@@ -39,6 +39,7 @@ log = logging.getLogger(__name__)
 
 # results.py reads the key render_ms_batch64 by this number.
 BATCH = 64
+ROWS_OF = {"train": "training", "val": "left-out", "test": "test"}  # by what is scored
 # Of one batch, from single queries; slower methods are not timed in batches
 SLOWEST_BATCH_MS = 20_000.0
 FIELD = "field"  # Gaussians of the evaluated method, without the process that they are mixed with
@@ -197,7 +198,8 @@ def evaluate(
     for (end, scored), (room, other), (ahead, figure) in product(
         cells.items(), others.items(), judged.items()
     ):
-        lead = lead_over_rows(scored[room].samples, scored[eval_on].samples, figure)
+        pair = scored[room].samples, scored[eval_on].samples
+        lead = lead_over_rows(*pair, figure, f"{ROWS_OF[eval_on]} rows")
         if lead is not None and other is not same:
             facts |= {f"{room}/{ahead}{end}{key}": value for key, value in lead.facts().items()}
     facts |= {f"{room}/train_s": float(np.mean(other.train_s)) for room, other in others.items()}

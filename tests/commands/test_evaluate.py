@@ -107,6 +107,7 @@ def test_a_last_fit_stood_beside_no_baseline(tmp_path):
     )[0].facts
     assert known["val/rmse_db"] < facts["val/rmse_db"] < facts["baseline/mean/rmse_db"]
     assert "the table leaves 8 out" in "\n".join(done.out)
+    assert facts["baseline/mean/ahead_pairs"] == "8 left-out rows"  # not test rows
 
 
 def test_evaluate_took_no_settings_of_the_data(tmp_path):
