@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from gsparc.apps.export.wire import Answer, parse_query
+from gsparc.apps.export.wire import Reply, parse_query
 from gsparc.prediction.predictor import Predictor
 
 
@@ -21,7 +21,7 @@ class WaitingRequest(NamedTuple):
     body: bytes
     raw: bool
     std: bool
-    answer: asyncio.Future[Answer | Exception]
+    answer: asyncio.Future[Reply | Exception]
 
 
 class Batcher:
@@ -41,7 +41,7 @@ class Batcher:
         self.waiting: list[WaitingRequest] = []
         self.some = asyncio.Event()
 
-    async def ask(self, size: int, body: bytes, raw: bool, std: bool) -> Answer:
+    async def ask(self, size: int, body: bytes, raw: bool, std: bool) -> Reply:
         """Answer at the n places of a body; raises what reading and the model do."""
         future = asyncio.get_running_loop().create_future()
         self.waiting.append(WaitingRequest(size, body, raw, std, future))
@@ -78,7 +78,7 @@ class Batcher:
             self.some.clear()
         return batch
 
-    def _answers(self, batch: list[WaitingRequest]) -> list[Answer | Exception]:
+    def _answers(self, batch: list[WaitingRequest]) -> list[Reply | Exception]:
         """Of each request, or its own fault."""
         try:
             end = self.predictor.site.moving_end
@@ -96,7 +96,7 @@ class Batcher:
             # to find whose fault it is.
             return [self._answers([request])[0] for request in batch]
 
-    def compute(self, places: np.ndarray) -> Answer:
+    def compute(self, places: np.ndarray) -> Reply:
         """Answers at world places (n, 3) [m], and deviations where they are known."""
         site = self.predictor.site
         ends: dict[str, Any] = site.name_moving(places)
@@ -109,4 +109,4 @@ class Batcher:
         if said.variance is not None:  # as many axes as the answers have
             axes = len(values), -1, *[1] * (said.mean.ndim - 2)
             std = said.variance.sqrt().reshape(axes).numpy().astype("<f4")
-        return Answer(values.astype("<f4"), std)
+        return Reply(values.astype("<f4"), std)

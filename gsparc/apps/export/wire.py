@@ -71,18 +71,18 @@ class FaultBody(BaseModel):
     detail: str
 
 
-class Answer(NamedTuple):
+class Reply(NamedTuple):
     """Values (n, ...) float32, and their deviations where they are known, or wanted."""
 
     values: np.ndarray
     std: np.ndarray | None
 
-    def part(self, rows: slice, std: bool) -> Answer:
+    def part(self, rows: slice, std: bool) -> Reply:
         """Return that of some rows, with deviations if wanted; `ValueError` where none is known."""
         if std and self.std is None:
             raise ValueError("the model states no deviations")
         # Copies: a view would keep the others' answers.
-        return Answer(self.values[rows].copy(), self.std[rows].copy() if std else None)  # type: ignore[index]
+        return Reply(self.values[rows].copy(), self.std[rows].copy() if std else None)  # type: ignore[index]
 
     def to_json(self, unit: str) -> bytes:
         """Return an `AnswerBody` as text."""
