@@ -32,9 +32,10 @@ class PilotsMixin(Asked):
         Its answers are in the phase and level of that run. The last 200 rows of a station count,
         those of runs before too, each turned by its own factor; the fit and its parameters stay.
 
-        >>> heard = predictor.hear(tx=[[2.0, 1.0, 1.5]], csi=pilots)  # doctest: +SKIP
-        >>> heard.csi(tx=[2.1, 1.0, 1.5]).shape == predictor.csi(tx=[2.1, 1.0, 1.5]).shape
-        True
+        >>> predictor.hear(rx=[2.0, 1.0, 1.5], csi=[1j])
+        Traceback (most recent call last):
+            ...
+        ValueError: hear: this model predicts rssi; update() takes powers
 
         Args:
             tx, rx: places (B, 3) [m, world], as in `csi`.
