@@ -271,7 +271,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin, PilotsMi
         self, tx: Any = None, rx: Any = None, *, unit: str | None = None, grad: bool = False
     ) -> Prediction:
         """Return mean (B, ...), variance and confidence (B,) at once, as tensors,
-        in the measurements' unit.
+        in the measurements' unit; of several stations, if neither end says which, (B, T, ...) and
+        (B, T).
 
         The variance is the expected squared error of an entry, None where the method states none.
         The confidence is None where the method has none; else the one that `confidence` answers.
@@ -334,7 +335,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin, PilotsMi
         grad: bool = False,
     ) -> Any:
         """Return amplitudes by direction at the receiver, (B, H, W) float32 in [0, 1],
-        as they were measured.
+        as they were measured; (B, T, H, W) of several stations.
 
         Their square is the power; 1 is the largest of all stored ones or
         of its own image, as the file was scaled. Row i is an elevation of the receiver, column j an
@@ -370,10 +371,12 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin, PilotsMi
         grad: bool = False,
     ) -> Any:
         """Return the channel (B, antennas, subcarriers) complex64,
-        in the physical units of the measurements.
+        in the physical units of the measurements; of several stations, if neither end says which,
+        (B, T, antennas, subcarriers).
 
         All three axes are there for one antenna or tone, too: of measured channels (B, K) take
-        `[:, 0]`. What was constant in all rows, as null tones are, is NaN.
+        `[:, 0]`. What was constant in all rows, as null tones are, is NaN. Where channels are made
+        of `paths`, these sum to them with the factor `reference_hz / f`, see `Paths.channel`.
 
         >>> heard, tones = np.exp(1j * places[:, :1] * [1, 2]), [2.4e9, 2.41e9]  # (60, 2)
         >>> known = {"tx": [9.0, 9.0, 2.6], "csi": heard, "frequency_hz": tones}
@@ -386,7 +389,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin, PilotsMi
             uplink: (B, U, L) or (U, L) complex channels heard now, for a model that reads them.
             frequency_hz: (K,) [Hz] of any OFDM grid within the band; None for the measured tones.
             symbols: OFDM symbols of a slot; then the result is Sionna's
-                [rx, rx_ant, tx, tx_ant, symbols, K].
+                [batch, rx, rx_ant, tx, tx_ant, symbols, K]: places on `batch`, stations on the end
+                that stands, antennas on the receiver where the measurements name an array.
             grad: as in `predict`; at the measured tones alone.
         """
         if uplink is None and frequency_hz is None and symbols is None:
