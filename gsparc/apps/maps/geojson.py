@@ -62,6 +62,19 @@ def _geometries(path: str | Path) -> list[Any]:
     return [feature.get("geometry", feature) for feature in content.get("features", [content])]
 
 
+def middle_of(path: str | Path, key: str) -> Georeference:
+    """Return an origin in the middle of shapes in degrees.
+
+    Raises:
+        DataError: see `read_shapes`; or no degrees.
+    """
+    low, high = np.reshape(read_shapes(path, key, None)[0].bounds, (2, 2))
+    if find_invalid_coordinate(*np.stack([low, high], 1)[::-1]) is not None:
+        far = f"{max(abs(low).max(), abs(high).max()):.3g} is no degree"
+        raise DataError(f"{key}={path}: {far}; say crs: local where these are the rows' metres")
+    return Georeference.from_coordinates(*((low + high) / 2)[::-1])
+
+
 def _in_degrees(places: np.ndarray, origin: Georeference) -> Iterator[tuple[str, np.ndarray]]:
     """Longitudes and latitudes (n, 2) of places (n, 2) by each way to write them,
     the standard's first.
