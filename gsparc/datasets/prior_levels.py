@@ -70,7 +70,7 @@ def read_prior_maps(
     several = not isinstance(path, str | Path | Mapping)
     several |= isinstance(path, str | Path) and Path(path).is_dir()
     listed: Sequence[Any] = [path] if isinstance(path, str | Path | Mapping) else path
-    sources = [_settings_of(source) for source in listed]
+    sources = [settings_of(source) for source in listed]
     if several and len(sources) == 1 and (folder := Path(sources[0].get("file", ""))).is_dir():
         kinds = (*GRIDS, OVERLAY)
         sources = [{"file": file} for file in sorted(folder.iterdir()) if file.suffix in kinds]
@@ -125,12 +125,16 @@ def names_of_station(shown: str) -> tuple[str, ...]:
     return (shown, *both.groups()) if both else (shown,)
 
 
-def _settings_of(source: Any) -> dict[str, Any]:
-    """Settings of one file, of which a name alone is short."""
+def settings_of(source: Any, setting: str = "model.prior") -> dict[str, Any]:
+    """Return settings of one file, of which a name alone is short.
+
+    Raises:
+        DataError: others.
+    """
     if isinstance(source, Mapping):
         key = "itm" if "itm" in source else "file"
         if key not in source or {*source} - {key, *BESIDE[key]}:
-            raise DataError(f"model.prior={source}: takes {key}, {', '.join(BESIDE[key])}")
+            raise DataError(f"{setting}={source}: takes {key}, {', '.join(BESIDE[key])}")
         return {name: value for name, value in source.items() if value is not None}
     terrain = str(source).removeprefix("itm:")
     return {"file" if terrain == str(source) else "itm": terrain}

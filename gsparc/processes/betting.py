@@ -12,7 +12,8 @@ from scipy.special import betaincinv
 
 ENOUGH = 20.0  # capital that settles a claim, from 1: wrong in 5 % of claims at most, each way
 MOST_LOG = 600.0  # of a capital, below what overflows
-BETS = ((np.arange(6) + 0.5) / 6) ** 1.5  # parts of the largest bet that cannot ruin
+# Parts of the largest bet that cannot ruin, near the best against shares of .92 to .7 and for 1
+BETS = np.array([0.04, 0.1, 0.25, 0.5, 0.75, 0.95])
 
 
 def betting_capital(

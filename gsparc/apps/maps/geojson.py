@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from pyproj import Transformer
 
 from gsparc.base.errors import DataError, explain_error
@@ -198,6 +199,20 @@ def _polygons(area: Any) -> list[Any]:
     from shapely import get_parts
 
     return [part for part in get_parts(area) if part.geom_type == "Polygon"]
+
+
+def write_way(
+    path: Path, stops: Mapping[str, np.ndarray], corners: Mapping[str, np.ndarray]
+) -> None:
+    """Write a way as a line through its corners, and stops as points with their columns; places are
+    `longitude` and `latitude` where these are columns, else `x` and `y`.
+    """
+    names = ["longitude", "latitude"] if "longitude" in corners else ["x", "y"]
+    line = np.column_stack([corners[name] for name in names]).tolist()
+    shapes: list[tuple[dict[str, Any], Any]] = [({"type": "LineString", "coordinates": line}, {})]
+    for row in pd.DataFrame(stops).to_dict("records"):
+        shapes.append(({"type": "Point", "coordinates": [row[name] for name in names]}, row))
+    write_shapes(path, shapes)
 
 
 def write_shapes(path: Path, shapes: list[tuple[dict[str, Any], Any]]) -> None:
