@@ -18,7 +18,7 @@ from gsparc.apps.maps.claim import Claim, ClaimErrors, read_claim
 from gsparc.apps.maps.geojson import read_shapes, write_way
 from gsparc.apps.maps.making import MOST_DB
 from gsparc.apps.maps.streets import StreetGraph
-from gsparc.base.errors import Caution, DataError
+from gsparc.base.errors import DataError
 from gsparc.base.limits import POSITIVE, choice, number, or_null, whole
 from gsparc.data.schema import Measurements
 from gsparc.datasets.own import read_any
@@ -43,8 +43,7 @@ def task(call: CommandCall) -> Result:
     """Judge the tours that were driven, draw the next ones, write and draw."""
     given, folder, threshold = call.given, call.folder, call.given["threshold_dbm"]
     question = audit.Question(threshold, float(given["share"]), tuple(given["within_db"]))
-    how = {name: given[name] for name in ("station", "area", "step_m")}
-    claim = read_claim(given["claim"], threshold, **how)
+    claim = read_claim(given["claim"], threshold, given["station"], given["area"], given["step_m"])
     key, drawn = audit.digest_of(claim, question), given["drawn"]
     draws = None if drawn is None else audit.read_draws(drawn, key, claim)
     facts: dict[str, Any] = {"audit/claim": claim.digest, "audit/key": key, "audit/verdict": "open"}
@@ -101,9 +100,7 @@ def _read_rows(given: Mapping[str, Any], claim: Claim) -> tuple[Measurements, au
     beside |= {} if station is None else {"stations": [station]}
     reading = read_any(given["rows"], **beside)
     for note in reading.notes:
-        log.log(
-            logging.WARNING if isinstance(note, Caution) else logging.INFO, "%s: %s", path, note
-        )
+        log.info("%s: %s", path, note)
     data = reading.data
     if not data.site.maps_levels or data.site.level_unit not in ("dBm", "dB"):
         raise DataError(f"{path}: in {data.site.level_unit}, of {data.site.kind}; expected dBm")
@@ -119,8 +116,9 @@ def _read_rows(given: Mapping[str, Any], claim: Claim) -> tuple[Measurements, au
             f"claim about {squares} m"
         )
     log.info("%s: %d of %d lie where nothing is claimed", path, away.sum(), len(away))
-    numbers = data.stations_of()[rows]
-    return data.subset(rows), audit.DriveRows(place[rows], level[rows], side[rows], numbers)
+    return data.subset(rows), audit.DriveRows(
+        place[rows], level[rows], side[rows], data.stations_of()[rows]
+    )
 
 
 def _draw_next(
