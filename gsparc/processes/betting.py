@@ -28,7 +28,7 @@ def betting_capital(
     it ends the same.
 
     >>> betting_capital(np.ones(120), 0.95)[[59, 119]].round(1)
-    array([ 6.9, 84.5])
+    array([ 6.4, 80.6])
 
     Args:
         value: (..., n) within 0 to 1.
@@ -87,8 +87,8 @@ def power_of_rows(count: int, share: float, chance: float = 0.9) -> tuple[float,
     """Return the share below which a claimed share falls with a chance after so many even rows,
     and the one above which it stands; NaN where none does.
 
-    >>> [round(end, 2) for end in power_of_rows(60, 0.95)]
-    [0.81, nan]
+    >>> [round(end, 2) for end in power_of_rows(60, 0.95, 0.8)]
+    [0.8, nan]
     """
     value = np.arange(count) >= np.arange(count + 1)[:, None]  # so many fail
     stands, falls = (
