@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from hashlib import sha256
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -53,7 +51,6 @@ def task(call: CommandCall) -> Result:
     chance, before = ndtr(-margin / audit.SPREAD_DB), (np.zeros(0),) * 3
     columns, figures, parts = dict[str, Any](), list[Figure](), list[dict[str, Any]]()
     if given["rows"] is not None:
-        facts["audit/rows"] = sha256(Path(given["rows"]).read_bytes()).hexdigest()[:16]
         data, rows = _read_rows(given, claim)
         claimed, errors = claim.level[claim.nearest(rows.place)], None
         if threshold is not None and len(np.unique(rows.place, axis=0)) >= LEAST_ROWS:
@@ -66,10 +63,8 @@ def task(call: CommandCall) -> Result:
             columns["capital.csv"] = table
             figures.append(audit_report.draw_capital(table))
             lines += audit_report.describe_verdict(verdict, count, table, outside)
-            missed = int((~table.reached).sum())
-            facts |= {"audit/verdict": verdict, "audit/drawn": count, "audit/missed": missed}
-            failed = np.where(table.reached, 1 - table.high, 0.0)
-            before = table.weight.to_numpy(), failed, table.ratio.to_numpy()
+            facts |= {"audit/verdict": verdict, "audit/places": count}
+            before = table.weight.to_numpy(), 1 - table.high.to_numpy(), table.ratio.to_numpy()
         else:
             lines.append("nobody drew these rows: no verdict, a model's estimate alone")
             if errors is not None:
@@ -81,10 +76,11 @@ def task(call: CommandCall) -> Result:
         lines, columns["by_part.csv"] = lines + wrong, pd.DataFrame(parts)
     if given["tours"] and facts["audit/verdict"] == "open":
         ratio = chance / chance.mean()
-        part = audit.doubt_part(*before, ratio)
-        draws, told = _draw_next(call, claim, key, draws, ratio, part)
-        lines = [question.power(given["tours"] * given["tour"]), *lines, told]
+        draws, told = _draw_next(call, claim, key, draws, ratio, audit.doubt_part(*before, ratio))
+        lines = [question.power(len(draws)), *lines, told]
     columns |= {} if draws is None else {"draws.csv": draws}
+    files = {name: given[name] for name in ("rows", "drawn") if given[name] is not None}
+    facts |= {f"audit/{name}_digest": audit.digest(file) for name, file in files.items()}
     audit_report.write_layers(
         folder / "audit.tif", claim, {"claim_db": claim.level, "chance_of_failing": chance}
     )

@@ -57,9 +57,10 @@ def test_a_verdict_and_its_files(claimed):
     done = run(folder / "fallen", *told)
     assert done.status == 0, done
     facts = json.loads((folder / "fallen" / "summary.json").read_text())
-    assert facts["audit/verdict"] == "falls" and facts["audit/drawn"] == 20
+    assert facts["audit/verdict"] == "falls" and facts["audit/places"] == 20
     page = (folder / "fallen" / "audit.html").read_text()
-    assert "verdict: falls after 20" in page and facts["audit/rows"] in page and "<svg" in page
+    assert "verdict: falls after 20" in page and "<svg" in page
+    assert facts["audit/rows_digest"] in page
     assert len(pd.read_csv(folder / "fallen" / "capital.csv")) == 40
     with rasterio.open(folder / "fallen" / "audit.tif") as file:
         assert file.descriptions == ("claim_db", "chance_of_failing")

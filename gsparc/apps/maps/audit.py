@@ -99,6 +99,11 @@ def digest_of(claim: Claim, question: Question) -> str:
     return sha256(about + claim.place.round(3).tobytes()).hexdigest()[:16]
 
 
+def digest(path: str | Path) -> str:
+    """Return what tells a file from others, 16 digits."""
+    return sha256(Path(path).read_bytes()).hexdigest()[:16]
+
+
 def doubt_part(
     weight: np.ndarray, failed: np.ndarray, ratio: np.ndarray, doubt: np.ndarray
 ) -> float:
@@ -234,12 +239,13 @@ def judge(
     back; or, where the reachable area alone is judged, not at all.
     """
     low, high, reached = rows.at_draws(claim, draws, question, reach)
-    weight = 1 / (1 - draws.part + draws.part * draws.ratio)
+    weight = np.where(
+        reached | (not reachable_only), 1 / (1 - draws.part + draws.part * draws.ratio), 0.0
+    )
     table = draws.assign(low=low, high=high, reached=reached, weight=weight)
     table = table[table.tour <= table.tour[reached].max()]
-    counted = table.weight.where(table.reached | (not reachable_only), 0.0).to_numpy()
     low, high, most = (end.to_numpy() for end in (table.low, table.high, 1 / (1 - table.part)))
-    stands, falls = claim_capital(low, high, question.ends, counted, most)
+    stands, falls = claim_capital(low, high, question.ends, table.weight.to_numpy(), most)
     verdict, count = verdict_of(stands, falls, ends_of(table))
     return verdict, count, table.assign(stands=stands, falls=falls)
 

@@ -23,6 +23,8 @@ from gsparc.pictures.parts import draw_parts
 from gsparc.pictures.report.page import Section, encode_picture, render_html
 from gsparc.processes.betting import ENOUGH
 
+WIDE = "Intervals are wide enough for all parts at once."
+
 
 def describe_verdict(verdict: str, count: int, table: pd.DataFrame, outside: bool) -> list[str]:
     """Return what a reader must know of `judge`; `outside`: the reachable area alone is judged."""
@@ -93,8 +95,7 @@ def write_page(
 ) -> None:
     """Write `audit.html`: what was said, where the claim is wrong, pictures."""
     heads = [Column(name, ".3g", of=name) for name in next(iter(parts), ())]
-    wide = "Intervals are wide enough for all parts at once."
-    tables = [Table.from_rows("Where it is wrong", heads, parts, note=wide)]
+    tables = [Table.from_rows("Where it is wrong", heads, parts, note=WIDE)]
     file = folder / "drive.png"
     pictures = [("claimed less measured", encode_picture(file))] if file.is_file() else []
     section = Section(title, pd.DataFrame(), list(lines), tables, list(figures), pictures)

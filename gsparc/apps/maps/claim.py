@@ -29,6 +29,9 @@ from gsparc.tables.array_checks import MOST_DB
 MOST_SQUARES = 250_000  # of a claim: finer ones are taken together
 LEARNED_ON, SAMPLED = 600, 600  # rows, and places that a share is drawn over
 DRAWS, BLOCK = 1000, 4096
+# Of the variance of errors, that a region beyond a drive shares: of 120 intervals from 100 rows of
+# two towns as they were walked 109 held the share with it, 85 without
+REGION = 0.1
 
 
 @dataclass(frozen=True)
@@ -173,7 +176,7 @@ class ClaimErrors:
         mean = float(sums @ value / sums.sum())
         values = torch.from_numpy(value - mean)[:, None]
         posterior = Exact.from_values(Prior(field.kernel), torch.from_numpy(at), values)
-        return cls(posterior, mean, float(1 / sums.sum()))
+        return cls(posterior, mean, float(1 / sums.sum()) + REGION * field.kernel.amplitude)
 
     def chance_below(self, place: np.ndarray, margin: np.ndarray) -> np.ndarray:
         """Return how likely measured levels at places (n, 2) are lower than claimed by more than
