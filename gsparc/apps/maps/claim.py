@@ -143,12 +143,14 @@ def _read_squares(
     kept = [names.index(band) if band in names else 0]
     alone = replace(raster, names=("",), units=(raster.units[kept[0]],), bands=raster.bands[kept])
     _, at, level = next(alone.levels(path, origin, key="claim"))
-    step = float(np.linalg.norm(at[1] - at[0])) if len(at) > 1 else 1.0
-    low, high = at.min(0) - step / 2, at.max(0) + step / 2
-    side = step_m or max(step, float(np.sqrt((high - low).prod() / MOST_SQUARES)))
-    grid = lay_grid(None, [*low, *high], step_m=side, origin=origin)
+    # Squares of degrees are no squares of metres
+    width = int(np.argmax(raster.points[:, 1] != raster.points[0, 1])) or 1
+    sides = np.linalg.norm(at[[1, width]] - at[0], axis=1) if len(at) > 1 else np.ones(2)
+    low, high = at.min(0) - sides / 2, at.max(0) + sides / 2
+    side = step_m or max(float(np.sqrt(sides.prod())), np.sqrt((high - low).prod() / MOST_SQUARES))
+    grid = lay_grid(None, [*low, *high], step_m=float(side), origin=origin)
     away, number = cKDTree(at).query(grid.places()[:, :2])
-    return grid, np.where(away <= 0.75 * step, level[number], np.nan)
+    return grid, np.where(away <= 0.51 * np.hypot(*sides), level[number], np.nan)
 
 
 @dataclass(frozen=True)

@@ -54,6 +54,15 @@ def test_yes_and_no_as_raster_and_as_polygons(raster, tmp_path):
         assert len(drawn.place) == pytest.approx(902 * 1109 / 2500, rel=0.05)
 
 
+def test_squares_of_degrees_in_the_north_leave_no_gaps(tmp_path):
+    size = {"height": 40, "width": 40, "dtype": "float32", "count": 1}
+    at = from_origin(25.0, 68.0, 1e-3, 1e-3)  # 42 by 112 m
+    with rasterio.open(tmp_path / "n.tif", "w", crs="EPSG:4326", transform=at, **size) as file:
+        file.write(np.full((40, 40), -90, np.float32), 1)
+    claim = read_claim(tmp_path / "n.tif", -110.0)
+    assert len(claim.place) * claim.grid.step**2 == pytest.approx(1600 * 41.8 * 111.5, rel=0.03)
+
+
 @pytest.mark.parametrize(
     ("given", "says"),
     [
