@@ -81,9 +81,8 @@ def task(call: CommandCall) -> Result:
     columns |= {} if draws is None else {"draws.csv": draws}
     files = {name: given[name] for name in ("rows", "drawn") if given[name] is not None}
     facts |= {f"audit/{name}_digest": audit.digest(file) for name, file in files.items()}
-    audit_report.write_layers(
-        folder / "audit.tif", claim, {"claim_db": claim.level, "chance_of_failing": chance}
-    )
+    doubted = {} if threshold is None else {"chance_of_failing": chance}
+    audit_report.write_layers(folder / "audit.tif", claim, {"claim_db": claim.level, **doubted})
     note = ", ".join(f"{name.removeprefix('audit/')} {value}" for name, value in facts.items())
     audit_report.write_page(folder, str(given["claim"]), note, lines, parts, figures)
     return Result(facts, (), lines, "audit.html ", columns)
@@ -92,9 +91,9 @@ def task(call: CommandCall) -> Result:
 def _read_rows(given: Mapping[str, Any], claim: Claim) -> tuple[Measurements, audit.DriveRows]:
     """Rows of what is audited, in the claim's metres."""
     path, station = f"rows={given['rows']}", given["station"]
-    beside = {k: v for k, v in given["dataset"].items() if k not in ("file", "name")}
-    beside |= {} if station is None else {"stations": [station]}
-    reading = read_any(given["rows"], **beside)
+    named = {} if station is None else {"stations": [station]}
+    settings = {k: v for k, v in given["dataset"].items() if k not in ("file", "name")}
+    reading = read_any(given["rows"], **settings | named)
     for note in reading.notes:
         log.info("%s: %s", path, note)
     data = reading.data

@@ -99,6 +99,8 @@ def test_a_claim_of_levels(claimed):
     assert run(folder / "weak", *levels, *told).status == 0
     facts = json.loads((folder / "weak" / "summary.json").read_text())
     assert facts["audit/verdict"] == "falls"
+    with rasterio.open(folder / "weak" / "audit.tif") as file:
+        assert file.descriptions == ("claim_db",)  # of levels no square fails by itself
 
 
 @pytest.mark.parametrize(

@@ -95,8 +95,9 @@ class Question:
 
 def digest_of(claim: Claim, question: Question) -> str:
     """Return what tells one audit from another: of file, places and question, 16 digits."""
-    about = f"{claim.digest} {question}".encode()
-    return sha256(about + claim.place.round(3).tobytes()).hexdigest()[:16]
+    return sha256(
+        f"{claim.digest} {question}".encode() + claim.place.round(3).tobytes()
+    ).hexdigest()[:16]
 
 
 def digest(path: str | Path) -> str:
