@@ -38,7 +38,8 @@ ARROWS = {
     "simulate tables training",
     "callbacks": "base evaluation field pictures processes training",
     "apps.locate": "base data datasets evaluation models pictures prediction processes runs",
-    "apps.maps": "base data evaluation models physics pictures prediction processes runs tables",
+    "apps.maps": "base data datasets evaluation models physics pictures prediction processes runs "
+    "tables",
     "apps.export": "base data field models ops physics prediction processes tables",
     "apps.link": "base data datasets models physics pictures prediction processes runs simulate",
     "apps.view": "apps.maps base data physics pictures prediction processes runs",

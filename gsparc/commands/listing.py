@@ -80,6 +80,7 @@ COMMANDS = {
         Command(
             "plan", "where to measure next: ckpt=FILE, or area=... before anything is measured"
         ),
+        Command("audit", "does a published map hold, and where to drive to tell: claim=FILE"),
         Command("place", "where one more station serves an area best: ckpt=FILE"),
         Command("report", "one page about many runs: RUN...", bare="runs"),
         Command("bench", "seconds of kernels beside plain PyTorch"),

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
 
 from gsparc.apps.maps.area import read_plan_settings
-from gsparc.apps.maps.geojson import read_outlines, write_shapes
+from gsparc.apps.maps.geojson import read_outlines, write_way
 from gsparc.apps.maps.pictures import draw_measurement_plan
 from gsparc.apps.maps.planning import plan_measurements
 from gsparc.apps.maps.promise import read_or_gather
@@ -51,12 +50,8 @@ def task(call: CommandCall) -> Result:
     columns |= {"rank": plan.chosen + 1, "expected_error_db": plan.expected_db.round(4)}
     if len(plan.path):
         columns["way_m"] = plan.metres.round(1)
-        way = pd.DataFrame(coordinates(np.pad(plan.path, ((0, 0), (0, 1))), predictor))
-        at = ["longitude", "latitude"] if "longitude" in way else ["x", "y"]
-        line = {"type": "LineString", "coordinates": way[at].to_numpy().tolist()}
-        stops = pd.DataFrame(columns).to_dict("records")
-        points = [({"type": "Point", "coordinates": [row[k] for k in at]}, row) for row in stops]
-        write_shapes(call.folder / "plan.geojson", [(line, {}), *points])
+        corners = coordinates(np.pad(plan.path, ((0, 0), (0, 1))), predictor)
+        write_way(call.folder / "plan.geojson", columns, corners)
     behind = read_outlines(call.given, plan.grid.origin)
     draw_measurement_plan(plan, call.folder / "plan.png", promise, predictor, floor, behind)
     facts = {

@@ -16,11 +16,9 @@ from gsparc.base.errors import Caution, DataError, list_first
 from gsparc.base.files import Files
 from gsparc.data.schema import Measurements
 from gsparc.data.station_names import site_name
-from gsparc.data.units import UNITS
 from gsparc.datasets.own import read_own
-from gsparc.datasets.rasters import GRIDS, OVERLAY, is_raster, read_raster
+from gsparc.datasets.rasters import BAND, GRIDS, OVERLAY, is_raster, read_raster
 from gsparc.datasets.terrain import terrain_levels
-from gsparc.physics.decibels import to_decibels
 from gsparc.tables import is_table
 from gsparc.tables.array_checks import MOST_DB
 from gsparc.tables.checks.piles import find_marks
@@ -30,8 +28,6 @@ from gsparc.tables.read import parse_table
 log = logging.getLogger(__name__)
 
 Levels = tuple[np.ndarray, np.ndarray]  # places (M, 2) [m], world, and levels (M,) [dB] there
-# Of the strongest station, as `gsparc map` writes; with a name behind it of one of several
-BAND = "power_db"
 BESIDE = {"file": ("crs", "nodata", "legend"), "itm": ("crs", "nodata", "tx_m", "rx_m", "mhz")}
 MOST = 4_000_000  # levels: they are kept with a model
 ABOUT_M = 100.0  # least distance from the box of rows and stations that levels are kept within [m]
@@ -74,7 +70,7 @@ def read_prior_maps(
     several = not isinstance(path, str | Path | Mapping)
     several |= isinstance(path, str | Path) and Path(path).is_dir()
     listed: Sequence[Any] = [path] if isinstance(path, str | Path | Mapping) else path
-    sources = [_settings_of(source) for source in listed]
+    sources = [settings_of(source) for source in listed]
     if several and len(sources) == 1 and (folder := Path(sources[0].get("file", ""))).is_dir():
         kinds = (*GRIDS, OVERLAY)
         sources = [{"file": file} for file in sorted(folder.iterdir()) if file.suffix in kinds]
@@ -129,12 +125,16 @@ def names_of_station(shown: str) -> tuple[str, ...]:
     return (shown, *both.groups()) if both else (shown,)
 
 
-def _settings_of(source: Any) -> dict[str, Any]:
-    """Settings of one file, of which a name alone is short."""
+def settings_of(source: Any, setting: str = "model.prior") -> dict[str, Any]:
+    """Return settings of one file, of which a name alone is short.
+
+    Raises:
+        DataError: others.
+    """
     if isinstance(source, Mapping):
         key = "itm" if "itm" in source else "file"
         if key not in source or {*source} - {key, *BESIDE[key]}:
-            raise DataError(f"model.prior={source}: takes {key}, {', '.join(BESIDE[key])}")
+            raise DataError(f"{setting}={source}: takes {key}, {', '.join(BESIDE[key])}")
         return {name: value for name, value in source.items() if value is not None}
     terrain = str(source).removeprefix("itm:")
     return {"file" if terrain == str(source) else "itm": terrain}
@@ -158,7 +158,7 @@ def _read_file(
     if "itm" in settings:
         yield from terrain_levels(path, data, **beside)
     elif is_raster(path, settings):
-        yield from _read_raster(path, data, stations, **beside)
+        yield from read_raster(path, **beside).levels(path, data.site.georeference, stations)
     else:
         yield from _read_rows(path, data, stations)
 
@@ -209,47 +209,6 @@ def _say_marks(path: Path, count: int, what: str) -> None:
 def _extent(points: np.ndarray) -> np.ndarray:
     """Lowest and highest (2, 2) of each coordinate."""
     return np.stack([points.min(0), points.max(0)], 1)
-
-
-def _read_raster(
-    path: Path, data: Measurements, stations: Collection[str], **settings: Any
-) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-    """Yield name, centres of squares and their levels, of named bands,
-    else of `BAND` or of the first.
-    """
-    raster = read_raster(path, **settings)
-    titles = raster.names
-    single = {"": titles.index(BAND) if BAND in titles else 0}
-    known = {*stations, *map(site_name, stations)}
-    named = [t.removeprefix(f"{BAND} ") for t in titles]
-    bands = {t: k for k, t in enumerate(named) if t != titles[k] or t in known}
-    if not bands and len(titles) > 1 and BAND not in titles:
-        # Of others: as a station alone is asked for, none of them is known
-        if stations and all(titles):
-            bands = {t: k for k, t in enumerate(named)}
-        else:
-            shown = list_first([title or f"{k}" for k, title in enumerate(titles, 1)])
-            log.warning("model.prior=%s: the first of its bands %s is taken", path, shown)
-    points = raster.locate(data.site.georeference, path)
-    for name, band in (bands or single).items():
-        yield name, points, _to_decibels(path, raster.bands[band], raster.units[band])
-
-
-def _to_decibels(path: Path, values: np.ndarray, name: str) -> np.ndarray:
-    """Levels of values whose unit a file names, if it names one;
-    `DataError` where that is none of powers.
-    """
-    unit = UNITS.get(name.lower())
-    if unit is None:
-        return values
-    if unit.kind not in ("level", "power"):
-        raise DataError(
-            f"model.prior={path}: its unit is {name}; levels are needed, or powers such as mW"
-        )
-    with np.errstate(divide="ignore", invalid="ignore"):  # of no power nothing is known
-        return (
-            to_decibels(unit.convert(values)) + 30 if unit.kind == "power" else unit.convert(values)
-        )
 
 
 def _read_rows(

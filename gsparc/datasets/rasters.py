@@ -4,8 +4,9 @@ globe, whose colours a legend explains.
 
 from __future__ import annotations
 
+import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -13,16 +14,23 @@ from xml.etree import ElementTree
 import numpy as np
 from PIL import Image
 
-from gsparc.base.errors import DataError, readable
+from gsparc.base.errors import DataError, list_first, readable
 from gsparc.base.files import read_text
 from gsparc.base.limits import parse_numbers
 from gsparc.data.georeference import Georeference
+from gsparc.data.station_names import site_name
+from gsparc.data.units import UNITS
+from gsparc.physics.decibels import to_decibels
+
+log = logging.getLogger(__name__)
 
 GRIDS, LISTS, OVERLAY = (".tif", ".tiff", ".bil", ".asc"), (".txt", ".csv", ".xyz"), ".kml"
 DEGREES = "EPSG:4326"
 LONGEST = 200  # characters of a first line that may be numbers
 LOCAL = "local"  # in place of a projection: metres of the measurements
 COLOUR = re.compile(r"#?([0-9a-fA-F]{6})=([-+]?\d*\.?\d+)")
+# Of the strongest station, as `gsparc map` writes; with a name behind it of one of several
+BAND = "power_db"
 CORNERS = ("north", "south", "east", "west")
 
 
@@ -53,11 +61,61 @@ class RasterFile:
             return self.points
         if origin is None:
             raise DataError(f"{path}: it has a place on Earth, which the measurements do not state")
+        return origin.from_degrees(*self._degrees(path, self.points))
+
+    def middle(self, path: Path) -> Georeference | None:
+        """Return an origin in its middle; None: its metres are those of the measurements.
+
+        Raises:
+            DataError: no such projection, or it leads off the Earth.
+        """
+        if self.crs is None:
+            return None
+        degrees = self._degrees(path, (self.points.min(0) + self.points.max(0))[None] / 2)
+        return Georeference.from_coordinates(*degrees)
+
+    def levels(
+        self,
+        path: Path,
+        origin: Georeference | None,
+        stations: Collection[str] = (),
+        key: str = "model.prior",
+    ) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+        """Yield name, centres (M, 2) [m] of squares and their levels (M,) [dB], of named bands,
+        else of `BAND` or of the first.
+
+        Args:
+            path: of the file, for messages.
+            origin: of the measurements' metres; None: the file must be in metres itself.
+            stations: names that bands may have.
+            key: setting that named the file.
+
+        Raises:
+            DataError: no place, or a unit of no powers.
+        """
+        titles = self.names
+        single = {"": titles.index(BAND) if BAND in titles else 0}
+        known = {*stations, *map(site_name, stations)}
+        named = [t.removeprefix(f"{BAND} ") for t in titles]
+        bands = {t: k for k, t in enumerate(named) if t != titles[k] or t in known}
+        if not bands and len(titles) > 1 and BAND not in titles:
+            # Of others: as a station alone is asked for, none of them is known
+            if stations and all(titles):
+                bands = {t: k for k, t in enumerate(named)}
+            else:
+                shown = list_first([title or f"{k}" for k, title in enumerate(titles, 1)])
+                log.warning("%s=%s: the first of its bands %s is taken", key, path, shown)
+        points, where = self.locate(origin, path), f"{key}={path}"
+        for name, band in (bands or single).items():
+            yield name, points, _to_decibels(where, self.bands[band], self.units[band])
+
+    def _degrees(self, path: Path, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Latitudes and longitudes (n,) of points (n, 2)."""
         from rasterio.warp import transform
 
         with readable(path, "no such projection", ValueError):
-            longitude, latitude = transform(self.crs, DEGREES, *self.points.T)
-        return origin.from_degrees(np.asarray(latitude), np.asarray(longitude))
+            longitude, latitude = transform(self.crs, DEGREES, *points.T)
+        return np.asarray(latitude), np.asarray(longitude)
 
 
 def is_raster(path: Path, settings: Mapping[str, object]) -> bool:
@@ -122,6 +180,21 @@ def read_raster(
         titles, units = ([str(text or "") for text in of] for of in (file.descriptions, file.units))
         stated = None if crs == LOCAL else file.crs or crs
     return RasterFile(points, stated, tuple(titles), tuple(units), bands)
+
+
+def _to_decibels(where: str, values: np.ndarray, name: str) -> np.ndarray:
+    """Levels of values whose unit a file names, if it names one;
+    `DataError` where that is none of powers.
+    """
+    unit = UNITS.get(name.lower())
+    if unit is None:
+        return values
+    if unit.kind not in ("level", "power"):
+        raise DataError(f"{where}: its unit is {name}; levels are needed, or powers such as mW")
+    with np.errstate(divide="ignore", invalid="ignore"):  # of no power nothing is known
+        return (
+            to_decibels(unit.convert(values)) + 30 if unit.kind == "power" else unit.convert(values)
+        )
 
 
 def _read_overlay(path: Path, legend: Sequence[str] | None) -> RasterFile:

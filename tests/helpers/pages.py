@@ -136,6 +136,14 @@ class Tiny:
             self.made[name] = str(make())
         return self.made[name]
 
+    def claim(self) -> Path:
+        """A raster of what `drive.csv` holds."""
+        path = self.folder / "map.asc"
+        head = "ncols 10\nnrows 10\nxllcorner 0\nyllcorner 0\ncellsize 2\nNODATA_value -9999\n"
+        row = " ".join(f"{-61.5 - 2 * x}" for x in range(10))
+        path.write_text(head + "\n".join([row] * 10) + "\n")
+        return path
+
     def _room(self, path: Path) -> Path:
         with np.load(channels(path, 60, shape="S")) as own:
             tx, rx = own["tx_position"], own["rx_position"]
@@ -246,6 +254,10 @@ class Tiny:
         elif name == "locate":
             here = {"data": str(self.folder / "tradeoff.npz"), "plan": "floor.png"}
             words |= {key: here[key] for key in words if key in here}
+        if name == "audit":  # draws belong to the claim that they are of
+            words = {key: value for key, value in words.items() if key not in ("drawn", "station")}
+            words |= {"claim": f"{{file: {self.claim()}, crs: local}}"}
+            words |= {} if "within_db" in words else {"threshold_dbm": "-70"}
         if name == "evaluate":
             words.pop("dataset.root", None)
             words |= {"dataset.file": self.data("city")} if "dataset.file" in words else {}
@@ -324,5 +336,6 @@ TINY = {  # what makes each command short
     "locate": {**SHORT, "calibrate": "0", "rows": "3"},
     "link": {"pusch.coarse": "8", "pusch.fine": "16"},
     "map": {**SHORT, "step_m": "4"},
+    "audit": SHORT,
     "plan": {**SHORT, "count": "2"},
 }

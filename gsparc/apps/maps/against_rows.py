@@ -50,7 +50,7 @@ def drive_beside_map(path: str | Path, data: Measurements) -> Drive:
         np.where(known, stored[name][cell, row, column], np.nan)
         for name in ("power_db", "lower_db", "upper_db")
     )
-    return _drive(data, rows, power - level, (high - low) / 2, float(stored["share"]))
+    return drive_of(data, rows, power - level, (high - low) / 2, float(stored["share"]))
 
 
 def _find(name: str, names: list[str]) -> int:
@@ -78,12 +78,13 @@ def drive_beside_model(
     if promise is not None:
         far = promise.distances(data.moving[rows], station)
         half = promise.calibration(SHARE).half_and_error(spread, far, station)[0]
-    return _drive(data, rows, np.asarray(columns["error_db"]), half, SHARE)
+    return drive_of(data, rows, np.asarray(columns["error_db"]), half, SHARE)
 
 
-def _drive(
+def drive_of(
     data: Measurements, rows: np.ndarray, error: np.ndarray, half: np.ndarray, share: float
 ) -> Drive:
+    """Return errors (n,) and half intervals (n,) [dB] of rows (n,) with their places."""
     station, local = data.stations_of(rows), data.moving[rows][:, -3:-1]
     still = data.site.every_station.position[station, :2]
     place = local + data.site.origin[:2]

@@ -189,6 +189,7 @@ def lay_grid(
     stations: int = 1,
     buildings: Any = None,
     indoors: bool = False,
+    origin: Georeference | None = None,
 ) -> Grid:
     """Return the cells of a map.
 
@@ -203,6 +204,7 @@ def lay_grid(
         stations: layers of each cell, for what memory is needed.
         buildings: GeoJSON file of footprints, whose cells are left out.
         indoors: they are kept, and told.
+        origin: of the metres, where there is no site.
 
     Raises:
         DataError: an area that is none, no height, a step that gives no cells, or more than memory
@@ -211,7 +213,8 @@ def lay_grid(
     check_arguments(
         locals(), step_m=or_null(POSITIVE), height_m=or_null(number(-FARTHEST, FARTHEST))
     )
-    low, high, contains = _outline(site, area, plan)
+    about = origin if site is None else site.georeference
+    low, high, contains = _outline(site, area, plan, about)
     height = _height(site, height_m)
     width = high - low
     step = step_m or float(np.sqrt(max(float(width.prod()), 1e-12) / CELLS))
@@ -230,25 +233,24 @@ def lay_grid(
     inside = np.array([np.ones(nx, bool) if contains is None else contains(row) for row in rows])
     within = np.zeros_like(inside)
     if buildings is not None:
-        is_built = _drawn(site, buildings, "buildings")[1]
+        is_built = draw_within(about, buildings, "buildings")[1]
         within = np.array([is_built(row) for row in rows])
     inside &= indoors | ~within
     if not inside.any():
         raise DataError(
             f"area={area}: no centre of a {step:g} m cell lies in it; draw it wider or map finer"
         )
-    about = None if site is None else site.georeference
     return Grid(x, y, height, step, inside, about, within & inside if indoors else None)
 
 
 def _outline(
-    site: Site | None, area: Any, plan: FloorPlan | None
+    site: Site | None, area: Any, plan: FloorPlan | None, about: Georeference | None
 ) -> tuple[np.ndarray, np.ndarray, Any]:
     """Corners (2,) of a rectangle, and what says which places (n, 2) are inside; None: all."""
     box = None if site is None else site.moving_box
     width = 0.0 if box is None else float(np.ptp(box[:, -3:-1], axis=0).max())
     if is_drawn(area):
-        (low, high), contains = _drawn(site, area, "area", width)
+        (low, high), contains = draw_within(about, area, "area", width)
         return low, high, contains
     if area is not None:
         low, high = _rectangle(area)
@@ -270,12 +272,16 @@ def _outline(
     return low - margin, high + margin, None
 
 
-def _drawn(site: Site | None, path: Any, key: str, width: float = 0.0) -> tuple[np.ndarray, Any]:
-    """Corners (2, 2) of a file's polygons, and what says which places (n, 2) are inside."""
-    drawn, _ = read_shapes(path, key, None if site is None else site.georeference, site_m=width)
+def draw_within(
+    origin: Georeference | None, path: Any, key: str, width: float = 0.0
+) -> tuple[np.ndarray, Any]:
+    """Return corners (2, 2) of polygons, and what says which places (n, 2 or more) are inside;
+    see `read_shapes`.
+    """
+    drawn, _ = read_shapes(path, key, origin, site_m=width)
     from shapely import contains_xy
 
-    return np.reshape(drawn.bounds, (2, 2)), lambda places: contains_xy(drawn, places)
+    return np.reshape(drawn.bounds, (2, 2)), lambda places: contains_xy(drawn, places[:, :2])
 
 
 def _rectangle(area: Any) -> tuple[np.ndarray, np.ndarray]:

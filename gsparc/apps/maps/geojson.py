@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import pandas as pd
 from pyproj import Transformer
 
 from gsparc.base.errors import DataError, explain_error
@@ -60,6 +61,19 @@ def _geometries(path: str | Path) -> list[Any]:
         return [from_wkt(line).__geo_interface__ for line in text.splitlines() if line.strip()]
     content = json.loads(text)
     return [feature.get("geometry", feature) for feature in content.get("features", [content])]
+
+
+def middle_of(path: str | Path, key: str) -> Georeference:
+    """Return an origin in the middle of shapes in degrees.
+
+    Raises:
+        DataError: see `read_shapes`; or no degrees.
+    """
+    low, high = np.reshape(read_shapes(path, key, None)[0].bounds, (2, 2))
+    if find_invalid_coordinate(*np.stack([low, high], 1)[::-1]) is not None:
+        far = f"{max(abs(low).max(), abs(high).max()):.3g} is no degree"
+        raise DataError(f"{key}={path}: {far}; say crs: local where these are the rows' metres")
+    return Georeference.from_coordinates(*((low + high) / 2)[::-1])
 
 
 def _in_degrees(places: np.ndarray, origin: Georeference) -> Iterator[tuple[str, np.ndarray]]:
@@ -185,6 +199,20 @@ def _polygons(area: Any) -> list[Any]:
     from shapely import get_parts
 
     return [part for part in get_parts(area) if part.geom_type == "Polygon"]
+
+
+def write_way(
+    path: Path, stops: Mapping[str, np.ndarray], corners: Mapping[str, np.ndarray]
+) -> None:
+    """Write a way as a line through its corners, and stops as points with their columns; places are
+    `longitude` and `latitude` where these are columns, else `x` and `y`.
+    """
+    names = ["longitude", "latitude"] if "longitude" in corners else ["x", "y"]
+    line = np.column_stack([corners[name] for name in names]).tolist()
+    shapes: list[tuple[dict[str, Any], Any]] = [({"type": "LineString", "coordinates": line}, {})]
+    for row in pd.DataFrame(stops).to_dict("records"):
+        shapes.append(({"type": "Point", "coordinates": [row[name] for name in names]}, row))
+    write_shapes(path, shapes)
 
 
 def write_shapes(path: Path, shapes: list[tuple[dict[str, Any], Any]]) -> None:

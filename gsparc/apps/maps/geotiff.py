@@ -13,6 +13,7 @@ from zipfile import ZipFile
 import numpy as np
 from matplotlib.image import imsave
 
+from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.field_map import ARRAYS, FieldMap
 from gsparc.apps.maps.geojson import write_shapes
 from gsparc.apps.maps.layers import Layer
@@ -47,7 +48,7 @@ def write_geotiff(path: str | Path, raster: FieldMap) -> None:
     bands = {**{name: raster.layer(name) for name in ARRAYS}, **raster.extra}
     if len(raster.stations) > 1:
         bands |= {f"power_db {name}": raster.power_db[i] for i, name in enumerate(raster.stations)}
-    profile = raster_profile(raster, count=len(bands), dtype="float32", nodata=float("nan"))
+    profile = raster_profile(raster.grid, count=len(bands), dtype="float32", nodata=float("nan"))
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
         file.update_tags(
             unit=raster.unit, threshold_db=raster.threshold_db, height_m=raster.grid.height
@@ -75,7 +76,7 @@ def write_classes(
     from rasterio.warp import transform_geom
 
     values = np.flipud(np.where(np.isfinite(number), number, NO_CLASS)).astype(np.uint16)
-    profile = raster_profile(raster, count=1, dtype="uint16", nodata=NO_CLASS)
+    profile = raster_profile(raster.grid, count=1, dtype="uint16", nodata=NO_CLASS)
     with whole_file(path) as partial, rasterio.open(partial, "w", **profile) as file:
         # Before the values, which fix what colours mean.
         file.write_colormap(
@@ -93,7 +94,7 @@ def write_classes(
     write_shapes(Path(path).with_suffix(".geojson"), named)
 
 
-def raster_profile(raster: FieldMap, **bands: Any) -> dict[str, Any]:
+def raster_profile(grid: Grid, **bands: Any) -> dict[str, Any]:
     """What rasterio is told of a file and its `bands`, in the projection of `Georeference`.
 
     Azimuthal equidistant, in which squares of the grid are squares: UTM would turn and resample
@@ -101,17 +102,17 @@ def raster_profile(raster: FieldMap, **bands: Any) -> dict[str, Any]:
     """
     from rasterio.transform import from_origin
 
-    (west, _, _, north), origin = raster.grid.extent, raster.grid.origin
+    (west, _, _, north), origin = grid.extent, grid.origin
     # Without a title programs show it as "unknown".
     form = "+proj=aeqd +datum=WGS84 +lat_0={0!r} +lon_0={1!r} +title=equidistant_about_{0}_{1}"
     place = None if origin is None else form.format(origin.latitude, origin.longitude)
     return {
         "driver": "GTiff",
-        "width": len(raster.grid.x),
-        "height": len(raster.grid.y),
+        "width": len(grid.x),
+        "height": len(grid.y),
         "crs": place,
         **bands,
-        "transform": from_origin(west, north, raster.grid.step, raster.grid.step),
+        "transform": from_origin(west, north, grid.step, grid.step),
         "compress": "deflate",
         "tiled": True,
     }
@@ -132,7 +133,7 @@ def write_kmz(path: str | Path, field: FieldMap, layers: Sequence[Layer]) -> Non
     from rasterio.transform import array_bounds
     from rasterio.warp import calculate_default_transform, reproject
 
-    profile = raster_profile(field)
+    profile = raster_profile(field.grid)
     x_low, x_high, y_low, y_high = field.grid.extent
     to, width, height = calculate_default_transform(
         profile["crs"], DEGREES, profile["width"], profile["height"], x_low, y_low, x_high, y_high

@@ -81,7 +81,7 @@ def make_sections(
         examples = join_examples(study)
         named = [] if examples else [("test.png", "")]
         pictures = [
-            (f"{setting}{suffix}", _png(run.folder / name))
+            (f"{setting}{suffix}", encode_picture(run.folder / name))
             for setting, run in zip(firsts.setting[:MOST_PICTURES], firsts.run, strict=False)
             for name, suffix in (*named, ("sectors.png", ": sectors"))
             if (run.folder / name).is_file()
@@ -120,7 +120,8 @@ def warnings(rows: pd.DataFrame) -> list[str]:
     return list(dict.fromkeys(remarks + summary.busy_machine(loads)))
 
 
-def _png(path: Path) -> str:
+def encode_picture(path: Path) -> str:
+    """Return a picture's file as a page holds it: small, PNG in base64."""
     with Image.open(path) as image:
         small = image.convert("RGB")
         small.thumbnail((PICTURE_PX, 4 * PICTURE_PX))
@@ -153,7 +154,8 @@ def write_report(
     note = (
         f"{count} run{'s' * (count > 1)}; made by {summary.program_version(summary.provenance())}"
     )
-    (folder / "report.html").write_text(render_html(title, note, sections), encoding="utf-8")
+    beside = f"{note}. CSV and Markdown of every table lie beside this page"
+    (folder / "report.html").write_text(render_html(title, beside, sections), encoding="utf-8")
     parts = [f"# {title}\n\n{note}\n"]
     for study in sections:
         parts.append(f"## {study.title}\n")
