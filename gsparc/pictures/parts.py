@@ -11,7 +11,7 @@ from matplotlib.patches import Rectangle
 
 from gsparc.evaluation.by_part import Drive
 from gsparc.pictures.drawing import GREY, PALETTE, colour_bar, save
-from gsparc.pictures.from_above import annotate, map_panels, scale_bar, set_bounds, split_frame
+from gsparc.pictures.from_above import map_panels, scale_bar, set_bounds, split_frame
 
 LEAST_DB = 3.0  # end of the colours
 LINE = 0.3  # inches of a bar
@@ -51,7 +51,8 @@ def draw_parts(drive: Drive, rows: Sequence[dict[str, Any]], title: str, path: P
                 )
             )
             if (middle > low).all() and (middle < high).all():
-                annotate(axis, f"{row['bias_db']:+.1f}", middle)
+                text = f"{row['bias_db']:+.1f}"
+                axis.text(*middle, text, ha="center", va="center", fontsize="x-small")
         scale_bar(axis)
     colour_bar(marks, axes, "predicted less measured [dB]", extend="both")
     curve, number = figure.add_subplot(room), np.arange(len(bars))
@@ -63,7 +64,8 @@ def draw_parts(drive: Drive, rows: Sequence[dict[str, Any]], title: str, path: P
     curve.set_xlim(-wide, wide)  # intervals of few squares leave the picture
     curve.axvline(0, color="black", linewidth=0.8)
     names = [
-        f"{row['part']} {row['name']}, {row['rows']} rows\nrmse {row['rmse_db']:.1f} dB"
+        f"{row['part']} {row['name']}".strip()
+        + f", {row['rows']} rows\nrmse {row['rmse_db']:.1f} dB"
         + ("" if row["within"] is None else f", {row['within']:.0%} within")
         for row in bars
     ]
