@@ -90,16 +90,16 @@ def test_a_network_with_two_wrong_azimuths(tmp_path):
     found, plain = judged(one, 6, *levels(method, one)), judged(one, 6, *reference(one, 6))
     assert found["rmse"] < 0.7 * plain["rmse"] and abs(found["bias_unlisted"]) < 3
     assert all(0.8 < found[name] < 0.97 for name in ("hold", "hold_listed", "hold_unlisted"))
-    every = method.all_stations()
-    assert every is not None and every.joint_method() is not None
+    every = method.joint_method()
+    assert every is not None
     moving = torch.from_numpy(one.asked - method.site.origin)[:, None].expand(-1, 30, 3)
-    level, covariance, noise = every.joint_method().predict_joint(moving, torch.arange(30))
+    level, covariance, noise = every.predict_joint(moving, torch.arange(30))
     mean, spread = levels(method, one)
     assert np.allclose(level + 10 * np.log10(method.site.target_scale), mean, atol=1e-3)
     assert np.allclose(covariance.diagonal(dim1=1, dim2=2).sqrt(), spread, rtol=1e-3)
     assert (torch.linalg.eigvalsh(covariance) > 0).all() and (covariance[:, 0, 1] != 0).all()
     assert (covariance[:, 0, 3] == 0).all() and (noise > 0).all()  # of sectors of two sites
-    more = every.joint_method().add_station(
+    more = every.add_station(
         np.zeros(3), torch.tensor([[90.0, 5, 65, 10, 0], [-1, 5, 65, 10, 0]])
     )
     around = torch.tensor([[500.0, 0, 1.5], [-500, 0, 1.5]])[:, None].expand(-1, 2, 3)
