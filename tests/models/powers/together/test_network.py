@@ -99,9 +99,7 @@ def test_a_network_with_two_wrong_azimuths(tmp_path):
     assert np.allclose(covariance.diagonal(dim1=1, dim2=2).sqrt(), spread, rtol=1e-3)
     assert (torch.linalg.eigvalsh(covariance) > 0).all() and (covariance[:, 0, 1] != 0).all()
     assert (covariance[:, 0, 3] == 0).all() and (noise > 0).all()  # of sectors of two sites
-    more = every.add_station(
-        np.zeros(3), torch.tensor([[90.0, 5, 65, 10, 0], [-1, 5, 65, 10, 0]])
-    )
+    more = every.add_station(np.zeros(3), torch.tensor([[90.0, 5, 65, 10, 0], [-1, 5, 65, 10, 0]]))
     around = torch.tensor([[500.0, 0, 1.5], [-500, 0, 1.5]])[:, None].expand(-1, 2, 3)
     east, west = more.predict_joint(around, torch.tensor([30, 31]))[0]
     assert east[0] > west[0] + 10 and east[1] == pytest.approx(float(west[1]))  # no pattern
