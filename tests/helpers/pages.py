@@ -108,7 +108,7 @@ class Tiny:
             for x, y in rng.uniform(0, 20, (40, 2))
             for s in ("a", "b")
         ]
-        for name in ("drive", "second", "both"):
+        for name in ("drive", "second", "both", "plan"):
             (folder / f"{name}.csv").write_text(heads + "".join(rows))
         (folder / "sites.csv").write_text("name,x,y,z\na,0,0,8\nb,20,20,8\n")
         (folder / "places.csv").write_text("x,y,z\n10,10,1.5\n20,20,1.5\n")
@@ -123,6 +123,7 @@ class Tiny:
                 "newrf": lambda: self._room(path.with_suffix(".npz")),
                 "own": lambda: powers(path.with_suffix(".npz"), 60),
                 "city": lambda: town_file(path.with_suffix(".npz"), 80),
+                "links": lambda: self._links(path.with_suffix(".npz")),
                 "sionna": lambda: (
                     simulate(small_campaign(40), path.with_suffix(".h5")),
                     path.with_suffix(".h5"),
@@ -160,6 +161,15 @@ class Tiny:
                 split_train=np.arange(48),
                 split_test=np.arange(48, 60),
             )
+        return path
+
+    def _links(self, path: Path) -> Path:
+        """Six ends that stood, and what one that moved heard of each."""
+        rng = np.random.default_rng(0)
+        tx = rng.uniform(0, 20, (6, 3)).repeat(15, 0)
+        rx = rng.uniform(0, 20, (90, 3))
+        level = -40 - 20 * np.log10(np.linalg.norm(tx - rx, axis=1))
+        np.savez(path, tx_position=tx, rx_position=rx, rssi_db=level)
         return path
 
     def _walks(self, path: Path) -> Path:
@@ -216,10 +226,14 @@ class Tiny:
             kind = chosen.removesuffix("_sim")
             if chosen in ("rfid", "argos"):
                 words["dataset.root"] = self.data(kind)
+                words.pop("dataset.listed", None)  # of the release's numbers
             elif chosen == "rfid_sim":
                 words |= {"dataset.count": "40", "dataset.root": str(self.folder)}
             elif chosen == "argos_sim":
                 words |= {"dataset.stand_in.count": "60", "dataset.stand_in.root": str(self.folder)}
+            elif words.get("dataset.file") == "links.npz":
+                words |= {"dataset.file": self.data("links")}
+                words |= {"split.leave_out": "1"} if "split.leave_out" in words else {}
             elif words.get("dataset.file") not in ("drive.csv", "both.csv"):
                 words["dataset.file"] = self.data(kind)
             if kind == "argos":
@@ -290,7 +304,7 @@ class Tiny:
         words |= TINY.get(name, {})
         gsparc = words.get("model", "gsparc") == "gsparc" and words.get("experiment") != "sionna"
         if name in ("train", "study") and gsparc:
-            words |= FIELD
+            words |= GSRF if words.get("paper") == "gsrf" else FIELD
         if name == "study" or (name == "train" and "experiment" in words):
             words["hydra.mode"] = "RUN"  # of its sweep one job
         words["hydra.run.dir"] = str(run)
@@ -327,6 +341,7 @@ ALIKE = {
     "hall_2": "ble",
 }
 SHORT = {"threads": "1"}
+GSRF = {"model.count": "20", "model.max_steps": "2"}
 FIELD = {"model.field.count": "20", "trainer.max_steps": "2", "trainer.val_check_interval": "1"}
 TINY = {  # what makes each command short
     "train": {**SHORT, "effort": "0.1", "baselines": "[mean]", "logger": "none"},
