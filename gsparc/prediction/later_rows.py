@@ -59,7 +59,8 @@ def check_updatable(site: Site) -> None:
     """
     if not site.maps_levels:
         targets = site.target.called + (" of two moving ends" if site.target.is_level else "")
-        raise ValueError(f"update: models of {targets} cannot be updated: train again on all rows")
+        other = "hear() takes channels" if site.target.is_complex else "train again on all rows"
+        raise ValueError(f"update: models of {targets} cannot be updated: {other}")
 
 
 def read_level_rows(data: Measurements, site: Site) -> LevelRows:

@@ -47,6 +47,7 @@ class PilotsMixin(Asked):
         """
         if self.site.kind != "csi":
             raise ValueError(f"hear: this model predicts {self.site.kind}; update() takes powers")
+        self.site.need_phase("hear")  # rows of a run share one factor
         placed, known = self.queries.query(tx, rx), self.site.measured
         one = self.method.predict(placed.query.rows(slice(1))).mean.shape[1:]
         shape = one if known is None else known.shape

@@ -97,4 +97,7 @@ def test_who_cannot_hear_says_who_can(predictor):
     plain = gsparc.fit(
         tx=places, rx=[0.0, 0.0, 2.0], csi=heard[:, 0], frequency_hz=[2.4e9], model="nearest"
     )
+    refused(r"hear\(\) takes channels", model.update, tx=places[:1], rssi=[-50.0])
+    free = replace(model.site, unknown_factor="phase")
+    refused("known up to", gsparc.Predictor(model.method, free).hear, **few)
     refused("init=diffuse does", plain.hear, tx=places[:1], csi=heard[:1, 0])
