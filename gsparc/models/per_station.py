@@ -336,9 +336,8 @@ class PerStation(Method):
 
     def joint_method(self) -> HasJoint | None:
         """See `Method.joint_method`; None: each has a copy of its own."""
-        return (
-            OneStationView(self._copies[UNHEARD], NOBODY).joint_method() if self._shared else None
-        )
+        shared = self.shared_copy
+        return None if shared is None else OneStationView(shared, NOBODY).joint_method()
 
     def add_carrier(self, frequency_hz: float) -> PerStation:
         """See `AddsCarriers`."""

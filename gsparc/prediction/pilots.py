@@ -65,8 +65,10 @@ class PilotsMixin(Asked):
         return view
 
 
-def tell(method: Method, query: Query, values: Tensor) -> Method:
+def tell(method: Method, query: Query, values: Tensor, doubt: float = 1.0) -> Method:
     """Return a fitted method that was told of channels (n, A, K), stored units, of one run.
+
+    `doubt` is what its variances are multiplied by, see `Mixture`.
 
     Raises:
         ValueError: it is not made of waves that pilots can be added to.
@@ -76,11 +78,9 @@ def tell(method: Method, query: Query, values: Tensor) -> Method:
     if isinstance(method, PerStation) and (shared := method.shared_copy) is not None:
         return method.with_shared_copy(tell(shared, query, values))
     if isinstance(method, Mixture) and method.member is not None:
-        return tell(method.member, query, values)
+        return tell(method.member, query, values, method.doubt)
     if isinstance(method, HeardField):
-        return HeardField(method.field, query, values, method)
+        return HeardField(method.field, query, values, method, method.doubt)
     if isinstance(method, ChannelField):
-        return HeardField(method, query, values)
-    raise ValueError(
-        f"hear: {method.name} takes no pilots after its fit; model=gsparc init=diffuse does"
-    )
+        return HeardField(method, query, values, doubt=doubt)
+    raise ValueError(f"hear: {method.name} takes no pilots after its fit; model=channels does")

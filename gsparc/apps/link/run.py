@@ -40,9 +40,8 @@ if TYPE_CHECKING:
 # 32 positions x antennas x fine tones bound what is held at once.
 CHUNK = 32
 SLOT = 14  # symbols
-BEAM_ENTRIES = (
-    1 << 24
-)  # of true and of predicted channels of beams: .5 GB with what is made of them
+# Of true and of predicted channels of beams: .5 GB with what is made of them
+BEAM_ENTRIES = 1 << 24
 
 
 @dataclass(frozen=True)

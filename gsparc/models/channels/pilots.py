@@ -79,15 +79,21 @@ class HeardField(View):
         query: places of the pilots, with stations where there are several.
         values: (n, A, K) complex, stored units, of one run; NaN where nothing was heard.
         before: the same field with the pilots of earlier runs.
+        doubt: what its variances are multiplied by, see `Mixture`.
     """
 
     no_gradient = "pilots after the fit are answered in closed form alone"
 
     def __init__(
-        self, field: ChannelField, query: Query, values: Tensor, before: HeardField | None = None
+        self,
+        field: ChannelField,
+        query: Query,
+        values: Tensor,
+        before: HeardField | None = None,
+        doubt: float = 1.0,
     ) -> None:
         super().__init__(field)
-        self.field = field
+        self.field, self.doubt = field, doubt
         ends, values = Ends.from_query(field.site, query), values.to(torch.complex128)
         told = self._told_slots(ends, values)
         self.run_factor = _run_factor(told.values())
@@ -141,7 +147,7 @@ class HeardField(View):
 
     def _predict_part(self, query: Query) -> Prediction:
         said, ends = self.field.predict(query), Ends.from_query(self.field.site, query)
-        mean, level = said.mean.clone(), abs(self.run_factor) ** 2
+        mean, level = said.mean.clone(), self.doubt * abs(self.run_factor) ** 2
         assert said.variance is not None
         removed = torch.zeros(len(query), dtype=torch.float64)
         for known in chain.from_iterable(self._known(ends)):

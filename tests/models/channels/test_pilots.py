@@ -94,10 +94,13 @@ def test_who_cannot_hear_says_who_can(predictor):
     model, places, heard = predictor
     few = {"tx": places[:2], "csi": heard[:2, :2]}
     refused(r"csi is of shape \(2, 2\), expected \(2, 3, 1, 1\)", model.hear, **few)
-    plain = gsparc.fit(
-        tx=places, rx=[0.0, 0.0, 2.0], csi=heard[:, 0], frequency_hz=[2.4e9], model="nearest"
-    )
-    refused(r"hear\(\) takes channels", model.update, tx=places[:1], rssi=[-50.0])
     free = replace(model.site, unknown_factor="phase")
     refused("known up to", gsparc.Predictor(model.method, free).hear, **few)
-    refused("init=diffuse does", plain.hear, tx=places[:1], csi=heard[:1, 0])
+    refused(r"hear\(\) takes channels", model.update, tx=places[:1], rssi=[-50.0])
+    one = {"tx": places, "rx": [0.0, 0.0, 2.0], "csi": heard[:, 0], "frequency_hz": [2.4e9]}
+    told = {"tx": places[:1], "csi": heard[:1, 0]}
+    refused("model=channels does", gsparc.fit(**one, model="nearest").hear, **told)
+    does = gsparc.fit(**one, model="channels", align="none")  # as it was told
+    does.method.doubt = 4.0  # stated variances were too small
+    wider = does.hear(**told).std(tx=places[5:9]) / does.std(tx=places[5:9])
+    assert (wider <= abs(does.hear(**told).method.run_factor) * 1.001).all() and wider.max() > 0.5
