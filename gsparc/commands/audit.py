@@ -66,7 +66,7 @@ def task(call: CommandCall) -> Result:
             facts |= {"audit/verdict": verdict, "audit/places": count}
             before = table.weight.to_numpy(), 1 - table.high.to_numpy(), table.ratio.to_numpy()
         else:
-            lines.append("nobody drew these rows: no verdict, a model's estimate alone")
+            lines.append("nobody drew these rows: no verdict")
             if errors is not None:
                 share, low, high = errors.share(claim.place, margin)
                 told = f"{share:.1%} hold, 90 % interval {low:.1%} to {high:.1%}"

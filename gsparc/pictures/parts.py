@@ -17,8 +17,16 @@ LEAST_DB = 3.0  # end of the colours
 LINE = 0.3  # inches of a bar
 
 
-def draw_parts(drive: Drive, rows: Sequence[dict[str, Any]], title: str, path: Path) -> None:
-    """Save bias with its interval by cell and ring, and by area, as `Drive.judge` has them."""
+def draw_parts(
+    drive: Drive,
+    rows: Sequence[dict[str, Any]],
+    title: str,
+    path: Path,
+    what: str = "predicted less measured",
+) -> None:
+    """Save bias with its interval by cell and ring, and by area, as `Drive.judge` has them;
+    axes say `what` it is.
+    """
     bars = [row for row in rows if row["part"] != "area"][::-1]
     areas = [row for row in rows if row["part"] == "area"]
     frames, side = split_frame(drive.place, drive.area_m / 4), drive.area_m
@@ -52,9 +60,11 @@ def draw_parts(drive: Drive, rows: Sequence[dict[str, Any]], title: str, path: P
             )
             if (middle > low).all() and (middle < high).all():
                 text = f"{row['bias_db']:+.1f}"
-                axis.text(*middle, text, ha="center", va="center", fontsize="x-small")
+                ground = {"facecolor": "white", "alpha": 0.7, "linewidth": 0, "pad": 0.6}
+                at = {"ha": "center", "va": "center", "fontsize": "x-small", "bbox": ground}
+                axis.text(*middle, text, **at)
         scale_bar(axis)
-    colour_bar(marks, axes, "predicted less measured [dB]", extend="both")
+    colour_bar(marks, axes, f"{what} [dB]", extend="both")
     curve, number = figure.add_subplot(room), np.arange(len(bars))
     bias = np.array([row["bias_db"] for row in bars])
     ends = np.array([[row["bias_low_db"], row["bias_high_db"]] for row in bars]).reshape(-1, 2)
@@ -70,7 +80,7 @@ def draw_parts(drive: Drive, rows: Sequence[dict[str, Any]], title: str, path: P
         for row in bars
     ]
     curve.set_yticks(number, names, fontsize="x-small")
-    curve.set(xlabel="mean of predicted less measured [dB]", title="by cell and by distance")
+    curve.set(xlabel=f"mean of {what} [dB]", title="by cell and by distance")
     curve.grid(axis="x", alpha=0.3)
     figure.suptitle(title)
     save(figure, path, 100)

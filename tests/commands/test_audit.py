@@ -82,7 +82,7 @@ def test_rows_that_nobody_drew_give_no_verdict(claimed):
     rows = drive(folder, np.linspace(-90, -112, 40), "log.csv")
     done = run(folder / "logged", f"claim={folder / 'map.tif'}", rows)
     facts = json.loads((folder / "logged" / "summary.json").read_text())
-    assert "no verdict, a model's estimate alone" in "\n".join(done.out)
+    assert "nobody drew these rows: no verdict" in "\n".join(done.out)
     assert facts["audit/verdict"] == "open"
     assert 0 <= facts["audit/model_low"] <= facts["audit/model_high"] <= 1
 

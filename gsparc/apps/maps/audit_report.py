@@ -52,7 +52,8 @@ def find_errors(
     parts = drive.judge()
     if not parts:
         return [], []
-    draw_parts(drive, parts, "claimed less measured", folder / "drive.png")
+    words = "claim and drive", folder / "drive.png", "claimed less measured"
+    draw_parts(drive, parts, *words)
     lines = [line.replace("predicted", "claimed") for line in describe_parts(parts, 0.9)]
     varied = claimed - claimed.mean()
     slope = float(varied @ rows.level) / max(float(varied @ varied), 1e-9)
