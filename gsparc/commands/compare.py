@@ -13,7 +13,8 @@ import pandas as pd
 from gsparc.base.files import platform_cache, write_samples
 from gsparc.commands.train import train_job
 from gsparc.evaluation.examples import join_examples
-from gsparc.evaluation.summary import provenance, write_summary
+from gsparc.evaluation.provenance import provenance
+from gsparc.evaluation.summary import write_summary
 from gsparc.pictures.drawing import PRINTED, save
 from gsparc.pictures.pictures import draw_spectra
 from gsparc.pictures.plots import draw_efforts, draw_splits, draw_sweep

@@ -14,7 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 from gsparc.base.files import SUMMARY
 from gsparc.commands.shared import cli
 from gsparc.data.split_files import write_split
-from gsparc.evaluation import summary
+from gsparc.evaluation.provenance import new_run_id, provenance
+from gsparc.evaluation.summary import write_summary
 from gsparc.models.array_vectors.vector_cache import forget_vectors
 from gsparc.pictures.pictures import draw_run
 from gsparc.runs.baselines import same_as_baseline
@@ -52,7 +53,7 @@ def train(
     with locked(run_dir):
         set_earlier_aside(run_dir, config.ckpt_path, config.get("init_from"))
         inputs = inputs or read_inputs(config)
-        data, split, method, run_id = inputs.data, inputs.split, inputs.method, summary.new_run_id()
+        data, split, method, run_id = inputs.data, inputs.split, inputs.method, new_run_id()
         learned = inputs.errors.learned(data, split)
         resumes = folds.folds_to_resume(config.ckpt_path, method, split)
         if in_full:
@@ -81,7 +82,7 @@ def train(
             asked, how["learned"] = inputs.errors.asked(data, split), learned
             evaluation = evaluate(fits.methods, fits.train_s, asked, split, **how)
             folds.end_curves(contexts, fits.train_s, evaluation.columns, config.eval_on)
-            facts = {**evaluation.facts, **summary.provenance(), **fits.facts(), "run_id": run_id}
+            facts = {**evaluation.facts, **provenance(), **fits.facts(), "run_id": run_id}
             facts |= {"seed": int(config.seed), "options/unused": unused}
             if in_full:
                 draw_run(
@@ -96,7 +97,7 @@ def train(
                     loggers,
                 )
         evaluation.write(run_dir, run_id=run_id)
-        summary.write_summary(run_dir / SUMMARY, facts)
+        write_summary(run_dir / SUMMARY, facts)
         return facts, TrainedRun(fits.methods, folds.checkpoints(contexts), data, split, evaluation)
 
 

@@ -26,8 +26,8 @@ from gsparc.base.errors import DataError, list_first
 from gsparc.base.files import SUMMARY, set_aside, write_whole
 from gsparc.data.assemble import content_hash, identity_hash
 from gsparc.data.schema import Measurements
+from gsparc.evaluation.provenance import provenance, run_git
 from gsparc.evaluation.results import read_summary
-from gsparc.evaluation.summary import provenance, run_git
 from gsparc.models.checkpoint import MODEL
 from gsparc.models.fitting import LAST, dotted_settings
 from gsparc.tables.said_columns import edited_beside

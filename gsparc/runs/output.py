@@ -19,12 +19,8 @@ from gsparc.base.limits import Limit, check_arguments
 from gsparc.data.splits import Split
 from gsparc.evaluation.by_station import worst_stations
 from gsparc.evaluation.console import last_warnings, note_said, open_console
-from gsparc.evaluation.summary import (
-    provenance,
-    remarks,
-    results_table,
-    write_summary,
-)
+from gsparc.evaluation.provenance import provenance
+from gsparc.evaluation.summary import remarks, results_table, write_summary
 from gsparc.evaluation.table import Table
 from gsparc.prediction.timing import machine_facts
 from gsparc.runs.settings import RunSettings, to_dict

@@ -14,15 +14,8 @@ from refusals import refused
 from rich.console import Console
 
 import gsparc.evaluation.summary
-from gsparc.evaluation.summary import (
-    describe_model,
-    program_version,
-    provenance,
-    remarks,
-    results_table,
-    run_git,
-    write_summary,
-)
+from gsparc.evaluation.provenance import program_version, provenance, run_git
+from gsparc.evaluation.summary import describe_model, remarks, results_table, write_summary
 
 INFINITE = [float("nan"), float("inf"), np.float32("nan"), torch.tensor(-torch.inf)]
 

@@ -7,7 +7,7 @@ from PIL import Image
 
 from gsparc.base import instantiate
 from gsparc.datasets import load
-from gsparc.evaluation import summary
+from gsparc.evaluation import provenance
 from gsparc.prediction.timing import ClockSettings
 
 
@@ -15,7 +15,7 @@ def look_once(patch) -> None:
     """Notes of installed packages, files of datasets and what git says: 60 ms of every training."""
     scan = cache(lambda path, group, read=instantiate.entry_points: read(group=group))
     patch.setattr(instantiate, "entry_points", lambda group: scan(tuple(sys.path), group))
-    for module, name in ((load, "_choices"), (summary, "_git"), (summary, "_versions")):
+    for module, name in ((load, "_choices"), (provenance, "_git"), (provenance, "_versions")):
         patch.setattr(module, name, cache(getattr(module, name)))
 
 

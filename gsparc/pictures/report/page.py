@@ -19,6 +19,7 @@ from PIL import Image
 from gsparc.evaluation import summary
 from gsparc.evaluation.examples import join_examples
 from gsparc.evaluation.metric_formats import LISTED, OF_KIND, judged_by
+from gsparc.evaluation.provenance import program_version, provenance
 from gsparc.evaluation.results import PROBLEM, average, own_rows, score_db, short_settings
 from gsparc.evaluation.table import Table
 from gsparc.pictures import plots
@@ -151,9 +152,7 @@ def write_report(
     and plots in the formats `figures`.
     """
     sections, count = make_sections(rows, fronts), len(own_rows(rows))
-    note = (
-        f"{count} run{'s' * (count > 1)}; made by {summary.program_version(summary.provenance())}"
-    )
+    note = f"{count} run{'s' * (count > 1)}; made by {program_version(provenance())}"
     beside = f"{note}. CSV and Markdown of every table lie beside this page"
     (folder / "report.html").write_text(render_html(title, beside, sections), encoding="utf-8")
     parts = [f"# {title}\n\n{note}\n"]

@@ -18,6 +18,7 @@ from rich.console import Console
 from gsparc.base.errors import list_first
 from gsparc.evaluation import summary
 from gsparc.evaluation.console import error_in_one_line, open_console
+from gsparc.evaluation.provenance import provenance
 from gsparc.runs.experiment.options import REDRAW
 from gsparc.runs.ledger import FAILURE, REFUSED
 
@@ -121,7 +122,7 @@ def report_sweep(folder: Path, title: str, console: Console, settings: SweepRepo
             log.warning("split.seed moves validation rows alone: %s", REDRAW)
         for same in equal_settings(fits):
             console.print(f"these settings gave the same figures to the bit: {same}", markup=False)
-    facts = {"sweep/runs": len(own_rows(rows)), **summary.provenance()}
+    facts = {"sweep/runs": len(own_rows(rows)), **provenance()}
     summary.write_summary(folder / "summary.json", facts)
     console.print(f"written to {folder}", highlight=False)
 
