@@ -11,7 +11,7 @@ from gsparc.data.schema import TrainTest
 from gsparc.data.spacing import number_squares, path_order, rows_far_from, tenth_of_extent
 
 if TYPE_CHECKING:
-    from gsparc.data.splits import SplitSettings
+    from gsparc.data.split_settings import SplitSettings
 
 
 def last_rows(order: np.ndarray, test_share: float) -> TrainTest:

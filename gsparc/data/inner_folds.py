@@ -19,15 +19,8 @@ from gsparc.base.errors import DataError
 from gsparc.data import spacing
 from gsparc.data.schema import Measurements, TrainTest
 from gsparc.data.spacing import neighbour_distance
-from gsparc.data.splits import (
-    CORNERS,
-    WHOLE,
-    AnySplit,
-    FileSettings,
-    Fold,
-    SplitSettings,
-    make_split,
-)
+from gsparc.data.split_settings import CORNERS, WHOLE, FileSettings, SplitSettings
+from gsparc.data.splits import AnySplit, Fold, make_split
 
 Draws = np.random.Generator
 # Times the usual distance to the nearest training row, from which validation rows are apart
@@ -43,7 +36,7 @@ class InnerFolds:
     """Folds of the training and validation rows; `test` are rows left out.
 
     Attributes:
-        name: of the split they are cut by, one of `gsparc.data.splits.NAMES`.
+        name: of the split they are cut by, one of `gsparc.data.split_settings.NAMES`.
         folds: one or more, of rows as the outer fold counts them.
         unit: (S,) int64 of all rows, which were left out together as one: a place, a square, a
             station or a stretch; errors within a unit are not independent.

@@ -16,7 +16,8 @@ import numpy as np
 
 from gsparc.base.errors import DataError, list_first, readable
 from gsparc.base.limits import choice
-from gsparc.data.splits import SplitSettings, make_split
+from gsparc.data.split_settings import SplitSettings
+from gsparc.data.splits import make_split
 from gsparc.datasets.campaign import check_layout
 from gsparc.tables import is_table
 from gsparc.tables.raw import Raw, read_raw

@@ -25,14 +25,8 @@ from gsparc.data.outliers import find_outliers
 from gsparc.data.row_order import content_order
 from gsparc.data.schema import Measurements
 from gsparc.data.split_files import read_split
-from gsparc.data.splits import (
-    FileSettings,
-    Split,
-    SplitSettings,
-    make_split,
-    remove_rows,
-    rows_to_leave_out,
-)
+from gsparc.data.split_settings import FileSettings, SplitSettings
+from gsparc.data.splits import Split, make_split, remove_rows, rows_to_leave_out
 from gsparc.datasets.datamodule import DataModule
 
 log = logging.getLogger(__name__)

@@ -15,7 +15,8 @@ from gsparc.base.errors import Caution, DataError
 from gsparc.base.instantiate import accepted_arguments, suggest_or_list
 from gsparc.data.row_order import order_rows
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, SplitSettings
+from gsparc.data.split_settings import SplitSettings
+from gsparc.data.splits import Fold
 from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.datasets.campaign import find_implausible
 from gsparc.models import checkpoint, fitting

@@ -14,7 +14,8 @@ from torch import Tensor
 
 from gsparc.data.inner_folds import InnerFolds, cut_folds
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, SplitSettings
+from gsparc.data.split_settings import SplitSettings
+from gsparc.data.splits import Fold
 from gsparc.models import fitting
 from gsparc.models.abilities import Reconditions
 from gsparc.models.device_offsets import without_devices

@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from gsparc.base.limits import POSITIVE, Checked, choice, setting, whole
-from gsparc.data.splits import FileSettings, Fold, SplitSettings
+from gsparc.data.split_settings import FileSettings, SplitSettings
+from gsparc.data.splits import Fold
 from gsparc.training import curve
 from gsparc.training.cost import LINE, NO_COST, Cost
 from gsparc.training.effort import Effort

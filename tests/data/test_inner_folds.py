@@ -6,7 +6,8 @@ from scipy.spatial import cKDTree
 
 from gsparc.base.errors import DataError
 from gsparc.data.inner_folds import NOT_TESTED, inner_folds
-from gsparc.data.splits import FileSettings, Fold, SplitSettings, make_split
+from gsparc.data.split_settings import FileSettings, SplitSettings
+from gsparc.data.splits import Fold, make_split
 
 KINDS = ("random", "grouped", "corner", "blocks", "sparse")
 SIDE = 0.2

@@ -8,7 +8,8 @@ from releases import real
 from gsparc.base.errors import DataError
 from gsparc.data.inner_folds import inner_folds
 from gsparc.data.split_files import read_split, write_split
-from gsparc.data.splits import SplitSettings, hash_indices, make_split
+from gsparc.data.split_settings import SplitSettings
+from gsparc.data.splits import hash_indices, make_split
 from gsparc.datasets.load import load, split_for
 from gsparc.datasets.rfid import load_rfid
 from gsparc.models.per_station import wrap_per_station

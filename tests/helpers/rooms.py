@@ -6,7 +6,8 @@ import numpy as np
 from shoeboxes import as_arrays, scatter
 
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.data.split_settings import SplitSettings
+from gsparc.data.splits import Fold, make_split
 from gsparc.simulate.shoebox import Room, Trace, trace_room
 from gsparc.tables.own import from_arrays
 

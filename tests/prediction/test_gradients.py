@@ -19,7 +19,8 @@ from rooms import directed, shoebox
 from torch.autograd import forward_ad
 
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.data.split_settings import SplitSettings
+from gsparc.data.splits import Fold, make_split
 from gsparc.datasets.load import load
 from gsparc.models.baselines import gp
 from gsparc.models.channels import complex_gp

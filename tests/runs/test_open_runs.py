@@ -9,7 +9,8 @@ from refusals import refused
 
 import gsparc
 from gsparc.base.errors import DataError
-from gsparc.data.splits import Fold, Split, SplitSettings, make_split
+from gsparc.data.split_settings import SplitSettings
+from gsparc.data.splits import Fold, Split, make_split
 from gsparc.datasets.load import answerable
 from gsparc.evaluation.scores import score_methods
 from gsparc.models.per_station import wrap_per_station

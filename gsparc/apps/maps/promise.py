@@ -18,7 +18,8 @@ from gsparc.apps.maps.intervals import Coverage, IntervalScales, calibrate, cros
 from gsparc.base.errors import DataError
 from gsparc.base.executor import run_all
 from gsparc.base.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
-from gsparc.data.splits import Fold, SplitSettings
+from gsparc.data.split_settings import SplitSettings
+from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.prediction.left_out import HeldOutLevels, Learned, leave_out, nearest_distances
 from gsparc.processes.uncertainty import coverage_and_width

@@ -7,7 +7,8 @@ from scipy.spatial.distance import cdist
 
 from gsparc.apps.maps.intervals import cross_validate
 from gsparc.apps.maps.promise import PromiseSettings, gather_promise
-from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.data.split_settings import SplitSettings
+from gsparc.data.splits import Fold, make_split
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.prediction.left_out import Learned, held_out_levels
 from gsparc.tables.own import from_arrays

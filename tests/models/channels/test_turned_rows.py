@@ -8,7 +8,8 @@ import packets
 import pytest
 import torch
 
-from gsparc.data.splits import Fold, SplitSettings
+from gsparc.data.split_settings import SplitSettings
+from gsparc.data.splits import Fold
 from gsparc.models.aligned_rows import align_phases
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.turned_rows import TurnedNeighbours

@@ -9,7 +9,8 @@ from releases import real
 from rooms import directed
 from scenes import error
 
-from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.data.split_settings import SplitSettings
+from gsparc.data.splits import Fold, make_split
 from gsparc.datasets.load import load
 from gsparc.field.initial import InitSettings
 from gsparc.models.directional.method import DirectionalGP

@@ -7,7 +7,7 @@ import pytest
 from posts import POSTS, distances, heard
 from scenes import fold_of
 
-from gsparc.data.splits import SplitSettings
+from gsparc.data.split_settings import SplitSettings
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.mixture import each_or_together
 from gsparc.models.mixture.mixture import Mixture

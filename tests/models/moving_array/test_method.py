@@ -11,7 +11,8 @@ from boxes import ROOM, TRANSMITTER, room_of_spectra
 from scipy.optimize import nnls
 
 from gsparc.data.query import Query
-from gsparc.data.splits import SplitSettings, make_split
+from gsparc.data.split_settings import SplitSettings
+from gsparc.data.splits import make_split
 from gsparc.evaluation.scores import score_methods
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.moving_array.method import MovingArrayField

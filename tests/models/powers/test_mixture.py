@@ -9,7 +9,8 @@ from closed import fitted_to, read_back
 from releases import real
 
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, SplitSettings, make_split
+from gsparc.data.split_settings import SplitSettings
+from gsparc.data.splits import Fold, make_split
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.powers.field import PowerField
 from gsparc.models.updated import map_level
