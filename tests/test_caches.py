@@ -9,7 +9,8 @@ from gsparc.data.assemble import identity_hash
 from gsparc.data.georeference import Georeference
 from gsparc.data.schema import Site, Stations
 from gsparc.models.array_vectors import vector_cache
-from gsparc.models.checkpoint import _site_from, _tensors_to_numpy, _to_plain
+from gsparc.models.checkpoint import _site_from
+from gsparc.models.checkpoint_content import tensors_to_numpy, to_stored_types
 from gsparc.ops import SphereGrid
 from gsparc.runs.ledger import measurements_hash
 
@@ -88,5 +89,5 @@ def test_every_fact_of_a_site_changes_the_keys_of_all_caches(campaign, monkeypat
 def test_facts_are_the_same_after_a_checkpoint(campaign):
     data = campaign("spectrum", 20)
     whole = replace(data.site, **{**FACTS, "target_scale": np.float64(3.0)})
-    again = _site_from(_tensors_to_numpy(_to_plain(asdict(whole), "site")))
+    again = _site_from(tensors_to_numpy(to_stored_types(asdict(whole), "site")))
     assert identity_hash(replace(data, site=again)) == identity_hash(replace(data, site=whole))

@@ -15,8 +15,8 @@ from gsparc.pictures.pictures import NAMES, draw_calibration
 from gsparc.prediction.confidence import Guarantee
 from gsparc.prediction.left_out import Evidence
 from gsparc.prediction.risk import SHARES, calibration_facts, explain_too_few, run_trials
-from gsparc.runs.open_runs import Unseen
 from gsparc.runs.output import CommandCall, Result, command
+from gsparc.runs.unseen import Unseen
 
 log = logging.getLogger(__name__)
 

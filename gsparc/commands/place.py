@@ -9,7 +9,7 @@ from gsparc.apps.maps.pictures import draw_placement
 from gsparc.apps.maps.promise import read_or_gather, reopen_training
 from gsparc.evaluation.summary import coordinates
 from gsparc.models import checkpoint
-from gsparc.models.per_station import UNHEARD
+from gsparc.models.station_sites import UNHEARD
 from gsparc.runs.open_runs import open_run
 from gsparc.runs.output import CommandCall, Result, command
 

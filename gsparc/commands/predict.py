@@ -5,7 +5,7 @@ as a table.
 from __future__ import annotations
 
 from gsparc.apps.maps.promise import read_promise
-from gsparc.prediction.answers import predict_file
+from gsparc.prediction.answer_files import predict_file
 from gsparc.prediction.operating_point import load
 from gsparc.runs.output import CommandCall, Result, command
 

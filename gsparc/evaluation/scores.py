@@ -17,7 +17,8 @@ from gsparc.data.splits import Fold, Split
 from gsparc.data.units import power_in_decibels
 from gsparc.evaluation.metric_formats import OF_KIND
 from gsparc.evaluation.metrics import power_errors
-from gsparc.models.method import Method, predict_in_batches
+from gsparc.models.method import Method
+from gsparc.models.predicting import predict_in_batches
 from gsparc.physics.decibels import from_decibels
 from gsparc.prediction.hearing import Hearing, levels_near
 from gsparc.tables.links.strongest import StrongestLists, levels_db, strongest_lists

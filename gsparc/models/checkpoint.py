@@ -4,43 +4,39 @@ read without code.
 
 from __future__ import annotations
 
-import hashlib
-import math
 import pickle
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 import yaml
-from torch import Tensor
 
 from gsparc.base.archives import verified_archive
 from gsparc.base.errors import DataError
 from gsparc.base.files import list_causes, load_yaml, whole_file
 from gsparc.base.locks import hold_file
 from gsparc.data.schema import Site, Stations
+from gsparc.models.checkpoint_content import (
+    FORMAT,
+    VERSION,
+    CheckpointError,
+    check_content,
+    content_digest,
+    find_non_finite,
+    tensors_to_numpy,
+    to_stored_types,
+)
 from gsparc.models.method import Method, import_path
 from gsparc.ops import SphereGrid
 
-VERSION = 2  # of what a checkpoint holds
-FORMAT = "gsparc-checkpoint"
-PARTS = {"format", "version", "config", "method", "target", "site", "state", "extra", "sha256"}
-DEEPEST = 50  # of containers in containers
 RENAMED = {"freedom": "unknown_factor"}  # facts of sites in older checkpoints
 # Classes in configurations of older checkpoints
 MOVED = ("gsparc.data.datasets.", "gsparc.datasets.")
 MODEL = "model.ckpt"  # of a run's folder
 WAIT_S = 60.0  # for others who write a file: a large file of later rows takes seconds
-
-
-class CheckpointError(ValueError):
-    """A file that is no readable checkpoint, or a state that cannot be written; one line,
-    with the file.
-    """
 
 
 @dataclass(frozen=True)
@@ -121,9 +117,9 @@ def save(
         "config": config,
         "method": method.name,
         "target": import_path(method.stored_class),
-        "site": _to_plain(asdict(method.site), "site"),
-        "state": _to_plain(method.state(), "state"),
-        "extra": _to_plain(dict(extra or {}), "extra"),
+        "site": to_stored_types(asdict(method.site), "site"),
+        "state": to_stored_types(method.state(), "state"),
+        "extra": to_stored_types(dict(extra or {}), "extra"),
     }
     with _one_writer(Path(path), WAIT_S):
         _write(Path(path), content)
@@ -150,7 +146,7 @@ class Rewriting:
         Raises:
             CheckpointError: as `save` does; the file is then as it was.
         """
-        self._content["extra"] = {**self._content["extra"], **_to_plain(dict(extra), "extra")}
+        self._content["extra"] = {**self._content["extra"], **to_stored_types(dict(extra), "extra")}
         self.stored = _write(self._out, self._content)
 
 
@@ -202,8 +198,8 @@ def _write(path: Path, content: dict[str, Any]) -> StoredModel:
     what nobody could read takes no file's place.
     """
     content.pop("sha256", None)
-    _check_content(content, path)
-    content["sha256"] = _content_digest(content)
+    check_content(content, path)
+    content["sha256"] = content_digest(content)
     stored = _stored_from_content(content, path)
     try:
         with whole_file(path.resolve()) as partial, partial.open("wb") as file:
@@ -252,30 +248,6 @@ def read_interrupted(path: Path) -> StoredModel:
     return stored
 
 
-def _content_digest(content: Mapping[str, Any]) -> str:
-    """SHA-256 of all that a checkpoint holds, of tensors type, shape and bytes."""
-    digest, stack = (
-        hashlib.sha256(),
-        [value for name, value in sorted(content.items()) if name != "sha256"],
-    )
-    while stack:
-        value = stack.pop()
-        if isinstance(value, Tensor):
-            digest.update(f"{value.dtype} {tuple(value.shape)}".encode())
-            packed = torch.empty(value.numel(), dtype=value.dtype).copy_(value.detach().flatten())
-            # One number may have strides of 0
-            digest.update(packed.view(torch.uint8).numpy().tobytes())
-        elif isinstance(value, Mapping):
-            digest.update(f"{len(value)} {list(value)}".encode())
-            stack += value.values()
-        elif isinstance(value, (list, tuple)):
-            digest.update(f"{type(value)} {len(value)}".encode())
-            stack += value
-        else:
-            digest.update(f"{value!r};".encode())
-    return digest.hexdigest()
-
-
 def _read_content(path: Path) -> dict[str, Any]:
     """What the archive holds, of our format and of finite numbers (CheckpointError)."""
     if path.is_dir():
@@ -299,53 +271,7 @@ def _read_content(path: Path) -> dict[str, Any]:
         reason = str(error).strip().splitlines()
         why = reason[0] if reason else type(error).__name__
         raise CheckpointError(f"{path}: cannot be read ({why})") from None
-    return _check_content(content, path)
-
-
-def _check_content(content: Any, path: Path) -> dict[str, Any]:
-    """Return what a file holds, or is to hold, if it is of our format,
-    whole and of finite numbers.
-    """
-    if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise CheckpointError(f"{path}: not a gsparc checkpoint (weights of another program?)")
-    version = content.get("version")
-    if version != VERSION:
-        raise CheckpointError(
-            f"{path}: of version {version}, this gsparc reads {VERSION}; train again with it"
-        )
-    if _exceeds_limits(content):  # what walks over it would not end
-        raise CheckpointError(
-            f"{path}: damaged (a part of it is there many times, too deep, or not there)"
-        )
-    # An archive's own sums are right of whatever was put in it. Older files have no sum of their
-    # own: where its name is damaged there is a part too many.
-    if content.keys() - PARTS or (
-        "sha256" in content and content["sha256"] != _content_digest(content)
-    ):
-        raise CheckpointError(
-            f"{path}: damaged, or changed by another program; take another copy of it"
-        )
-    for part in ("site", "state"):
-        where = find_non_finite(_drop_unknown_places(content.get(part)), part)
-        if where is not None:  # its sum is right: it was written like this
-            raise CheckpointError(
-                f"{path}: {where} is NaN or infinite; train again, or take an earlier file"
-            )
-    return content
-
-
-def _drop_unknown_places(part: Any) -> Any:
-    """A site with 0 for NaN in places and sectors of stations: what nobody knows; else as it is."""
-    stations = part.get("stations") if isinstance(part, Mapping) else None
-    if not isinstance(stations, Mapping):
-        return part
-    facts = {name: stations.get(name) for name in ("position", "sector")}
-    finite_facts = {
-        name: torch.where(torch.isnan(fact), 0, fact)
-        for name, fact in facts.items()
-        if isinstance(fact, Tensor) and fact.is_floating_point()
-    }
-    return {**part, "stations": {**stations, **finite_facts}}
+    return check_content(content, path)
 
 
 def _stored_from_content(content: Mapping[str, Any], path: Path) -> StoredModel:
@@ -368,7 +294,7 @@ def _stored_from_content(content: Mapping[str, Any], path: Path) -> StoredModel:
 
 def _site_from(facts: Mapping[str, Any]) -> Site:
     names = {f.name for f in fields(Site)}
-    now = {RENAMED.get(k, k): v for k, v in _tensors_to_numpy(facts).items()}
+    now = {RENAMED.get(k, k): v for k, v in tensors_to_numpy(facts).items()}
     values = {k: v for k, v in now.items() if k in names}
     if values.get("grid") is not None:
         values["grid"] = SphereGrid(**values["grid"])
@@ -380,84 +306,3 @@ def _site_from(facts: Mapping[str, Any]) -> Site:
 
         values["georeference"] = Georeference(**values["georeference"])
     return Site(**values)
-
-
-def _tensors_to_numpy(facts: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        k: v.numpy()
-        if isinstance(v, Tensor)
-        else _tensors_to_numpy(v)
-        if isinstance(v, Mapping)
-        else v
-        for k, v in facts.items()
-    }
-
-
-def _exceeds_limits(content: Any) -> bool:
-    """Whether a container is in it twice or too deep,
-    or a tensor has not as many numbers as are stored.
-    """
-    stack, seen = [(content, 0)], set[int]()
-    while stack:
-        value, depth = stack.pop()
-        if isinstance(value, Tensor):
-            other = value.is_meta or value.is_quantized or value.is_nested
-            if (
-                other
-                or value.layout != torch.strided
-                or value.nbytes > value.untyped_storage().nbytes()
-            ):
-                return True
-        elif isinstance(value, (Mapping, list, tuple)) and value:
-            if id(value) in seen or depth > DEEPEST:
-                return True
-            seen.add(id(value))
-            parts = value.values() if isinstance(value, Mapping) else value
-            stack += [(part, depth + 1) for part in parts]
-    return False
-
-
-def find_non_finite(value: Any, where: str, *, infinite: bool = False) -> str | None:
-    """Return where the first NaN is, or infinity unless it may be `infinite`; None:
-    all are finite.
-    """
-    if isinstance(value, Tensor):
-        wrong = torch.isnan(value) if infinite else ~torch.isfinite(value)
-        return f"{where}{wrong.nonzero()[0].tolist()}" if wrong.any() else None
-    if isinstance(value, float):
-        return where if math.isnan(value) or (math.isinf(value) and not infinite) else None
-    parts: Iterable[tuple[str, Any]] = ()
-    if isinstance(value, Mapping):
-        parts = ((f"{where}.{key}", entry) for key, entry in value.items())
-    elif isinstance(value, (list, tuple)):
-        parts = ((f"{where}[{i}]", entry) for i, entry in enumerate(value))
-    each = (find_non_finite(part, name, infinite=infinite) for name, part in parts)
-    return next((result for result in each if result is not None), None)
-
-
-def _to_plain(value: Any, where: str) -> Any:
-    """The same value in types that weights-only unpickling accepts;
-    views do not drag their storage along.
-    """
-    if value is None or type(value) in (bool, int, float, str, bytes):
-        return value
-    if isinstance(value, Tensor):
-        tensor = value.detach().contiguous()
-        return tensor.clone() if tensor.untyped_storage().nbytes() > tensor.nbytes else tensor
-    if isinstance(value, np.ndarray):
-        return _to_plain(torch.from_numpy(np.ascontiguousarray(value)), where)
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, Mapping):
-        return {_to_plain(k, where): _to_plain(v, f"{where}.{k}") for k, v in value.items()}
-    if isinstance(value, (list, tuple)):
-        items = [_to_plain(v, f"{where}[{i}]") for i, v in enumerate(value)]
-        return items if isinstance(value, list) else tuple(items)
-    if isinstance(value, Path):
-        return str(value)
-    for base in (bool, int, float, str):  # enums and other named subclasses
-        if isinstance(value, base):
-            return base(value)
-    raise CheckpointError(
-        f"{where} is a {type(value).__name__}; a checkpoint holds tensors, numbers, strings"
-    )

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from hydra.utils import get_class
 
 from gsparc.models import checkpoint
+from gsparc.models.checkpoint_content import CheckpointError
 from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method, MethodFactory, import_path
 from gsparc.models.per_station import PerStation
@@ -37,15 +38,15 @@ def method_from_checkpoint(stored: checkpoint.StoredModel) -> Method:
         elif stored.target in all_methods().values():
             factory = get_class(stored.target)()
         else:
-            raise checkpoint.CheckpointError(
+            raise CheckpointError(
                 f"{stored.path}: made by {stored.target!r}, which no gsparc or plugin here knows"
             )
         return rebuild_method(factory, stored)
-    except checkpoint.CheckpointError:
+    except CheckpointError:
         raise
     except Exception as error:  # the state comes from a file: anything may be wrong with it
         reason = (str(error).strip() or type(error).__name__).splitlines()[0]
-        raise checkpoint.CheckpointError(
+        raise CheckpointError(
             f"{stored.path}: {stored.method} cannot be restored ({reason})"
         ) from error
 
@@ -85,5 +86,5 @@ def load_module(path: str | Path) -> GaussianModule:
 
     method, stored = load(path)
     if not isinstance(method, LearnedField):
-        raise checkpoint.CheckpointError(f"{path}: {stored.method} holds no Gaussian field")
+        raise CheckpointError(f"{path}: {stored.method} holds no Gaussian field")
     return make_module(method)

@@ -11,9 +11,8 @@ import logging
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import reduce
-from hashlib import sha256
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +22,7 @@ from gsparc.base.errors import Caution, Severe, group_warnings, list_first
 from gsparc.base.executor import run_all, uses_other_processes
 from gsparc.data.ends import NOBODY, SAME_PLACE_M, Ends, station_distances
 from gsparc.data.query import Query
-from gsparc.data.schema import OF_STATION, Measurements, Site
+from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, fitting
@@ -33,8 +32,8 @@ from gsparc.models.fitting import common_label
 from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.powers.own_terms import pool_station_weights
 from gsparc.models.sanity import make_stored
+from gsparc.models.station_sites import UNHEARD, station_site, stations_of_fold, to_station_query
 from gsparc.models.station_views import OneStationView
-from gsparc.models.target_rows import heard_rows
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.stopwatch import Stopwatch
@@ -43,8 +42,6 @@ log = logging.getLogger(__name__)
 
 # Facts of copies that add up, as seconds do; other numbers are averaged.
 COUNTS = ("model/num_gaussians", "model/steps", "model/steps_taken")
-
-UNHEARD = NOBODY  # the copy for all that were never heard
 
 
 def wrap_per_station(factory: MethodFactory, data: Measurements) -> MethodFactory:
@@ -58,52 +55,6 @@ def wrap_per_station(factory: MethodFactory, data: Measurements) -> MethodFactor
     if data.site.paired and not factory.both_ends:
         raise ValueError(f"{factory.name}: both ends move here; it needs one that stands still")
     return factory
-
-
-class StationsOfFold(NamedTuple):
-    """Stations (T,) bool: with training rows enough for a method,
-    and with test rows but without those.
-    """
-
-    learnable: np.ndarray
-    only_tested: np.ndarray
-
-
-def stations_of_fold(method: MethodFactory, data: Measurements, fold: Fold) -> StationsOfFold:
-    """Return which stations `method` can learn, and which it is tested on without."""
-    count = len(data.site.every_station)
-    # Rows where nothing was heard count for a method that learns from their level.
-    rows = fold.train if method.uses_censored else heard_rows(data, fold.train)
-    n_train, n_test = (
-        np.bincount(data.stations_of(some), minlength=count) for some in (rows, fold.test)
-    )
-    return StationsOfFold(n_train >= LEAST_ROWS, (n_test > 0) & (n_train < LEAST_ROWS))
-
-
-def station_site(site: Site, number: int) -> Site:
-    """Return the site as one station sees it; of `UNHEARD`, with both ends moving.
-
-    Its hash is its own, so that nothing kept of one station is taken for another's.
-    """
-    site = replace(site, sha256=sha256(f"{site.sha256} {number}".encode()).hexdigest())
-    if number == UNHEARD:
-        return replace(site, stations=None, static_end=None, static_position=None)
-    stations, hertz = site.every_station, float(site.carriers[number])
-    rotation = site.rx_rotation if stations.rotation is None else stations.rotation[number]
-    place = stations.position[number]
-    array = site.array if stations.array is None else stations.array[number]
-    levels = site.device_levels
-    return replace(
-        site,
-        device_levels=None if levels is None else levels[number : number + 1],
-        name=f"{site.name}{OF_STATION}{stations.shown[number]}",
-        # Which way it looks is a fact of its own
-        stations=None if stations.sector is None else stations.subset(np.array([number])),
-        array=array,
-        carrier_hz=None if np.isnan(hertz) else hertz,
-        static_position=place if np.isfinite(place).all() else None,
-        rx_rotation=rotation,
-    )
 
 
 class PerStation(Method):
@@ -300,7 +251,7 @@ class PerStation(Method):
         for number in stations.unique().tolist():
             chosen, copy = (stations == number).nonzero()[:, 0], self.station_method(number)
             answers.append(
-                (chosen, copy.predict(_to_station_query(copy.fitted_site, query.rows(chosen))))
+                (chosen, copy.predict(to_station_query(copy.fitted_site, query.rows(chosen))))
             )
         # Answers come station by station; `joined` puts them back in the query's order.
         rows, parts = zip(*answers, strict=True)
@@ -425,14 +376,3 @@ def _combine_facts(facts: list[Any], name: str) -> float | int | str | None:
     if isinstance(values[0], str):
         return ", ".join(dict.fromkeys(values))
     return sum(values) if name in COUNTS or name.startswith("time/") else float(np.mean(values))
-
-
-def _to_station_query(site: Site, query: Query) -> Query:
-    """Rows of one station as its copy sees them: one pose where the receiver is the station,
-    no number.
-    """
-    if site.stations is not None:
-        return query
-    # One pose instead of B equal ones: what depends on the receiver alone is computed once.
-    still = site.static_end == "rx" and query.rx.batched
-    return replace(query, rx=query.rx[0] if still else query.rx, station=None)

@@ -21,16 +21,10 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.abilities import HasMembers
 from gsparc.models.baselines.mean import Mean
-from gsparc.models.checkpoint import find_non_finite
+from gsparc.models.checkpoint_content import find_non_finite
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.method import (
-    Method,
-    MethodFactory,
-    Prediction,
-    factors_to_measured,
-    import_path,
-    predict_in_batches,
-)
+from gsparc.models.method import Method, MethodFactory, Prediction, import_path
+from gsparc.models.predicting import factors_to_measured, predict_in_batches
 from gsparc.models.stack import to_real_entries
 from gsparc.models.target_rows import heard_rows
 from gsparc.processes.density import TINY

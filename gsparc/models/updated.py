@@ -18,7 +18,7 @@ from gsparc.data.ends import NOBODY, Ends
 from gsparc.data.query import Query
 from gsparc.data.schema import Site
 from gsparc.models.abilities import AddsLinks, HasProcess
-from gsparc.models.checkpoint import CheckpointError, find_non_finite
+from gsparc.models.checkpoint_content import CheckpointError, find_non_finite
 from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.per_station import PerStation
 from gsparc.models.reduced import View

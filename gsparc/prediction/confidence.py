@@ -21,7 +21,8 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.baselines.gp import kernel_of_targets
-from gsparc.models.method import Prediction, predict_with_threads
+from gsparc.models.method import Prediction
+from gsparc.models.predicting import predict_with_threads
 from gsparc.physics.decibels import from_decibels
 from gsparc.prediction.query import Asked, PlacedQuery
 from gsparc.processes.factor import Factor

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from gsparc.data.schema import Measurements
-from gsparc.models.per_station import station_site
 from gsparc.models.powers.members import foresee_errors
+from gsparc.models.station_sites import station_site
 from gsparc.models.target_rows import power_rows
 
 MANY, FURTHER, LOOKED_AT = 60, 20, 6  # rows of a station from which on nothing is said; stations

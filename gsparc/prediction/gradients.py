@@ -9,7 +9,8 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import End
-from gsparc.models.method import Method, Prediction, suitable_threads
+from gsparc.models.method import Method, Prediction
+from gsparc.models.predicting import suitable_threads
 from gsparc.ops import Pose
 from gsparc.ops.transforms import needs_reference
 from gsparc.prediction.query import PlacedQuery, Queries

@@ -15,7 +15,8 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.units import power_in_decibels
 from gsparc.models.method import MEAN_DEVICE, Method
-from gsparc.models.per_station import UNHEARD, PerStation
+from gsparc.models.per_station import PerStation
+from gsparc.models.station_sites import UNHEARD
 from gsparc.processes.censored import truncated_moments
 from gsparc.processes.stored import Stored, from_plain, to_plain
 from gsparc.tables.links.strongest import StrongestLists, levels_db, strongest_lists

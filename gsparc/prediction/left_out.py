@@ -19,8 +19,10 @@ from gsparc.data.splits import Fold
 from gsparc.models import fitting
 from gsparc.models.abilities import Reconditions
 from gsparc.models.device_offsets import without_devices
-from gsparc.models.method import Method, MethodFactory, Prediction, predict_in_batches
-from gsparc.models.per_station import PerStation, stations_of_fold, wrap_per_station
+from gsparc.models.method import Method, MethodFactory, Prediction
+from gsparc.models.per_station import PerStation, wrap_per_station
+from gsparc.models.predicting import predict_in_batches
+from gsparc.models.station_sites import stations_of_fold
 from gsparc.prediction.confidence import KINDS, Trusted
 from gsparc.prediction.levels import measured_levels, predicted_levels
 from gsparc.processes.uncertainty import censored_distribution

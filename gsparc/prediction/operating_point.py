@@ -194,7 +194,7 @@ def load(
         unit: of powers, like `dBm` or `mW`; None: that of the measurements.
 
     Raises:
-        gsparc.models.checkpoint.CheckpointError: missing, damaged, hostile or newer file.
+        gsparc.models.checkpoint_content.CheckpointError: missing, damaged, hostile or newer file.
         ValueError: nothing is as fast as `budget_ms` (the fastest is named), or no such confidence
             or unit.
     """

@@ -20,8 +20,10 @@ from gsparc.data.target import Kind
 from gsparc.data.units import PowerUnit
 from gsparc.models.abilities import AddsCarriers, HasGaussians
 from gsparc.models.device_offsets import find_device
-from gsparc.models.method import MEAN_DEVICE, Method, Prediction, predict_with_threads
-from gsparc.models.per_station import PerStation, station_site
+from gsparc.models.method import MEAN_DEVICE, Method, Prediction
+from gsparc.models.per_station import PerStation
+from gsparc.models.predicting import predict_with_threads
+from gsparc.models.station_sites import station_site
 from gsparc.models.station_views import AnywhereView
 from gsparc.physics.row_factors import describe_factor
 from gsparc.prediction.confidence import ConfidenceMixin, Trusted

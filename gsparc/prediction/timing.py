@@ -16,7 +16,8 @@ import torch
 
 from gsparc.base.limits import Checked, setting, whole
 from gsparc.data.schema import Measurements
-from gsparc.models.method import Method, predict_with_threads
+from gsparc.models.method import Method
+from gsparc.models.predicting import predict_with_threads
 
 Key = TypeVar("Key")
 Call = Callable[[int], object]

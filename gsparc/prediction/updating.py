@@ -19,8 +19,10 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.station_names import find_station
 from gsparc.data.units import PowerUnit
-from gsparc.models.method import Method, predict_with_threads
-from gsparc.models.per_station import PerStation, station_site
+from gsparc.models.method import Method
+from gsparc.models.per_station import PerStation
+from gsparc.models.predicting import predict_with_threads
+from gsparc.models.station_sites import station_site
 from gsparc.models.station_views import AnywhereView, OneStationView
 from gsparc.models.updated import (
     STORED,

@@ -22,7 +22,8 @@ from torch import Tensor
 
 from gsparc.processes.averages import MeanVariance
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import distances, matern32
+from gsparc.processes.kernel import distances
+from gsparc.processes.matern import matern32
 from gsparc.processes.stored import Stored
 
 ERRORS = 1 / 20  # length of a map's own errors between its rows, as a share of the site

@@ -18,7 +18,8 @@ from gsparc.processes.changes import (
     covariance_by_kind,
 )
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import distances, matern32
+from gsparc.processes.kernel import distances
+from gsparc.processes.matern import matern32
 
 UNSEEN, RARE = 0.1, 1e-12  # rows that a share of none counts as; least probability of a row
 TOLD = 16  # earlier rows that tell of the next one

@@ -17,20 +17,13 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split, hash_indices
 from gsparc.datasets.datamodule import DataModule
 from gsparc.datasets.load import answerable, datamodule, split_for
-from gsparc.evaluation.scores import rows_to_score
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
 from gsparc.models.registry import build
-from gsparc.prediction import risk
 from gsparc.prediction.confidence import (
-    Guarantee,
-    Trusted,
-    calibrated_box,
-    confidence_threshold,
     read_trusted,
-    store_trusted,
 )
-from gsparc.prediction.left_out import Evidence, Learned, gather_evidence
+from gsparc.prediction.left_out import Learned
 from gsparc.prediction.predictor import Predictor
 from gsparc.runs.align_site import align_to_site
 from gsparc.runs.evaluate import dataset_facts, split_facts
@@ -366,91 +359,3 @@ def _trained(
     except (ValueError, OSError):
         return None
     return None if were_trained_on(stored, before) is False else (data, before)
-
-
-@dataclass(frozen=True)
-class Unseen:
-    """A checkpoint with evidence of its own test rows:
-    a bound holds for rows that nothing was chosen on.
-
-    Attributes:
-        path: of the file.
-        facts: see `Opened.facts`.
-        earlier: what the file holds of its confidence.
-        rivals: by what the model learned from.
-        evidence: of the test rows.
-    """
-
-    path: str
-    facts: dict[str, Any]
-    earlier: Trusted
-    rivals: Trusted
-    evidence: Evidence
-
-    @staticmethod
-    def open(path: str, dataset: Mapping[str, Any], split: Mapping[str, Any]) -> Unseen:
-        """Ask a checkpoint about its test rows; see `open_run`.
-
-        Raises:
-            ValueError: it may have learned from some of them, so that no promise would hold.
-        """
-        run = open_run(path, dataset).read(split, others_whole=True)
-        if run.learned != 0:
-            advice = "calibrate with the data and split of its training"
-            raise ValueError(f"{path} was trained on {run.foreign}; {advice}")
-        learned_data, before = run.trained or (run.data, run.split)
-        rivals = Trusted.from_fold(learned_data, before.folds[0])
-        rows = rows_to_score(run.split.folds[0], "test")
-        evidence = gather_evidence(run.methods[0], run.data, rows, rivals)
-        return Unseen(path, run.facts(), read_trusted(run.stored[0].extra), rivals, evidence)
-
-    def calibrate_and_store(
-        self, guarantee: Guarantee, kind: str, spatial: bool, seed: int, failed: float | None = None
-    ) -> tuple[Trusted, str]:
-        """Choose a confidence and its threshold, keep them with the model,
-        return them and how it went; `failed` as in `Trusted`.
-        """
-        evidence, how = self.evidence, (kind, spatial, seed)
-        kind_used, choice, _, choose_on = risk.calibrate_threshold(
-            evidence, guarantee, *how, tested=False
-        )
-        threshold = confidence_threshold(kind_used, choice)
-        box = calibrated_box(self.rivals.known, evidence.position)
-        stored = replace(
-            self.rivals,
-            kind=kind_used,
-            threshold=threshold,
-            promise=guarantee,
-            box=box,
-            failed=failed,
-        )
-        before = self.earlier.kind or "the model's own"
-        # Programs that read confidences get another number from now on: it is said.
-        why = f", {risk.explain_kind(evidence, choose_on)}" if kind == "auto" else ""
-        kind_changed = f"confidence={kind_used}{why}, before: {before}; "
-        if kind == "auto" and not np.isfinite(threshold):
-            # Without a promise a choice by chance would replace what falls away
-            # from the measurements.
-            stored, kind_changed = (
-                self.earlier,
-                (f"confidence stays {before}, the checkpoint is unchanged; "),
-            )
-        else:
-            store_trusted(self.path, stored)
-        if np.isfinite(threshold):
-            share = np.mean(evidence.scores[kind_used] >= choice.value)
-            of = (
-                f"at most {guarantee.alpha:.0%} of the accepted are worse than "
-                f"{guarantee.limit_db:g} dB"
-            )
-            from_there = (
-                f"accepted from {threshold:.4g}, {share:.0%} of {len(evidence)} test positions"
-            )
-            of += (
-                f", which fails in at most {guarantee.delta:.0%} of cases; threshold stored in "
-                f"{self.path}"
-            )
-            return stored, f"{kind_changed}{from_there}: {of}"
-        return stored, f"{kind_changed}no threshold keeps the promise: " + risk.explain_none(
-            evidence, guarantee, *how
-        )

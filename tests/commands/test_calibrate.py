@@ -26,7 +26,7 @@ from gsparc.prediction.risk import (
     split_choose_calibrate_test,
 )
 from gsparc.processes.uncertainty import least_accepted
-from gsparc.runs.open_runs import Unseen
+from gsparc.runs.unseen import Unseen
 
 
 def _evidence(count: int = 900, seed: int = 0) -> Evidence:

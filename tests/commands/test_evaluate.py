@@ -22,6 +22,7 @@ from gsparc.datasets.public.fetch import MIRROR
 from gsparc.evaluation.console import ConsoleHandler
 from gsparc.evaluation.summary import remarks
 from gsparc.models import checkpoint, loading
+from gsparc.models.checkpoint_content import CheckpointError
 
 
 @pytest.fixture(scope="module")
@@ -143,7 +144,7 @@ def test_evaluate_took_no_settings_of_the_data(tmp_path):
 def test_the_traceback_comes_when_asked_for(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["evaluate", f"hydra.run.dir={tmp_path}", "ckpt=none.ckpt"])
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
-    with pytest.raises(checkpoint.CheckpointError, match="no such checkpoint"):
+    with pytest.raises(CheckpointError, match="no such checkpoint"):
         COMMANDS["evaluate"].run()
 
 

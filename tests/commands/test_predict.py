@@ -19,7 +19,7 @@ from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
-from gsparc.prediction.answers import predict_file
+from gsparc.prediction.answer_files import predict_file
 from gsparc.prediction.left_out import HeldOutLevels
 from gsparc.runs.align_site import align_to_site
 from gsparc.tables.own import from_arrays

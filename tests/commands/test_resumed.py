@@ -20,6 +20,7 @@ from gsparc.datasets.datamodule import Loaded
 from gsparc.datasets.load import datamodule
 from gsparc.datasets.load import load as load_data
 from gsparc.models import checkpoint, fitting
+from gsparc.models.checkpoint_content import CheckpointError
 from gsparc.models.fitting import Origin
 from gsparc.models.loading import load_module
 from gsparc.training.context import FitContext
@@ -212,7 +213,7 @@ def test_the_module_of_a_checkpoint_predicts_what_gsparc_load_does(name, spectra
 
 
 def test_a_method_without_a_field_has_no_module(others):
-    with pytest.raises(checkpoint.CheckpointError, match="nearest holds no Gaussian field"):
+    with pytest.raises(CheckpointError, match="nearest holds no Gaussian field"):
         load_module(others["nearest"])
 
 

@@ -21,6 +21,7 @@ from told import CLIENTS, Soak
 import gsparc
 from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
+from gsparc.models.checkpoint_content import FORMAT
 from gsparc.prediction.updating import versions_extra
 
 SOAK_S = int(os.environ.get("GSPARC_SOAK_S", "15"))
@@ -184,7 +185,7 @@ def test_a_kill_leaves_a_whole_file(before, tmp_path):
         rows = len(gsparc.load(out).rows)
         assert rows >= kept
         kept = rows
-    assert kept > 0 and torch.load(out, weights_only=True)["format"] == checkpoint.FORMAT
+    assert kept > 0 and torch.load(out, weights_only=True)["format"] == FORMAT
 
 
 def test_lists_of_the_strongest_raised_all_levels(tmp_path):

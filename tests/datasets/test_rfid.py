@@ -9,7 +9,7 @@ from releases import release
 
 from gsparc.datasets.load import load, split_for
 from gsparc.datasets.rfid import WAVELENGTH, load_rfid, planar_array
-from gsparc.models.per_station import station_site
+from gsparc.models.station_sites import station_site
 
 
 def test_tiny_folder(rfid_folder):

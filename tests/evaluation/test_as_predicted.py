@@ -13,7 +13,7 @@ from gsparc.data.splits import Fold, Split
 from gsparc.models import checkpoint, fitting
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
-from gsparc.prediction.answers import predict_file
+from gsparc.prediction.answer_files import predict_file
 from gsparc.prediction.hearing import Hearing
 from gsparc.prediction.operating_point import load
 from gsparc.runs.align_site import align_to_site

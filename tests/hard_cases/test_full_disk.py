@@ -11,7 +11,7 @@ import pytest
 from crashes import Limited
 
 from gsparc.models import checkpoint
-from gsparc.models.checkpoint import CheckpointError
+from gsparc.models.checkpoint_content import CheckpointError
 from gsparc.training.context import FitContext
 
 

@@ -21,7 +21,7 @@ from gsparc.base.instantiate import import_target
 from gsparc.datasets.own import Own
 from gsparc.models import checkpoint, loading
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.checkpoint import CheckpointError
+from gsparc.models.checkpoint_content import CheckpointError
 from gsparc.training.context import FitContext
 
 refused = partial(refused_as, CheckpointError)

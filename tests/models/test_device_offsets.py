@@ -12,7 +12,7 @@ import torch
 import gsparc
 from gsparc.data.splits import Fold
 from gsparc.models.device_offsets import take_off_devices, without_devices
-from gsparc.prediction.answers import predict_file
+from gsparc.prediction.answer_files import predict_file
 from gsparc.tables.own import from_arrays
 
 RNG = np.random.default_rng(5)

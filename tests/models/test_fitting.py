@@ -11,7 +11,8 @@ from scenes import fold_of
 from gsparc.base import executor
 from gsparc.models import fitting
 from gsparc.models.baselines.nearest import Nearest
-from gsparc.models.per_station import PerStation, station_site
+from gsparc.models.per_station import PerStation
+from gsparc.models.station_sites import station_site
 from gsparc.training.context import FitContext
 
 

@@ -17,8 +17,9 @@ from gsparc.datasets.load import split_for
 from gsparc.evaluation.scores import score_methods
 from gsparc.models import checkpoint, loading, per_station
 from gsparc.models.fitting import fit_or_resume
-from gsparc.models.per_station import PerStation, station_site, stations_of_fold, wrap_per_station
+from gsparc.models.per_station import PerStation, wrap_per_station
 from gsparc.models.registry import method_class
+from gsparc.models.station_sites import station_site, stations_of_fold
 from gsparc.prediction.timing import ClockSettings
 from gsparc.runs.baselines import baselines_for
 from gsparc.runs.evaluate import evaluate

@@ -20,7 +20,7 @@ from gsparc.prediction.confidence import (
 )
 from gsparc.prediction.left_out import gather_evidence
 from gsparc.processes.kernel import WhiteNoise
-from gsparc.runs.open_runs import Unseen
+from gsparc.runs.unseen import Unseen
 from gsparc.training.context import FitContext
 
 

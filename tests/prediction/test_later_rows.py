@@ -9,7 +9,7 @@ from rooms_later import PLACES, SCREENED, levels
 
 import gsparc
 from gsparc.models import checkpoint
-from gsparc.models.checkpoint import CheckpointError
+from gsparc.models.checkpoint_content import CheckpointError
 from gsparc.prediction.later_rows import ABOVE_DB
 from gsparc.prediction.updating import ToldBefore, versions_extra
 

@@ -47,7 +47,7 @@ from gsparc.apps.export.wire import (
 )
 from gsparc.base.files import is_out_of_space, list_causes
 from gsparc.base.limits import Checked, SettingError, number, setting, whole
-from gsparc.models.checkpoint import CheckpointError
+from gsparc.models.checkpoint_content import CheckpointError
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.updating import ToldBefore
 

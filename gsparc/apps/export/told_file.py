@@ -9,6 +9,7 @@ from typing import Any
 
 from gsparc.data.schema import Site
 from gsparc.models import checkpoint
+from gsparc.models.checkpoint_content import CheckpointError
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.updating import Found, versions_extra
 
@@ -50,7 +51,7 @@ class ToldFile:
                     other = (
                         f"{self.path}: holds a model of other stations now; start the server again"
                     )
-                    raise checkpoint.CheckpointError(other)
+                    raise CheckpointError(other)
             answer = told.update(**rows)
             file.store(versions_extra(told.versions))
         self._sha256 = file.stored.sha256

@@ -14,7 +14,7 @@ from gsparc.data.moments import number_moments
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.target import Kind
-from gsparc.models.method import predict_with_threads
+from gsparc.models.predicting import predict_with_threads
 from gsparc.prediction.predictor import Predictor
 
 # About as many of a spectrum are compared: an array's have far fewer degrees of freedom

@@ -15,8 +15,9 @@ from torch import Tensor
 
 from gsparc.data.ends import SAME_PLACE_M
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import distances, matern32
+from gsparc.processes.kernel import distances
 from gsparc.processes.left_out import LeftOutErrors, left_out_residuals
+from gsparc.processes.matern import matern32
 from gsparc.processes.stored import Stored
 
 LENGTHS = (0.1, 0.2, 0.4, 0.8)  # of the site's diagonal, that are tried

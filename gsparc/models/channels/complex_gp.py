@@ -29,8 +29,8 @@ from gsparc.data.splits import Fold
 from gsparc.models.channels.columns import Group, Slot, fit_run_factors, negative_log_likelihood
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Prediction
-from gsparc.models.per_station import stations_of_fold
 from gsparc.models.run_factors import RunFactors
+from gsparc.models.station_sites import stations_of_fold
 from gsparc.processes.averages import mean_at_places
 from gsparc.processes.density import TINY
 from gsparc.processes.few_rows import covering_rows

@@ -24,11 +24,12 @@ from gsparc.models.directional.visibility import VisibilityGP
 from gsparc.models.image_sources.gp_likelihood import condition_with_noise
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import spherical_waves
-from gsparc.models.method import to_double
+from gsparc.models.predicting import to_double
 from gsparc.physics.waves import point_wave, ranges
 from gsparc.processes.conditioned import Conditioned
-from gsparc.processes.kernel import distances, matern32_of_squares
+from gsparc.processes.kernel import distances
 from gsparc.processes.left_out import rows_of_groups
+from gsparc.processes.matern import matern32_of_squares
 
 CONSTANTS = (0.9, 0.97, 0.995)  # share of a gain's variance that is the same everywhere
 LENGTHS_M = (0.5, 2.0)  # over which the rest of it varies

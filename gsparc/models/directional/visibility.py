@@ -16,8 +16,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.processes.kernel import distances, matern32_of_squares
+from gsparc.processes.kernel import distances
 from gsparc.processes.left_out import left_out_residuals as residuals
+from gsparc.processes.matern import matern32_of_squares
 
 LENGTHS_M = tuple(0.05 * 2.0 ** np.arange(7))  # candidates for every source
 NOISES = (0.03, 0.1, 0.3, 1.0)  # candidates, in units of the process's variance

@@ -29,7 +29,7 @@ from torch import Tensor
 
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import JITTER, SourceScene
-from gsparc.models.method import to_double
+from gsparc.models.predicting import to_double
 from gsparc.processes.conditioned import Conditioned
 
 

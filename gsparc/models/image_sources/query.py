@@ -16,7 +16,7 @@ from gsparc.models.closed_form import Moments
 from gsparc.models.image_sources.gp_likelihood import GainPosterior, quadrature_variances
 from gsparc.models.image_sources.rows import ranges_at
 from gsparc.models.image_sources.scene import unit_vectors
-from gsparc.models.method import to_double
+from gsparc.models.predicting import to_double
 from gsparc.physics.mirror_planes import image_rotations
 from gsparc.physics.waves import wave_over_band
 from gsparc.processes.few_rows import evenly_spaced

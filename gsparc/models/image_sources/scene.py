@@ -17,7 +17,7 @@ from gsparc.models.image_sources.clutter.unfold import Unfolding
 from gsparc.models.image_sources.rows import Rows
 from gsparc.physics.mirror_planes import NO_PLANES, Reflections, all_sequences, images
 from gsparc.physics.waves import point_wave, ranges
-from gsparc.processes.kernel import matern32_of_squares
+from gsparc.processes.matern import matern32_of_squares
 from gsparc.processes.places import first_end
 
 BETAS = 0.8, 0.95  # decay rates of Adam's moments: of tens of steps, not its usual thousand

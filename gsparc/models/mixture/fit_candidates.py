@@ -17,8 +17,8 @@ from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.ensemble import reached_noise_floor
-from gsparc.models.method import factors_to_measured
 from gsparc.models.mixture.candidates import Candidate
+from gsparc.models.predicting import factors_to_measured
 from gsparc.models.stack import LEAST_HELD, error_products, to_real_entries, weigh
 from gsparc.models.terms import EffectSettings
 from gsparc.physics.decibels import TINY_POWER

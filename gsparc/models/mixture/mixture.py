@@ -26,10 +26,11 @@ from gsparc.models.abilities import HasPaths, HasProcess, QueryPaths
 from gsparc.models.channels.initial import estimate_run_factors
 from gsparc.models.closed_form import ClosedForm, LeftOutRows, method_from_state, method_state
 from gsparc.models.image_sources.frame import merge_equal_paths
-from gsparc.models.method import Method, Prediction, factors_to_measured
+from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture import fit_candidates
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.mixture.each_or_together import LearnsTogether
+from gsparc.models.predicting import factors_to_measured
 from gsparc.models.reduced import View
 from gsparc.models.refined_places import move_rows, position_errors, refine_places
 from gsparc.models.run_factors import RunFactors

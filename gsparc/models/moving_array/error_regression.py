@@ -16,7 +16,8 @@ from torch import Tensor
 
 from gsparc.models.relative_error import LEAST_ERROR, RelativeErrorRegression
 from gsparc.processes.factor import Factor
-from gsparc.processes.kernel import Kernel, matern32
+from gsparc.processes.kernel import Kernel
+from gsparc.processes.matern import matern32
 from gsparc.processes.neighbourhood import rows_with_nearest
 from gsparc.processes.stored import Stored
 

@@ -19,7 +19,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.method import Prediction, to_double
+from gsparc.models.method import Prediction
 from gsparc.models.moving_array.error_regression import fit_errors, image_features
 from gsparc.models.moving_array.power_gp import PowerTrend, TrendSettings, fit_trend
 from gsparc.models.moving_array.query import ImageRenderer, ReceivingArray, reduce_moving_array
@@ -31,6 +31,7 @@ from gsparc.models.moving_array.triangulate import (
     nonnegative_powers,
     site_problem,
 )
+from gsparc.models.predicting import to_double
 from gsparc.models.target_rows import heard_rows, training_targets
 from gsparc.physics.lags import BLOCK, SpectrumLags, pixel_exponent
 from gsparc.physics.separable import Separable, fit_separable

@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from gsparc.data.query import Query
-from gsparc.models.method import Method, Prediction, to_double
+from gsparc.models.method import Method, Prediction
 from gsparc.models.moving_array.power_gp import PowerTrend
 from gsparc.models.moving_array.residual import Residual
 from gsparc.models.moving_array.triangulate import bearings, sum_lags
+from gsparc.models.predicting import to_double
 from gsparc.models.reduced import Interpolated, Settings, View
 from gsparc.ops.transforms import is_differentiated
 from gsparc.physics.lags import SpectrumLags

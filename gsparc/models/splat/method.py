@@ -33,7 +33,8 @@ from gsparc.field.response import ResponseSettings
 from gsparc.models import checkpoint
 from gsparc.models.checkpoint import StoredModel, read_interrupted
 from gsparc.models.fitting import Origin
-from gsparc.models.method import Method, Prediction, to_double
+from gsparc.models.method import Method, Prediction
+from gsparc.models.predicting import to_double
 from gsparc.models.splat import reduce
 from gsparc.models.splat.auto_settings import Choices, apply_choices, resolve_auto
 from gsparc.models.splat.closed_form_start import start_in_closed_form

@@ -16,7 +16,7 @@ from gsparc.apps.locate import locate
 from gsparc.apps.locate.search import Trust
 from gsparc.apps.locate.snapshots import SiteField
 from gsparc.models import checkpoint
-from gsparc.models.method import predict_with_threads
+from gsparc.models.predicting import predict_with_threads
 
 
 @pytest.fixture(scope="module")

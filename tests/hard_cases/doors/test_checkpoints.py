@@ -23,7 +23,7 @@ from doors import assert_refused, knock
 import gsparc
 from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
-from gsparc.models.checkpoint import CheckpointError
+from gsparc.models.checkpoint_content import CheckpointError
 from gsparc.models.registry import build
 from gsparc.training.context import FitContext
 

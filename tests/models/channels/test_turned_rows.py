@@ -14,7 +14,7 @@ from gsparc.models.aligned_rows import align_phases
 from gsparc.models.channels.complex_gp import ComplexGP
 from gsparc.models.channels.turned_rows import TurnedNeighbours
 from gsparc.models.gsparc import Gsparc
-from gsparc.models.method import factors_to_measured
+from gsparc.models.predicting import factors_to_measured
 from gsparc.physics.row_factors import align_factors
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext

@@ -11,7 +11,7 @@ from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.query import EnsembleMeans
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import KernelVisibility, SourceScene, spherical_waves
-from gsparc.processes.kernel import matern32_of_squares
+from gsparc.processes.matern import matern32_of_squares
 
 COUNT = 24
 

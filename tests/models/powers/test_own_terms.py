@@ -17,7 +17,7 @@ import gsparc
 from gsparc.commands.listing import COMMANDS
 from gsparc.evaluation.summary import describe_model
 from gsparc.models import checkpoint
-from gsparc.models.checkpoint import CheckpointError
+from gsparc.models.checkpoint_content import CheckpointError
 from gsparc.models.powers import own_terms
 from gsparc.models.registry import build
 from gsparc.processes import stored, term, trend

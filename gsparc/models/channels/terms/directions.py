@@ -19,8 +19,9 @@ from gsparc.models.channels.columns import Slot, SlotPlaces
 from gsparc.models.channels.kernels import directional_correlation
 from gsparc.models.channels.terms.compressed import Basis
 from gsparc.models.channels.terms.term import HIGHEST, ChannelTerm
-from gsparc.processes.kernel import distances, matern32
+from gsparc.processes.kernel import distances
 from gsparc.processes.left_out import ENTRIES
+from gsparc.processes.matern import matern32
 
 HALF = 0.25  # length of the mean of directions from which they are of a half sphere
 TILTED = 0.5  # pull of logarithms of factors towards ends to 0: a prior of standard deviation 1

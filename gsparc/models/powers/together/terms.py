@@ -21,7 +21,8 @@ from gsparc.models.baselines.distance_law import locate_still_end, say_estimated
 from gsparc.models.target_rows import power_rows
 from gsparc.processes.factor import Factor
 from gsparc.processes.few_rows import draw_places, first_rows, shuffle_groups
-from gsparc.processes.kernel import distances, matern32
+from gsparc.processes.kernel import distances
+from gsparc.processes.matern import matern32
 from gsparc.processes.nearest import JITTER
 from gsparc.processes.places import NO_PLACES, first_end
 from gsparc.processes.powers import PowerRows

@@ -22,7 +22,7 @@ from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.links import LinkPriors, links_of_others
 from gsparc.models.powers.together.terms import places_and_notes, rows_of_stations
 from gsparc.ops import Pose
-from gsparc.prediction.answers import predict_file
+from gsparc.prediction.answer_files import predict_file
 from gsparc.prediction.predictor import Predictor
 from gsparc.processes.powers import PowerRows
 from gsparc.tables.own import from_arrays
