@@ -27,7 +27,8 @@ from gsparc.data.schema import LIGHT
 from gsparc.datasets.rfid import planar_array
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.llvm import prepare_llvm
-from gsparc.simulate.raytracer import RayTracer, Sampling
+from gsparc.simulate.raytracer import RayTracer
+from gsparc.simulate.sampling import Sampling
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.solid import Solid, box
 from gsparc.simulate.scenes.transmitters import Antenna

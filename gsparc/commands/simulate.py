@@ -20,8 +20,8 @@ from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.effects import from_config as effects_from_config
-from gsparc.simulate.raytracer import Sampling
 from gsparc.simulate.report import choice_table, closing_sentences, summary_facts
+from gsparc.simulate.sampling import Sampling
 from gsparc.simulate.scenes.settings import from_config as scene_from_config
 from gsparc.simulate.scenes.solid import write_walls
 from gsparc.simulate.settings import CampaignSettings

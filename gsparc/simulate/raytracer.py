@@ -10,10 +10,9 @@ receivers inside objects.
 from __future__ import annotations
 
 import logging
-import math
 from collections.abc import Iterator, Sequence
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -23,11 +22,13 @@ import torch
 
 from gsparc.data.schema import LIGHT
 from gsparc.simulate import llvm
-from gsparc.simulate.effects import DIFFRACTION, EDGE, Effects
+from gsparc.simulate.effects import Effects
 from gsparc.simulate.loading import load_scene
 from gsparc.simulate.paths import TracedPaths, join_receivers
+from gsparc.simulate.sampling import Sampling, divide_into_calls
 from gsparc.simulate.scenes.solid import Solid
 from gsparc.simulate.scenes.transmitters import ISOTROPIC, Antenna
+from gsparc.simulate.solver_paths import collect_paths
 from gsparc.simulate.survey import TracingEngine
 
 log = logging.getLogger(__name__)
@@ -38,26 +39,6 @@ CANDIDATES_PER_RECEIVER = 20_000
 HASHES = 64_000_000
 GROUND_LEVEL = 0.7  # least share of the ground's area that is level
 LARGEST_BUFFER = 8_000_000  # candidates of one call; about 300 bytes each
-
-
-@dataclass(frozen=True)
-class Sampling:
-    """Effort of the solver.
-
-    Attributes:
-        samples: rays per call; the convergence error falls with it.
-        batch: receivers of one call.
-        seed: of the rays; one for all batches, because receivers share candidate paths.
-    """
-
-    samples: int = 300_000
-    batch: int = 200
-    seed: int = 1
-
-    @property
-    def part(self) -> int:
-        """Receivers of a call of fewer than a batch."""
-        return math.ceil(self.batch / 3)
 
 
 class RayTracer(TracingEngine):
@@ -164,7 +145,7 @@ class RayTracer(TracingEngine):
             solved = self.trace_in_batches(filled, effects, seed)
             ports = 2 if effects.polarisation else 1
             part = join_receivers(
-                [_collect(solution, number, ports) for solution, number in solved]
+                [collect_paths(solution, number, ports) for solution, number in solved]
             )
             parts.append(part.select_receivers(np.arange(count)))
             first += count
@@ -392,56 +373,3 @@ def _lattice(points: int) -> Any:
     lattice = fibonacci_lattice(points)
     dr.eval(lattice)
     return lattice
-
-
-def divide_into_calls(receivers: int, batch: int) -> list[tuple[int, int]]:
-    """Divide receivers into calls, each filled up to a batch, a third of one; of few a ninth ..."""
-    size, whole = Sampling(batch=batch).part, receivers // batch if receivers > batch else 0
-    while size > 1 and math.ceil(size / 3) >= receivers:
-        size = math.ceil(size / 3)
-    rest = receivers - whole * batch
-    if whole and rest > 2 * size:
-        return [*[(batch, batch)] * whole, (rest, batch)]
-    return [
-        *[(batch, batch)] * whole,
-        *((min(size, rest - at), size) for at in range(0, rest, size)),
-    ]
-
-
-def _collect(solution: Any, receivers: int, ports: int) -> TracedPaths:
-    """The solver's flat buffer, sorted; its padded public arrays would need receivers x longest
-    list.
-    """
-    buffer = solution._paths_buffer
-    owner = buffer.target_indices.numpy().astype(np.int64)
-    if not len(owner):  # nothing is heard anywhere: the solver has made no gains either
-        return TracedPaths.from_unsorted(
-            receivers,
-            owner,
-            np.zeros((0, ports), np.complex64),
-            np.zeros(0),
-            np.zeros((0, 3), np.float32),
-            *np.zeros((2, 0), np.uint8),
-        )
-    gain = np.stack([part[0].numpy() for part in buffer.a], axis=1).astype(np.complex64)
-    delay = buffer.tau.numpy().astype(np.float64)
-    kinds = buffer.interaction_types.numpy().astype(np.uint8).reshape(len(owner), -1)
-    edge = np.zeros(len(owner), dtype=bool)
-    if buffer.diffracting_wedges is not None:
-        wedges = buffer.diffracting_wedges
-        # A free edge has the same triangle on both sides.
-        edge = wedges.prim0.numpy() == wedges.primn.numpy()
-    kinds = np.where(edge[:, None] & (kinds == DIFFRACTION), EDGE, kinds).astype(np.uint8)
-    mechanisms = (
-        np.bitwise_or.reduce(kinds, axis=1) if kinds.shape[1] else np.zeros(len(owner), np.uint8)
-    )
-    order = (kinds > 0).sum(1).astype(np.uint8)
-    direction = buffer.k_rx.numpy().T.astype(np.float32).reshape(len(owner), 3)
-    direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
-    sight = np.bincount(owner[order == 0], minlength=receivers)
-    if len(sight) and sight.max() > 1:
-        row = int(sight.argmax())
-        raise RuntimeError(
-            f"receiver {row} of a batch has {sight[row]} lines of sight, one at most is true"
-        )
-    return TracedPaths.from_unsorted(receivers, owner, gain, delay, direction, mechanisms, order)

@@ -9,7 +9,7 @@ from pathlib import Path
 from gsparc.base.limits import Checked, choice, setting, whole
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.effects import Effects
-from gsparc.simulate.raytracer import Sampling
+from gsparc.simulate.sampling import Sampling
 from gsparc.simulate.scenes.settings import SceneSettings
 from gsparc.simulate.spectrum import ArraySettings, SpectrumSettings
 

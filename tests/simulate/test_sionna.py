@@ -12,7 +12,8 @@ from gsparc.datasets.load import load
 from gsparc.simulate import llvm, raytracer
 from gsparc.simulate.campaign import simulate
 from gsparc.simulate.effects import BITS, Effects
-from gsparc.simulate.raytracer import RayTracer, Sampling
+from gsparc.simulate.raytracer import RayTracer
+from gsparc.simulate.sampling import Sampling, divide_into_calls
 from gsparc.simulate.scenes.build import build_survey
 from gsparc.simulate.scenes.conference import conference_room
 from gsparc.simulate.scenes.receivers import draw_places, stands_clear_of
@@ -161,7 +162,7 @@ def test_chains_share_no_hash(places):
 
 def test_calls_have_one_of_few_sizes():
     for receivers in range(1, 402):
-        parts = raytracer.divide_into_calls(receivers, 200)
+        parts = divide_into_calls(receivers, 200)
         assert sum(count for count, _ in parts) == receivers
         assert all(count <= size and size in (1, 3, 8, 23, 67, 200) for count, size in parts)
 

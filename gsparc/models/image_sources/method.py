@@ -28,12 +28,11 @@ from gsparc.models.image_sources.frame import (
     require_static_phase,
 )
 from gsparc.models.image_sources.gp_likelihood import GainPosterior
+from gsparc.models.image_sources.offsets import remove_offsets
 from gsparc.models.image_sources.query import VARIANCE_ROWS, EnsembleMeans
 from gsparc.models.image_sources.refine import POLISHING_STEPS
 from gsparc.models.image_sources.rows import (
     Rows,
-    measured_places,
-    ranges_at,
     rows_of_measurements,
     static_array,
 )
@@ -41,9 +40,9 @@ from gsparc.models.image_sources.scene import JITTER, SourceScene
 from gsparc.models.image_sources.search import Found, SearchSettings
 from gsparc.models.method import Method
 from gsparc.models.reduced import MeanOnly, Settings
-from gsparc.physics.mirror_planes import hesse_form, image_rotations
-from gsparc.physics.row_factors import UnknownFactor, align_factors
-from gsparc.physics.waves import point_wave, wave_over_band
+from gsparc.physics.mirror_planes import hesse_form
+from gsparc.physics.row_factors import UnknownFactor
+from gsparc.physics.waves import point_wave
 from gsparc.processes.averages import mixture_moments
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.effort import Effort
@@ -295,7 +294,9 @@ class ImageSourceGP(SourcesInFrame):
     def _align_offsets(self, data: Measurements, known: np.ndarray, effort: Effort) -> Measurements:
         """Estimate offsets against the line of sight, then against more and more sources."""
         direct = SourceScene.from_static_end(self._transmitter_in_frame(), torch.zeros(1))
-        aligned = self._remove_offsets(data, known, direct, torch.ones(1, self.frame.antennas))
+        free: UnknownFactor = "phase" if self.settings.offsets == "phase" else "phase+delay"
+        remove = partial(remove_offsets, middle=self.frame.middle, free=free)
+        aligned = remove(data, known, direct, torch.ones(1, self.frame.antennas))
         for sources in ALIGNMENT_SOURCES:
             few = replace(
                 self.settings, max_sources=sources, final_steps=POLISHING_STEPS, clutter=False
@@ -304,36 +305,8 @@ class ImageSourceGP(SourcesInFrame):
             scene = self._run_searches([rows], few, effort)[0].scene
             for _ in range(ALIGNMENT_ROUNDS):
                 gains = GainPosterior(self._draw_search_rows(aligned, known, 0), scene).mean_gains
-                aligned = self._remove_offsets(data, known, scene, gains)
+                aligned = remove(data, known, scene, gains)
         return aligned
-
-    def _remove_offsets(
-        self, data: Measurements, known: np.ndarray, scene: SourceScene, gains: Tensor
-    ) -> Measurements:
-        """Targets of the known rows without their offsets against a scene's sources
-        of constant gains.
-        """
-        frequency = data.site.tones()
-        places, turned = (
-            measured_places(data, known),
-            image_rotations(scene.planes, scene.sequences),
-        )
-        away = ranges_at(places.flatten(0, 1), scene.sources + self.frame.middle, turned)
-        waves = wave_over_band(away, torch.from_numpy(frequency))
-        # Antennas of known places share the gains; those of unknown ones each have their own.
-        if gains.shape[1] == 1 or places.shape[1] > 1:
-            gains = gains[:, :1]
-        summed = torch.einsum("mkf,kr->mrf", waves, gains.to(waves.dtype))
-        predicted = summed.reshape(len(known), -1, len(frequency)).numpy()
-        measured = (
-            data.target[known] if data.mask is None else np.where(data.mask, data.target, 0)[known]
-        )
-        free: UnknownFactor = "phase" if self.settings.offsets == "phase" else "phase+delay"
-        target = data.target.copy()
-        target[known] *= align_factors(measured, predicted, frequency, free)[:, None].astype(
-            target.dtype
-        )
-        return replace(data, target=target)
 
     def _predict_normalised(self, places: Tensor, tones: Tensor, float64: bool) -> Moments:
         """See `SourcesInFrame`; the variance is the posterior's plus that of the ensemble."""

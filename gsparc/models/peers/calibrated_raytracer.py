@@ -33,7 +33,8 @@ from gsparc.simulate.calibration import (
 )
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import TracedPaths
-from gsparc.simulate.raytracer import RayTracer, Sampling
+from gsparc.simulate.raytracer import RayTracer
+from gsparc.simulate.sampling import Sampling
 from gsparc.simulate.scenes.build import known_scene, load_tracer
 from gsparc.simulate.scenes.settings import from_config
 from gsparc.training.context import FitContext, FitReport

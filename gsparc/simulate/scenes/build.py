@@ -15,7 +15,8 @@ from gsparc.base.instantiate import from_settings
 from gsparc.data.ends import SAME_PLACE_M
 from gsparc.data.georeference import Georeference
 from gsparc.data.walls import SIZE, RoomSettings
-from gsparc.simulate.raytracer import RayTracer, Sampling
+from gsparc.simulate.raytracer import RayTracer
+from gsparc.simulate.sampling import Sampling
 from gsparc.simulate.scenes.osm import Town, read_town
 from gsparc.simulate.scenes.receivers import Ground, place_receivers, stands_clear_of
 from gsparc.simulate.scenes.settings import (

@@ -24,7 +24,8 @@ from gsparc.simulate.calibration import (
     used_materials,
 )
 from gsparc.simulate.effects import Effects
-from gsparc.simulate.raytracer import RayTracer, Sampling
+from gsparc.simulate.raytracer import RayTracer
+from gsparc.simulate.sampling import Sampling
 from gsparc.simulate.scenes.settings import SceneSettings
 from gsparc.tables.own import from_arrays
 from gsparc.training.context import FitContext
