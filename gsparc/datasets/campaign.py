@@ -26,8 +26,7 @@ from gsparc.tables.advice import run_warnings
 from gsparc.tables.arrays import Raw, numbered_rows, rename_arrays
 from gsparc.tables.checks.conventions import convention_warnings
 from gsparc.tables.checks.level_steps import LevelStep, LinkLevels, find_level_steps, link_levels
-from gsparc.tables.checks.plausibility import sanity_warnings
-from gsparc.tables.checks.unit_warnings import unit_warnings
+from gsparc.tables.checks.plausibility import sanity_warnings, unit_warnings
 from gsparc.tables.own import interpret
 from gsparc.tables.own_checks import Checker
 from gsparc.tables.raw import read_raw

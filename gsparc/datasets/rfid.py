@@ -39,8 +39,7 @@ from gsparc.data.spacing import number_places
 from gsparc.datasets.campaign import Release, read_split
 from gsparc.ops import SphereGrid
 from gsparc.tables.conventions import convert_conventions
-from gsparc.tables.own_checks import HIGHEST_HZ, LOWEST_HZ
-from gsparc.tables.rotations import is_unit, quaternion_to_matrix
+from gsparc.tables.own_checks import HIGHEST_HZ, LOWEST_HZ, is_unit, quaternion_to_matrix
 
 if TYPE_CHECKING:
     from gsparc.tables.sheet import Sheet

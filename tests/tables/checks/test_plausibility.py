@@ -17,7 +17,7 @@ from gsparc.tables.checks.level_steps import (
     link_levels,
     step_warnings,
 )
-from gsparc.tables.checks.unit_warnings import unit_warnings
+from gsparc.tables.checks.plausibility import unit_warnings
 from gsparc.tables.own import from_arrays
 
 

@@ -10,7 +10,7 @@ import pytest
 from gsparc.base.errors import DataError
 from gsparc.base.limits import SettingError
 from gsparc.data.selection import Selection
-from gsparc.tables.checks.unit_warnings import unit_warnings
+from gsparc.tables.checks.plausibility import unit_warnings
 from gsparc.tables.own import from_arrays, interpret
 from gsparc.tables.raw import Raw
 
