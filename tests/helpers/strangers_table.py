@@ -10,7 +10,9 @@ distance; of spectra the angle from each image's peak to the transmitter, the me
 """
 
 import csv
+import shutil
 import sys
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -198,8 +200,13 @@ def _peaks(data: Measurements, test: np.ndarray) -> str:
 
 def row_of(name: str, before: str) -> list[str]:
     """The row of one file."""
-    what, first, answer, right = CASES[name]
-    path = next(REAL.glob(f"strangers*/{name}"))
+    given = next(REAL.glob(f"strangers*/{name}"))
+    with tempfile.TemporaryDirectory() as folder:  # `check` writes beside a file
+        return _row(Path(shutil.copy2(given, folder)), CASES[name], before)
+
+
+def _row(path: Path, case: tuple[str, dict, dict | None, dict | None], before: str) -> list[str]:
+    what, first, answer, right = case
     found = said(path, **first).replace(f"{path.parent}/", "").splitlines()
     asked = [line.removeprefix("asked").strip() for line in found if line.startswith("asked")]
     refusals = found[:-1] if "refused" in found[-1] else []
@@ -215,7 +222,7 @@ def row_of(name: str, before: str) -> list[str]:
     answered = read if answer is None else error(path, first | answer)
     best = answered if right is None else error(path, first | right)
     how = " ".join(f"{key}={value}" for key, value in (answer or {}).items()).replace("'", "")
-    return [name, what, held, "; ".join(asked or refusals), read, how, best, before]
+    return [path.name, what, held, "; ".join(asked or refusals), read, how, best, before]
 
 
 def main(names: list[str]) -> None:

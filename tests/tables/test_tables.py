@@ -266,6 +266,14 @@ def test_names_that_a_join_wrote_as_floats_were_other_stations(write):
     ]
 
 
+def test_stations_that_a_column_parts_stand_where_the_list_has_the_whole(write):
+    stations = write("pci,x,y,z\n7,1,2,3\n8,4,5,6\n", "stations.csv")
+    drive = write("x,y,rssi,pci,beam\n1,1,-80,7,a\n1,2,-81,8,a\n2,1,-90,7,b\n")
+    arrays = parse_table(drive, {"station": "pci+beam"}, stations).arrays
+    assert arrays["station_name"].tolist() == ["7 a", "7 b", "8 a"]
+    assert arrays["station_position"].tolist() == [[1, 2, 3], [1, 2, 3], [4, 5, 6]]
+
+
 @pytest.mark.parametrize(
     "heads, columns",
     [
@@ -469,6 +477,11 @@ SPOILT = {
         "x,y,rssi,cell,cell_x,cell_y\n1,2,-80,a,5,5\n2,2,-80,,5,5\n",
         {},
         "column 'cell', line 3: no station",
+    ),
+    "neighbours without identity": (
+        "x,y,rssi,cell_id,psc,arfcn\n1,2,-80,7,211,10\n2,2,-81,,212,10\n",
+        {},
+        "column 'cell_id', line 3: no station; expected its name, or dataset.columns.station=psc+arf",
     ),
     "half of a channel": (
         "x,y,h_re_0,h_im_0,h_re_1\n1,2,3,4,5\n",

@@ -161,7 +161,8 @@ def test_offsets_beside_a_carrier_were_refused():
 
 def test_real_files_are_sound_and_conjugated_channels_are_not():
     path = real("real/techtile-csi-920mhz.npz")
-    for each in (path, real("newrf-conference.npz"), real("rfid-s23-160")):
+    others = ("newrf-conference.npz", "rfid-s23-160", "ofdm/wsr-nlos-a.npz")
+    for each in (path, *map(real, others)):
         assert convention_warnings(read_any(each).data) == []
     arrays = dict(np.load(path))
     arrays["station_position"] = arrays.pop("rx_antenna_position")
