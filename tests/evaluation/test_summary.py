@@ -13,7 +13,7 @@ import torch
 from refusals import refused
 from rich.console import Console
 
-import gsparc.evaluation.summary
+from gsparc.evaluation import provenance as provenance_module
 from gsparc.evaluation.provenance import program_version, provenance, run_git
 from gsparc.evaluation.summary import describe_model, remarks, results_table, write_summary
 
@@ -56,8 +56,8 @@ def test_table_shows_no_accuracy_without_its_time():
 def test_commit_is_known_inside_the_tree_only(tmp_path):
     facts = provenance()
     assert "torch" in facts["versions"] and "python 3" in facts["versions"]
-    outside = tmp_path / "summary.py"
-    shutil.copy(gsparc.evaluation.summary.__file__, outside)
+    outside = tmp_path / "provenance.py"
+    shutil.copy(provenance_module.__file__, outside)
     # Inside another project's repository an untracked copy must not claim that project's commit.
     subprocess.run(["git", "init", "-q", str(tmp_path)], check=True)
     assert runpy.run_path(str(outside))["provenance"]()["git"] is None
