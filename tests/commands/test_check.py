@@ -255,8 +255,8 @@ def test_check_said_nothing_of_azimuths(tmp_path):
     """Training named wrong ones and those that no row tells;
     who looked before it was told of none.
     """
-    write_own(tmp_path / "right.npz", network(1, moments=150, asked=2).arrays(6))
-    write_own(tmp_path / "wrong.npz", network(1, wrong=2, moments=150, asked=2).arrays(6))
+    write_own(tmp_path / "right.npz", network(1, moments=220, asked=120).arrays(6))
+    write_own(tmp_path / "wrong.npz", network(1, wrong=2, moments=220, asked=120).arrays(6))
     text = " ".join(_said(tmp_path / "right.npz")[1].split())
     assert "the drive would not show an error" in text and "contradicted" not in text
     assert "warning azimuths are contradicted by levels" in " ".join(
