@@ -116,6 +116,7 @@ def test_options_without_effect_are_said_and_stored(spectra_file, tmp_path, monk
     monkeypatch.setattr(options, "command_line_options", lambda: given)
     train(plain(spectra_file, "nearest"), tmp_path)
     stored = json.loads((tmp_path / "summary.json").read_text())
+    assert {"git", "versions", "memory/peak_mb", "time/train_s", "seed"} <= set(stored)
     assert stored["options/unused"] == "trainer.max_steps=3, effort=3"
     (record,) = [r for r in caplog.records if "without effect" in r.message]
     assert record.levelno == logging.WARNING and "(nearest counts nothing)" in record.message
