@@ -1,4 +1,4 @@
-"""The Gaussian process: its components, its thinned answers, and the real data."""
+"""The Gaussian process against brute force, scikit-learn and the real data."""
 
 from dataclasses import replace
 
@@ -7,6 +7,8 @@ import pytest
 import torch
 from releases import real
 from sklearn.decomposition import PCA
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
 from gsparc.data.target import TARGETS
 from gsparc.datasets.load import load, split_for
@@ -55,6 +57,31 @@ def test_a_query_of_an_averaged_process_read_every_pixel_of_its_components(
         for each in (whole, less)
     ]
     torch.testing.assert_close(thin[1].mean, thin[0].mean, atol=0.02, rtol=0)
+
+
+def test_prediction_and_variance_are_scikit_learns(campaign, folds, tmp_path):
+    data, fold = campaign("csi", 40), folds(40).folds[0]
+    gp = GaussianProcess()
+    gp.fit(data, fold, FitContext(tmp_path))
+    rows = np.concatenate([fold.train, fold.val])
+    k = gp.scores.prior.kernel
+    target = data.target[rows].reshape(len(rows), -1).view(np.float32)
+    short, long = (
+        ConstantKernel(k.amplitude * one.share) * Matern(one.length, nu=1.5) for one in k.signals
+    )
+    shape = short + long + WhiteKernel(k.amplitude * k.noise)
+    library = GaussianProcessRegressor(shape, optimizer=None, alpha=0).fit(
+        data.moving[rows], target - target.mean(0)
+    )
+    mean, deviation = library.predict(data.moving[fold.test], return_std=True)
+    batch = data.batch(fold.test)
+    found = gp.predict(batch)
+    expected = torch.from_numpy(mean + target.mean(0)).float().view(-1, 4, 3, 2)
+    assert torch.allclose(torch.view_as_real(found.mean), expected, atol=1e-4)
+    # A complex entry holds two real numbers.
+    assert torch.allclose(
+        found.variance, torch.from_numpy(2 * deviation[:, 0] ** 2).float(), rtol=1e-3
+    )
 
 
 def test_metric_formats_on_the_real_subset(tmp_path):
