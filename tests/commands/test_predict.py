@@ -109,17 +109,8 @@ def test_a_station_was_not_found_by_its_name_in_the_list_of_cells(town, tmp_path
 
 
 @pytest.mark.parametrize("labels", [None, ("A-1", "A-2", "B-1")])
-def test_a_column_of_cells_was_renamed(town, tmp_path, monkeypatch, labels):
-    """A column `cell` came back as `station`, with the model's names in it."""
-    monkeypatch.setitem(vars(town.site.stations), "label", labels)
-    asked = "mast" if labels is None else "B-1"
-    (row,) = answered(town, tmp_path, ["x", "y", "z", "cell"], [[5, 5, 1.5, asked]])
-    assert [*row][:4] == ["x", "y", "z", "cell"] and row["cell"] == asked
-
-
-@pytest.mark.parametrize("labels", [None, ("A-1", "A-2", "B-1")])
 def test_columns_of_predictions_changed_with_those_of_places(town, tmp_path, monkeypatch, labels):
-    """Of places with a column `cell` there was no `station`,
+    """A column `cell` came back as `station`, with the model's names in it,
     and one of any other head replaced it.
     """
     monkeypatch.setitem(vars(town.site.stations), "label", labels)
@@ -127,6 +118,7 @@ def test_columns_of_predictions_changed_with_those_of_places(town, tmp_path, mon
     for head in ("station", "cell", "PCI"):
         (row,) = answered(town, tmp_path, ["x", "y", "z", head], [[5, 5, 1.5, "mast"]])
         assert {*row} == {*plain, head} and row["station"] == plain["station"]
+        assert [*row][:4] == ["x", "y", "z", head] and row[head] == "mast"
 
 
 def test_coordinates_were_written_anew_under_other_heads(valley, tmp_path):

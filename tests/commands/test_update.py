@@ -3,8 +3,6 @@
 import csv
 import json
 import os
-import signal
-import subprocess
 import sys
 import threading
 import time
@@ -12,7 +10,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-import torch
 from both_ends import walled_floor
 from doors import knock
 from rooms_later import PLACES, SCREENED, levels, room_file
@@ -21,7 +18,6 @@ from told import CLIENTS, Soak
 import gsparc
 from gsparc.commands.listing import COMMANDS
 from gsparc.models import checkpoint
-from gsparc.models.checkpoint_content import FORMAT
 from gsparc.prediction.updating import versions_extra
 
 SOAK_S = int(os.environ.get("GSPARC_SOAK_S", "15"))
@@ -160,32 +156,6 @@ def test_rows_that_were_acknowledged_were_lost(tmp_path, capsys):
     assert counts["told"] > counts["by command"] > 0 and counts["kills"] > 0
     assert counts["lost"] == counts["twice"] == counts["of nobody"] == 0
     assert counts["of these on disk"] <= CLIENTS * counts["kills"]  # what was in flight
-
-
-@pytest.mark.slow
-def test_a_kill_leaves_a_whole_file(before, tmp_path):
-    out, new = tmp_path / "live.ckpt", room_file(tmp_path / "new.npz", 60, change=-12.0)
-    out.write_bytes(before.read_bytes())
-    script = (
-        "import gsparc\nfrom gsparc.models import checkpoint\n"
-        "from gsparc.prediction.updating import versions_extra\nimport numpy as np, sys\n"
-        f"new = np.load({str(new)!r})\npredictor = gsparc.load({str(out)!r})\nprint('ready', "
-        "flush=True)\n"
-        "while True:\n"
-        "    predictor.update(rx=new['rx_position'][:3], rssi=new['rssi_db'][:3])\n"
-        f"    checkpoint.update_extra({str(out)!r}, versions_extra(predictor.versions))\n"
-    )
-    rng, kept = np.random.default_rng(0), 0
-    for _ in range(20):
-        process = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE)
-        process.stdout.readline()
-        time.sleep(rng.uniform(0.0, 0.5))
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
-        rows = len(gsparc.load(out).rows)
-        assert rows >= kept
-        kept = rows
-    assert kept > 0 and torch.load(out, weights_only=True)["format"] == FORMAT
 
 
 def test_lists_of_the_strongest_raised_all_levels(tmp_path):

@@ -1,18 +1,13 @@
-"""How often audits of `gsparc audit` are wrong, and how many drawn places they take.
+"""Simulated audits: a claimed share of .95, tours of 20, at most 1,500 places.
 
-python tests/helpers/audit_table.py [audits]: a claimed share of .95, tours of 20, at most 1,500
-places; in brackets the 90 % quantile. Strata of an area: its share, whether the model marks it,
-whether it fails, whether a car gets there. What is drawn in a tour has no order here: verdicts are
-read at its end alone.
+Strata of an area: its share, whether the model marks it, whether it fails, whether a car gets
+there. What is drawn in a tour has no order here: verdicts are read at its end alone.
 """
-
-import sys
 
 import numpy as np
 
 from gsparc.apps.maps.audit import Question, doubt_part
-from gsparc.processes.betting import ENOUGH, claim_capital, verdict_of
-from gsparc.processes.uncertainty import binomial_interval
+from gsparc.processes.betting import claim_capital, verdict_of
 
 CLAIM, TOUR, MOST, FLOOR = 0.95, 20, 1500, 0.1
 
@@ -70,56 +65,12 @@ def audits(strata, count, seed=0, most=MOST):
     return np.array(verdicts), np.array(taken)
 
 
-def levels(bias, within, count, seed=0, most=400, by_row=False):
+def levels(bias, within, count, seed=0, most=400):
     """The same of a claim of levels, of a deviation of 9 dB about a bias [dB]."""
     random, question = np.random.default_rng(seed), Question(None, within_db=within)
     level = -random.normal(bias, 9.0, (count, most))
     value = question.bounds(np.zeros_like(level), level, np.zeros_like(level))[0]
-    ends = np.arange(1 if by_row else TOUR, most + 1, 1 if by_row else TOUR)
+    ends = np.arange(TOUR, most + 1, TOUR)
     pairs = zip(*claim_capital(value, value, question.ends), strict=True)
     words, rows = zip(*(verdict_of(*pair, ends) for pair in pairs), strict=True)
     return np.array(words), np.array(rows)
-
-
-def shown(label, verdicts, taken, wrong=()):
-    shares = {word: int((verdicts == word).sum()) for word in ("stands", "falls")}
-    middle, most = np.quantile(taken, [0.5, 0.9])
-    line = f"{label:46s}" + "".join(f" {k} {v / len(taken):6.1%}" for k, v in shares.items())
-    limits = [
-        f"{word} <= {binomial_interval(shares[word], len(taken), 0.9)[1]:.3f}" for word in wrong
-    ]
-    sys.stdout.write(f"{line}  rows {middle:4.0f} ({most:4.0f})  {' '.join(limits)}\n")
-
-
-def main(count):
-    few = max(count // 4, 10)
-    for true in (1.0, 0.99, 0.98, 0.95, 0.92, 0.9, 0.85, 0.8, 0.7):
-        wrong, many = (("stands", "falls"), count) if true == CLAIM else ((), few)
-        shown(f"true {true}", *audits(area(true), many), wrong)
-    for true in (0.9, 0.8, 0.99):
-        for recall in (0.7, 0.5, 0.2, 0.0):
-            label = f"true {true}, {recall:.0%} of the bad part marked"
-            shown(label, *audits(area(true, max(0.2, 1 - true), recall), few))
-    for recall in (0.7, 0.0):
-        label = f"true 0.95, {recall:.0%} of the bad part marked"
-        shown(label, *audits(area(CLAIM, 0.2, recall), few, most=600), ("stands", "falls"))
-    for true, fails in ((CLAIM, True), (CLAIM, False), (0.99, True), (0.9, False)):
-        size = 0.04 if true == CLAIM else 0.01
-        label = f"true {true}, {size:.0%} unreached: {'fails' if fails else 'holds'}"
-        wrong = ("stands", "falls") if true == CLAIM else ()
-        strata = area(true, corner=size, corner_fails=fails)
-        shown(label, *audits(strata, count if wrong else few), wrong)
-    random = np.random.default_rng(0)
-    value = np.sort((random.random((few, 300)) < CLAIM) * 1.0, axis=1)
-    falls = (claim_capital(value, value, (CLAIM, 1.0))[1] >= ENOUGH).any(1).mean()
-    sys.stdout.write(f"true 0.95, read row by row, the bad corner first: falls {falls:.1%}\n")
-    for within in ((-3.0, 3.0), (-20.0, 3.0)):
-        for bias in (0, 3, 6, 8):
-            wrong = ("stands", "falls") if bias == 3 else ()
-            label = f"bias {bias} dB, claimed within {within}"
-            shown(label, *levels(bias, within, count), wrong)
-            shown(f"{label}, by row", *levels(bias, within, count, by_row=True))
-
-
-if __name__ == "__main__":
-    main(int(sys.argv[1]) if len(sys.argv) > 1 else 1000)

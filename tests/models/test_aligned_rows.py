@@ -123,3 +123,5 @@ def test_one_row_of_a_station_has_nothing_to_be_turned_to(logged):
     """The nearest others of a row alone were an IndexError."""
     found = align_rows(Snapshots.from_rows(logged, np.arange(1)), "phase+delay", logged.site)
     assert found.factors.shape == (1, logged.target.shape[2]) and (found.factors == 1).all()
+    with pytest.raises(ValueError, match="to=taps: channels are known up to a phase and a delay"):
+        logged.site.need_phase("to=taps")

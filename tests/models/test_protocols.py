@@ -363,6 +363,11 @@ def test_what_is_scored_of_stations_is_what_is_served(tmp_path, name, how):
         torch.testing.assert_close(
             served(predictor.select_station(number), data, rows), scored, rtol=1e-4, atol=0
         )
+        if how == "together":  # by the places of both ends, also where no station stands
+            both = {"tx": data.moving[rows] + data.site.origin, "rx": kinds.POSTS[number]}
+            level = predictor.rssi(**both, unit="linear")[:, 0] / data.site.target_scale
+            np.testing.assert_allclose(level, scored[:, 0], rtol=1e-4)
+            assert np.isfinite(predictor.rssi(**both | {"rx": kinds.POSTS[number] + 20})).all()
 
 
 @pytest.mark.parametrize("words", ["model=complex_gp", "model=gsparc model.effects.phase=false"])

@@ -2,18 +2,13 @@
 as if it had never been.
 """
 
-from dataclasses import replace
-
-import kinds
 import numpy as np
 import pytest
 import torch
 from campaigns import channels, powers, spectra
-from cities import city
-from rooms import directed
 
 from gsparc.datasets.load import load, split_for
-from gsparc.models.registry import built_in_methods, method_class
+from gsparc.models.registry import method_class
 from gsparc.training.context import FitContext
 
 MAKERS = {"spectrum": spectra, "csi": channels, "rssi_db": powers}
@@ -81,47 +76,3 @@ def test_left_out_it_had_never_been_and_kept_it_is_finite_or_refused(
         assert "\n" not in str(refused)
     else:
         assert torch.isfinite(found).all()
-
-
-MAKE = {  # measurements that methods train or search on, and these methods
-    "spectra": (
-        kinds.images,
-        ("gsrf", "wrfgs", "swiftwrf", "nerf2", "splat", "image_process", "gsparc"),
-    ),
-    "spectra of a known array": (kinds.static_array, ("array", "array_process", "ngrf", "gsparc")),
-    "spectra at carriers": (
-        kinds.carriers,
-        ("carriers", "other_carriers", "direct_beam", "wideband", "gsparc"),
-    ),
-    "spectra of a moving array": (kinds.moving_array, ("moving_array", "bearings", "gsparc")),
-    "channels": (
-        kinds.bands,
-        ("gsrf", "ngrf", "image_source_gp", "image_sources", "channels", "gsparc"),
-    ),
-    "channels with directions": (lambda _: directed(60)[0], ("newrf", "directional_gp", "gsparc")),
-    "powers": (kinds.received, ("powers", "gsparc")),
-    "uplink": (lambda _: city("all"), ("ridge", "fire", "uplink")),
-}
-
-
-def spoilt(data, wrong):
-    """With row 7 of a hundred million times the power, or three thousand kilometres away."""
-    if wrong == "place":
-        name = "tx" if data.site.moving_end == "tx" else "rx_position"
-        place = np.array(getattr(data, name))
-        place[7] = 3e6, 0, 0
-        return replace(data, **{name: place})
-    loud = np.where(np.arange(len(data)) == 7, np.float32(1e8), np.float32(1))
-    names = ("target",) if data.uplink is None else ("target", "uplink")
-    every = {name: getattr(data, name) for name in names}
-    return replace(data, **{n: loud.reshape(-1, *[1] * (v.ndim - 1)) * v for n, v in every.items()})
-
-
-def test_no_method_is_forgotten():
-    here = {
-        name
-        for names in (*QUICK.values(), *(names for _, names in MAKE.values()))
-        for name in names
-    }
-    # It needs a scene: tests/peers
-    assert here | {"calibrated_raytracer"} == set(built_in_methods())

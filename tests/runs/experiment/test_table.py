@@ -248,14 +248,3 @@ def test_the_last_of_three_was_bold_in_a_comparison():
     )
     (alone,) = split_by_problem(averages(cells[:3]))
     assert "**" not in markdown([alone], "gsparc")
-
-
-def test_the_lead_of_the_first_had_no_verdict():
-    """`6.20 ± 1.27 dB before newrf (standard error over the same 3 draws)` left the reader to
-    compute t.
-    """
-    leads = ((6.0, 5.9, 6.1), "significant"), ((2.0, 0.1, 0.9), "not significant")
-    for gains, verdict in leads:
-        cells = drawn("gp", 30.0, 30.0, 30.0) + drawn("gsparc", *(30.0 + gain for gain in gains))
-        (block,) = split_by_problem(averages(cells))
-        assert remarks(block, "gsparc")[0].endswith(f"over the same 3 draws): {verdict}")

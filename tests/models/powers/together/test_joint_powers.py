@@ -39,7 +39,6 @@ from gsparc.models.powers.together.terms import (
 )
 from gsparc.models.registry import method_class
 from gsparc.ops import Pose
-from gsparc.prediction.predictor import Predictor
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.prior import Prior
 from gsparc.processes.shared import left_out_processes
@@ -339,25 +338,6 @@ def test_what_it_refuses():
     )
     own, terms = prior_of(data)
     refused("not fitted yet", known_field(data.site, POSTS, own, terms).left_out)
-
-
-def test_gsparc_learns_stations_together(tmp_path):
-    data = town()
-    fold = fold_of(data)
-    method = wrap_per_station(Gsparc(), data)
-    report = method.fit(data, fold, FitContext(tmp_path, stations="together"))
-    assert any("6 stations in one model" in note for note in report.notes)
-    batch = data.batch(fold.test)
-    said = method.predict(batch)
-    assert torch.allclose(said.mean, method.predict(Query(batch.tx, batch.rx)).mean, rtol=1e-4)
-    predictor = Predictor(method, data.site)
-    place, number = data.tx[fold.test[0]] + data.site.origin, int(data.station[fold.test[0]])
-    post = POSTS[number]
-    one = predictor.select_station(number).rssi(tx=place)
-    assert np.allclose(one, db(said.mean[0] * data.site.target_scale), atol=4e-3)
-    assert np.allclose(one, predictor.rssi(tx=place, rx=post), atol=4e-3)
-    # No station
-    assert np.isfinite(predictor.rssi(tx=place, rx=post + np.array([20.0, 20, 0]))).all()
 
 
 def test_stations_at_one_place_are_told_apart_by_their_numbers():

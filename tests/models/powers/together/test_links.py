@@ -1,5 +1,6 @@
 """Levels between two places, neither of which was ever an end: of robots on one floor."""
 
+import copy
 from functools import cache
 
 import numpy as np
@@ -120,12 +121,16 @@ def test_a_copy_of_each_place_refused_a_new_one():
     assert kind == "together" and "both ends move" in why
 
 
+@cache
+def served() -> Predictor:
+    method = wrap_per_station(Gsparc(), robots()).create_for(robots())
+    method.fit(robots(), fold(), FitContext())
+    return Predictor(method, robots().site)
+
+
 @pytest.mark.parametrize("ending", ["csv", "npz"])
 def test_a_table_of_both_ends_was_answered_for_the_known_transmitters(tmp_path, ending):
-    data, rows = robots(), fold().test[:20]
-    method = wrap_per_station(Gsparc(), data).create_for(data)
-    method.fit(data, fold(), FitContext())
-    predictor = Predictor(method, data.site)
+    data, rows, predictor = robots(), fold().test[:20], served()
     still = np.asarray(data.site.every_station.position)[data.stations_of(rows)]
     ends = {"tx": still + data.site.origin, "rx": data.moving[rows] + data.site.origin}
     path = tmp_path / f"links.{ending}"
@@ -142,11 +147,8 @@ def test_a_table_of_both_ends_was_answered_for_the_known_transmitters(tmp_path, 
 
 
 def test_an_end_may_stand_anywhere():
-    data, rows = robots(), fold().test[:20]
-    method = wrap_per_station(Gsparc(), data).create_for(data)
-    method.fit(data, fold(), FitContext())
-    predictor, place = Predictor(method, data.site), np.array([-2.0, 2.0, 0.3])
-    receivers = data.moving[rows] + data.site.origin
+    data, predictor, place = robots(), served(), np.array([-2.0, 2.0, 0.3])
+    receivers = data.moving[fold().test[:20]] + data.site.origin
     alone = predictor.stand_at(place)
     assert np.allclose(alone.rssi(rx=receivers), predictor.rssi(tx=place, rx=receivers), atol=1e-4)
     assert not alone.site.several and "from (-2, 2, 0.3)" in alone.site.name
@@ -250,8 +252,7 @@ def test_known_stations_of_many_gains_were_told_by_their_neighbours():
 
 
 def test_links_of_an_earlier_fit_stayed():
-    data, some = robots(), fold().train
-    method, _ = fitted_to(JointPowerField(), data, some)
+    data, some, method = robots(), fold().train, copy.deepcopy(field())
     few = some[np.isin(data.stations_of(some), np.unique(data.stations_of(some))[:5])]
     assert method.links is not None
     method.fit(data, Fold(few, few[:0], few[:0]), FitContext())

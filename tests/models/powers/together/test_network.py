@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from known_fields import known_field
-from networks import Network, draw_network, judged, network, reference
+from networks import Network, draw_network, judged, network
 
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
@@ -83,18 +83,36 @@ def levels(method: PerStation, one: Network) -> tuple[np.ndarray, np.ndarray]:
     return mean + 10 * np.log10(site.target_scale), spread
 
 
-@pytest.mark.slow
-def test_a_network_with_two_wrong_azimuths(tmp_path):
+@pytest.fixture(scope="module")
+def turned(tmp_path_factory) -> tuple[Network, PerStation, list[str]]:
+    """A network with two wrong azimuths, its model, and the sectors that are named."""
     one = network(1, wrong=2, moments=220, asked=120)
-    method, report = fitted(one, 6, tmp_path)
-    found, plain = judged(one, 6, *levels(method, one)), judged(one, 6, *reference(one, 6))
-    assert found["rmse"] < 0.7 * plain["rmse"] and abs(found["bias_unlisted"]) < 3
+    method, report = fitted(one, 6, tmp_path_factory.mktemp("turned"))
+    return one, method, contradicted(report.notes)
+
+
+@pytest.mark.slow
+def test_a_network_with_two_wrong_azimuths(turned, tmp_path):
+    one, method, named = turned
+    mean, spread = levels(method, one)
+    found = judged(one, 6, mean, spread)
+    assert found["rmse"] < 0.7 * 14.93 and abs(found["bias_unlisted"]) < 3  # a process per cell
     assert all(0.8 < found[name] < 0.97 for name in ("hold", "hold_listed", "hold_unlisted"))
+    wrong = one.azimuth != network(1, moments=220, asked=120).azimuth
+    names = method.site.stations.name
+    assert named and set(named) <= {names[i] for i in np.flatnonzero(wrong)}
+    checkpoint.save(tmp_path / "model.ckpt", method)
+    again, _ = loading.load(tmp_path / "model.ckpt")
+    assert np.allclose(levels(again, one)[0], mean, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_errors_of_sectors_together_are_those_of_each(turned):
+    one, method, _ = turned
+    mean, spread = levels(method, one)
     every = method.joint_method()
-    assert every is not None
     moving = torch.from_numpy(one.asked - method.site.origin)[:, None].expand(-1, 30, 3)
     level, covariance, noise = every.predict_joint(moving, torch.arange(30))
-    mean, spread = levels(method, one)
     assert np.allclose(level + 10 * np.log10(method.site.target_scale), mean, atol=1e-3)
     assert np.allclose(covariance.diagonal(dim1=1, dim2=2).sqrt(), spread, rtol=1e-3)
     assert (torch.linalg.eigvalsh(covariance) > 0).all() and (covariance[:, 0, 1] != 0).all()
@@ -103,28 +121,14 @@ def test_a_network_with_two_wrong_azimuths(tmp_path):
     around = torch.tensor([[500.0, 0, 1.5], [-500, 0, 1.5]])[:, None].expand(-1, 2, 3)
     east, west = more.predict_joint(around, torch.tensor([30, 31]))[0]
     assert east[0] > west[0] + 10 and east[1] == pytest.approx(float(west[1]))  # no pattern
-    learned = Fold(np.arange(500), np.arange(0), np.arange(0))  # split=none drew no picture
-    draw_sector_levels(method, one.data(6), learned, tmp_path / "sectors.png")
-    assert (tmp_path / "sectors.png").is_file()
-    wrong = one.azimuth != network(1, moments=220, asked=120).azimuth
-    named = contradicted(report.notes)
-    assert method.site is not None and method.site.stations is not None
-    names = method.site.stations.name
-    assert named and set(named) <= {names[i] for i in np.flatnonzero(wrong)}
-    checkpoint.save(tmp_path / "model.ckpt", method)
-    again, _ = loading.load(tmp_path / "model.ckpt")
-    assert np.allclose(levels(again, one)[0], levels(method, one)[0], atol=1e-3)
 
 
 @pytest.mark.slow
 def test_sites_without_azimuths_have_no_pattern(tmp_path):
     one = network(2, moments=180, asked=100)
     method, report = fitted(one, 6, tmp_path, azimuths=False)
-    found, plain = (
-        judged(one, 6, *levels(method, one)),
-        judged(one, 6, *reference(one, 6, azimuths=False)),
-    )
-    assert found["rmse"] < 0.7 * plain["rmse"] and found["best"] > plain["best"]
+    found = judged(one, 6, *levels(method, one))
+    assert found["rmse"] < 0.7 * 22.42 and found["best"] > 0.47  # a process per cell
     assert not any("beams" in note for note in report.notes)
 
 
@@ -193,45 +197,20 @@ def notes_of_azimuths(data: Measurements, monkeypatch) -> list[str]:
     return said
 
 
-RARE = pytest.mark.rare
-
-
 @pytest.mark.slow
-def test_a_contradicted_azimuth_was_in_no_picture(tmp_path, monkeypatch):
-    one = network(1, wrong=2, moments=220, asked=120)
-    method, report = fitted(one, 6, tmp_path)
-    named = contradicted(report.notes)
+def test_a_contradicted_azimuth_was_in_no_picture(turned, tmp_path, monkeypatch):
+    one, method, named = turned
     figures = []
     monkeypatch.setattr(
         "gsparc.pictures.pictures.save", lambda figure, path: figures.append(figure)
     )
-    draw_sector_levels(
-        method, one.data(6), Fold(np.arange(3960), NONE, NONE), tmp_path / "sectors.png"
-    )
+    learned = Fold(np.arange(3960), NONE, NONE)  # split=none drew no picture
+    draw_sector_levels(method, one.data(6), learned, tmp_path / "sectors.png")
     titles = [axis.get_title() for axis in figures[0].axes]
     title = "12 of 30 sectors, contradicted azimuths first; too few rows to draw: 0-0, 0-2, "
     assert figures[0].get_suptitle().startswith(title)
-    assert "(given " in titles[0]
     assert {title.split(",")[0] for title in titles if "(given " in title} == {*named}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("seed", [pytest.param(0, marks=RARE), 1, pytest.param(2, marks=RARE)])
-@pytest.mark.parametrize("count", [pytest.param(3, marks=RARE), 6, pytest.param(10, marks=RARE)])
-@pytest.mark.parametrize(
-    ("azimuths", "wrong"),
-    [pytest.param(True, 0, marks=RARE), (True, 2), pytest.param(False, 0, marks=RARE)],
-)
-def test_networks_of_thirty_sectors(seed, count, azimuths, wrong, tmp_path):
-    one = network(seed, wrong)
-    method, _ = fitted(one, count, tmp_path, azimuths)
-    found = judged(one, count, *levels(method, one))
-    plain = judged(one, count, *reference(one, count, azimuths))
-    assert found["rmse"] < 0.9 * plain["rmse"] and abs(found["bias_unlisted"]) < 3, found
-    assert all(0.82 <= found[name] <= 0.95 for name in ("hold", "hold_listed", "hold_unlisted")), (
-        found
-    )
-    assert found["best"] > plain["best"] - 0.05, (found, plain)
+    assert "(given " in titles[0]
 
 
 def test_stations_at_places_of_their_own_are_no_network():
