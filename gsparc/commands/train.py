@@ -84,21 +84,12 @@ def train(
             folds.end_curves(contexts, fits.train_s, evaluation.columns, config.eval_on)
             facts = {**evaluation.facts, **provenance(), **fits.facts(), "run_id": run_id}
             facts |= {"seed": int(config.seed), "options/unused": unused}
+            run = TrainedRun(fits.methods, folds.checkpoints(contexts), data, split, evaluation)
             if in_full:
-                draw_run(
-                    fits.methods[0],
-                    data,
-                    split,
-                    inputs.walls,
-                    facts,
-                    evaluation.examples,
-                    config.eval_on,
-                    run_dir,
-                    loggers,
-                )
+                draw_run(run, inputs.walls, facts, config.eval_on, run_dir, loggers)
         evaluation.write(run_dir, run_id=run_id)
         write_summary(run_dir / SUMMARY, facts)
-        return facts, TrainedRun(fits.methods, folds.checkpoints(contexts), data, split, evaluation)
+        return facts, run
 
 
 def train_job(job: Job, left: str | None) -> None:

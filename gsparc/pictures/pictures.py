@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from gsparc.base.errors import list_first
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold, Split
+from gsparc.data.splits import Fold
 from gsparc.data.walls import SceneWalls
 from gsparc.evaluation.examples import Examples
 from gsparc.evaluation.metrics import SpectrumMetrics
@@ -30,32 +30,32 @@ from gsparc.prediction.left_out import Evidence, predict_rows
 from gsparc.prediction.risk import Trial, bounded_loss
 from gsparc.processes.sectors import NO_AZIMUTH
 from gsparc.processes.uncertainty import risk_coverage
+from gsparc.runs.evaluate import TrainedRun
 from gsparc.training import tracking
 
 
 def draw_run(
-    method: Method,
-    data: Measurements,
-    split: Split,
+    run: TrainedRun,
     walls: SceneWalls | None,
     facts: Mapping[str, Any],
-    examples: Examples | None,
     eval_on: str,
     run_dir: Path,
     loggers: Sequence[Any],
 ) -> None:
-    """Draw predictions and what was found; give loggers the pictures,
+    """Draw what the first fold's method predicts and found; give loggers the pictures,
     figures and the table of a run.
     """
     # Under other names, as `time/train_s` would cut off its curve; of the baselines a table.
     numbers = {name: value for name, value in facts.items() if isinstance(value, (int, float))}
     finals = {f"final/{name}": v for name, v in numbers.items() if not name.startswith("baseline/")}
     tracking.log_final(loggers, finals)
-    fold = split.folds[0]
+    method, data, fold = run.methods[0], run.data, run.split.folds[0]
     draw_sector_levels(method, data, fold, run_dir / "sectors.png")
     if len(fold.test):
         title = f"{data.site.name}: test rows of {method.label}"
-        draw_predictions(method, data, fold.test, examples, title, run_dir / "test.png")
+        draw_predictions(
+            method, data, fold.test, run.evaluation.examples, title, run_dir / "test.png"
+        )
         tracking.log_picture(loggers, "test rows", run_dir / "test.png")
     table = results_table(facts, str(facts["model/label"]), prefix=eval_on)
     tracking.log_table(loggers, "results", *table.texts())
