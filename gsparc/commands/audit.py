@@ -40,12 +40,12 @@ LEAST_ROWS = 10  # that a process of errors is learned from
 def task(call: CommandCall) -> Result:
     """Judge the tours that were driven, draw the next ones, write and draw."""
     given, folder, threshold = call.given, call.folder, call.given["threshold_dbm"]
-    question = audit.Question(threshold, float(given["share"]), tuple(given["within_db"]))
+    demand = audit.Demand(threshold, float(given["share"]), tuple(given["within_db"]))
     claim = read_claim(given["claim"], threshold, given["station"], given["area"], given["step_m"])
-    key, drawn = audit.digest_of(claim, question), given["drawn"]
+    key, drawn = audit.digest_of(claim, demand), given["drawn"]
     draws = None if drawn is None else audit.read_draws(drawn, key, claim)
     facts: dict[str, Any] = {"audit/claim": claim.digest, "audit/key": key, "audit/verdict": "open"}
-    lines = [f"claim: {question.words}; {len(claim.place)} squares of {claim.grid.step:.3g} m"]
+    lines = [f"claim: {demand.words}; {len(claim.place)} squares of {claim.grid.step:.3g} m"]
     # A claim of levels, or of yes alone, is in doubt everywhere alike before there are rows
     margin = np.nan_to_num(claim.level - (np.nan if threshold is None else threshold))
     chance, before = ndtr(-margin / audit.SPREAD_DB), (np.zeros(0),) * 3
@@ -59,7 +59,7 @@ def task(call: CommandCall) -> Result:
             chance = errors.chance_below(claim.place, margin) + 1e-9
         if draws is not None:
             outside, reach = given["unreached"] == "outside", given["reach_m"] or claim.grid.step
-            verdict, count, table = audit.judge(claim, draws, rows, question, reach, outside)
+            verdict, count, table = audit.judge(claim, draws, rows, demand, reach, outside)
             columns["capital.csv"] = table
             figures.append(audit_report.draw_capital(table))
             lines += audit_report.describe_verdict(verdict, count, table, outside)
@@ -77,7 +77,7 @@ def task(call: CommandCall) -> Result:
     if given["tours"] and facts["audit/verdict"] == "open":
         ratio = chance / chance.mean()
         draws, told = _draw_next(call, claim, key, draws, ratio, audit.doubt_part(*before, ratio))
-        lines = [question.power(len(draws)), *lines, told]
+        lines = [demand.power(len(draws)), *lines, told]
     columns |= {} if draws is None else {"draws.csv": draws}
     files = {name: given[name] for name in ("rows", "drawn") if given[name] is not None}
     facts |= {f"audit/{name}_digest": audit.digest(file) for name, file in files.items()}

@@ -6,7 +6,7 @@ there. What is drawn in a tour has no order here: verdicts are read at its end a
 
 import numpy as np
 
-from gsparc.apps.maps.audit import Question, doubt_part
+from gsparc.apps.maps.audit import Demand, doubt_part
 from gsparc.processes.betting import claim_capital, verdict_of
 
 CLAIM, TOUR, MOST, FLOOR = 0.95, 20, 1500, 0.1
@@ -67,10 +67,10 @@ def audits(strata, count, seed=0, most=MOST):
 
 def levels(bias, within, count, seed=0, most=400):
     """The same of a claim of levels, of a deviation of 9 dB about a bias [dB]."""
-    random, question = np.random.default_rng(seed), Question(None, within_db=within)
+    random, demand = np.random.default_rng(seed), Demand(None, within_db=within)
     level = -random.normal(bias, 9.0, (count, most))
-    value = question.bounds(np.zeros_like(level), level, np.zeros_like(level))[0]
+    value = demand.bounds(np.zeros_like(level), level, np.zeros_like(level))[0]
     ends = np.arange(TOUR, most + 1, TOUR)
-    pairs = zip(*claim_capital(value, value, question.ends), strict=True)
+    pairs = zip(*claim_capital(value, value, demand.ends), strict=True)
     words, rows = zip(*(verdict_of(*pair, ends) for pair in pairs), strict=True)
     return np.array(words), np.array(rows)

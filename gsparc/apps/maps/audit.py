@@ -30,7 +30,7 @@ WRITTEN = ("audit", "tour", "stop", "place", "x", "y", "part", "ratio")  # of `d
 
 
 @dataclass(frozen=True)
-class Question:
+class Demand:
     """What a claim is held to.
 
     Attributes:
@@ -93,11 +93,11 @@ class Question:
         return f"with {count} rows {fall} can fall, {stand} can stand ({OFTEN:.0%} of the times)"
 
 
-def digest_of(claim: Claim, question: Question) -> str:
-    """Return what tells one audit from another: of file, places and question, 16 digits."""
-    return sha256(
-        f"{claim.digest} {question}".encode() + claim.place.round(3).tobytes()
-    ).hexdigest()[:16]
+def digest_of(claim: Claim, demand: Demand) -> str:
+    """Return what tells one audit from another: of file, places and demand, 16 digits."""
+    return sha256(f"{claim.digest} {demand}".encode() + claim.place.round(3).tobytes()).hexdigest()[
+        :16
+    ]
 
 
 def digest(path: str | Path) -> str:
@@ -193,7 +193,7 @@ class DriveRows:
     Attributes:
         place: (n, 2) in the claim's metres.
         level: (n,) measured [dB].
-        side: (n,) see `Question.bounds`.
+        side: (n,) see `Demand.bounds`.
         station: (n,) number; places are judged by the best of them.
     """
 
@@ -203,7 +203,7 @@ class DriveRows:
     station: np.ndarray
 
     def at_draws(
-        self, claim: Claim, draws: pd.DataFrame, question: Question, reach: float
+        self, claim: Claim, draws: pd.DataFrame, demand: Demand, reach: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return bounds (n,) of the value of each drawn place, and whether it was reached (n,).
 
@@ -216,11 +216,11 @@ class DriveRows:
             if not rows:
                 continue
             claimed = np.full(len(rows), claim.level[number[k]])
-            ends = question.bounds(claimed, self.level[rows], self.side[rows])
+            ends = demand.bounds(claimed, self.level[rows], self.side[rows])
             kind = np.unique(self.station[rows], return_inverse=True)[1]
             means = np.array([np.bincount(kind, end) for end in ends]) / np.bincount(kind)
             # The strongest serves: most hold, and least is claimed beyond what it has.
-            low[k], high[k] = means.max(1) if question.threshold_db is not None else means.min(1)
+            low[k], high[k] = means.max(1) if demand.threshold_db is not None else means.min(1)
         return low, high, np.array([len(rows) > 0 for rows in near], bool)
 
 
@@ -228,7 +228,7 @@ def judge(
     claim: Claim,
     draws: pd.DataFrame,
     rows: DriveRows,
-    question: Question,
+    demand: Demand,
     reach: float,
     reachable_only: bool = False,
 ) -> tuple[str, int, pd.DataFrame]:
@@ -239,14 +239,14 @@ def judge(
     A place without rows counts against both verdicts, so that a tour which goes on never takes one
     back; or, where the reachable area alone is judged, not at all.
     """
-    low, high, reached = rows.at_draws(claim, draws, question, reach)
+    low, high, reached = rows.at_draws(claim, draws, demand, reach)
     weight = np.where(
         reached | (not reachable_only), 1 / (1 - draws.part + draws.part * draws.ratio), 0.0
     )
     table = draws.assign(low=low, high=high, reached=reached, weight=weight)
     table = table[table.tour <= table.tour[reached].max()]
     low, high, most = (end.to_numpy() for end in (table.low, table.high, 1 / (1 - table.part)))
-    stands, falls = claim_capital(low, high, question.ends, table.weight.to_numpy(), most)
+    stands, falls = claim_capital(low, high, demand.ends, table.weight.to_numpy(), most)
     verdict, count = verdict_of(stands, falls, ends_of(table))
     return verdict, count, table.assign(stands=stands, falls=falls)
 

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from gsparc.apps.maps.audit import DriveRows, Question, digest_of, draw_tours, judge, read_draws
+from gsparc.apps.maps.audit import Demand, DriveRows, digest_of, draw_tours, judge, read_draws
 from gsparc.apps.maps.claim import ClaimErrors, read_claim
 from gsparc.apps.maps.streets import StreetGraph
 from gsparc.base.errors import DataError
@@ -13,7 +13,7 @@ from gsparc.base.errors import DataError
 rasterio = pytest.importorskip("rasterio", reason="pip install 'gsparc[maps]'")
 from rasterio.transform import from_origin  # noqa: E402
 
-SERVED = Question(-110.0, 0.95)
+SERVED = Demand(-110.0, 0.95)
 
 
 def write_raster(path, values, crs="EPSG:32617", **more):
@@ -91,7 +91,7 @@ def test_rows_in_degrees_need_a_projection_of_the_claim(tmp_path, raster):
 @pytest.mark.parametrize("asked", [(None,), (-110.0, 0.95, (-3.0, 3.0)), (None, 0.95, (3.0, -3.0))])
 def test_a_question_is_of_coverage_or_of_levels(asked):
     with pytest.raises(DataError, match="threshold_dbm=-110 share"):
-        Question(*asked)
+        Demand(*asked)
 
 
 @pytest.fixture
@@ -112,7 +112,7 @@ def test_draws_are_repeated_by_their_seed_and_known_again(drawn, tmp_path):
     assert len(ways) == 3 and (draws.groupby("tour").stop.max() == 10).all()
     draws.to_csv(tmp_path / "draws.csv", index=False)
     assert len(read_draws(tmp_path / "draws.csv", key, claim)) == 30
-    other = digest_of(claim, Question(-110.0, 0.9))
+    other = digest_of(claim, Demand(-110.0, 0.9))
     with pytest.raises(DataError, match="no draws of this claim"):
         read_draws(tmp_path / "draws.csv", other, claim)
 
