@@ -162,6 +162,20 @@ class LaterRows(Stored):
         pairs = zip(vars(self).values(), vars(later).values(), strict=True)
         return LaterRows(*(torch.cat(pair) for pair in pairs))
 
+    def merge(self) -> LaterRows:
+        """Return one row a place, as likely to every kind: what rows there miss in the mean, by
+        their noise; as new as the last of them.
+        """
+        places, which = self.places.unique(dim=0, return_inverse=True)
+        told = 1 / (self.noise + self.faded + TINY)
+        total = told.new_zeros(len(places)).index_add(0, which, told)
+        missed = torch.zeros_like(total).index_add(0, which, told * self.missed) / total
+        last = torch.zeros_like(which[: len(places)]).scatter_reduce(
+            0, which, torch.arange(len(which)), "amax", include_self=False
+        )
+        rows = replace(self[last], missed=missed, noise=1 / total, faded=0 * total)
+        return rows[rows.number.argsort()]
+
     def spread(self, extent: float, most: int) -> LaterRows:
         """Return so many rows at most, the latest of each part of a site
         of this extent before others [m].
@@ -246,7 +260,7 @@ def evidence(
         extent, common, scale: see `Belief`.
         looked: rows of a station, at most.
     """
-    spread = [rows.spread(extent, looked) for rows in stations]
+    spread = [rows.merge().spread(extent, looked) for rows in stations]
     most = max(len(rows) for rows in spread)
     # Stations of fewer rows get rows of endless noise, which tell nothing of kinds.
     missed = torch.stack([_padded(_values(rows, common).T, most) for rows in spread]).mT
@@ -256,12 +270,10 @@ def evidence(
     )
     places, doubt = parts
     noise = torch.stack([_padded(rows.noise, most, UNTOLD) for rows in spread])[:, None]
-    faded = torch.stack([_padded(rows.faded, most) for rows in spread])[:, None]
-    noise = NOISES[:, None] + noise + faded + TINY
     gram = covariance_by_kind(places, places, doubt, doubt, extent, scale)[:, None].repeat(
         1, len(NOISES), 1, 1, 1
     )
-    gram.diagonal(dim1=-2, dim2=-1).add_(noise[:, :, None])
+    gram.diagonal(dim1=-2, dim2=-1).add_((NOISES[:, None] + noise)[:, :, None])
     factor = Factor.from_gram(gram, "raise")
     white = factor.whiten(missed[:, None, ..., None].expand(-1, len(NOISES), -1, -1, -1))
     return -0.5 * (white.square().sum((-1, -2)) + factor.log_determinant)
@@ -354,9 +366,10 @@ def correct(
     weight, added = belief.of(station)
     kinds = (weight >= LEAST).nonzero()[:, 0]
     weight = weight[kinds] / weight[kinds].sum()
-    noise, values = added + rows.noise + rows.faded + TINY, _values(rows, belief.common)[kinds]
+    rows = rows.merge()
+    values = _values(rows, belief.common)[kinds]
     if len(rows) <= NEAR:
-        mean, variance, near = _solve(belief, rows, noise, values, kinds, places[None], doubt[None])
+        mean, variance, near = _solve(belief, rows, added, values, kinds, places[None], doubt[None])
         mean, variance, near = mean[0], variance[0], near[0]
     else:
         nearest = torch.from_numpy(cKDTree(rows.places.numpy()).query(places.numpy(), NEAR)[1])
@@ -365,7 +378,7 @@ def correct(
             _solve(
                 belief,
                 rows[index],
-                noise[index],
+                added,
                 values[:, index].movedim(0, 1),
                 kinds,
                 place[:, None],
@@ -389,7 +402,7 @@ def correct(
 def _solve(
     belief: Belief,
     rows: LaterRows,
-    noise: Tensor,
+    added: Tensor,
     values: Tensor,
     kept: Tensor,
     places: Tensor,
@@ -401,7 +414,7 @@ def _solve(
     """
     lengths = belief.extent, belief.scale, kept
     gram = covariance_by_kind(rows.places, rows.places, rows.doubt, rows.doubt, *lengths)
-    gram.diagonal(dim1=-2, dim2=-1).add_(noise.unsqueeze(-2))
+    gram.diagonal(dim1=-2, dim2=-1).add_((rows.noise + added).unsqueeze(-2))
     cross = covariance_by_kind(places, rows.places, doubt, rows.doubt, *lengths)
     factor = Factor.from_gram(gram, "raise")
     mean = (cross @ factor.solve(values[..., None]))[..., 0]
