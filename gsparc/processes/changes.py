@@ -11,6 +11,7 @@ one of all rows that a map was learned from.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -29,11 +30,14 @@ ERRORS = 1 / 20  # length of a map's own errors between its rows, as a share of 
 NEAR, LOOKED = 64, 60  # rows that tell of a place; ones of a station that tell its kind of change
 # Side of the parts of a place that these are of, as a share; more than parts
 PART, RADIX = 1 / 5, 1000
+# Weights of coordinates whose sums tell places apart
+MIXED = torch.tensor((2, 3, 5, 7, 11, 13)).double().sqrt() * 1e3
 BLOCK = 64  # queries at a time where each has neighbours of its own: memory
 NOISES = torch.tensor(
     (0.0, 1.0, 4.0, 12.0, 36.0)
 ).double()  # what later rows of a station may have on top [dB^2]
-NOISY = torch.tensor((0.8, 0.05, 0.05, 0.05, 0.05)).double()  # shares of stations before any row
+# Shares of stations before any row, of a garage and a library that were surveyed again
+NOISY = torch.tensor((0.67, 0.06, 0.2, 0.06, 0.01)).double()
 STRENGTH = 10.0  # stations that shares of kinds before any row count as
 SETTLED, LEAST = 25, 0.02  # rounds of shares; weight below which a kind is not asked
 COMMON, OFFSETS = 5, 2.0  # stations that an offset of all of them is told from; its deviation [dB]
@@ -45,7 +49,7 @@ WHOLE = 4  # power of the share of the place that rows lie in: whether a lone st
 # Length over which rows of a lone station that seems moved void the map: a local change's
 AWAY = 1 / 10
 SURE = 3.0  # deviations by which rows that came before must be contradicted to fade
-CHANGED = 3  # of KINDS: the change that is expected of a station once one was noticed
+CHANGED = 3  # of KINDS: a local change
 UNTOLD = 1e9  # noise of a row that is not there [dB^2]
 REFITTED = 200  # latest rows of a station that tell the lengths of changes
 # Of a scale that are tried; deviations of an octave
@@ -74,13 +78,16 @@ class Kind(NamedTuple):
 
 
 KINDS = (
-    Kind("none", 0.0, 0.0, 0.1, 1.0, 0.8),
+    Kind("none", 0.0, 0.0, 0.1, 1.0, 0.7),
     Kind("offset", 2.5, 0.0, 0.1, 1.0, 0.06),
     Kind("offset", 10.0, 0.0, 0.1, 1.0, 0.04),
     Kind("local", 0.5, 6.0, 1 / 10, 1.0, 0.04),
     Kind("local", 3.0, 3.0, 1 / 4, 1.0, 0.04),
     Kind("moved", 10.0, 8.0, 1 / 4, 0.0, 0.02),
+    # A map whose errors are larger than it states; nothing changed
+    Kind("none", 0.0, 3.0, 1 / 20, 1.0, 0.1),
 )
+SAME = torch.tensor([kind.name == "none" for kind in KINDS])
 OFFSET, LOCAL, SIZE, KEEPS, SHARE = (
     torch.tensor(part).double() for part in zip(*(k[1:] for k in KINDS), strict=True)
 )
@@ -162,11 +169,15 @@ class LaterRows(Stored):
         pairs = zip(vars(self).values(), vars(later).values(), strict=True)
         return LaterRows(*(torch.cat(pair) for pair in pairs))
 
-    def merge(self) -> LaterRows:
-        """Return one row a place, as likely to every kind: what rows there miss in the mean, by
-        their noise; as new as the last of them.
+    def merge(self, visits: bool = False) -> LaterRows:
+        """Return one row a place, of every update where `visits`: what rows there miss in the mean,
+        by their noise; as new as the last of them.
         """
-        places, which = self.places.unique(dim=0, return_inverse=True)
+        if not len(self):
+            return self
+        # Places that differ have other sums; rows of equal ones are sought much faster so.
+        visit = self.places @ MIXED[: self.places.shape[1]] + self.batch * visits
+        places, which = visit.unique(return_inverse=True)
         told = 1 / (self.noise + self.faded + TINY)
         total = told.new_zeros(len(places)).index_add(0, which, told)
         missed = torch.zeros_like(total).index_add(0, which, told * self.missed) / total
@@ -260,7 +271,7 @@ def evidence(
         extent, common, scale: see `Belief`.
         looked: rows of a station, at most.
     """
-    spread = [rows.merge().spread(extent, looked) for rows in stations]
+    spread = [rows.spread(extent, looked) for rows in stations]
     most = max(len(rows) for rows in spread)
     # Stations of fewer rows get rows of endless noise, which tell nothing of kinds.
     missed = torch.stack([_padded(_values(rows, common).T, most) for rows in spread]).mT
@@ -276,7 +287,9 @@ def evidence(
     gram.diagonal(dim1=-2, dim2=-1).add_((NOISES[:, None] + noise)[:, :, None])
     factor = Factor.from_gram(gram, "raise")
     white = factor.whiten(missed[:, None, ..., None].expand(-1, len(NOISES), -1, -1, -1))
-    return -0.5 * (white.square().sum((-1, -2)) + factor.log_determinant)
+    lacking = torch.tensor([most - len(rows) for rows in spread])[:, None, None]
+    determinant = factor.log_determinant - lacking * math.log(UNTOLD)
+    return -0.5 * (white.square().sum((-1, -2)) + determinant)
 
 
 def _padded(values: Tensor, length: int, filling: float = 0.0) -> Tensor:
@@ -295,8 +308,8 @@ def learn(stations: Mapping[int, LaterRows], extent: float, scale: float = 1.0) 
     names = tuple(sorted(name for name, rows in stations.items() if len(rows)))
     if not names:
         return Belief(extent, scale=scale)
-    common = _common_offset([stations[name] for name in names])
-    log_density = evidence([stations[name] for name in names], extent, common, scale)
+    common = common_offset([stations[name] for name in names])
+    log_density = evidence([stations[name].merge() for name in names], extent, common, scale)
     share, noisy = SHARE, NOISY
     for _ in range(SETTLED):
         weight = (noisy.log()[:, None] + share.log() + log_density).flatten(1).softmax(1)
@@ -319,14 +332,15 @@ def refit_scale(stations: Mapping[int, LaterRows], belief: Belief) -> float:
     )
     if not parts:
         return belief.scale
-    common, before = _common_offset(parts), NOISY.log()[:, None] + SHARE.log()
+    common, before = common_offset(parts), NOISY.log()[:, None] + SHARE.log()
+    parts = [rows.merge() for rows in parts]
     density = [evidence(parts, belief.extent, common, scale, REFITTED) + before for scale in scales]
     likely = torch.stack(density).flatten(2).logsumexp(2).sum(1)
     return scales[int((likely - (OCTAVES * torch.tensor(scales).log2()).square() / 2).argmax())]
 
 
-def _common_offset(stations: Sequence[LaterRows]) -> float:
-    """What all stations' latest rows miss alike [dB]: 0 of few stations,
+def common_offset(stations: Sequence[LaterRows]) -> float:
+    """Return what all stations' latest rows miss alike [dB]: 0 of few stations,
     shrunk by how unsure it is.
 
     Either it is 0, or normal with deviation `OFFSETS`. Its error has two parts: stations differ,
@@ -397,6 +411,30 @@ def correct(
     mean = belief.common + level + (KEEPS[kinds, None] + away) * mean + away * (rows.middle - level)
     middle = weight @ mean
     return MeanVariance(middle, weight @ (variance + (mean - middle).square()))
+
+
+@torch.no_grad()
+def main_effect(rows: LaterRows, extent: float) -> tuple[str, float, Tensor]:
+    """Return the name of the change that does most to predictions at a station's rows, decibels
+    that are added where it is, and shares (n,) of it of these rows' places, merged.
+    """
+    belief, rows = learn({0: rows}, extent), rows.merge()
+    weight, added = belief.of(0)
+    kinds = torch.arange(len(KINDS))
+    mean, _, _ = _solve(
+        belief, rows, added, _values(rows, 0.0), kinds, rows.places[None], rows.doubt[None]
+    )
+    # Of a map that tells nothing any more its middle is what is left.
+    mean = mean[0] - (1 - KEEPS)[:, None] * (rows.level - rows.middle)
+    effects = {
+        name: sum(weight[k] * mean[k] for k, kind in enumerate(KINDS) if kind.name == name)
+        for name in {kind.name for kind in KINDS} - {"none"}
+    }
+    name = max(effects, key=lambda name: float(effects[name].square().mean()))
+    applied = sum(effects.values())
+    share = applied.square() if name == "local" else torch.ones_like(applied)
+    share = share / share.sum()
+    return name, float(share @ applied), share
 
 
 def _solve(
