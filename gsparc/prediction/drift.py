@@ -21,6 +21,7 @@ from torch import Tensor
 
 from gsparc.data.schema import Site
 from gsparc.processes.changes import (
+    NAMED,
     NOISY,
     SAME,
     SHARE,
@@ -37,7 +38,6 @@ from gsparc.processes.stored import Stored
 ROWS = 10_000  # readings to a false alarm, at least, in the mean
 TOGETHER = 8  # rows of a station that are tested at a time
 LOOKED = 32  # rows near new ones that tell of them
-NAMED = 60  # rows that may name a change; what later ones miss is another
 UNLIKELY = -3.0  # log ratio below which what seemed to begin has not
 # Two deviations of what stations of unchanged buildings differ by from survey to survey [dB]
 UNUSUAL = 3.0

@@ -38,6 +38,7 @@ NOISES = torch.tensor(
 ).double()  # what later rows of a station may have on top [dB^2]
 # Shares of stations before any row, of a garage and a library that were surveyed again
 NOISY = torch.tensor((0.8, 0.05, 0.1, 0.04, 0.01)).double()
+NAMED = 120  # rows that name a change: of fewer a small part of the place may have too few
 STRENGTH = 10.0  # stations that shares of kinds before any row count as
 SETTLED, LEAST = 25, 0.02  # rounds of shares; weight below which a kind is not asked
 COMMON, OFFSETS = 5, 2.0  # stations that an offset of all of them is told from; its deviation [dB]
@@ -295,19 +296,24 @@ def _padded(values: Tensor, length: int, filling: float = 0.0) -> Tensor:
     return torch.cat([values, values.new_full((length - len(values), *values.shape[1:]), filling)])
 
 
-def learn(stations: Mapping[int, LaterRows], extent: float, scale: float = 1.0) -> Belief:
+def learn(
+    stations: Mapping[int, LaterRows], extent: float, scale: float = 1.0, looked: int = LOOKED
+) -> Belief:
     """Return what the stations' rows say together: the common offset, the noise,
     and kinds of change.
 
     Args:
         stations: rows of each.
         extent, scale: see `Belief`.
+        looked: places of a station that tell its kind of change.
     """
     names = tuple(sorted(name for name, rows in stations.items() if len(rows)))
     if not names:
         return Belief(extent, scale=scale)
     common = common_offset([stations[name] for name in names])
-    log_density = evidence([stations[name].merge() for name in names], extent, common, scale)
+    log_density = evidence(
+        [stations[name].merge() for name in names], extent, common, scale, looked
+    )
     share, noisy = SHARE, NOISY
     for _ in range(SETTLED):
         weight = (noisy.log()[:, None] + share.log() + log_density).flatten(1).softmax(1)
@@ -416,7 +422,7 @@ def main_effect(rows: LaterRows, extent: float) -> tuple[str, float, Tensor]:
     """Return the name of the change that does most to predictions at a station's rows, decibels
     that are added where it is, and shares (n,) of it of these rows' places, merged.
     """
-    belief, rows = learn({0: rows}, extent), rows.merge()
+    belief, rows = learn({0: rows}, extent, looked=NAMED), rows.merge()
     weight, added = belief.of(0)
     kinds = torch.arange(len(KINDS))
     mean, _, _ = _solve(
