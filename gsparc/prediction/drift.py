@@ -114,7 +114,7 @@ class Watch(Stored):
             for part in later.number[later.number >= first].split(TOGETHER):
                 told = later[(later.number <= part[-1]) & (later.number >= result.begun[station])]
                 if result._standing(station) is None:
-                    result = result._advance(station, told, part, extent, rows)
+                    result = result._advance(station, told, len(part), extent, rows)
             if (turn := result._standing(station)) is not None:
                 alarms = list(result.alarms)
                 now = _named(alarms[turn], later[later.number >= result.begun[station]], extent)
@@ -153,12 +153,12 @@ class Watch(Stored):
         return replace(rows, missed=rows.missed - offset)
 
     def _advance(
-        self, station: int, world: LaterRows, new: Tensor, extent: float, rows: float
+        self, station: int, world: LaterRows, count: int, extent: float, rows: float
     ) -> Watch:
-        """The state after rows of numbers `new`, the last ones of a world."""
-        before, new = world[: -len(new)], world[-len(new) :]
+        """The state after the last `count` rows of a world."""
+        before, new = world[:-count], world[-count:]
         run = world[world.number >= self.since[station]]
-        near = _nearest(before, new), _nearest(run[: -len(new)], new)
+        near = _nearest(before, new), _nearest(run[:-count], new)
         parts = [near[0].join(new), near[0], near[1].join(new), near[1]]
         likely = evidence([part.merge(visits=True) for part in parts], extent, 0.0)
         density = (likely + NOISY.log()[:, None]).logsumexp(1) + SHARE.log()
@@ -170,7 +170,9 @@ class Watch(Stored):
             self.since[station], self.total[station] = int(new.number[-1]) + 1, 0.0
         if self.detector[station] < math.log(rows):
             return self
-        change = correct(learn({0: run}, extent), 0, run, run.places, run.level, run.doubt).mean
+        change = correct(
+            learn({0: run}, extent, looked=NAMED), 0, run, run.places, run.level, run.doubt
+        ).mean
         change = change - run.level
         # It began where what follows is told better so than by the map.
         gain = run.missed.square() - (run.missed - change).square()

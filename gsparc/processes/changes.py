@@ -430,12 +430,13 @@ def main_effect(rows: LaterRows, extent: float) -> tuple[str, float, Tensor]:
     )
     # Of a map that tells nothing any more its middle is what is left.
     mean = mean[0] - (1 - KEEPS)[:, None] * (rows.level - rows.middle)
+    none = torch.zeros_like(rows.missed)
     effects = {
-        name: sum(weight[k] * mean[k] for k, kind in enumerate(KINDS) if kind.name == name)
+        name: sum((weight[k] * mean[k] for k, kind in enumerate(KINDS) if kind.name == name), none)
         for name in {kind.name for kind in KINDS} - {"none"}
     }
     name = max(effects, key=lambda name: float(effects[name].square().mean()))
-    applied = sum(effects.values())
+    applied = sum(effects.values(), none)
     share = torch.ones_like(applied) if name == "offset" else applied.square()
     share = share / share.sum()
     return name, float(share @ applied), share
