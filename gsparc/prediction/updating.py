@@ -45,7 +45,7 @@ from gsparc.prediction.later_rows import (
     read_level_rows,
 )
 from gsparc.prediction.query import Asked
-from gsparc.processes.changes import Belief, LaterRows, learn, refit_scale
+from gsparc.processes.changes import Belief, LaterRows, correct, learn, refit_scale
 from gsparc.processes.stored import Stored, from_plain, to_plain
 from gsparc.tables.array_checks import MOST_DB
 
@@ -180,22 +180,17 @@ class UpdateMixin(Asked):
         belief, stations = changes.belief, changes.stations
         extent = belief.extent
         new = self._read_rows(rows, changes)
+        before = {name: stations.get(name, later[:0]) for name, later in new.items()}
         for name, later in new.items():
-            before = stations.get(name, later[:0])
-            stations[name] = before.fade(later, extent, fade_db).join(later)[-window:]
-        # The test believes what earlier rows said of a station's noise.
-        noisy = {
-            name: replace(station, noise=station.noise + belief.of(name)[1])
-            for name, station in known_only(stations).items()
-        }
-        watch, surprises = version.watch.look(noisy, first, extent, false_alarm)
+            stations[name] = before[name].fade(later, extent, fade_db).join(later)[-window:]
+        watch = version.watch.look(known_only(stations), first, extent, false_alarm)
         numbers = np.arange(first, first + sum(map(len, new.values())))
-        # Of a station that had no map nothing is expected that could change.
-        kept = reduce(LaterRows.join, stations.values(), LaterRows.empty())
-        kept = kept[kept.number >= first][kept.number[kept.number >= first].argsort()]
-        deviations = (kept.missed / (kept.doubt + kept.noise).sqrt()).numpy()
-        was_known = torch.cat([kept.number[:0], *(rows.number for rows in noisy.values())])
-        deviations[torch.isin(kept.number, was_known).numpy()] = surprises
+        deviations = np.zeros(len(numbers))
+        for name, later in new.items():
+            now = correct(belief, name, before[name], later.places, later.level, later.doubt)
+            variance = now.variance + later.noise + belief.of(name)[1]
+            surprise = (later.level + later.missed - now.mean) / variance.sqrt()
+            deviations[later.number.numpy() - first] = surprise.numpy()
         alarms, skipped = (
             watch.alarms[len(version.watch.alarms) :],
             silent + len(rows) - len(numbers),

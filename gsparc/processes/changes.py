@@ -11,6 +11,7 @@ one of all rows that a map was learned from.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
@@ -30,11 +31,15 @@ ERRORS = 1 / 20  # length of a map's own errors between its rows, as a share of 
 NEAR, LOOKED = 64, 60  # rows that tell of a place; ones of a station that tell its kind of change
 # Side of the parts of a place that these are of, as a share; more than parts
 PART, RADIX = 1 / 5, 1000
+# Weights of coordinates whose sums tell places apart
+MIXED = torch.tensor((2, 3, 5, 7, 11, 13)).double().sqrt() * 1e3
 BLOCK = 64  # queries at a time where each has neighbours of its own: memory
 NOISES = torch.tensor(
     (0.0, 1.0, 4.0, 12.0, 36.0)
 ).double()  # what later rows of a station may have on top [dB^2]
-NOISY = torch.tensor((0.8, 0.05, 0.05, 0.05, 0.05)).double()  # shares of stations before any row
+# Shares of stations before any row, of a garage and a library that were surveyed again
+NOISY = torch.tensor((0.8, 0.05, 0.1, 0.04, 0.01)).double()
+NAMED = 120  # rows that name a change: of fewer a small part of the place may have too few
 STRENGTH = 10.0  # stations that shares of kinds before any row count as
 SETTLED, LEAST = 25, 0.02  # rounds of shares; weight below which a kind is not asked
 COMMON, OFFSETS = 5, 2.0  # stations that an offset of all of them is told from; its deviation [dB]
@@ -46,7 +51,7 @@ WHOLE = 4  # power of the share of the place that rows lie in: whether a lone st
 # Length over which rows of a lone station that seems moved void the map: a local change's
 AWAY = 1 / 10
 SURE = 3.0  # deviations by which rows that came before must be contradicted to fade
-CHANGED = 3  # of KINDS: the change that is expected of a station once one was noticed
+CHANGED = 3  # of KINDS: a local change
 UNTOLD = 1e9  # noise of a row that is not there [dB^2]
 REFITTED = 200  # latest rows of a station that tell the lengths of changes
 # Of a scale that are tried; deviations of an octave
@@ -82,6 +87,7 @@ KINDS = (
     Kind("local", 3.0, 3.0, 1 / 4, 1.0, 0.04),
     Kind("moved", 10.0, 8.0, 1 / 4, 0.0, 0.02),
 )
+SAME = torch.tensor([kind.name == "none" for kind in KINDS])
 OFFSET, LOCAL, SIZE, KEEPS, SHARE = (
     torch.tensor(part).double() for part in zip(*(k[1:] for k in KINDS), strict=True)
 )
@@ -162,6 +168,24 @@ class LaterRows(Stored):
         """Return these rows and later ones."""
         pairs = zip(vars(self).values(), vars(later).values(), strict=True)
         return LaterRows(*(torch.cat(pair) for pair in pairs))
+
+    def merge(self, visits: bool = False) -> LaterRows:
+        """Return one row a place, of every update where `visits`: what rows there miss in the mean,
+        by their noise; as new as the last of them.
+        """
+        if not len(self):
+            return self
+        # Places that differ have other sums; rows of equal ones are sought much faster so.
+        visit = self.places @ MIXED[: self.places.shape[1]] + self.batch * visits
+        places, which = visit.unique(return_inverse=True)
+        told = 1 / (self.noise + self.faded + TINY)
+        total = told.new_zeros(len(places)).index_add(0, which, told)
+        missed = torch.zeros_like(total).index_add(0, which, told * self.missed) / total
+        last = torch.zeros_like(which[: len(places)]).scatter_reduce(
+            0, which, torch.arange(len(which)), "amax", include_self=False
+        )
+        rows = replace(self[last], missed=missed, noise=1 / total, faded=0 * total)
+        return rows[rows.number.argsort()]
 
     def spread(self, extent: float, most: int) -> LaterRows:
         """Return so many rows at most, the latest of each part of a site
@@ -257,15 +281,15 @@ def evidence(
     )
     places, doubt = parts
     noise = torch.stack([_padded(rows.noise, most, UNTOLD) for rows in spread])[:, None]
-    faded = torch.stack([_padded(rows.faded, most) for rows in spread])[:, None]
-    noise = NOISES[:, None] + noise + faded + TINY
     gram = covariance_by_kind(places, places, doubt, doubt, extent, scale)[:, None].repeat(
         1, len(NOISES), 1, 1, 1
     )
-    gram.diagonal(dim1=-2, dim2=-1).add_(noise[:, :, None])
+    gram.diagonal(dim1=-2, dim2=-1).add_((NOISES[:, None] + noise)[:, :, None])
     factor = Factor.from_gram(gram, "raise")
     white = factor.whiten(missed[:, None, ..., None].expand(-1, len(NOISES), -1, -1, -1))
-    return -0.5 * (white.square().sum((-1, -2)) + factor.log_determinant)
+    lacking = torch.tensor([most - len(rows) for rows in spread])[:, None, None]
+    determinant = factor.log_determinant - lacking * math.log(UNTOLD)
+    return -0.5 * (white.square().sum((-1, -2)) + determinant)
 
 
 def _padded(values: Tensor, length: int, filling: float = 0.0) -> Tensor:
@@ -273,19 +297,24 @@ def _padded(values: Tensor, length: int, filling: float = 0.0) -> Tensor:
     return torch.cat([values, values.new_full((length - len(values), *values.shape[1:]), filling)])
 
 
-def learn(stations: Mapping[int, LaterRows], extent: float, scale: float = 1.0) -> Belief:
+def learn(
+    stations: Mapping[int, LaterRows], extent: float, scale: float = 1.0, looked: int = LOOKED
+) -> Belief:
     """Return what the stations' rows say together: the common offset, the noise,
     and kinds of change.
 
     Args:
         stations: rows of each.
         extent, scale: see `Belief`.
+        looked: places of a station that tell its kind of change.
     """
     names = tuple(sorted(name for name, rows in stations.items() if len(rows)))
     if not names:
         return Belief(extent, scale=scale)
-    common = _common_offset([stations[name] for name in names])
-    log_density = evidence([stations[name] for name in names], extent, common, scale)
+    common = common_offset([stations[name] for name in names])
+    log_density = evidence(
+        [stations[name].merge() for name in names], extent, common, scale, looked
+    )
     share, noisy = SHARE, NOISY
     for _ in range(SETTLED):
         weight = (noisy.log()[:, None] + share.log() + log_density).flatten(1).softmax(1)
@@ -308,14 +337,15 @@ def refit_scale(stations: Mapping[int, LaterRows], belief: Belief) -> float:
     )
     if not parts:
         return belief.scale
-    common, before = _common_offset(parts), NOISY.log()[:, None] + SHARE.log()
+    common, before = common_offset(parts), NOISY.log()[:, None] + SHARE.log()
+    parts = [rows.merge() for rows in parts]
     density = [evidence(parts, belief.extent, common, scale, REFITTED) + before for scale in scales]
     likely = torch.stack(density).flatten(2).logsumexp(2).sum(1)
     return scales[int((likely - (OCTAVES * torch.tensor(scales).log2()).square() / 2).argmax())]
 
 
-def _common_offset(stations: Sequence[LaterRows]) -> float:
-    """What all stations' latest rows miss alike [dB]: 0 of few stations,
+def common_offset(stations: Sequence[LaterRows]) -> float:
+    """Return what all stations' latest rows miss alike [dB]: 0 of few stations,
     shrunk by how unsure it is.
 
     Either it is 0, or normal with deviation `OFFSETS`. Its error has two parts: stations differ,
@@ -355,9 +385,10 @@ def correct(
     weight, added = belief.of(station)
     kinds = (weight >= LEAST).nonzero()[:, 0]
     weight = weight[kinds] / weight[kinds].sum()
-    noise, values = added + rows.noise + rows.faded + TINY, _values(rows, belief.common)[kinds]
+    rows = rows.merge()
+    values = _values(rows, belief.common)[kinds]
     if len(rows) <= NEAR:
-        mean, variance, near = _solve(belief, rows, noise, values, kinds, places[None], doubt[None])
+        mean, variance, near = _solve(belief, rows, added, values, kinds, places[None], doubt[None])
         mean, variance, near = mean[0], variance[0], near[0]
     else:
         nearest = torch.from_numpy(cKDTree(rows.places.numpy()).query(places.numpy(), NEAR)[1])
@@ -366,7 +397,7 @@ def correct(
             _solve(
                 belief,
                 rows[index],
-                noise[index],
+                added,
                 values[:, index].movedim(0, 1),
                 kinds,
                 place[:, None],
@@ -387,10 +418,35 @@ def correct(
     return MeanVariance(middle, weight @ (variance + (mean - middle).square()))
 
 
+@torch.no_grad()
+def main_effect(rows: LaterRows, extent: float) -> tuple[str, float, Tensor]:
+    """Return the name of the change that does most to predictions at a station's rows, decibels
+    that are added where it is, and shares (n,) of it of these rows' places, merged.
+    """
+    belief, rows = learn({0: rows}, extent, looked=NAMED), rows.merge()
+    weight, added = belief.of(0)
+    kinds = torch.arange(len(KINDS))
+    mean, _, _ = _solve(
+        belief, rows, added, _values(rows, 0.0), kinds, rows.places[None], rows.doubt[None]
+    )
+    # Of a map that tells nothing any more its middle is what is left.
+    mean = mean[0] - (1 - KEEPS)[:, None] * (rows.level - rows.middle)
+    none = torch.zeros_like(rows.missed)
+    effects = {
+        name: sum((weight[k] * mean[k] for k, kind in enumerate(KINDS) if kind.name == name), none)
+        for name in {kind.name for kind in KINDS} - {"none"}
+    }
+    name = max(effects, key=lambda name: float(effects[name].square().mean()))
+    applied = sum(effects.values(), none)
+    share = torch.ones_like(applied) if name == "offset" else applied.square()
+    share = share / share.sum()
+    return name, float(share @ applied), share
+
+
 def _solve(
     belief: Belief,
     rows: LaterRows,
-    noise: Tensor,
+    added: Tensor,
     values: Tensor,
     kept: Tensor,
     places: Tensor,
@@ -402,7 +458,7 @@ def _solve(
     """
     lengths = belief.extent, belief.scale, kept
     gram = covariance_by_kind(rows.places, rows.places, rows.doubt, rows.doubt, *lengths)
-    gram.diagonal(dim1=-2, dim2=-1).add_(noise.unsqueeze(-2))
+    gram.diagonal(dim1=-2, dim2=-1).add_((rows.noise + added).unsqueeze(-2))
     cross = covariance_by_kind(places, rows.places, doubt, rows.doubt, *lengths)
     factor = Factor.from_gram(gram, "raise")
     mean = (cross @ factor.solve(values[..., None]))[..., 0]

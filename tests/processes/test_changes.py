@@ -10,7 +10,6 @@ from rooms_later import draw, later_rows
 from gsparc.processes import changes
 from gsparc.processes.changes import KINDS, Belief, LaterRows, correct, learn
 from gsparc.processes.factor import Factor
-from gsparc.processes.innovations import innovations
 
 EXTENT = 28.0
 
@@ -91,23 +90,7 @@ def test_no_system_is_larger_than_the_nearest_rows(monkeypatch):
     monkeypatch.setattr(changes.Factor, "from_gram", spied)
     belief = learn({0: rows}, EXTENT)
     asked(belief, rows, draw(5, 9))
-    innovations(rows, 2990, EXTENT)
     assert sizes and max(sizes) <= changes.NEAR
-
-
-def test_innovations_of_a_map_that_holds_are_white():
-    surprise, _ = innovations(later_rows(600, 4), 0, EXTENT)
-    assert surprise.square().mean() == pytest.approx(1, abs=0.15)
-    assert abs(np.corrcoef(surprise[1:], surprise[:-1])[0, 1]) < 0.12
-
-
-def test_edges_of_a_change_surprise_little_and_what_returned_is_told_by_ratios():
-    surprise, ratio = innovations(later_rows(600, 4, change=-12.0), 0, EXTENT, changed=True)
-    assert surprise.square().mean() < 1.1 and (surprise.abs() > 3).double().mean() < 0.005
-    assert ratio.exp().mean() == pytest.approx(1, abs=0.05)
-    both = later_rows(300, 5, change=-12.0).join(later_rows(60, 6))
-    surprise, ratio = innovations(both, 300, EXTENT, changed=True)
-    assert ratio.sum() > 8 and ratio.min() > -1.5
 
 
 def test_one_row_that_is_off_fades_none_elsewhere():
