@@ -25,7 +25,7 @@ LANES = 16
 # Rows that fill the last register: far away and of weight 0, so that they add nothing.
 BEYOND = 1e6  # [m], a place that is near none
 MOST_STEPS = 8  # `kMostSteps` of ops/csrc/field/clutter.h
-LOST = 0.01  # of the mean variance at rows, which combinations of rows that are left out may add
+LOST = 0.003  # of the mean variance at rows, which combinations of rows that are left out may add
 
 Arrays = dict[str, Tensor]
 

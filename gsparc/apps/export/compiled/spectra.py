@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 
 from gsparc.apps.export.compiled.blob import Form
 from gsparc.field.frozen import FrozenArray, FrozenView
