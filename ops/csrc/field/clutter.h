@@ -9,8 +9,9 @@ namespace GSPARC_ISA {
 
 struct Clutter {
     static constexpr int kMostSteps = 8, kStep = 9, kBox = 7, kPatch = 16;  // reflections; numbers of each
-    static constexpr float kMargin = 0.03f, kSoft = 0.02f, kEdge = 1e-6f, kParallel = 1e-9f;
+    static constexpr float kMargin = 0.03f, kSoft = 0.02f, kEdge = 1e-6f, kParallel = 1e-9f, kNone = -2;
     int variants, steps, boxes, patches;
+    // Legs that end on plane `kNone` are of other searches, whose paths are longer: near a box they would hide.
     // Boxes and patches begin with the number of their search. A patch: its plane, corners, normal, offset, tangents.
     const float *still, *legs, *box, *patch;
 
@@ -30,7 +31,7 @@ struct Clutter {
         for (int v = 0; !valid && v <= variants; ++v) valid = trace(source, v % variants, place, points, planes);
         float seen = 1;
         for (int b = 0; valid && b < boxes; ++b)
-            if (box[b * kBox] == float(search)) seen *= past_box(box + b * kBox + 1, points);
+            if (box[b * kBox] == float(search)) seen *= past_box(box + b * kBox + 1, points, planes);
         bool ends_somewhere = false;
         for (int j = 0; j <= steps; ++j) {
             float missed = 1;
@@ -66,9 +67,10 @@ private:
         return valid;
     }
 
-    float past_box(const float* corners, const float (*points)[3]) const {
+    float past_box(const float* corners, const float (*points)[3], const float* planes) const {
         float chord = -INFINITY;
         for (int j = 0; j <= steps; ++j) {
+            if (planes[j] == kNone) continue;
             float enter = 0, leave = 1, squared = 0;
             for (int axis = 0; axis < 3; ++axis) {
                 const float start = points[j][axis], way = points[j + 1][axis] - start, whole = fabsf(way) < kEdge ? kEdge : way;

@@ -40,8 +40,8 @@ void gsparc_free(gsparc_field* field);
 gsparc_facts gsparc_about(const gsparc_field* field);
 
 /* The answer at one place, in the units of the measurements: a spectrum in [0, 1], a channel, a linear power.
- * `variance`: expected squared error of a power, or of a channel's entry (mean over these), NaN of others; `unknown`: the share in [0, 1] of what the training rows do
- * not tell, NaN where that is not known. Either may be null, which is quicker. */
+ * `variance`: expected squared error of a power, or of an entry of a channel (mean over these), NaN of others; `unknown`: the
+ * share in [0, 1] of what the training rows do not tell, NaN where that is not known. Either may be null, which is quicker. */
 int gsparc_query(const gsparc_field* field, const float* place, float* values, float* variance, float* unknown, void* scratch);
 
 #ifdef __cplusplus

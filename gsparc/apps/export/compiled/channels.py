@@ -222,8 +222,8 @@ def _clutter(
         met = torch.cat([part.flip(0)[:, :, :, 0] for part in parts], -1).movedim(0, 2)
         plane = legs.plane[:, :, 0, :-1, None].float()
         step = torch.cat([plane, met], -1)
-        # Before the first reflection of shorter ones: legs of no length, which end on no plane.
-        none = torch.tensor([-1.0, 0, 0, 0, 0, -1, 0, 0, 0]).expand(
+        # Before the first reflection of searches of shorter paths: legs that are not there.
+        none = torch.tensor([-2.0, 0, 0, 0, 0, -1, 0, 0, 0]).expand(
             *step.shape[:2], steps - step.shape[2], -1
         )
         row = torch.cat([legs.present.float(), torch.cat([none, step], 2).flatten(2)], 2)

@@ -185,10 +185,9 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
             f"{method.name}: of spectra only rendered Gaussians can be compiled (model=gsparc)"
         )
     if site.target.is_complex:
+        able = "model=image_source_gp, directional_gp, or gsparc with model.effects.residual=false"
         raise ValueError(
-            f"{method.name}: channels that are no sum of image sources have no compiled form "
-            "(model=image_source_gp has; so has model=gsparc of a phase that rows share, with "
-            "model.effects.residual=false)"
+            f"{method.name}: channels that are no sum of sources have no compiled form; take {able}"
         )
     # The law of distance goes on outside the box
     far = far_places(site, ANSWERED // FAR_SHARE, seed)
