@@ -10,8 +10,9 @@ from gsparc.apps.export.compiled.blob import CHECKED, HEAD, SECTION, Form, pack_
 SIZES = {
     1: (0, 1, 2, 7, 8, 9, 10, 11, 12, 13),
     2: (0, 1, 2, 7, 8, 9),
-    3: (0, 1, 2, 3, 4, 5),
+    3: tuple(range(15)),
     4: (0, 1, 2, 3, 4),
+    5: (0, 1),
 }
 WHOLE = [
     0,
@@ -69,9 +70,29 @@ def needed(kind: int, n: list[int]) -> dict[str, int]:
             "starts": -(-height // 4) * -(-width // 4) + 1,
         }
     if kind == 3:
-        count, rows, outputs, antennas, still, combs = n
-        padded, axes = -(-rows // 16) * 16, 6 if still > 1 else 3
+        count, rows, outputs, antennas, still, combs, searches, tellers, rank = n[:9]
+        watchers, blurred, variants, steps, boxes, patches = n[9:]
+        padded, wide, watching = (-(-size // 16) * 16 for size in (rows, tellers, watchers))
+        axes, told = 6 if still > 1 else 3, count if tellers else 0
+        hiding = {"still": 3, "legs": count * variants * (1 + 9 * steps)}
         return {
+            "counts": searches,
+            "shares": searches,
+            "watch": 3 * watching,
+            "watch_by": count if watchers else 0,
+            "watch_level": count if watchers else 0,
+            "watch_weights": count * watching,
+            "blur": blurred,
+            "blur_by": 9 * blurred,
+            "blur_rows": 3 * blurred * padded,
+            "teller": tellers,
+            "phasor": 2 * told,
+            "power": told,
+            "there": told * 2 * wide,
+            "root": rank * 2 * wide,
+            **(hiding if boxes or patches else {}),
+            "boxes": 7 * boxes,
+            "patches": 16 * patches,
             "moving": antennas * 3,
             "sources": count * 3,
             "images": still * count * 3,
@@ -85,6 +106,8 @@ def needed(kind: int, n: list[int]) -> dict[str, int]:
             "offsets": still * 3 if still > 1 else 0,
             "factors": 2 * antennas * still * outputs,
         }
+    if kind == 5:  # members are files of their own
+        return {}
     axes, rows, _, sets, terms = n
     return {
         "places": rows * axes,
@@ -148,6 +171,9 @@ def mutated(form: Form, draw: np.random.Generator) -> bytes:
             )
             with np.errstate(over="ignore"):
                 value[at] = some[draw.integers(len(some))]
+    if fits and form.kind == 3 and arrays["counts"].size:
+        # All of one search: told by as many sources as `needed` says.
+        arrays["counts"] = np.resize([numbers[0], 0], arrays["counts"].size).astype(np.int32)
     blob = bytearray(
         pack_form(Form(form.kind, numbers, arrays), np.zeros(3), float(draw.random() < 0.5))
     )

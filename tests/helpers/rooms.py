@@ -41,14 +41,24 @@ def shoebox(
 
 
 def directed(
-    count: int, *, pillar: bool = False, tones: int = 1, seed: int = 0
+    count: int,
+    *,
+    pillar: bool = False,
+    tones: int = 1,
+    array: np.ndarray | None = None,
+    seed: int = 0,
 ) -> tuple[Measurements, Fold, np.ndarray]:
     """A shoebox whose receivers measured where every visible path comes from,
     and its sources (7, 3) [m].
     """
     comb = 2.4e9 + 1e6 * np.arange(tones)
     trace, data, fold = shoebox(
-        count, pillar=pillar, frequency_hz=comb if tones > 1 else 2.4e9, max_order=1, seed=seed
+        count,
+        pillar=pillar,
+        frequency_hz=comb if tones > 1 else 2.4e9,
+        max_order=1,
+        array=array,
+        seed=seed,
     )
     sources = trace.images.mirror_points(trace.tx[0])
     rays = sources[None] - trace.rx[:, None]

@@ -1,7 +1,6 @@
 // The forms of a field, compiled once per instruction set.
 #include "image.h"
 #include "mixture.h"
-#include "sources.h"
 
 namespace gsparc {
 namespace GSPARC_ISA {

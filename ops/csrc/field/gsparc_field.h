@@ -13,7 +13,7 @@
 extern "C" {
 #endif
 
-#define GSPARC_FIELD_VERSION 3
+#define GSPARC_FIELD_VERSION 4
 #define GSPARC_FARTHEST_M 1e7              /* from the origin of the world: no place in metres lies beyond, as in Python */
 #define GSPARC_MOST_BYTES (INT64_C(1) << 28) /* of an answer and its scratch memory: files of more are refused, as damaged */
 
@@ -40,8 +40,8 @@ void gsparc_free(gsparc_field* field);
 gsparc_facts gsparc_about(const gsparc_field* field);
 
 /* The answer at one place, in the units of the measurements: a spectrum in [0, 1], a channel, a linear power.
- * `variance`: expected squared error of a power, NaN of others; `unknown`: the share in [0, 1] of what the training rows do
- * not tell, NaN where that is not known. Either may be null, which is quicker. */
+ * `variance`: expected squared error of a power, or of an entry of a channel (mean over these), NaN of others; `unknown`: the
+ * share in [0, 1] of what the training rows do not tell, NaN where that is not known. Either may be null, which is quicker. */
 int gsparc_query(const gsparc_field* field, const float* place, float* values, float* variance, float* unknown, void* scratch);
 
 #ifdef __cplusplus

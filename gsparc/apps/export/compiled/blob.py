@@ -13,7 +13,7 @@ import numpy as np
 from gsparc.prediction.predictor import Predictor
 
 # \r\n as in PNG: a transfer as text would change it, which is then found out. 64: a cache line.
-MAGIC, VERSION, LINE = b"GSPARC\r\n", 3, 64
+MAGIC, VERSION, LINE = b"GSPARC\r\n", 4, 64
 TYPES = {np.dtype(t): i for i, t in enumerate((np.float32, np.float64, np.int32, np.int64))}
 HEAD, SECTION = struct.Struct("<8sIIqq"), struct.Struct("<24sIIqq")
 CHECKED = 16  # bytes before those that the checksum is of
@@ -29,12 +29,14 @@ class Form:
         numbers: sizes and parameters, in the order in which the form's constructor reads them.
         arrays: by name, contiguous, of a type in `TYPES`.
         predictor: answers as the form does, for its error; None: the model itself does.
+        variance_lost: share of the mean variance at rows that variances are too large by.
     """
 
     kind: int
     numbers: list[float]
     arrays: dict[str, np.ndarray] = field(repr=False)
     predictor: Predictor | None = None
+    variance_lost: float = 0.0
 
 
 def pack_form(form: Form, origin: np.ndarray, error: float = 0.0, worst: float = 0.0) -> bytes:

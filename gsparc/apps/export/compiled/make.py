@@ -10,16 +10,15 @@ import numpy as np
 import torch
 
 from gsparc.apps.export.compiled.blob import Form
+from gsparc.apps.export.compiled.channels import compile_mean, compile_sources
 from gsparc.apps.export.compiled.powers import compile_powers
-from gsparc.apps.export.compiled.spectra import compile_array, compile_sources, compile_view
+from gsparc.apps.export.compiled.spectra import compile_array, compile_view
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.target import Kind
 from gsparc.field.frozen import FrozenArray, FrozenView
 from gsparc.models.baselines.gp import GaussianProcess
-from gsparc.models.closed_form import ClosedForm
-from gsparc.models.image_sources.clutter.blocking import Clutter
+from gsparc.models.directional.method import DirectionalGP
 from gsparc.models.image_sources.method import ImageSourceGP
-from gsparc.models.image_sources.rows import rows_of_measurements
 from gsparc.models.method import Method
 from gsparc.models.mixture.mixture import Mixture
 from gsparc.models.per_station import PerStation
@@ -31,7 +30,7 @@ from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.answers import ask
 from gsparc.prediction.predictor import Predictor
 
-ANSWERED = {"csi": 1500, "rssi": 3000}  # places that distilled forms are made from
+ANSWERED = 3000  # places that distilled powers are made from
 
 
 @dataclass(frozen=True)
@@ -77,7 +76,10 @@ def compile_model(predictor: Predictor, count: int = 4096, seed: int = 0) -> Com
     # An exact form is not measured: its error is that of rounding to float32.
     exact = compile_exactly(method, site)
     if exact is not None:
-        return CompiledForm(exact, 0.0, 0.0, f"{_NAMES[exact.kind]}, exactly")
+        summary = f"{_NAMES[exact.kind]}, exactly"
+        if lost := exact.variance_lost:
+            summary += f"; variances of {lost:.1%} more in the mean"
+        return CompiledForm(exact, 0.0, 0.0, summary)
     form = distil_form(predictor, seed)
     assert form.predictor is not None
     # Other seeds than that of the places distilled from,
@@ -126,7 +128,7 @@ _NAMES = dict(
             "a frozen image",
             "a sum of sources",
             "a process of powers",
-            "a mean of processes of powers",
+            "a mean of several such",
         ),
         1,
     )
@@ -136,7 +138,10 @@ _NAMES = dict(
 def compile_exactly(method: Method, site: Site) -> Form | None:
     """Return the form whose answers are the model's but for rounding; None where there is none."""
     if isinstance(method, Mixture):
-        return None if method.member is None else compile_exactly(method.member, site)
+        forms = [compile_exactly(member, site) for member in method.members]
+        known = [form for form in forms if form is not None]
+        whole = len(known) == len(forms)
+        return compile_mean(known, method.weights, method.doubt) if whole else None
     if isinstance(method, PowerField):
         if method.powers is None or method.fringes is not None:
             return None
@@ -147,9 +152,8 @@ def compile_exactly(method: Method, site: Site) -> Form | None:
         return _rendered(method, site)
     if isinstance(method, GaussianProcess):
         return None if method.powers is None else compile_powers(method.powers, site.target_scale)
-    if isinstance(method, ImageSourceGP):
-        cluttered = any(len(member.scene.clutter) for member in method.members)
-        return None if cluttered else compile_sources(method, site, method.query)
+    if isinstance(method, (ImageSourceGP, DirectionalGP)):
+        return compile_sources(method, site)
     return None
 
 
@@ -165,8 +169,8 @@ def _rendered(method: LearnedField, site: Site) -> Form | None:
 
 
 def distil_form(predictor: Predictor, seed: int) -> Form:
-    """Return a form near a model: its array's part alone, or sources or a process of powers given
-    its answers at random places.
+    """Return a form near a model: its array's part alone, or a process of powers given its answers
+    at random places.
 
     Raises:
         ValueError: channels that are not made of sources, or spectra that are not rendered.
@@ -180,13 +184,14 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
         raise ValueError(
             f"{method.name}: of spectra only rendered Gaussians can be compiled (model=gsparc)"
         )
-    sources = _sources_of(method) if site.target.is_complex else None
-    places = random_places(site, ANSWERED[site.kind], seed)
-    if sources is None:  # the law of distance that goes on outside the box
-        places = np.concatenate([places, far_places(site, len(places) // FAR_SHARE, seed)])
-    data = sample_model(predictor, places)
-    if sources is not None:
-        return _sources_given(sources, data)
+    if site.target.is_complex:
+        able = "model=image_source_gp, directional_gp, or gsparc with model.effects.residual=false"
+        raise ValueError(
+            f"{method.name}: channels that are no sum of sources have no compiled form; take {able}"
+        )
+    # The law of distance goes on outside the box
+    far = far_places(site, ANSWERED // FAR_SHARE, seed)
+    data = sample_model(predictor, np.concatenate([random_places(site, ANSWERED, seed), far]))
     # All rows are learned from: a model's answers have no noise
     # that validation would guard against.
     process = GaussianProcess()
@@ -194,36 +199,6 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
     form = compile_exactly(process, site)
     assert form is not None
     return replace(form, predictor=Predictor(process, site))
-
-
-def _sources_of(method: Method) -> ImageSourceGP:
-    """The sources of largest weight in a model of channels."""
-    parts = method.weighted_members() if isinstance(method, ClosedForm) else ()
-    for _, member in sorted(parts, key=lambda part: -part[0]):
-        if isinstance(member, ImageSourceGP):
-            return member
-    fault = (
-        "channels that are no sum of image sources have no compiled form "
-        "(model=image_source_gp has)"
-    )
-    raise ValueError(f"{method.name}: {fault}")
-
-
-def _sources_given(method: ImageSourceGP, data: Measurements) -> Form:
-    """The heaviest search's sources without clutter, their gains given a model's answers."""
-    member = method.members[int(torch.as_tensor(method.weights).argmax())]
-    # Sources work in their own unit, in which rows' factors are divided out.
-    data = replace(data, target=data.target * method.factors.numpy()[:, None])
-    rows = method.frame.normalise(
-        rows_of_measurements(data, np.arange(len(data)), len(data), method.settings.seed)
-    )
-    scene = replace(member.scene, clutter=Clutter.empty())
-    # Without __init__: its sources are given, and searching is what would be repeated.
-    alone = ImageSourceGP.__new__(ImageSourceGP)
-    alone.__dict__.update(method.__dict__, weights=torch.ones(1))
-    alone._set_posteriors(rows, [scene])
-    form = compile_sources(alone, data.site, alone.query)
-    return replace(form, predictor=Predictor(alone, data.site))
 
 
 def random_places(site: Site, count: int, seed: int) -> np.ndarray:

@@ -37,7 +37,7 @@ def compile_powers(process: PowerProcess, scale: float) -> Form | None:
         named = {f"member{i}": np.frombuffer(file, np.int64) for i, file in enumerate(files)}
         # As many as `kMost` of ops/csrc/field/mixture.h.
         fits = len(files) == len(weights) <= LANES
-        return Form(5, [len(weights), *weights], named) if fits else None
+        return Form(5, [len(weights), 1.0, *weights], named) if fits else None
     posterior, kernel, trend = process.posterior, process.kernel, process.trend
     if (signed := kernel.compiled_lengths) is None or trend.more:
         return None
