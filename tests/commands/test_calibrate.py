@@ -73,7 +73,7 @@ def test_few_good_rows_promised_nothing_as_no_level_accepted_enough() -> None:
 
 def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> None:
     evidence, kept = _evidence(), []
-    monkeypatch.setattr("gsparc.runs.open_runs.store_trusted", lambda *stored: kept.append(stored))
+    monkeypatch.setattr("gsparc.runs.unseen.store_trusted", lambda *stored: kept.append(stored))
     how, unseen = (
         ("auto", False, 0),
         Unseen("a.ckpt", {}, Trusted(), Trusted(known=evidence.position), evidence),
