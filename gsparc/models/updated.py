@@ -25,7 +25,8 @@ from gsparc.models.reduced import View
 from gsparc.models.station_views import OneStationView
 from gsparc.models.target_rows import linear_moments
 from gsparc.processes.averages import MeanVariance
-from gsparc.processes.changes import TINY, Belief, LaterRows, correct
+from gsparc.processes.changes import TINY, Belief, correct
+from gsparc.processes.later_rows import LaterRows
 from gsparc.processes.powers import PowerRows
 from gsparc.processes.stored import Stored, from_plain
 

@@ -25,13 +25,13 @@ from gsparc.processes.changes import (
     NOISY,
     SAME,
     SHARE,
-    LaterRows,
     common_offset,
     correct,
     evidence,
     learn,
     main_effect,
 )
+from gsparc.processes.later_rows import LaterRows
 from gsparc.processes.places import first_end, horizontal
 from gsparc.processes.stored import Stored
 

@@ -45,7 +45,8 @@ from gsparc.prediction.later_rows import (
     read_level_rows,
 )
 from gsparc.prediction.query import Asked
-from gsparc.processes.changes import Belief, LaterRows, correct, learn, refit_scale
+from gsparc.processes.changes import Belief, correct, fade, learn, refit_scale
+from gsparc.processes.later_rows import LaterRows
 from gsparc.processes.stored import Stored, from_plain, to_plain
 from gsparc.tables.array_checks import MOST_DB
 
@@ -182,7 +183,7 @@ class UpdateMixin(Asked):
         new = self._read_rows(rows, changes)
         before = {name: stations.get(name, later[:0]) for name, later in new.items()}
         for name, later in new.items():
-            stations[name] = before[name].fade(later, extent, fade_db).join(later)[-window:]
+            stations[name] = fade(before[name], later, extent, fade_db).join(later)[-window:]
         watch = version.watch.look(known_only(stations), first, extent, false_alarm)
         numbers = np.arange(first, first + sum(map(len, new.values())))
         deviations = np.zeros(len(numbers))

@@ -24,15 +24,12 @@ from torch import Tensor
 from gsparc.processes.averages import MeanVariance
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import distances
+from gsparc.processes.later_rows import TINY, LaterRows
 from gsparc.processes.matern import matern32
 from gsparc.processes.stored import Stored
 
 ERRORS = 1 / 20  # length of a map's own errors between its rows, as a share of the site
 NEAR, LOOKED = 64, 60  # rows that tell of a place; ones of a station that tell its kind of change
-# Side of the parts of a place that these are of, as a share; more than parts
-PART, RADIX = 1 / 5, 1000
-# Weights of coordinates whose sums tell places apart
-MIXED = torch.tensor((2, 3, 5, 7, 11, 13)).double().sqrt() * 1e3
 BLOCK = 64  # queries at a time where each has neighbours of its own: memory
 NOISES = torch.tensor(
     (0.0, 1.0, 4.0, 12.0, 36.0)
@@ -57,7 +54,6 @@ REFITTED = 200  # latest rows of a station that tell the lengths of changes
 # Of a scale that are tried; deviations of an octave
 STEPS, OCTAVES = (1.0, 0.5, 2**-0.5, 2**0.5, 2.0), 2.0
 HUNDRED = 100.0  # later rows that a fading is stated for
-TINY = 1e-6  # [dB^2]
 
 
 class Kind(NamedTuple):
@@ -123,111 +119,25 @@ class Belief(Stored):
         return self.weight[index], torch.as_tensor(self.noise).expand(len(self.names))[index]
 
 
-@dataclass(frozen=True)
-class LaterRows(Stored):
-    """Rows of one station that came after its map was learned.
+def fade(rows: LaterRows, later: LaterRows, extent: float, fade_db: float) -> LaterRows:
+    """Return the rows with the variance that their age adds,
+    and what later ones contradict of them.
 
-    Attributes:
-        number: (n,) int64 of each row, ascending as they came.
-        batch: (n,) int64, the update that it came with.
-        places: (n, D) float64 [m].
-        level: (n,) of the map there [dB].
-        missed: (n,) what was measured less that [dB].
-        doubt: (n,) variance of the map's error there [dB^2].
-        noise: (n,) variance of a measurement [dB^2].
-        faded: (n,) variance that was added since, as later rows contradict [dB^2].
-        silent: (n,) bool, where nothing was heard, and the level that it was below stands for the
-            power.
+    Of what the means of both miss nearby, first of an offset of all, then of what is left, the
+    square counts beyond `SURE` deviations. Nearby is near:
+    on either side of an edge rows are right.
     """
-
-    number: Tensor
-    batch: Tensor
-    places: Tensor
-    level: Tensor
-    missed: Tensor
-    doubt: Tensor
-    noise: Tensor
-    faded: Tensor
-    silent: Tensor
-
-    def __len__(self) -> int:
-        return len(self.number)
-
-    @classmethod
-    def empty(cls) -> LaterRows:
-        """Return no rows."""
-        none, number = torch.zeros(0).double(), torch.zeros(0, dtype=torch.int64)
-        place = torch.zeros(0, 3).double()
-        return cls(number, number, place, none, none, none, none, none, none > 0)
-
-    def __getitem__(self, chosen: Tensor | slice) -> LaterRows:
-        """Return the rows `chosen`."""
-        return LaterRows(*(part[chosen] for part in vars(self).values()))
-
-    def join(self, later: LaterRows) -> LaterRows:
-        """Return these rows and later ones."""
-        pairs = zip(vars(self).values(), vars(later).values(), strict=True)
-        return LaterRows(*(torch.cat(pair) for pair in pairs))
-
-    def merge(self, visits: bool = False) -> LaterRows:
-        """Return one row a place, of every update where `visits`: what rows there miss in the mean,
-        by their noise; as new as the last of them.
-        """
-        if not len(self):
-            return self
-        # Places that differ have other sums; rows of equal ones are sought much faster so.
-        visit = self.places @ MIXED[: self.places.shape[1]] + self.batch * visits
-        places, which = visit.unique(return_inverse=True)
-        told = 1 / (self.noise + self.faded + TINY)
-        total = told.new_zeros(len(places)).index_add(0, which, told)
-        missed = torch.zeros_like(total).index_add(0, which, told * self.missed) / total
-        last = torch.zeros_like(which[: len(places)]).scatter_reduce(
-            0, which, torch.arange(len(which)), "amax", include_self=False
-        )
-        rows = replace(self[last], missed=missed, noise=1 / total, faded=0 * total)
-        return rows[rows.number.argsort()]
-
-    def spread(self, extent: float, most: int) -> LaterRows:
-        """Return so many rows at most, the latest of each part of a site
-        of this extent before others [m].
-
-        Rows of a walk that ends elsewhere are no reason to forget what was changed.
-        """
-        places = self.places.flip(0)
-        part = (places / (extent * PART)).floor() @ (
-            RADIX ** torch.arange(places.shape[1])
-        ).double()
-        parts, order = part.sort(stable=True)
-        turn = torch.empty_like(order)
-        turn[order] = torch.arange(len(order)) - torch.searchsorted(parts, parts)
-        return self[(len(order) - 1 - turn.argsort(stable=True)[:most]).sort().values]
-
-    @property
-    def middle(self) -> Tensor:
-        """What a map that tells nothing any more is taken for [dB]."""
-        return self.level.mean()
-
-    def fade(self, later: LaterRows, extent: float, fade_db: float) -> LaterRows:
-        """Return the rows with the variance that their age adds,
-        and what later ones contradict of them.
-
-        Of what the means of both miss nearby, first of an offset of all, then of what is left, the
-        square counts beyond `SURE` deviations. Nearby is near:
-        on either side of an edge rows are right.
-        """
-        near = matern32(distances(later.places, self.places), extent * ERRORS) + TINY
-        total, spread = near.sum(1), self.doubt + self.noise + self.faded
-        off = later.missed - near @ self.missed / total
-        error = later.doubt + later.noise + near.square() @ spread / total.square()
-        # One row tells of no offset; those of a part of the place miss alike, too.
-        unsure = SURE**2 * (error.mean() + LOCAL[CHANGED].square()) / (len(off) - 1)
-        added = (off.mean().square() - unsure).clamp_min(0.0)
-        residual, total = off - off.mean() * (added > 0), near.sum(0)
-        local = (residual @ near / total).square() - SURE**2 * (
-            error @ near.square()
-        ) / total.square()
-        aged = fade_db**2 * len(later) / HUNDRED
-        return replace(self, faded=self.faded + aged + added + near.amax(0) * local.clamp_min(0.0))
+    near = matern32(distances(later.places, rows.places), extent * ERRORS) + TINY
+    total, spread = near.sum(1), rows.doubt + rows.noise + rows.faded
+    off = later.missed - near @ rows.missed / total
+    error = later.doubt + later.noise + near.square() @ spread / total.square()
+    # One row tells of no offset; those of a part of the place miss alike, too.
+    unsure = SURE**2 * (error.mean() + LOCAL[CHANGED].square()) / (len(off) - 1)
+    added = (off.mean().square() - unsure).clamp_min(0.0)
+    residual, total = off - off.mean() * (added > 0), near.sum(0)
+    local = (residual @ near / total).square() - SURE**2 * (error @ near.square()) / total.square()
+    aged = fade_db**2 * len(later) / HUNDRED
+    return replace(rows, faded=rows.faded + aged + added + near.amax(0) * local.clamp_min(0.0))
 
 
 def covariance_by_kind(

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from gsparc.processes.changes import LaterRows
+from gsparc.processes.later_rows import LaterRows
 
 SIZE, HEIGHT, CABINET, RADIUS = 20.0, 1.5, np.array([5.0, 5.0]), 4.0
 

@@ -9,7 +9,8 @@ from rooms_later import CABINET, later_rows
 
 from gsparc.data.schema import Site, Stations
 from gsparc.prediction.drift import Watch
-from gsparc.processes.changes import LaterRows
+from gsparc.processes.changes import fade
+from gsparc.processes.later_rows import LaterRows
 
 BEGIN, EXTENT = 150, 28.0
 
@@ -53,7 +54,7 @@ def test_a_change_is_noticed_once_and_its_end_is_named():
     for turn, change in enumerate((0.0, 0.0, *[-12.0] * 6, *[0.0] * 4)):
         new = later_rows(50, 7 + turn, change=change)
         new = LaterRows(new.number + 50 * turn, new.batch + turn, *list(vars(new).values())[2:])
-        rows = rows.fade(new, EXTENT, 1.0).join(new) if turn else new
+        rows = fade(rows, new, EXTENT, 1.0).join(new) if turn else new
         watch = watch.look({0: rows}, 50 * turn, EXTENT)
     first, last = watch.alarms
     assert first.kind == "local" and 100 <= first.at < 180
