@@ -344,7 +344,7 @@ def main_effect(rows: LaterRows, extent: float) -> tuple[str, float, Tensor]:
     none = torch.zeros_like(rows.missed)
     effects = {
         name: sum((weight[k] * mean[k] for k, kind in enumerate(KINDS) if kind.name == name), none)
-        for name in {kind.name for kind in KINDS} - {"none"}
+        for name in dict.fromkeys(kind.name for kind in KINDS if kind.name != "none")
     }
     name = max(effects, key=lambda name: float(effects[name].square().mean()))
     applied = sum(effects.values(), none)

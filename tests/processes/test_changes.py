@@ -8,7 +8,7 @@ import torch
 from rooms_later import draw, later_rows
 
 from gsparc.processes import changes
-from gsparc.processes.changes import KINDS, Belief, correct, fade, learn
+from gsparc.processes.changes import KINDS, Belief, correct, fade, learn, main_effect
 from gsparc.processes.factor import Factor
 from gsparc.processes.later_rows import LaterRows
 
@@ -117,3 +117,9 @@ def test_a_walk_elsewhere_is_no_reason_to_forget_a_change():
     )
     assert (before < -65).all() and after == pytest.approx(before, abs=1)
     assert len(rows.join(far).spread(EXTENT, 40)) == 40
+
+
+def test_rows_that_equal_their_map_had_a_change_that_is_no_number():
+    rows = later_rows(20, 3)
+    kind, change, share = main_effect(replace(rows, missed=0 * rows.missed), EXTENT)
+    assert kind != "none" and change == 0 and share.sum() == pytest.approx(1)
