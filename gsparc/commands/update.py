@@ -79,7 +79,7 @@ def _add_rows(
     data, placed = read_like_stored(stored, given["data"], keep_new=keep_new)
     if not placed:
         raise DataError(f"{given['data']}: has no places; later rows need them")
-    how = {name: given[name] for name in ("window", "fade_db", "false_alarm")}
+    how = {name: given[name] for name in ("window", "false_alarm")}
     rows, row_count, skipped = read_level_rows(data, predictor.site), 0, 0
     size, content = given["batch"] or len(rows), rows.content()
     if content in predictor.told and not given["again"]:

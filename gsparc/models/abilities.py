@@ -83,7 +83,7 @@ class AddsLinks(Protocol):
     def linked_stations(self) -> list[int] | None:
         """Numbers of stations with rows; None: of others it cannot learn."""
 
-    def add_links(self, rows: PowerRows, faded: Tensor) -> Any:
+    def add_links(self, rows: PowerRows) -> Any:
         """See `gsparc.models.powers.together.field.JointPowerField.add_links`."""
 
 

@@ -25,12 +25,11 @@ from gsparc.models.reduced import View
 from gsparc.models.station_views import OneStationView
 from gsparc.models.target_rows import linear_moments
 from gsparc.processes.averages import MeanVariance
-from gsparc.processes.changes import TINY, Belief, correct
-from gsparc.processes.later_rows import LaterRows
+from gsparc.processes.changes import Belief, correct
+from gsparc.processes.later_rows import TINY, LaterRows
 from gsparc.processes.powers import PowerRows
 from gsparc.processes.stored import Stored, from_plain
 
-NOW = 2**62  # number after those of all rows
 STORED = "updates"  # in what a checkpoint holds besides
 UNSAID = 1.0  # variance of powers, of their square, where a method states none
 # Share of a stated variance that counts as the map's own error where nothing tells it apart
@@ -49,7 +48,6 @@ class Changes(Stored):
     Attributes:
         belief: see there.
         rows: later rows, a pair of station and rows each; 0 stands for a site with one station.
-        shifts: (station, dB, number of the row that comes next) that were said, not measured.
         new: local places of stations that came later [m], whose rows stand under `NOBODY` - 1, - 2,
             and so on.
         next_number, next_batch: of the row and of the update that come next.
@@ -57,16 +55,24 @@ class Changes(Stored):
 
     belief: Belief
     rows: tuple[tuple[int, LaterRows], ...] = ()
-    shifts: tuple[tuple[int, float, int], ...] = ()
     next_number: int = 0
     next_batch: int = 0
     new: tuple[tuple[float, float, float], ...] = ()
 
-    @property
-    def links(self) -> tuple[PowerRows, Tensor] | None:
-        """Rows of new stations that were heard, at places (n, 6) of both ends, and variances (n,)
-        by which they faded since [dB^2]; None: there are none.
+    @classmethod
+    def read(cls, state: Mapping[str, Any]) -> Changes:
+        """Return those of a file.
+
+        Raises:
+            ValueError: an older one, in which levels were set by hand.
         """
+        if state.get("shifts"):
+            raise ValueError("levels were moved by `shift`, which is no more; tell rows instead")
+        return super().read({name: state[name] for name in cls.__annotations__})
+
+    @property
+    def links(self) -> PowerRows | None:
+        """Rows of new stations that were heard, at places (n, 6) of both ends; None: none."""
         parts = [(n, rows[~rows.silent]) for n, rows in self.rows if n < NOBODY]
         rows = reduce(LaterRows.join, (rows for _, rows in parts), LaterRows.empty())
         if not len(rows):
@@ -74,7 +80,7 @@ class Changes(Stored):
         number = np.repeat([NOBODY - 1 - n for n, _ in parts], [len(part) for _, part in parts])
         places = np.concatenate([rows.places.numpy(), np.array(self.new)[number]], 1)
         level = (rows.level + rows.missed).numpy()
-        return PowerRows(places, level, np.zeros(len(rows), np.int8)), rows.faded
+        return PowerRows(places, level, np.zeros(len(rows), np.int8))
 
     @property
     def stations(self) -> dict[int, LaterRows]:
@@ -92,17 +98,6 @@ class Changes(Stored):
             raise ValueError(
                 f"{len(self.belief.weight)} weights of {len(self.belief.names)} stations"
             )
-
-    def shift(self, station: int | np.ndarray, number: int | np.ndarray = NOW) -> Any:
-        """Return what was said of stations () or (n,)
-        before the rows of these numbers came [dB].
-        """
-        # Older files do not say when.
-        parts = [(change * (station == name), since) for name, change, *since in self.shifts]
-        return sum(
-            (change * (number >= (*since, 0)[0]) for change, since in parts),
-            0.0 * np.asarray(station),
-        )
 
 
 @dataclass(frozen=True)
@@ -152,7 +147,7 @@ class Updated(View):
         super().__init__(inner)
         self.changes, self.own, self.site = changes, own, inner.fitted_site
         links = changes.links
-        self.told = inner if links is None else _with_links(inner, *links)
+        self.told = inner if links is None else _with_links(inner, links)
 
     @property
     def stored_class(self) -> type[MethodFactory]:
@@ -201,7 +196,6 @@ class Updated(View):
                 mean[at], doubt[at] = correct(
                     self.changes.belief, station, later, places[at], mean[at], doubt[at]
                 )
-            mean[at] += self.changes.shift(station)
         return Level(mean, doubt, before.noise)
 
     def state(self) -> dict[str, Any]:  # type: ignore[override]
@@ -249,10 +243,10 @@ def linked_stations(method: Method) -> list[int] | None:
     return member.linked_stations if isinstance(member, AddsLinks) else None
 
 
-def _with_links(method: Method, rows: PowerRows, faded: Tensor) -> Method:
+def _with_links(method: Method, rows: PowerRows) -> Method:
     """A method with rows of new stations."""
     member: Any = getattr(method, "member", method)
-    learned = member.add_links(rows, faded)
+    learned = member.add_links(rows)
     if member is method:
         return cast(Method, learned)
     result = copy(method)
@@ -266,7 +260,7 @@ def with_changes(method: Method, changes: Changes | None, own: int | None = None
 
     `own` is the number of the station that the method alone answers for; None: it knows all.
     """
-    changes = changes if changes is not None and (changes.rows or changes.shifts) else None
+    changes = changes if changes is not None and changes.rows else None
     if isinstance(method, OneStationView):
         view = copy(method)
         view.inner = with_changes(method.inner, changes)

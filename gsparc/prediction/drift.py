@@ -5,7 +5,8 @@ much likelier they are in a world that changed, whose kinds are those of the map
 sums over all times of change (the recursion of Shiryaev and Roberts; J. Shin, A. Ramdas, A.
 Rinaldo, arXiv:2203.03532). That sum, less the number of rows, is a martingale without change, for
 all stations together: an alarm where it exceeds the stated number of rows keeps the mean number of
-rows to a false alarm above it. A change is named by what it does to predictions.
+rows to a false alarm above it. A change is named by what it does to predictions, and what came
+before it tells no more. Of a changed world the next change is sought alike.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ ROWS = 10_000  # readings to a false alarm, at least, in the mean
 TOGETHER = 8  # rows of a station that are tested at a time
 LOOKED = 32  # rows near new ones that tell of them
 UNLIKELY = -3.0  # log ratio below which what seemed to begin has not
+AGAIN = 2  # power of the rows to a false alarm of a changed world: rows tell of it, no map
 # Two deviations of what stations of unchanged buildings differ by from survey to survey [dB]
 UNUSUAL = 3.0
 SILENT = 0.5  # share of rows since a change in which a station is not heard any more: it is gone
@@ -113,19 +115,18 @@ class Watch(Stored):
             later = result._without_device(all_rows)
             for part in later.number[later.number >= first].split(TOGETHER):
                 told = later[(later.number <= part[-1]) & (later.number >= result.begun[station])]
-                if result._standing(station) is None:
-                    result = result._advance(station, told, len(part), extent, rows)
+                result = result._advance(station, told, len(part), extent, rows)
             if (turn := result._standing(station)) is not None:
-                alarms = list(result.alarms)
-                now = _named(alarms[turn], later[later.number >= result.begun[station]], extent)
-                if now.kind == RETURNED:
-                    start = max(first, now.since)
-                    result.begun[station] = result.since[station] = start
-                    alarms.append(replace(now, since=start, at=int(later.number[-1])))
-                elif ((later.number >= now.since) & (later.number < first)).sum() < NAMED:
-                    alarms[turn] = now
+                alarms, world = list(result.alarms), later[later.number >= result.begun[station]]
+                if (world.number < first).sum() < NAMED:
+                    alarms[turn] = _named(alarms[turn], world, extent)
                 result = replace(result, alarms=tuple(alarms))
         return result
+
+    def of_now(self, station: int, rows: LaterRows) -> LaterRows:
+        """Return a station's rows since the update in which its last change began."""
+        now = rows.batch[rows.number >= self.begun[station]]
+        return rows[rows.batch >= now.min()] if len(now) else rows
 
     def _standing(self, station: int) -> int | None:
         """Number of the alarm that stands for a station; None: it is as the map says."""
@@ -162,29 +163,37 @@ class Watch(Stored):
         parts = [near[0].join(new), near[0], near[1].join(new), near[1]]
         likely = evidence([part.merge(visits=True) for part in parts], extent, 0.0)
         density = (likely + NOISY.log()[:, None]).logsumexp(1) + SHARE.log()
-        stays, changed = density[:2, SAME].logsumexp(1), density[2:, ~SAME].logsumexp(1)
-        ratio = float(changed[0] - changed[1] - stays[0] + stays[1])
+        # A map's world ends with a change of it, a changed one with any that its rows do not say.
+        changed = self._standing(station) is not None
+        stays = density[:2, SAME | changed].logsumexp(1)
+        ends = density[2:, ~SAME | changed].logsumexp(1)
+        ratio = float(ends[0] - ends[1] - stays[0] + stays[1])
         self.detector[station] = np.logaddexp(self.detector[station], math.log(len(new))) + ratio
         self.total[station] += ratio
         if self.total[station] < UNLIKELY:
             self.since[station], self.total[station] = int(new.number[-1]) + 1, 0.0
-        if self.detector[station] < math.log(rows):
+        if self.detector[station] < math.log(rows) * (AGAIN if changed else 1):
             return self
-        change = correct(
-            learn({0: run}, extent, looked=NAMED), 0, run, run.places, run.level, run.doubt
-        ).mean
-        change = change - run.level
-        # It began where what follows is told better so than by the map.
-        gain = run.missed.square() - (run.missed - change).square()
+        # It began where what follows is told better so than by what came before.
+        before, now = (_told(part, run, extent) for part in (world[: -len(run)], run))
+        gain = (run.missed - before).square() - (run.missed - now).square()
         run = run[int(gain.flip(0).cumsum(0).flip(0).argmax()) :]
         noted = Alarm(station, "", int(run.number[0]), int(new.number[-1]), 0.0, (0.0, 0.0))
         noted = _named(noted, run, extent)
         # What is too small for a change may still grow.
-        if abs(noted.change_db) < UNUSUAL:
+        if abs(noted.change_db) < UNUSUAL and not changed:
             return self
+        if abs(noted.change_db) < UNUSUAL / 2:
+            noted = replace(noted, kind=RETURNED)
         self.detector[station], self.total[station] = -math.inf, 0.0
-        self.begun[station] = noted.since
+        self.begun[station], self.since[station] = noted.since, noted.at + 1
         return replace(self, alarms=(*self.alarms, noted))
+
+
+def _told(rows: LaterRows, at: LaterRows, extent: float) -> Tensor:
+    """Change (n,) of the map where other rows are [dB], as a station's rows say."""
+    belief = learn({0: rows}, extent, looked=NAMED)
+    return correct(belief, 0, rows, at.places, at.level, at.doubt).mean - at.level
 
 
 def _nearest(rows: LaterRows, new: LaterRows) -> LaterRows:
@@ -196,8 +205,7 @@ def _nearest(rows: LaterRows, new: LaterRows) -> LaterRows:
 def _named(alarm: Alarm, rows: LaterRows, extent: float) -> Alarm:
     """An alarm as a station's rows since tell."""
     kind, change, share = main_effect(rows, extent)
-    gone = rows.silent.double().mean() > SILENT
-    kind = RETURNED if abs(change) < UNUSUAL / 2 else "gone" if gone else kind
+    kind = "gone" if rows.silent.double().mean() > SILENT else kind
     where = _middle(rows.merge().places, share)
     return replace(alarm, kind=kind, change_db=change, place=where)
 

@@ -13,11 +13,9 @@ import torch
 
 from gsparc.base.errors import DataError
 from gsparc.base.limits import POSITIVE, check_arguments, switch, whole
-from gsparc.base.limits import number as limit_number
 from gsparc.data.ends import NOBODY, SAME_PLACE_M, stations_at
 from gsparc.data.query import Query
 from gsparc.data.schema import Measurements, Site
-from gsparc.data.station_names import find_station
 from gsparc.data.units import PowerUnit
 from gsparc.models.method import Method
 from gsparc.models.per_station import PerStation
@@ -45,18 +43,15 @@ from gsparc.prediction.later_rows import (
     read_level_rows,
 )
 from gsparc.prediction.query import Asked
-from gsparc.processes.changes import Belief, correct, fade, learn, refit_scale
+from gsparc.processes.changes import Belief, correct, learn, refit_scale
 from gsparc.processes.later_rows import LaterRows
 from gsparc.processes.stored import Stored, from_plain, to_plain
-from gsparc.tables.array_checks import MOST_DB
 
 WINDOW = 1_000  # later rows of a station that are kept
-FADE_DB = 1.0  # deviation that a hundred later rows of a station add to one of it that came before
 JOURNAL = 1_000  # lines that a version keeps
 VERSIONS = 11  # that are kept, the one that answers among them
 LIMITS = {
     "window": whole(1),
-    "fade_db": limit_number(0),
     "false_alarm": POSITIVE,
     "refit": switch(),
 }
@@ -125,7 +120,6 @@ class UpdateMixin(Asked):
         rssi: Any = None,
         unit: str | None = None,
         window: int = WINDOW,
-        fade_db: float = FADE_DB,
         false_alarm: float = ROWS,
         refit: bool = False,
         key: str | None = None,
@@ -152,8 +146,6 @@ class UpdateMixin(Asked):
                 power of 0) tells nothing.
             unit: of `rssi`; None: that of the measurements.
             window: later rows of a station that are kept, at least 1; the first ones are dropped.
-            fade_db: deviation that a hundred later rows of a station add to one that came before
-                [dB].
             false_alarm: readings to a false alarm without any change, at least, in the mean.
             refit: fit the length over which changes vary to the rows kept, too; tenths of a second.
             key: a name of these rows, which are taken once; None: as often as they are told.
@@ -183,8 +175,9 @@ class UpdateMixin(Asked):
         new = self._read_rows(rows, changes)
         before = {name: stations.get(name, later[:0]) for name, later in new.items()}
         for name, later in new.items():
-            stations[name] = fade(before[name], later, extent, fade_db).join(later)[-window:]
+            stations[name] = before[name].join(later)[-window:]
         watch = version.watch.look(known_only(stations), first, extent, false_alarm)
+        stations |= {n: watch.of_now(n, rows) for n, rows in known_only(stations).items()}
         numbers = np.arange(first, first + sum(map(len, new.values())))
         deviations = np.zeros(len(numbers))
         for name, later in new.items():
@@ -228,28 +221,6 @@ class UpdateMixin(Asked):
         }
         self._add_version(remainder, f"forget: {len(gone)} rows")
 
-    def shift(self, change_db: float, station: str | int | None = None) -> None:
-        """Say that the level of a station, or of all, is so many decibels higher from now on.
-
-        Raises:
-            ValueError: no such station, or no finite number.
-        """
-        known = self._model_site.every_station
-        number = self._own_station if station is None else find_station(station, known)
-        if station is not None and number is None:
-            raise ValueError(
-                f"shift: no station {station!r}; there are {', '.join(self.stations) or 'none'}"
-            )
-        limit_number(-MOST_DB, MOST_DB).check("change_db", change_db)
-        changes = self._current.changes
-        numbers = range(len(known)) if number is None else [number]
-        shifts = tuple((n, float(change_db), changes.next_number) for n in numbers)
-        whose = "all stations" if number is None else station or known.shown[number]
-        entry = f"shift: {change_db:+g} dB of {whose}"
-        self._add_version(
-            changes.stations, entry, replace(changes, shifts=(*changes.shifts, *shifts))
-        )
-
     def undo(self, count: int = 1) -> None:
         """Go back so many versions, bit for bit; `ValueError` where so many are not kept."""
         whole(1).check("count", count)
@@ -283,17 +254,14 @@ class UpdateMixin(Asked):
 
     @property
     def measured(self) -> dict[str, np.ndarray]:
-        """Later rows that are kept, as they came: `number`, `batch`, `station`, `place`, `level`,
-        `faded_db`.
+        """Later rows that are kept, as they came: `number`, `batch`, `station`, `place`, `level`.
 
-        Stations by number, places (n, 3) [m, world], levels in `site.level_unit`, and the deviation
-        by which each has faded since [dB].
+        Stations by number, places (n, 3) [m, world], levels in `site.level_unit`.
         """
         pairs = self._current.changes.rows
         parts = [pair for _, pair in pairs]
         joined = reduce(LaterRows.join, parts, LaterRows.empty())
         of = np.repeat([name for name, _ in pairs], [len(part) for part in parts]).astype(np.int64)
-        raised = torch.from_numpy(self._current.changes.shift(of, joined.number.numpy()))
         result = {
             "number": joined.number,
             "batch": joined.batch,
@@ -301,8 +269,7 @@ class UpdateMixin(Asked):
             "place": joined.places + torch.from_numpy(self.site.origin)
             if len(joined)
             else joined.places,
-            "level": joined.level + joined.missed + raised + to_decibels(self.site.target_scale),
-            "faded_db": joined.faded.sqrt(),
+            "level": joined.level + joined.missed + to_decibels(self.site.target_scale),
         }
         order = joined.number.argsort()
         return {name: value[order].numpy() for name, value in result.items()}
@@ -420,7 +387,7 @@ class UpdateMixin(Asked):
                 answers = AnywhereView(method)
             query = Query.from_places(there, torch.from_numpy(rows.places[index]).float())
             level = map_level(answers, predict_with_threads(answers, query), site)
-            missed = rows.decibels[index] - level.mean.numpy() - changes.shift(name)
+            missed = rows.decibels[index] - level.mean.numpy()
             # Of silence only a level is known that the power is below.
             tells = missed * -rows.side[index] > LOUD * np.sqrt((level.doubt + level.noise).numpy())
             used = np.flatnonzero((rows.side[index] == 0) | tells)
@@ -428,7 +395,7 @@ class UpdateMixin(Asked):
             number[index[used]] = 0
         number[number == 0] = changes.next_number + np.arange((number == 0).sum())
         for name, (index, level) in levels.items():
-            missed = torch.from_numpy(rows.decibels[index]) - level.mean - changes.shift(name)
+            missed = torch.from_numpy(rows.decibels[index]) - level.mean
             result[name] = LaterRows(
                 torch.from_numpy(number[index]),
                 torch.full((len(index),), changes.next_batch),
@@ -437,7 +404,6 @@ class UpdateMixin(Asked):
                 missed,
                 level.doubt,
                 level.noise,
-                torch.zeros_like(missed),
                 torch.from_numpy(rows.side[index] != 0),
             )
         return {name: rows for name, rows in result.items() if len(rows)}

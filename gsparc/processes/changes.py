@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ from torch import Tensor
 from gsparc.processes.averages import MeanVariance
 from gsparc.processes.factor import Factor
 from gsparc.processes.kernel import distances
-from gsparc.processes.later_rows import TINY, LaterRows
+from gsparc.processes.later_rows import LaterRows
 from gsparc.processes.matern import matern32
 from gsparc.processes.stored import Stored
 
@@ -47,13 +47,10 @@ ALIKE, COUNTS = (
 WHOLE = 4  # power of the share of the place that rows lie in: whether a lone station was moved
 # Length over which rows of a lone station that seems moved void the map: a local change's
 AWAY = 1 / 10
-SURE = 3.0  # deviations by which rows that came before must be contradicted to fade
-CHANGED = 3  # of KINDS: a local change
 UNTOLD = 1e9  # noise of a row that is not there [dB^2]
 REFITTED = 200  # latest rows of a station that tell the lengths of changes
 # Of a scale that are tried; deviations of an octave
 STEPS, OCTAVES = (1.0, 0.5, 2**-0.5, 2**0.5, 2.0), 2.0
-HUNDRED = 100.0  # later rows that a fading is stated for
 
 
 class Kind(NamedTuple):
@@ -117,27 +114,6 @@ class Belief(Stored):
             return self.share, torch.zeros(())
         index = self.names.index(station)
         return self.weight[index], torch.as_tensor(self.noise).expand(len(self.names))[index]
-
-
-def fade(rows: LaterRows, later: LaterRows, extent: float, fade_db: float) -> LaterRows:
-    """Return the rows with the variance that their age adds,
-    and what later ones contradict of them.
-
-    Of what the means of both miss nearby, first of an offset of all, then of what is left, the
-    square counts beyond `SURE` deviations. Nearby is near:
-    on either side of an edge rows are right.
-    """
-    near = matern32(distances(later.places, rows.places), extent * ERRORS) + TINY
-    total, spread = near.sum(1), rows.doubt + rows.noise + rows.faded
-    off = later.missed - near @ rows.missed / total
-    error = later.doubt + later.noise + near.square() @ spread / total.square()
-    # One row tells of no offset; those of a part of the place miss alike, too.
-    unsure = SURE**2 * (error.mean() + LOCAL[CHANGED].square()) / (len(off) - 1)
-    added = (off.mean().square() - unsure).clamp_min(0.0)
-    residual, total = off - off.mean() * (added > 0), near.sum(0)
-    local = (residual @ near / total).square() - SURE**2 * (error @ near.square()) / total.square()
-    aged = fade_db**2 * len(later) / HUNDRED
-    return replace(rows, faded=rows.faded + aged + added + near.amax(0) * local.clamp_min(0.0))
 
 
 def covariance_by_kind(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -28,7 +30,6 @@ class LaterRows(Stored):
         missed: (n,) what was measured less that [dB].
         doubt: (n,) variance of the map's error there [dB^2].
         noise: (n,) variance of a measurement [dB^2].
-        faded: (n,) variance that was added since, as later rows contradict [dB^2].
         silent: (n,) bool, where nothing was heard, and the level that it was below stands for the
             power.
     """
@@ -40,7 +41,6 @@ class LaterRows(Stored):
     missed: Tensor
     doubt: Tensor
     noise: Tensor
-    faded: Tensor
     silent: Tensor
 
     def __len__(self) -> int:
@@ -51,7 +51,12 @@ class LaterRows(Stored):
         """Return no rows."""
         none, number = torch.zeros(0).double(), torch.zeros(0, dtype=torch.int64)
         place = torch.zeros(0, 3).double()
-        return cls(number, number, place, none, none, none, none, none, none > 0)
+        return cls(number, number, place, none, none, none, none, none > 0)
+
+    @classmethod
+    def read(cls, state: Mapping[str, Any]) -> LaterRows:
+        """Return those of a file; an older one also has variances that grew since."""
+        return super().read({name: state[name] for name in cls.__annotations__})
 
     def __getitem__(self, chosen: Tensor | slice) -> LaterRows:
         """Return the rows `chosen`."""
@@ -71,13 +76,13 @@ class LaterRows(Stored):
         # Places that differ have other sums; rows of equal ones are sought much faster so.
         visit = self.places @ MIXED[: self.places.shape[1]] + self.batch * visits
         places, which = visit.unique(return_inverse=True)
-        told = 1 / (self.noise + self.faded + TINY)
+        told = 1 / (self.noise + TINY)
         total = told.new_zeros(len(places)).index_add(0, which, told)
         missed = torch.zeros_like(total).index_add(0, which, told * self.missed) / total
         last = torch.zeros_like(which[: len(places)]).scatter_reduce(
             0, which, torch.arange(len(which)), "amax", include_self=False
         )
-        rows = replace(self[last], missed=missed, noise=1 / total, faded=0 * total)
+        rows = replace(self[last], missed=missed, noise=1 / total)
         return rows[rows.number.argsort()]
 
     def spread(self, extent: float, most: int) -> LaterRows:

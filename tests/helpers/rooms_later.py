@@ -64,5 +64,5 @@ def later_rows(count: int, seed: int, **changed: float) -> LaterRows:
     places, rng = draw(count, seed), np.random.default_rng(seed)
     missed = truth(places, **changed) - truth(places) + rng.normal(0, np.sqrt(4.5), count)
     number, flat = torch.arange(count), np.ones(count)
-    parts = places, -60 * flat, missed, 0.5 * flat, 4 * flat, 0 * flat
+    parts = places, -60 * flat, missed, 0.5 * flat, 4 * flat
     return LaterRows(number, 0 * number, *map(torch.from_numpy, parts), number < 0)

@@ -9,7 +9,6 @@ from rooms_later import CABINET, later_rows
 
 from gsparc.data.schema import Site, Stations
 from gsparc.prediction.drift import Watch
-from gsparc.processes.changes import fade
 from gsparc.processes.later_rows import LaterRows
 
 BEGIN, EXTENT = 150, 28.0
@@ -54,8 +53,8 @@ def test_a_change_is_noticed_once_and_its_end_is_named():
     for turn, change in enumerate((0.0, 0.0, *[-12.0] * 6, *[0.0] * 4)):
         new = later_rows(50, 7 + turn, change=change)
         new = LaterRows(new.number + 50 * turn, new.batch + turn, *list(vars(new).values())[2:])
-        rows = fade(rows, new, EXTENT, 1.0).join(new) if turn else new
-        watch = watch.look({0: rows}, 50 * turn, EXTENT)
+        watch = watch.look({0: rows.join(new)}, 50 * turn, EXTENT)
+        rows = watch.of_now(0, rows.join(new))
     first, last = watch.alarms
     assert first.kind == "local" and 100 <= first.at < 180
     assert last.kind == "returned" and 400 <= last.at < 600 and abs(last.change_db) < 1.5

@@ -102,8 +102,6 @@ def test_places_beside_those_of_the_model_and_one_that_stands_still_are_taken(pr
 @pytest.mark.parametrize(
     "name, value",
     [
-        ("fade_db", -1),
-        ("fade_db", np.nan),
         ("false_alarm", 0),
         ("false_alarm", np.inf),
         ("window", 1.5),
@@ -121,8 +119,6 @@ def test_what_is_no_number_of_rows_or_decibels_is_refused(predictor):
     predictor.update(rx=AT, rssi=LEVELS)
     for rows in (np.nan, [0.5], "a"):
         refused("whole numbers are needed", predictor.forget, rows)
-    for change in (np.nan, 1e300, "3"):
-        refused("change_db=", predictor.shift, change)
     refused("count=1.5", predictor.undo, 1.5)
     refused(
         "not fitted yet",
@@ -130,16 +126,6 @@ def test_what_is_no_number_of_rows_or_decibels_is_refused(predictor):
         rx=AT,
         rssi=LEVELS,
     )
-
-
-def test_levels_come_back_as_they_came_whatever_was_said_of_the_station(predictor):
-    """They were off by what was said before they came, and would be by what is said after."""
-    predictor.update(rx=AT, rssi=LEVELS)
-    predictor.shift(3.0)
-    predictor.update(rx=AT, rssi=LEVELS)
-    predictor.shift(-2.0)
-    assert np.allclose(predictor.measured["level"], LEVELS * 2)
-    assert len(predictor.measured["level"]) == 6
 
 
 def test_rows_of_a_key_are_taken_once_until_they_are_undone(predictor, tmp_path):

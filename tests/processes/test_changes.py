@@ -8,7 +8,7 @@ import torch
 from rooms_later import draw, later_rows
 
 from gsparc.processes import changes
-from gsparc.processes.changes import KINDS, Belief, correct, fade, learn, main_effect
+from gsparc.processes.changes import KINDS, Belief, correct, learn, main_effect
 from gsparc.processes.factor import Factor
 from gsparc.processes.later_rows import LaterRows
 
@@ -92,20 +92,6 @@ def test_no_system_is_larger_than_the_nearest_rows(monkeypatch):
     belief = learn({0: rows}, EXTENT)
     asked(belief, rows, draw(5, 9))
     assert sizes and max(sizes) <= changes.NEAR
-
-
-def test_one_row_that_is_off_fades_none_elsewhere():
-    before, row = later_rows(100, 5), later_rows(1, 6, offset=-15.0)
-    far = np.linalg.norm((before.places - row.places)[:, :2].numpy(), axis=1) > 8
-    assert fade(before, row, EXTENT, 0.0).faded[far].max() < 0.5
-
-
-def test_rows_that_are_contradicted_fade_and_others_keep_their_weight():
-    before, later = later_rows(100, 5), later_rows(100, 6, change=-12.0)
-    faded = fade(before, later, EXTENT, 0.0).faded
-    near = np.linalg.norm(before.places[:, :2].numpy() - 5, axis=1)
-    assert faded[near < 2].min() > 10 and faded[near > 8].median() < 0.1
-    assert fade(before, later_rows(100, 7), EXTENT, 1.0).faded.median() == pytest.approx(1, abs=0.2)
 
 
 def test_a_walk_elsewhere_is_no_reason_to_forget_a_change():

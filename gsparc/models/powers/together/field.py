@@ -381,11 +381,11 @@ class JointPowerField(ClosedForm):
         """Numbers of stations with rows; None where it has no links."""
         return None if self.links is None else [*self.rows]
 
-    def add_links(self, rows: PowerRows, faded: Tensor) -> JointPowerField:
+    def add_links(self, rows: PowerRows) -> JointPowerField:
         """Return one that knows rows of stations without any, too, listed or not.
 
         Args:
-            rows, faded: see `Links.add`.
+            rows: see `Links.add`.
 
         Raises:
             ValueError: it has no links.
@@ -396,7 +396,7 @@ class JointPowerField(ClosedForm):
         result.places = np.concatenate([self.places, new[~listed]])
         numbers = stations_at(torch.from_numpy(result.places), new).tolist()
         result.rows = self.rows | dict.fromkeys(numbers, links.index[:0])
-        result.links = links.add(rows, faded)
+        result.links = links.add(rows)
         return result
 
     @property

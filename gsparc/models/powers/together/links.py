@@ -141,20 +141,17 @@ class Links(Stored):
     index: Tensor
     reciprocal: bool = False
 
-    def add(self, rows: PowerRows, faded: Tensor) -> Links:
-        """Return the same given further rows (n,) that were heard, at settings as they are.
-
-        Args:
-            rows: `places` (n, 6).
-            faded: (n,) variances on top of their noise [dB^2].
+    def add(self, rows: PowerRows) -> Links:
+        """Return the same given further rows, of places (n, 6), that were heard, at settings as
+        they are.
         """
         heard, values = self.heard, link_values(rows, self.law)
         if heard is not None:
-            heard = _add_values(heard, values, faded)
-        index = torch.cat([self.index, torch.full((len(faded),), -1, dtype=self.index.dtype)])
+            heard = _add_values(heard, values)
+        index = torch.cat([self.index, torch.full((len(rows.places),), -1, dtype=self.index.dtype)])
         if self.reciprocal:
-            values, faded = link_values(with_exchanged(rows), self.law), faded.repeat(2)
-        unheard = _add_values(self.unheard, values, faded)
+            values = link_values(with_exchanged(rows), self.law)
+        unheard = _add_values(self.unheard, values)
         return Links(self.law, heard, unheard, index, self.reciprocal)
 
     def of_station(self, heard: bool) -> Nearest | None:
@@ -277,12 +274,12 @@ def errors_of_heard(rows: StationRows, priors: LinkPriors, seed: int) -> np.ndar
     return (heard.left_out().mean - values)[:, 0].numpy()
 
 
-def _add_values(process: Nearest, values: PlaceValues, faded: Tensor) -> Nearest:
-    """The process given further values, among its densest, of noise that `faded` (n,) adds to."""
-    kernel, near = process.prior.kernel, process.near
-    level = np.full(len(faded), near.level.max(), np.int8)
+def _add_values(process: Nearest, values: PlaceValues) -> Nearest:
+    """The process given further values, among its densest."""
+    near, noise = process.near, process.prior.kernel.noise
+    level = np.full(len(values.places), near.level.max(), np.int8)
     places = np.concatenate([near.places, values.places])
-    noise = torch.cat([process.noise, kernel.noise + faded / kernel.amplitude])
+    noise = torch.cat([process.noise, process.noise.new_full((len(level),), float(noise))])
     rest = torch.cat([process.rest, values.values])
     near = Neighbourhood(places, np.concatenate([near.level, level]))
     return replace(process, near=near, rest=rest, noise=noise)
