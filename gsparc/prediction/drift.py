@@ -126,7 +126,10 @@ class Watch(Stored):
     def of_now(self, station: int, rows: LaterRows) -> LaterRows:
         """Return a station's rows since the update in which its last change began."""
         now = rows.batch[rows.number >= self.begun[station]]
-        return rows[rows.batch >= now.min()] if len(now) else rows
+        turn = self._standing(station)
+        # What more rows make smaller than a change was none.
+        small = turn is not None and abs(self.alarms[turn].change_db) < UNUSUAL
+        return rows if small or not len(now) else rows[rows.batch >= now.min()]
 
     def _standing(self, station: int) -> int | None:
         """Number of the alarm that stands for a station; None: it is as the map says."""
@@ -175,7 +178,9 @@ class Watch(Stored):
         if self.detector[station] < math.log(rows) * (AGAIN if changed else 1):
             return self
         # It began where what follows is told better so than by what came before.
-        before, now = (_told(part, run, extent) for part in (world[: -len(run)], run))
+        before, now = (
+            _told(part, run, extent) for part in (world[: -len(run) if changed else 0], run)
+        )
         gain = (run.missed - before).square() - (run.missed - now).square()
         run = run[int(gain.flip(0).cumsum(0).flip(0).argmax()) :]
         noted = Alarm(station, "", int(run.number[0]), int(new.number[-1]), 0.0, (0.0, 0.0))
