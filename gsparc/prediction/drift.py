@@ -40,7 +40,7 @@ ROWS = 10_000  # readings to a false alarm, at least, in the mean
 TOGETHER = 8  # rows of a station that are tested at a time
 LOOKED = 32  # rows near new ones that tell of them
 UNLIKELY = -3.0  # log ratio below which what seemed to begin has not
-AGAIN = 2  # power of the rows to a false alarm of a changed world: rows tell of it, no map
+AGAIN = 4  # power of the rows to a false alarm of a changed world: rows tell of it, no map
 # Two deviations of what stations of unchanged buildings differ by from survey to survey [dB]
 UNUSUAL = 3.0
 SILENT = 0.5  # share of rows since a change in which a station is not heard any more: it is gone
