@@ -1,11 +1,12 @@
-"""Single places answered in one call: an array's spectrum,
-and weights of the nearest rows of a process.
+"""Places answered in one call: an array's spectrum, weights of the nearest rows of a process,
+and correlations of waves from many directions.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import torch
 from torch import Tensor
 
 from gsparc.ops import calls
@@ -103,3 +104,21 @@ def nearest_weights(
     )
     # -1 where every covariance has a factor.
     return None if failed >= 0 else (weights, gains)
+
+
+def sum_directional(
+    squared: Tensor, before: Tensor, after: Tensor, powers: Tensor, concentration: float
+) -> Tensor:
+    """Return sums (T, n, m) complex128 of correlations of waves that come from about M directions.
+
+    Args:
+        squared: (n, m) float64, (k d)^2 of displacements d.
+        before, after: (M, n) and (M, m) float64; their differences are k d's parts towards each.
+        powers: (T, M) float64.
+        concentration: about each, of a von Mises-Fisher density.
+    """
+    sums = torch.empty(len(powers), *squared.shape, dtype=torch.complex128)
+    inputs = contiguous((squared, before, after, powers))
+    sizes = (*squared.shape, *reversed(powers.shape))
+    calls.launch("directional", squared, *inputs, sums, sizes=sizes, numbers=(concentration,))
+    return sums

@@ -1,6 +1,7 @@
 // The kernels, compiled once per instruction set (GSPARC_ISA names it); results do not depend on the threads.
 #define GSPARC_PACKS
 #include "backward.h"
+#include "directional.h"
 #include "frozen.h"
 #include "project.h"
 #include "query.h"

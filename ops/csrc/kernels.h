@@ -17,7 +17,7 @@ template <class S> struct ProjectArgs {
 // Kernels of Python, each a `template <class S> int64_t NAME(const Call&)` in a header of kernels.cpp.
 #define GSPARC_KERNELS(X) \
     X(composite) X(composite_backward) X(weights) X(weights_backward) X(freeze) X(thaw) X(similarity) \
-    X(array_spectrum) X(nearest_weights)
+    X(array_spectrum) X(nearest_weights) X(directional)
 
 template <class S> struct Kernels {
     // Returns -1, or 4 * Gaussian + (0 means, 1 quats, 2 scales, 3 opacities) for the first that is not sound.

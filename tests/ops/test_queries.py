@@ -2,10 +2,17 @@
 
 import pytest
 import torch
+from compute_kernels import SETS, assert_threads_agree, instruction_set
 
 from gsparc.datasets.rfid import planar_array
+from gsparc.models.channels.kernels import directional_correlation, fibonacci_sphere
 from gsparc.ops import SphereGrid
-from gsparc.ops.queries import array_spectrum, has_query_kernel, nearest_weights
+from gsparc.ops.queries import (
+    array_spectrum,
+    has_query_kernel,
+    nearest_weights,
+    sum_directional,
+)
 from gsparc.physics.bartlett import SpectrumRenderer
 from gsparc.processes.features import correlation, matern_mixture
 from gsparc.processes.kernel import ExponentialShadowing, Kernel, Shadowing, WhiteNoise
@@ -75,6 +82,27 @@ def test_rows_without_a_factor_are_said():
     places = torch.zeros(3, 3, dtype=torch.float64)
     noise, rows = torch.full((3,), -0.5, dtype=torch.float64), torch.tensor([[0, 1, 2]])
     assert nearest_weights(places[:1], places, noise, rows, (1.0,), (1.0,)) is None
+
+
+@SETS
+@pytest.mark.parametrize("concentration", [0.01, 5.0, 60.0])
+def test_sums_of_waves_from_many_directions(name, concentration):
+    """A place beside itself, beside its neighbour and a thousand wavelengths on."""
+    torch.manual_seed(2)
+    places, rows = torch.rand(5, 3, dtype=torch.float64), torch.rand(19, 3, dtype=torch.float64)
+    rows[:2], rows[2] = places[:2], places[2] + 1e-9
+    squared, angles = 9e6 * (places[:, None] - rows).square().sum(2), fibonacci_sphere(7)
+    before, after = 3e3 * angles @ places.T, 3e3 * angles @ rows.T
+    powers = torch.rand(6, 7, dtype=torch.float64)
+    along = before[:, :, None] - after[:, None]
+    each = directional_correlation(squared, along, concentration)
+    expected = torch.tensordot(powers.to(each.dtype), each, 1)
+    with instruction_set(name):
+        for sets in (powers, powers[:1]):
+            (sums,) = assert_threads_agree(
+                lambda sets=sets: [sum_directional(squared, before, after, sets, concentration)]
+            )
+            torch.testing.assert_close(sums, expected[: len(sets)], atol=1e-10, rtol=0)
 
 
 def test_followed_tensors_are_left_to_autograd():

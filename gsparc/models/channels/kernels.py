@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from gsparc.ops.transforms import needs_reference
 from gsparc.physics.waves import NEAR_M
 from gsparc.processes.kernel import IsotropicWaves
 
@@ -39,27 +38,9 @@ def directional_correlation(squared: Tensor, along: Tensor, concentration: float
         along: (...) k d's component towards the direction.
         concentration: about it.
     """
-    if squared.requires_grad or along.requires_grad or needs_reference(squared, along):
-        root = torch.complex(concentration**2 - squared, 2 * concentration * along).sqrt()
-        root = torch.where(root.abs() < SMALL, root + SMALL, root)
-        return root.sinh() / root * (concentration / math.sinh(concentration))
-    # In real numbers and in place: complex sqrt and sinh take four times as long.
-    with torch.no_grad():
-        real, imag = concentration**2 - squared, 2 * concentration * along
-        size = (real.square() + imag.square()).sqrt_()
-        larger = size.add(real.abs()).mul_(0.5).sqrt_().clamp_min_(SMALL)
-        smaller = imag.div_(2 * larger)
-        a, b = torch.where(real > 0, larger, smaller), torch.where(real > 0, smaller, larger)
-        rising, falling = a.exp(), (-a).exp()
-        x, y = (rising - falling).mul_(b.cos()), rising.add_(falling).mul_(b.sin())
-        share = (
-            size.clamp_min_(SMALL**2)
-            .reciprocal_()
-            .mul_(0.5 * concentration / math.sinh(concentration))
-        )
-        return torch.complex(
-            (x * a).addcmul_(y, b).mul_(share), y.mul_(a).sub_(x.mul_(b)).mul_(share)
-        )
+    root = torch.complex(concentration**2 - squared, 2 * concentration * along).sqrt()
+    root = torch.where(root.abs() < SMALL, root + SMALL, root)
+    return root.sinh() / root * (concentration / math.sinh(concentration))
 
 
 def isotropic_correlation(

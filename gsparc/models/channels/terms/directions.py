@@ -19,6 +19,7 @@ from gsparc.models.channels.columns import Slot, SlotPlaces
 from gsparc.models.channels.kernels import directional_correlation
 from gsparc.models.channels.terms.compressed import Basis
 from gsparc.models.channels.terms.term import HIGHEST, ChannelTerm
+from gsparc.ops.queries import has_query_kernel, sum_directional
 from gsparc.processes.kernel import distances
 from gsparc.processes.left_out import ENTRIES
 from gsparc.processes.matern import matern32
@@ -68,15 +69,20 @@ class Directions(ChannelTerm):
         at = torch.acos(cosine.clamp(-1, 1)) * ((knots - 1) / math.pi)
         return (1 - (at[..., None] - torch.arange(knots, dtype=torch.float64)).abs()).clamp_min(0)
 
-    def correlations(self, angles: Tensor, wavenumber: float, a: Tensor, b: Tensor) -> Tensor:
-        """Return correlations (M, n, m) complex128 of waves from each of `angles` (M, 3),
-        in the envelope.
+    def sum_correlations(
+        self, powers: Tensor, angles: Tensor, wavenumber: float, a: Tensor, b: Tensor
+    ) -> Tensor:
+        """Return sums (T, n, m) complex128 over waves from each of `angles` (M, 3)
+        of powers (T, M), without the envelope.
         """
         # Differences of small numbers, wherever the origin is
-        middle, distance = b[:1], distances(a, b)
+        middle, squared = b[:1], (wavenumber * distances(a, b)).square()
         before, after = (wavenumber * (angles @ (places - middle).T) for places in (a, b))
+        if has_query_kernel(squared, before, after, powers):
+            return sum_directional(squared, before, after, powers, self.concentration)
         along = before[:, :, None] - after[:, None]
-        return directional_correlation((wavenumber * distance).square(), along, self.concentration)
+        each = directional_correlation(squared, along, self.concentration)
+        return torch.tensordot(powers.to(each.dtype), each, 1)
 
     def covariance(self, a: SlotPlaces, b: SlotPlaces) -> Tensor:
         """Return `E sum_b p_b w_b V_b(d)` (n, m) complex128, see `Term`."""
@@ -84,14 +90,10 @@ class Directions(ChannelTerm):
 
     def end_covariances(self, a: Sequence[SlotPlaces], b: Sequence[SlotPlaces]) -> Iterable[Tensor]:
         """Return covariances of ends whose correlations are computed once, see `ChannelTerm`."""
-        powers = self.direction_powers([places_of_slot.slot for places_of_slot in a]).to(
-            torch.complex128
-        )
+        powers = self.direction_powers([places_of_slot.slot for places_of_slot in a])
         wavenumber, other, parts = a[0].slot.wavenumber, b[0].places, []
         for part in a[0].places.split(max(ENTRIES // (len(other) * len(self.angles)), 1)):
-            each = torch.tensordot(
-                powers, self.correlations(self.angles, wavenumber, part, other), 1
-            )
+            each = self.sum_correlations(powers, self.angles, wavenumber, part, other)
             parts.append(each * matern32(distances(part, other), self.frame.envelope))
         whole = torch.cat(parts, 1)
         return whole if len(whole) == len(a) else repeat(whole[0], len(a))
@@ -106,9 +108,10 @@ class Directions(ChannelTerm):
 
         def correlation_matrices() -> list[Tensor]:
             bound = matern32(distances(places, places), self.frame.envelope)
-            ones = self.angles.split(1)
+            unit = self.power.new_ones(1, 1)
             return [
-                self.correlations(angle, wavenumber, places, places)[0] * bound for angle in ones
+                self.sum_correlations(unit, angle, wavenumber, places, places)[0] * bound
+                for angle in self.angles.split(1)
             ]
 
         return basis.compress_once(
