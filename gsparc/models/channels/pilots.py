@@ -1,9 +1,9 @@
 """Channels heard after the fit: the waves that are known, conditioned on pilots of later runs.
 
 Pilots y of a run are `c h + e`, c one amplitude and phase of the run, which nobody knows: the
-largest likelihood of the field as fitted has `c = m^H S^-1 y / m^H S^-1 m`, m and S the mean and
-covariance of its predictions there. Parameters stay as they are, and no matrix of the training rows
-is factored again.
+largest likelihood has `c = m^H S^-1 y / m^H S^-1 m`, m and S the mean and covariance there of what
+the field as fitted predicts, given pilots of earlier runs. Parameters stay as they are,
+and no matrix of the training rows is factored again.
 """
 
 from __future__ import annotations
@@ -66,9 +66,10 @@ class _Told:
         """(p, D) of what the prediction missed."""
         return self.factor.solve(self.heard - self.mean)
 
-    def divided(self, factor: complex) -> _Told:
-        """Return the pilots without a factor."""
-        return replace(self, heard=self.heard / factor)
+    def undo_factor(self, factor: complex, new: Tensor) -> _Told:
+        """Return the pilots of rows `new` (n,) bool of all ends without a factor."""
+        mine = new[self.known.own][:, None]
+        return replace(self, heard=torch.where(mine, self.heard / factor, self.heard))
 
 
 class HeardField(View):
@@ -95,19 +96,16 @@ class HeardField(View):
         super().__init__(field)
         self.field, self.doubt = field, doubt
         ends, values = Ends.from_query(field.site, query), values.to(torch.complex128)
-        told = self._told_slots(ends, values)
-        self.run_factor = _run_factor(told.values())
-        values = values / self.run_factor
+        earlier = 0 if before is None else len(before.values)
         if before is not None:
             pairs = zip(vars(before.ends).values(), vars(ends).values(), strict=True)
             ends, values = Ends(*map(torch.cat, pairs)), torch.cat([before.values, values])
         last = _last_rows(ends.station, KEPT)
-        self.ends: Ends = ends.rows(last)
-        self.values: Tensor = values[last]
-        if before is None and len(last) == len(query):
-            self.told = {key: slot.divided(self.run_factor) for key, slot in told.items()}
-        else:
-            self.told = self._told_slots(self.ends, self.values)
+        self.ends, values, new = ends.rows(last), values[last], last >= earlier
+        told = self._told_slots(self.ends, values)
+        self.run_factor = _run_factor(told.values(), new)
+        self.values = torch.where(new[:, None, None], values / self.run_factor, values)
+        self.told = {key: slot.undo_factor(self.run_factor, new) for key, slot in told.items()}
 
     def _known(self, ends: Ends) -> Iterator[list[_Known]]:
         """What is known at places, in lists of slots with equal ones."""
@@ -172,11 +170,18 @@ def _last_rows(station: Tensor, most: int) -> Tensor:
     return torch.cat(kept).sort().values
 
 
-def _run_factor(told: Iterable[_Told]) -> complex:
-    """The factor of a run of the largest likelihood, see above."""
+def _run_factor(told: Iterable[_Told], new: Tensor) -> complex:
+    """The factor of the largest likelihood, see above, of the run of rows `new` (n,) bool.
+
+    Rows of earlier runs come first and count as known.
+    """
     above, below = 0j, TINY_POWER
     for slot in told:
-        solved = slot.factor.solve(slot.mean).conj() / slot.known.model.scale
-        above += complex((solved * slot.heard).sum())
-        below += float((solved * slot.mean).sum().real)
+        own = new[slot.known.own]
+        known = torch.where(own[:, None], 0, slot.heard)
+        # A row whitened is what it adds to those before it.
+        expected = slot.factor.whiten(slot.mean - known)[own]
+        heard = slot.factor.whiten(slot.heard - known)[own]
+        above += complex((expected.conj() * heard).sum()) / slot.known.model.scale
+        below += float(expected.abs().square().sum()) / slot.known.model.scale
     return above / below

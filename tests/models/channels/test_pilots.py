@@ -63,6 +63,18 @@ def test_runs_that_come_later_keep_their_own_factors():
     assert max(len(slot.heard) for slot in many.told.values()) == KEPT
 
 
+def test_a_run_is_known_by_pilots_of_earlier_runs_too():
+    """Where the fit knows little, runs that share places differ by their factor."""
+    data = ceiling(ends=3, count=60)
+    before, later = _rows(data, 5)
+    field, again = tied(data, before), later[::6]
+    first = HeardField(field, data.batch(later), _values(data, later))
+    turned = data.batch(again), TURN * _values(data, again)
+    for told, error in ((first, (0, 0.1)), (None, (0.1, 10))):
+        factor = HeardField(field, *turned, told).run_factor / first.run_factor
+        assert error[0] < abs(factor / TURN - 1) < error[1]
+
+
 @pytest.fixture(scope="module")
 def predictor():
     data = ceiling(ends=3, count=60)
