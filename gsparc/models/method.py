@@ -60,6 +60,14 @@ class Prediction:
         """Return 1 - `unknown`, (B,) in [0, 1]: larger is surer."""
         return None if self.unknown is None else (1 - self.unknown).clamp(0, 1)
 
+    @property
+    def deviation(self) -> Tensor | None:
+        """Return root mean square errors of an entry, float32, with as many axes as the mean."""
+        if self.variance is None:
+            return None
+        axes = [1] * (self.mean.ndim - self.variance.ndim)
+        return self.variance.sqrt().float().reshape(*self.variance.shape, *axes)
+
     def of_devices(
         self,
         site: Site,

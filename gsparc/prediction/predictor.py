@@ -311,11 +311,8 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin, PilotsMi
             ValueError: the method knows none, or as in `rssi`.
         """
         placed, said = self._moments(self._whole, tx, rx, unit)
-        if said.variance is None:
+        if (spread := said.deviation) is None:
             raise ValueError(f"{self.method.name} states no deviations")
-        spread = said.variance.sqrt().float()
-        # As many axes as the answers have, so that both broadcast.
-        spread = spread.reshape(len(spread), *[1] * (said.mean.ndim - 1))
         return placed.match(placed.by_station(spread))
 
     def cycle_places(self, places: np.ndarray) -> Call:

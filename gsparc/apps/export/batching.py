@@ -102,11 +102,8 @@ class Batcher:
         ends: dict[str, Any] = site.name_moving(places)
         with self.lock:
             said = self.predictor.predict(**ends)
-        values, std = said.mean.numpy(), None
+        values, std = said.mean.numpy(), said.deviation
         if np.iscomplexobj(values):  # real and imaginary part
             values = site.in_shape_of_file(values)
             values = np.stack([values.real, values.imag], -1)
-        if said.variance is not None:  # as many axes as the answers have
-            axes = len(values), -1, *[1] * (said.mean.ndim - 2)
-            std = said.variance.sqrt().reshape(axes).numpy().astype("<f4")
-        return Reply(values.astype("<f4"), std)
+        return Reply(values.astype("<f4"), None if std is None else std.numpy().astype("<f4"))
