@@ -9,7 +9,8 @@ Without Gaussians it is the plain process.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, NamedTuple, TypeVar, get_type_hints
 
@@ -43,8 +44,15 @@ class LeftOutRows:
 
     def mean_at(self, rows: np.ndarray) -> Tensor:
         """Return predictions (m, ...) of some of the rows (m,)."""
+        return self.mean[self._find(rows)]
+
+    def variance_at(self, rows: np.ndarray) -> Tensor:
+        """Return their variances (m,)."""
+        return self.variance[self._find(rows)]
+
+    def _find(self, rows: np.ndarray) -> np.ndarray:
         order = np.argsort(self.rows)
-        return self.mean[order[np.searchsorted(self.rows, rows, sorter=order)]]
+        return order[np.searchsorted(self.rows, rows, sorter=order)]
 
 
 class Moments(NamedTuple):
@@ -104,6 +112,13 @@ class ClosedForm(Method):
     def weighted_members(self) -> Iterator[tuple[float, ClosedForm]]:
         """Yield methods that are no mixtures, with their weights in the mean."""
         yield 1.0, self
+
+
+def rows_left_out(members: Iterable[ClosedForm]) -> np.ndarray:
+    """Return rows (n,) that each member predicted without them; none where one kept no such."""
+    none = np.zeros(0, np.int64)
+    rows = [none if member.held is None else member.held.rows for member in members]
+    return functools.reduce(np.intersect1d, rows)
 
 
 def method_state(method: Method) -> dict[str, Any]:

@@ -23,6 +23,7 @@ CURVES = np.array([0, 0.5, 1, 2, 4])[:, None, None], np.linspace(-6, 6, 25)[:, N
 NEARLY_BEST = 0.98  # of the best level's chance to pass: the laxest such level is tried first
 SURE_OF_EFFECT = 0.8
 COMPLETED = 100  # passes over censored rows
+LEAST_RATIO = 1e-12  # of squared errors to variances: its logarithm is finite
 ONE_DEVIATION = float(erf(0.5**0.5))  # share of a normal variable within a deviation of its mean
 
 
@@ -57,6 +58,24 @@ def standard_error(values: np.ndarray, group: np.ndarray | None = None) -> float
     if len(sums) < 2:
         return float("inf")
     return float(np.sqrt(len(sums) / (len(sums) - 1) * (sums**2).sum()) / len(values))
+
+
+def variance_factor(ratios: np.ndarray) -> float:
+    """Return what stated variances are to be multiplied by; of few rows, or unlike ones, nearer 1.
+
+    Before any row is seen its logarithm is normal about 0 with a deviation of 1: to be wrong by a
+    half is as likely as by two.
+
+    >>> round(variance_factor(np.full(50, 0.25)), 3), variance_factor(np.array([0.25]))
+    (0.257, 1.0)
+
+    Args:
+        ratios: (n,) squared errors over stated variances, of rows that nothing was learned from.
+    """
+    mean = max(float(np.mean(ratios)), LEAST_RATIO)
+    # Entries of a row may err together: it tells no more than one complex entry does.
+    error = max((standard_error(ratios) / mean) ** 2, 1 / len(ratios))
+    return float(mean ** (1 / (1 + error)))
 
 
 def mean_and_error(values: np.ndarray, group: np.ndarray) -> tuple[float, float]:

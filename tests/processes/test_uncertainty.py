@@ -21,6 +21,7 @@ from gsparc.processes.uncertainty import (
     risk_coverage,
     standard_error,
     threshold_levels,
+    variance_factor,
 )
 
 TENTHS = 0.1, 0.1  # at most a tenth is bad, but for a tenth of all sets
@@ -153,3 +154,16 @@ def test_where_the_search_begins_misleads_no_more_sets_than_promised():
     assert accepting(growing, 12, LAX) < 0.2 and accepting(growing, 12, LAX, -0.5) < 0.1
     # Whatever the score, of six that choose levels and thirteen that calibrate.
     assert 0.02 < accepting(0.2 * np.ones(19), 6, (0.2, 0.1)) < 0.1
+
+
+def test_variances_are_mended_as_surely_as_rows_tell():
+    """Variances four times too large were halved alone: rows as stated were added to the mean."""
+    rng = np.random.default_rng(0)
+    alike = rng.chisquare(400, 32) / 400
+    for right in (0.22, 1.0, 4.0):
+        assert variance_factor(right * alike) == pytest.approx(right, rel=0.07)
+        inverse = 1 / variance_factor(right / alike)
+        assert variance_factor(alike / right) == pytest.approx(inverse, rel=0.02)
+    single = [variance_factor(4 * rng.exponential(size=5)) for _ in range(200)]
+    assert 1.5 < np.exp(np.mean(np.log(single))) < 3.5  # shrunk: five entries tell little
+    assert 0 < variance_factor(np.zeros(9)) < 1e-6

@@ -101,10 +101,11 @@ class HeardField(View):
             pairs = zip(vars(before.ends).values(), vars(ends).values(), strict=True)
             ends, values = Ends(*map(torch.cat, pairs)), torch.cat([before.values, values])
         last = _last_rows(ends.station, KEPT)
-        self.ends, values, new = ends.rows(last), values[last], last >= earlier
+        self.ends: Ends = ends.rows(last)
+        values, new = values[last], last >= earlier
         told = self._told_slots(self.ends, values)
         self.run_factor = _run_factor(told.values(), new)
-        self.values = torch.where(new[:, None, None], values / self.run_factor, values)
+        self.values: Tensor = torch.where(new[:, None, None], values / self.run_factor, values)
         self.told = {key: slot.undo_factor(self.run_factor, new) for key, slot in told.items()}
 
     def _known(self, ends: Ends) -> Iterator[list[_Known]]:

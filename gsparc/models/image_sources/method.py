@@ -38,7 +38,7 @@ from gsparc.models.image_sources.rows import (
 )
 from gsparc.models.image_sources.scene import JITTER, SourceScene
 from gsparc.models.image_sources.search import Found, SearchSettings
-from gsparc.models.method import Method
+from gsparc.models.method import Method, Prediction
 from gsparc.models.reduced import MeanOnly, Settings
 from gsparc.physics.mirror_planes import hesse_form
 from gsparc.physics.row_factors import UnknownFactor
@@ -271,19 +271,20 @@ class ImageSourceGP(SourcesInFrame):
         """Rows of every group predicted by the searches that left it out,
         from at most `limit` others.
         """
-        rows, means = [], []
+        rows, answers = [], []
         for turn, group in enumerate(self._groups):
             if mine := [member for member in members if member.number % len(self._groups) == turn]:
                 # As many rows as the process that answers has: fewer would err more than it does.
                 others = self._draw(data, self._rows_of_search(known, turn), limit)
                 rows.append(group)
-                means.append(
-                    copy.copy(self)._set_members(others, mine).predict(data.batch(group)).mean
+                answers.append(
+                    copy.copy(self)._set_members(others, mine).predict(data.batch(group))
                 )
         if not rows:
             return None
-        mean = torch.cat(means)
-        return LeftOutRows(np.concatenate(rows), mean, torch.full((len(mean),), float("nan")))
+        joint = Prediction.joined(answers)
+        assert joint.variance is not None
+        return LeftOutRows(np.concatenate(rows), joint.mean, joint.variance)
 
     def _transmitter_in_frame(self) -> Tensor:
         assert self.site is not None and self.site.static_position is not None

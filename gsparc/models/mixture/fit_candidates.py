@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import functools
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,7 +14,7 @@ from gsparc.data.inner_folds import NOT_TESTED, InnerFolds
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.field.initial import InitSettings
-from gsparc.models.closed_form import ClosedForm, LeftOutRows
+from gsparc.models.closed_form import ClosedForm, LeftOutRows, rows_left_out
 from gsparc.models.image_sources.ensemble import reached_noise_floor
 from gsparc.models.mixture.candidates import Candidate
 from gsparc.models.predicting import factors_to_measured
@@ -149,10 +148,8 @@ def weigh_candidates(
     if len(members) == 1:
         return {first: 1.0}
     left_out = [member.held for member in members.values()]
-    kept = [answers.rows for answers in left_out if answers is not None]
-    rows = np.zeros(0, np.int64)
-    if len(kept) == len(members):  # only rows that every member was without can be compared
-        rows = functools.reduce(np.intersect1d, kept)
+    # Only rows that every member was without can be compared
+    rows = rows_left_out(members.values())
     predicted = [method.predict(data.batch(val)).mean for method in members.values()]
     if len(rows):
         pairs = zip(left_out, predicted, strict=True)

@@ -24,7 +24,13 @@ from gsparc.data.walls import read_walls
 from gsparc.field.initial import InitSettings
 from gsparc.models.abilities import HasPaths, HasProcess, QueryPaths
 from gsparc.models.channels.initial import estimate_run_factors
-from gsparc.models.closed_form import ClosedForm, LeftOutRows, method_from_state, method_state
+from gsparc.models.closed_form import (
+    ClosedForm,
+    LeftOutRows,
+    method_from_state,
+    method_state,
+    rows_left_out,
+)
 from gsparc.models.image_sources.frame import merge_equal_paths
 from gsparc.models.method import Method, Prediction
 from gsparc.models.mixture import fit_candidates
@@ -39,12 +45,12 @@ from gsparc.models.terms import EffectSettings
 from gsparc.physics.decibels import TINY_POWER
 from gsparc.processes.averages import mixture_moments
 from gsparc.processes.powers import PowerProcess
+from gsparc.processes.uncertainty import variance_factor
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.stopwatch import Stopwatch
 
 log = logging.getLogger(__name__)
-BELIEVED = 10  # rows that a variance as stated counts as, where others tell how wrong it is
 QUERY_CHUNK = 1024  # memory; stations at one place share most of their work, see `ChannelField`
 # Of fields, in words.
 PARTS = {"power": "a trend over distance", "residual": "a Gaussian process of the rest"}
@@ -210,15 +216,22 @@ class Mixture(LearnsTogether, ClosedForm):
         """What variances of channels are to be multiplied by, from rows that members left out."""
         if not (data.site.target.is_complex and len(val)):
             return 1.0
-        batch = data.batch(val)
-        said = self._mix_predictions(batch)
-        mean = said.mean
+        said = self._mix_predictions(data.batch(val))
+        rows, mean, variance = val, said.mean, cast(Tensor, said.variance).double()
+        if len(others := rows_left_out(self.members)):
+            held = [member.held for member in self.members if member.held is not None]
+            parts = [
+                (weight, answers.mean_at(others), answers.variance_at(others))
+                for weight, answers in zip(self.weights, held, strict=True)
+            ]
+            both = zip((mean, variance), mixture_moments(parts), strict=True)
+            rows, (mean, variance) = np.r_[val, others], (torch.cat(pair) for pair in both)
         if data.site.unknown_factor != "none":
-            mean = mean * factors_to_measured(mean, data, val)
-        missed = to_real_entries(mean - batch.target).square().sum(1) / mean[0].numel()
-        ratios = missed / cast(Tensor, said.variance).double().clamp_min(TINY_POWER)
-        # As if few rows more had been what was expected
-        return float((ratios.sum() + BELIEVED) / (len(val) + BELIEVED))
+            mean = mean * factors_to_measured(mean, data, rows)
+        target = data.batch(rows).target
+        missed = to_real_entries(mean - target).square().sum(1) / mean[0].numel()
+        ratios = missed / variance.clamp_min(TINY_POWER)
+        return variance_factor(ratios.numpy())
 
     def _explained_share(
         self, data: Measurements, fold: Fold, is_conditioned: bool
