@@ -28,18 +28,6 @@ def draw_places(places: np.ndarray, most: int, seed: Seed) -> np.ndarray:
     return np.sort(shuffle_rows(seed, places)[:most])
 
 
-def shuffle_groups(group: np.ndarray, seed: Seed) -> np.ndarray:
-    """Return an order of rows (n,): groups, numbered from 0, by chance,
-    and in each the rows as they are.
-
-    >>> order = shuffle_groups(np.array([0, 1, 0]), seed=0)
-    >>> np.diff(np.flatnonzero(np.isin(order, [0, 2])))  # the first and last follow each other
-    array([1])
-    """
-    rank = np.random.default_rng(seed).permutation(int(group.max(initial=-1)) + 1)
-    return np.argsort(rank[group], kind="stable")
-
-
 def first_rows(order: np.ndarray, most: int, group: np.ndarray, silent: np.ndarray) -> np.ndarray:
     """Return of each group the first rows in an order, sorted;
     at least half were heard where as many were.

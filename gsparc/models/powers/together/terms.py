@@ -13,6 +13,7 @@ from typing import Self
 
 import numpy as np
 import torch
+from numpy.lib.stride_tricks import sliding_window_view
 from torch import Tensor
 
 from gsparc.base.hashes import shuffle_rows
@@ -20,7 +21,7 @@ from gsparc.data.schema import Measurements
 from gsparc.models.baselines.distance_law import locate_still_end, say_estimated
 from gsparc.models.target_rows import power_rows
 from gsparc.processes.factor import Factor
-from gsparc.processes.few_rows import draw_places, first_rows, shuffle_groups
+from gsparc.processes.few_rows import draw_places, first_rows
 from gsparc.processes.kernel import distances
 from gsparc.processes.matern import matern32
 from gsparc.processes.nearest import JITTER
@@ -87,8 +88,14 @@ class StationRows(PowerRows):
         place = self._place_numbers
         first = np.full(int(place.max()) + 1, len(self.index))
         np.minimum.at(first, place, self.index)
-        stretch = np.argsort(np.argsort(first)) // STRETCH
-        return self.subset(np.sort(shuffle_groups(stretch[place], seed)[:limit]))
+        # Places of a site in the order of measuring; the ones that begin stretches by content.
+        order = np.argsort(first)
+        at = first_end(self.places)[np.unique(place, return_index=True)[1]]
+        turn = np.argsort(shuffle_rows(seed, at))[order]
+        begun = np.pad(turn, (STRETCH - 1, 0), constant_values=len(turn))
+        stretch = np.empty_like(turn)
+        stretch[order] = sliding_window_view(begun, STRETCH).min(1)
+        return self.subset(np.sort(np.argsort(stretch[place], kind="stable")[:limit]))
 
     @property
     def _place_numbers(self) -> np.ndarray:

@@ -424,3 +424,13 @@ def test_a_median_station_of_one_row_took_the_kernel_of_all_into_a_corner():
     )
     assert after.noise == pytest.approx(before.noise, rel=0.3)
     assert after.lengths == pytest.approx(before.lengths, rel=0.3)
+
+
+def test_a_row_less_drew_other_stretches_for_all_settings():
+    """Of a campus 1 % less moved answers at walked places by 1.6 and 2.3 dB, now by .3 to .5."""
+    places, none = np.c_[np.random.default_rng(5).normal(size=(4000, 3)).cumsum(0)], np.zeros(4000)
+    rows = StationRows(np.c_[places, places], none, none, none, np.arange(4000))
+    less = rows.subset(np.delete(np.arange(4000), [7, 1000, 3000]))
+    drawn, again = (part.draw_stretches(400, 0).index for part in (rows, less))
+    assert len(drawn) == 400 and len(np.intersect1d(drawn, again)) > 380
+    assert (np.diff(drawn) == 1).mean() > 0.7
