@@ -178,10 +178,8 @@ class Watch(Stored):
         if self.detector[station] < math.log(rows) * (AGAIN if changed else 1):
             return self
         # It began where what follows is told better so than by what came before.
-        before, now = (
-            _told(part, run, extent) for part in (world[: -len(run) if changed else 0], run)
-        )
-        gain = (run.missed - before).square() - (run.missed - now).square()
+        old = _told(world[: -len(run) if changed else 0], run, extent)
+        gain = (run.missed - old).square() - (run.missed - _told(run, run, extent)).square()
         run = run[int(gain.flip(0).cumsum(0).flip(0).argmax()) :]
         noted = Alarm(station, "", int(run.number[0]), int(new.number[-1]), 0.0, (0.0, 0.0))
         noted = _named(noted, run, extent)

@@ -276,10 +276,10 @@ def errors_of_heard(rows: StationRows, priors: LinkPriors, seed: int) -> np.ndar
 
 def _add_values(process: Nearest, values: PlaceValues) -> Nearest:
     """The process given further values, among its densest."""
-    near, noise = process.near, process.prior.kernel.noise
+    near, added = process.near, float(process.prior.kernel.noise)
     level = np.full(len(values.places), near.level.max(), np.int8)
     places = np.concatenate([near.places, values.places])
-    noise = torch.cat([process.noise, process.noise.new_full((len(level),), float(noise))])
+    noise = torch.cat([process.noise, process.noise.new_full((len(level),), added)])
     rest = torch.cat([process.rest, values.values])
     near = Neighbourhood(places, np.concatenate([near.level, level]))
     return replace(process, near=near, rest=rest, noise=noise)
