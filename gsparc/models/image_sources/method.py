@@ -276,10 +276,9 @@ class ImageSourceGP(SourcesInFrame):
             if mine := [member for member in members if member.number % len(self._groups) == turn]:
                 # As many rows as the process that answers has: fewer would err more than it does.
                 others = self._draw(data, self._rows_of_search(known, turn), limit)
+                of_searches = copy.copy(self)._set_members(others, mine)
                 rows.append(group)
-                answers.append(
-                    copy.copy(self)._set_members(others, mine).predict(data.batch(group))
-                )
+                answers.append(of_searches.predict(data.batch(group)))
         if not rows:
             return None
         joint = Prediction.joined(answers)
