@@ -68,7 +68,7 @@ class Changes(Stored):
         """
         if state.get("shifts"):
             raise ValueError("levels were moved by `shift`, which is no more; tell rows instead")
-        return super().read({name: state[name] for name in cls.__annotations__})
+        return super().read({name: part for name, part in state.items() if name != "shifts"})
 
     @property
     def links(self) -> PowerRows | None:

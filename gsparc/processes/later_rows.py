@@ -56,7 +56,7 @@ class LaterRows(Stored):
     @classmethod
     def read(cls, state: Mapping[str, Any]) -> LaterRows:
         """Return those of a file; an older one also has variances that grew since."""
-        return super().read({name: state[name] for name in cls.__annotations__})
+        return super().read({name: part for name, part in state.items() if name != "faded"})
 
     def __getitem__(self, chosen: Tensor | slice) -> LaterRows:
         """Return the rows `chosen`."""

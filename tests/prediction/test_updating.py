@@ -5,6 +5,7 @@ import time
 
 import numpy as np
 import pytest
+import torch
 from refusals import refused
 from rooms_later import PLACES, SCREENED, draw, levels, truth
 
@@ -60,7 +61,12 @@ def test_levels_that_an_older_file_moved_by_hand_are_not_lost_in_silence(predict
     predictor.update(**changed(10))
     extra = versions_extra(predictor.versions)
     assert read_versions(extra)[-1].changes.next_number == 10
-    extra["updates"][-1]["state"]["changes"]["state"]["shifts"] = [[0, -3.0, 10]]
+    state = extra["updates"][-1]["state"]["changes"]["state"]
+    state["rows"][0][1]["state"]["faded"] = torch.zeros(10)
+    state["shifts"] = []
+    del state["new"]  # files of before links
+    assert read_versions(extra)[-1].changes.next_number == 10
+    state["shifts"] = [[0, -3.0, 10]]
     refused("levels were moved by `shift`", read_versions, extra)
 
 
