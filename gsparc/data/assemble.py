@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from gsparc.base.errors import Problems
-from gsparc.data.blocks import iterate_bytes, row_blocks
-from gsparc.data.outliers import find_strong_outliers, peak_magnitudes, too_far
+from gsparc.data.blocks import iterate_bytes
+from gsparc.data.outliers import too_far
 from gsparc.data.schema import Measurements
 
 FARTHEST = 1e7  # [m]; an Earth radius and a half: anything beyond is not a position in metres
@@ -27,29 +27,6 @@ def check_positions(
         good = np.isfinite(position).all(axis=-1) & (np.abs(position) <= FARTHEST).all(axis=-1)
     expected = f"expected three finite coordinates in metres, none beyond {FARTHEST:.0e}"
     return problems.add_values(where, row_names, position, good, expected)
-
-
-def rounded_rms(values: np.ndarray, weight: np.ndarray | None = None) -> float:
-    """Return the root mean square of rows `values` (S, ...), real or complex, in whole dB;
-    0 if all are zero.
-
-    This is a constant of the site, taken over all rows but those of `find_strong_outliers`:
-    rounding keeps any single row (which may be a test row) from influencing it.
-    `weight` is a bool mask of measured entries.
-    """
-    highest = peak_magnitudes(values, weight)
-    usual = ~find_strong_outliers(highest)
-    peak = float(highest[usual].max(initial=0.0))
-    if peak == 0.0:
-        return 0.0
-    total, count = 0.0, 0
-    for part in row_blocks(values):
-        rows = values[part][usual[part]]
-        # Relative to the peak, so that squares of 1e-200 or 1e200 neither vanish nor overflow.
-        rows = rows if weight is None else rows[weight[part][usual[part]]]
-        magnitude = np.abs(rows).astype(np.float64) / peak
-        total, count = total + float((magnitude**2).sum()), count + magnitude.size
-    return float(10 ** (round(20 * np.log10(peak * np.sqrt(total / count))) / 20))
 
 
 def content_hash(arrays: Mapping[str, np.ndarray | float | None]) -> str:

@@ -7,39 +7,23 @@ belongs to the site.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from gsparc.base.errors import list_first
-from gsparc.data.blocks import row_blocks
 from gsparc.data.georeference import Georeference
+from gsparc.data.scale import FEW, few_beyond, find_strong_outliers, peak_magnitudes
 from gsparc.data.schema import Measurements
 
-FEW = 0.02  # share of the rows, at least one row
-GAP_DB = 50.0  # to the next row: no step of a receiver between two of its neighbours is as high
 FAR = 10.0  # times the farthest distance of the others from the median place
 FAR_M = 50.0  # and this much farther: in a small box nothing is far
 # Of a box: its margin, how wide rows lie in it at least; rows that tell
 WITHIN, APART_PLACES = 0.1, 3
 
 
-def find_strong_outliers(peaks: np.ndarray) -> np.ndarray:
-    """Tell which rows (S,) have a largest magnitude, `peaks` (S,), far above all others';
-    no silent ones.
-    """
-    with np.errstate(divide="ignore"):
-        level = 20 * np.log10(np.asarray(peaks, dtype=np.float64))
-    finite = np.isfinite(level)
-    strong = np.zeros(len(level), bool)
-    strong[finite] = _few_beyond(level[finite], lambda inner, outer: outer - inner > GAP_DB)
-    return strong
-
-
 def too_far(positions: np.ndarray) -> np.ndarray:
     """Tell which rows (S,) of `positions` (S, 3) [m] lie far outside the region of all others."""
     distance = np.linalg.norm(positions - np.median(positions, axis=0), axis=1)
-    return _few_beyond(distance, lambda inner, outer: outer > FAR * inner and outer - inner > FAR_M)
+    return few_beyond(distance, lambda inner, outer: outer > FAR * inner and outer - inner > FAR_M)
 
 
 def far_from_box(positions: np.ndarray, box: np.ndarray) -> np.ndarray:
@@ -89,24 +73,6 @@ def find_gap(places: np.ndarray) -> tuple[np.ndarray, float] | None:
         if gaps[cut - 1] > FAR * wide:
             return np.isin(np.arange(len(places)), order[cut:]), float(gaps[cut - 1])
     return None
-
-
-def _few_beyond(values: np.ndarray, gap: Callable[[float, float], bool]) -> np.ndarray:
-    """The most, but few, largest of `values` (n,) above which there is a gap, as (n,) bool."""
-    order = np.argsort(values, kind="stable")
-    for count in range(min(max(1, int(FEW * len(values))), len(values) - 1), 0, -1):
-        if gap(values[order[-count - 1]], values[order[-count]]):
-            return np.isin(np.arange(len(values)), order[-count:])
-    return np.zeros(len(values), bool)
-
-
-def peak_magnitudes(values: np.ndarray, mask: np.ndarray | None = None) -> np.ndarray:
-    """Return the largest magnitude (S,) of the measured entries of rows `values` (S, ...)."""
-    highest = []
-    for part in row_blocks(values):
-        magnitude = np.abs(values[part] if mask is None else np.where(mask[part], values[part], 0))
-        highest.append(magnitude.reshape(len(magnitude), -1).max(axis=1, initial=0))
-    return np.concatenate(highest)
 
 
 def find_outliers(data: Measurements) -> dict[str, np.ndarray]:

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from typing import ClassVar, Literal, TypeVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from gsparc.data.scale import find_strong_outliers, peak_magnitudes, rounded_rms
 from gsparc.physics.decibels import RELATIVE_DB, TINY_POWER, finite_decibels, from_decibels
 
 Kind = Literal["spectrum", "csi", "rssi"]
 Values = TypeVar("Values", np.ndarray, Tensor)
+MOST_DB = 400  # of any level
+NEGATIVE = "linear power, at least 0 (is it in dB?"
 
 
 class Target(ABC):
@@ -21,6 +25,8 @@ class Target(ABC):
     Attributes:
         kind: its name in files and settings.
         called: several of them, in words.
+        arrays: of a file (`gsparc/data/fields.csv`) that may hold it.
+        types: of entries, as they are stored and as they are scaled.
         numbers: real numbers of an entry.
         exponent: of an entry's magnitude that is its power.
         axes: of an array of them, rows among them.
@@ -33,6 +39,8 @@ class Target(ABC):
 
     kind: ClassVar[Kind]
     called: ClassVar[str]
+    arrays: ClassVar[tuple[str, ...]]
+    types: ClassVar[tuple[type[np.generic], type[np.generic]]] = np.float32, np.float64
     numbers: ClassVar[int] = 1
     exponent: ClassVar[int] = 2
     axes: ClassVar[int] = 3
@@ -40,6 +48,22 @@ class Target(ABC):
     is_image: ClassVar[bool] = False
     is_level: ClassVar[bool] = False
     loss: ClassVar[Literal["square", "log"]] = "square"
+
+    def fault(self, array: str) -> tuple[Callable[[np.ndarray], np.ndarray], str] | None:
+        """Return what tells entries that an array of a file cannot hold, and what it holds;
+        None where any number may be.
+        """
+        return None
+
+    def linear(self, array: str, values: np.ndarray) -> np.ndarray:
+        """Return values of an array of a file in linear units."""
+        return values
+
+    @abstractmethod
+    def scale(self, values: np.ndarray, mask: np.ndarray | None) -> float:
+        """Return the constant of a site that its linear values (S, ...) are divided by;
+        0 where all are silent.
+        """
 
     @abstractmethod
     def describe(self, count: int, shape: tuple[int, ...]) -> str:
@@ -90,8 +114,18 @@ class Target(ABC):
 class Spectrum(Target):
     """Amplitudes over directions (H, W), in [0, 1]."""
 
-    kind, called = "spectrum", "spectra"
+    kind, called, arrays = "spectrum", "spectra", ("spectrum",)
     is_image, loss = True, "log"
+
+    def fault(self, array: str) -> tuple[Callable[[np.ndarray], np.ndarray], str] | None:
+        """See `Target.fault`."""
+        return lambda part: part < 0, f"{NEGATIVE}; then dataset.decibels=true)"
+
+    def scale(self, values: np.ndarray, mask: np.ndarray | None) -> float:
+        """Return the largest but for outliers; 1 where that is about 1; see `Target.scale`."""
+        highest = peak_magnitudes(values)
+        largest = float(highest[~find_strong_outliers(highest)].max(initial=0.0))
+        return 1.0 if 0.1 <= largest <= 1 else largest
 
     def describe(self, count: int, shape: tuple[int, ...]) -> str:
         """See `Target.describe`."""
@@ -110,9 +144,14 @@ class Spectrum(Target):
 class Channel(Target):
     """Complex gains (antennas, subcarriers)."""
 
-    kind, called = "csi", "channels"
+    kind, called, arrays = "csi", "channels", ("csi",)
+    types = np.complex64, np.complex128
     numbers = 2
     is_complex = True
+
+    def scale(self, values: np.ndarray, mask: np.ndarray | None) -> float:
+        """Return the root mean square; see `Target.scale`."""
+        return rounded_rms(values, mask)
 
     def describe(self, count: int, shape: tuple[int, ...]) -> str:
         """See `Target.describe`."""
@@ -136,10 +175,24 @@ class Channel(Target):
 class Power(Target):
     """Received powers (1,), linear; their errors are of decibels."""
 
-    kind, called = "rssi", "powers"
+    kind, called, arrays = "rssi", "powers", ("rssi", "rssi_db")
     is_level = True
     exponent = 1
     axes = 2
+
+    def fault(self, array: str) -> tuple[Callable[[np.ndarray], np.ndarray], str] | None:
+        """See `Target.fault`."""
+        if array == "rssi_db":
+            return lambda part: np.abs(part) > MOST_DB, f"dB between -{MOST_DB} and {MOST_DB}"
+        return lambda part: part < 0, f"{NEGATIVE})"
+
+    def linear(self, array: str, values: np.ndarray) -> np.ndarray:
+        """See `Target.linear`."""
+        return from_decibels(values) if array == "rssi_db" else values
+
+    def scale(self, values: np.ndarray, mask: np.ndarray | None) -> float:
+        """Return the mean in whole decibels; see `Target.scale`."""
+        return rounded_rms(np.sqrt(values), mask) ** 2
 
     def describe(self, count: int, shape: tuple[int, ...]) -> str:
         """See `Target.describe`."""
@@ -172,3 +225,4 @@ class Power(Target):
 
 
 TARGETS: dict[Kind, Target] = {target.kind: target for target in (Spectrum(), Channel(), Power())}
+MEASUREMENTS = {array: target for target in TARGETS.values() for array in target.arrays}

@@ -18,8 +18,9 @@ import numpy as np
 from gsparc.base.errors import DataError, Problems, readable
 from gsparc.base.files import read_yaml
 from gsparc.base.limits import choice, finite_array, or_word, whole
-from gsparc.data.assemble import centre_positions, rounded_rms
+from gsparc.data.assemble import centre_positions
 from gsparc.data.position_encoder import encode_positions
+from gsparc.data.scale import rounded_rms
 from gsparc.data.schema import Measurements, Site, TrainTest
 from gsparc.datasets.campaign import Release, StandIn, load_stand_in, read_split
 from gsparc.tables.own_checks import Checker

@@ -11,8 +11,6 @@ from gsparc.base.errors import Problems
 from gsparc.data.schema import FIELDS, HOLDS, POWER
 from gsparc.tables.arrays import Raw
 
-MOST_DB = 400  # of any level
-
 Shape = tuple[int | str | None, ...]
 
 

@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 
 from gsparc.base.errors import Caution
+from gsparc.data.target import MOST_DB
 from gsparc.data.units import UNITS
 from gsparc.tables import heads
-from gsparc.tables.array_checks import MOST_DB
 from gsparc.tables.column import Chosen, Column, name_block, name_columns
 from gsparc.tables.other_names import join_polar
 from gsparc.tables.own_checks import LOWEST_HZ

@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 from gsparc.base.errors import list_first, suggest_name
 from gsparc.data.assemble import check_positions
 from gsparc.data.blocks import row_blocks
-from gsparc.data.schema import FIELDS, MEASUREMENTS, Stations, TrainTest
-from gsparc.data.target import TARGETS, Kind
+from gsparc.data.schema import FIELDS, Stations, TrainTest
+from gsparc.data.target import MEASUREMENTS, TARGETS, Kind
 from gsparc.ops import SphereGrid
-from gsparc.tables.array_checks import MOST_DB, ArrayChecker
+from gsparc.tables.array_checks import ArrayChecker
 from gsparc.tables.arrays import numbered_rows
 
 # From long wave (100 kHz) to the far infrared: what lies outside was mostly given in MHz or GHz.
@@ -47,9 +47,8 @@ class Checker(ArrayChecker):
                     self.refuse(name, f"units are {unit!r}; expected {FIELDS[name].unit!r}")
                 shapes = FIELDS[name].shapes
                 # Channels and spectra may have an axis of stations behind that of rows.
-                shapes += (
-                    [(*shape, None) for shape in shapes] if name in ("csi", "spectrum") else []
-                )
+                several = name in MEASUREMENTS and not MEASUREMENTS[name].is_level
+                shapes += [(*shape, None) for shape in shapes] if several else []
                 sound &= self.read_array(name, *shapes) is not None
                 continue
             # A name that the file holds, too, cannot be what the misspelt one was to be.
@@ -134,15 +133,11 @@ class Checker(ArrayChecker):
             unmarked = "not finite; expected numbers (mark what was not measured in mask)"
             self.refuse_rows(name, rows_with(values, are_infinite, mask), unmarked)
             followed = str(self.raw.attributes.get("conventions", "")).split()
-            if name == "csi" or values.dtype.kind == "u" or "decibels" in followed:
+            fault = MEASUREMENTS[name].fault(name)
+            if fault is None or values.dtype.kind == "u" or "decibels" in followed:
                 return
-            if name == "rssi_db":
-                wanted = f"dB between -{MOST_DB} and {MOST_DB}"
-                out = rows_with(values, lambda part: np.abs(part) > MOST_DB, mask)
-            else:
-                wanted = "linear power, at least 0 (is it in dB?"
-                wanted += "; then dataset.decibels=true)" if name == "spectrum" else ")"
-                out = rows_with(values, lambda part: part < 0, mask)
+            is_out, wanted = fault
+            out = rows_with(values, is_out, mask)
         self.refuse_rows(name, out, f"out of range; expected {wanted}")
 
     def read_devices(

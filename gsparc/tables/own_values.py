@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsparc.data.assemble import rounded_rms
 from gsparc.data.blocks import is_big, write_blocks
-from gsparc.data.outliers import find_strong_outliers, peak_magnitudes
 from gsparc.data.schema import FIELDS
-from gsparc.data.target import TARGETS, Kind
-from gsparc.physics.decibels import from_decibels
+from gsparc.data.target import MEASUREMENTS, Kind
 from gsparc.tables.own_checks import Checker
 
 
 def read_measured(check: Checker, name: str) -> tuple[np.ndarray | None, Kind]:
     """The measurement as (S, H, W), (S, A, K) or (S, 1), and its kind; None when unusable."""
-    kind: Kind = "spectrum" if name == "spectrum" else "csi" if name == "csi" else "rssi"
-    facts = TARGETS[kind]
+    facts = MEASUREMENTS[name]
+    kind = facts.kind
     array = check.read_array(name, *([(None,)] if facts.is_level else FIELDS[name].shapes))
     if array is None:
         return None, kind
@@ -88,23 +85,18 @@ def scale_values(
         values = np.where(mask_or_level, values, np.zeros((), values.dtype))
     if values.dtype == np.uint8:
         return values, 1.0 if values.any() else 0.0
-    if name == "rssi_db":
-        values = from_decibels(values) * (1 if mask_or_level is None else mask_or_level)
-    if name == "spectrum":
-        highest = peak_magnitudes(values)
-        largest = float(highest[~find_strong_outliers(highest)].max(initial=0.0))
-        scale = 1.0 if 0.1 <= largest <= 1 else largest
-    elif name == "csi":
-        scale = rounded_rms(values, mask)
-    else:
-        scale = rounded_rms(np.sqrt(values), mask) ** 2
+    facts, given = MEASUREMENTS[name], values
+    values = facts.linear(name, given)
+    if values is not given and mask_or_level is not None:
+        values = values * mask_or_level
+    scale = facts.scale(values, mask)
     if scale <= 0:
         return values, 0.0
     lift = 2.0**200 if scale < 1e-290 else 1.0  # exact; units of 1e-310 have no reciprocal
     divisor = scale * lift
-    stored, exact = (np.complex64, np.complex128) if name == "csi" else (np.float32, np.float64)
+    stored, exact = facts.types
     with np.errstate(over="ignore"):  # what is then infinite is refused by row
-        if mask_or_level is not None or name == "rssi_db" or not is_big(values):
+        if mask_or_level is not None or values is not given or not is_big(values):
             return (values * lift / divisor).astype(stored), scale
         return write_blocks(
             values.shape, stored, lambda at: values[at].astype(exact) * lift / divisor

@@ -5,7 +5,8 @@ import pytest
 from campaigns import channels, powers, spectra
 
 from gsparc.commands.check import main as check
-from gsparc.data.outliers import find_outliers, find_strong_outliers, too_far
+from gsparc.data.outliers import find_outliers, too_far
+from gsparc.data.scale import find_strong_outliers
 from gsparc.datasets.load import load, split_for
 
 MAKERS = {"spectrum": spectra, "csi": channels, "rssi": powers}

@@ -14,9 +14,10 @@ import numpy as np
 
 from gsparc.base.errors import Question, Severe, list_first
 from gsparc.data.assemble import FARTHEST
-from gsparc.data.schema import MEASUREMENTS, OTHER, End, StaticEnds, Stations
+from gsparc.data.schema import OTHER, End, StaticEnds, Stations
 from gsparc.data.selection import Selection, select, take_rows
 from gsparc.data.spacing import number_places
+from gsparc.data.target import MEASUREMENTS
 from gsparc.tables.arrays import Raw, numbered_rows
 from gsparc.tables.checks.piles import find_marks
 from gsparc.tables.links.hearing import POWERS, censor_rows, check_said, forget_unknown

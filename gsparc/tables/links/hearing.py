@@ -14,8 +14,8 @@ from gsparc.base.limits import Limit, choice, number, or_null, or_word
 from gsparc.data.blocks import is_big
 from gsparc.data.schema import OTHER, StaticEnds
 from gsparc.data.selection import take_rows
+from gsparc.data.target import MOST_DB
 from gsparc.physics.decibels import to_decibels
-from gsparc.tables.array_checks import MOST_DB
 from gsparc.tables.checks.piles import APART_DB, find_marks, find_saturation
 from gsparc.tables.own_checks import Checker
 
