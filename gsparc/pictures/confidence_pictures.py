@@ -48,13 +48,15 @@ def _label(row: Row) -> str:
 
 def _loss(row: Row) -> np.ndarray:
     """What a test row costs (n,): the paper's of spectra, |e|^2 / |h|^2 of channels,
-    |decibels| of powers.
+    |decibels| of powers; of others the mean absolute error.
     """
     samples = row["run"].samples
     if "error_db" in samples:
         return np.abs(samples["error_db"])
     if "error_power" in samples:
         return bounded_loss(samples["error_power"] / np.maximum(samples["target_power"], 1e-300))
+    if "ssim_gauss" not in samples:
+        return samples["mae"]
     # Images smaller than the window have no SSIM: the absolute error alone tells.
     return weigh_losses(samples["mae"], np.nan_to_num(samples["ssim_gauss"], nan=1.0))
 

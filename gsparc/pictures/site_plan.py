@@ -91,7 +91,7 @@ def find_spots(data: Measurements, levels: LinkLevels | None) -> Spots:
 def _levels(data: Measurements, which: np.ndarray, count: int) -> tuple[np.ndarray | None, str]:
     """Level (count,) [dB] at each place that rows `which` (S,) are of, and what it is."""
     several = data.site.several
-    if data.site.target.is_image:
+    if not (data.site.target.is_complex or data.site.target.is_level):
         return None, ""
     power = data.powers()
     heard = np.ones(power.shape, bool) if data.mask is None else data.mask.reshape(power.shape)

@@ -14,6 +14,7 @@ import torch
 from gsparc.base.executor import run_all
 from gsparc.base.files import write_archive, write_samples
 from gsparc.data.schema import Site
+from gsparc.data.target import Kind
 from gsparc.data.units import LINEAR, PowerUnit
 from gsparc.models.method import Prediction
 from gsparc.prediction.predictor import Predictor
@@ -123,7 +124,7 @@ def write_answers(
         columns[f"{name}_std"] = outputs.variance.sqrt().float().numpy()
     if power is None:
         mean = site.in_shape_of_file(mean) if site.target.is_complex else mean
-        columns |= {kind: mean} if archive else _entries(mean)
+        columns |= {kind: mean} if archive else _entries(kind, mean)
     columns |= {name: values.round(DIGITS) for name, values in predictions.heard.items()}
     columns |= {} if outputs.confidence is None else {"confidence": outputs.confidence.numpy()}
     columns |= (
@@ -177,12 +178,13 @@ def _in_order(
     return {**ordered, **rest}
 
 
-def _entries(channels: np.ndarray) -> dict[str, np.ndarray]:
-    """Real and imaginary parts; numbers of antenna and subcarrier where there are several."""
+def _entries(kind: Kind, values: np.ndarray) -> dict[str, np.ndarray]:
+    """Entries, of channels real and imaginary parts; with their numbers on axes of several."""
     columns: dict[str, np.ndarray] = {}
-    for place in np.ndindex(channels.shape[1:]):
-        counts = zip(place, channels.shape[1:], strict=True)
+    for place in np.ndindex(values.shape[1:]):
+        counts = zip(place, values.shape[1:], strict=True)
         number = "".join(f"_{index}" for index, count in counts if count > 1)
-        entry = channels[:, *place]
-        columns |= {f"csi_re{number}": entry.real, f"csi_im{number}": entry.imag}
+        entry = values[:, *place]
+        parts = {"_re": entry.real, "_im": entry.imag} if np.iscomplexobj(values) else {"": entry}
+        columns |= {f"{kind}{part}{number}": column for part, column in parts.items()}
     return columns

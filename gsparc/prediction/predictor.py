@@ -322,8 +322,13 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin, PilotsMi
         the first that the model answers for is asked.
         """
         predictor = self.ask_station(next(iter(self.queries.answered.tolist()), 0))
-        ask = getattr(predictor, self.site.kind)
-        return lambda number: ask(**self.site.world_ends(places[number % len(places)]))
+
+        def ask(number: int) -> Any:
+            ends = self.site.world_ends(places[number % len(places)])
+            placed, mean = predictor._mean(self.site.kind, ends.get("tx"), ends.get("rx"))
+            return placed.match(mean)
+
+        return ask
 
     def spectrum(
         self,

@@ -61,16 +61,15 @@ def traits(data: Measurements) -> set[str]:
         "metres": metres,
         "heights": not data.site.target.is_image and bool(np.ptp(data.moving[:, 2])),
     }
-    if data.site.target.is_level:
-        holds = {}
-    elif grid is None:
+    holds = {}
+    if data.site.target.is_complex:
         tones, square, antennas = (
             shape[1] > 1,
             1 < shape[0] == shape[1],
             known_array(data) is not None,
         )
         holds = {"channels": True, "tones": tones, "square": square, "antennas": antennas}
-    else:
+    if grid is not None:
         # Of the file, or of its transpose: no `grid_deg` says otherwise.
         plain = grid in (SphereGrid.hemisphere(*shape), SphereGrid.hemisphere(*shape[::-1]))
         holds = {"spectra": True, "above": grid.first_elevation >= 0, "hemisphere": plain}

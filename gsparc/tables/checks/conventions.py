@@ -74,7 +74,7 @@ def convention_warnings(data: Measurements) -> list[str]:
     and what mends it.
     """
     facts = data.site.target
-    if facts.is_level:
+    if facts.kind not in FEWEST:
         return _rivals_of_places(data)
     whole, labels = _arrayed(data)
     rows = _drawn(whole)

@@ -189,6 +189,8 @@ def distil_form(predictor: Predictor, seed: int) -> Form:
         raise ValueError(
             f"{method.name}: channels that are no sum of sources have no compiled form; take {able}"
         )
+    if not site.target.is_level:
+        raise ValueError(f"{method.name}: {site.target.called} have no compiled form")
     # The law of distance goes on outside the box
     far = far_places(site, ANSWERED // FAR_SHARE, seed)
     data = sample_model(predictor, np.concatenate([random_places(site, ANSWERED, seed), far]))
