@@ -28,24 +28,8 @@ SOURCES = Path(gsparc.ops.__file__).parent / "csrc"
 # Sources of GPU kernels, of projections and of the Python module are no part of the C library.
 OTHERS = shutil.ignore_patterns("cuda", "projection", "bindings.cpp")
 LIMITS = {name: whole(1) for name in ("places", "taps", "antennas")}
-LIMITS |= {"rate_hz": or_null(POSITIVE), "to": choice("c", "taps", "deepmimo")}
+LIMITS |= {"rate_hz": or_null(POSITIVE)}
 Facts = tuple[dict[str, Any], list[str]]
-
-
-@command(**LIMITS)
-def task(call: CommandCall) -> Result:
-    """Export, and say what is lost."""
-    given, path = call.given, Path(call.given["ckpt"])
-    out = Path(given["out"] or path.with_name(f"{path.stem}-{given['to']}"))
-    # The files of an export belong together: none is written beside those of another one.
-    if out.exists():
-        raise SettingError(f"out={out}: is there already; remove it or name another folder")
-    predictor = load(call.given["ckpt"]).select_station(given["station"])
-    # The folder appears by renaming: an export that fails leaves nothing behind.
-    with whole_folder(out) as folder:
-        facts, lines = WRITERS[given["to"]](predictor, given, folder, out)
-    facts |= {"model/name": predictor.method.name, "out": str(out), "ckpt": str(path)}
-    return Result(facts, (), lines, "summary ")
 
 
 def _library(predictor: Predictor, given: Mapping[str, Any], folder: Path, out: Path) -> Facts:
@@ -100,3 +84,19 @@ def _scenario(predictor: Predictor, given: Mapping[str, Any], folder: Path, out:
 
 
 WRITERS = {"c": _library, "taps": _impulses, "deepmimo": _scenario}
+
+
+@command(**LIMITS, to=choice(*WRITERS))
+def task(call: CommandCall) -> Result:
+    """Export, and say what is lost."""
+    given, path = call.given, Path(call.given["ckpt"])
+    out = Path(given["out"] or path.with_name(f"{path.stem}-{given['to']}"))
+    # The files of an export belong together: none is written beside those of another one.
+    if out.exists():
+        raise SettingError(f"out={out}: is there already; remove it or name another folder")
+    predictor = load(call.given["ckpt"]).select_station(given["station"])
+    # The folder appears by renaming: an export that fails leaves nothing behind.
+    with whole_folder(out) as folder:
+        facts, lines = WRITERS[given["to"]](predictor, given, folder, out)
+    facts |= {"model/name": predictor.method.name, "out": str(out), "ckpt": str(path)}
+    return Result(facts, (), lines, "summary ")
