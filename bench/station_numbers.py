@@ -97,7 +97,7 @@ def main() -> None:
             law = members.means(rows, data.site, ())[0]
             kernel = VAGUE.start(extent, ExponentialShadowing)
             member = members.PowerMember(law.trend, 1.0, kernel)
-            member = members.learn_numbers(rows, member, VAGUE, extent, 3 * LOOKS)
+            member = members.fit_member_kernel(rows, member, VAGUE, extent, 3 * LOOKS)
             exponent = members.exponent_of(condition_on_powers(rows, member.prior, 0)[0])
             kernel = member.kernel
             noise = kernel.amplitude * kernel.noise

@@ -33,7 +33,7 @@ from gsparc.ops.operators import (
 from gsparc.ops.results import Plan
 from gsparc.ops.settings import KernelSettings
 
-__all__ = ["composite", "draw_frozen", "freeze", "load", "make_plan", "mean_weights"]
+__all__ = ["composite", "freeze", "load", "make_plan", "mean_weights", "render_frozen"]
 
 BYTES_PER_ENTRY = 36  # entries and what sorting them takes
 MOST_PAIRS = 2**31  # of poses and Gaussians: the kernels count them in 32 bits
@@ -225,7 +225,7 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
     return order, (starts, ends, rank_of[of_entries].to(torch.int32), blocks)
 
 
-def draw_frozen(
+def render_frozen(
     grid: SphereGrid,
     buffers: tuple[Tensor, ...],
     features: Tensor,

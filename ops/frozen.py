@@ -88,7 +88,7 @@ class FrozenPlan:
         if features.dim() not in (2, 3):
             raise ValueError(f"features must be (N, C) or (B, N, C), got {tuple(features.shape)}")
         batch = features if features.dim() == 3 else features.unsqueeze(0)
-        image = backends.backend_named(self.backend).draw_frozen(
+        image = backends.backend_named(self.backend).render_frozen(
             self.grid, self.buffers, batch, self.order, visible_only
         )
         # The first and last of (B, N, C): B and C.

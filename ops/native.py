@@ -23,7 +23,7 @@ from gsparc.ops.operators import (
 )
 from gsparc.ops.results import Plan
 
-__all__ = ["composite", "draw_frozen", "freeze", "instruction_set", "make_plan", "mean_weights"]
+__all__ = ["composite", "freeze", "instruction_set", "make_plan", "mean_weights", "render_frozen"]
 
 
 def run_on_plan(
@@ -110,7 +110,7 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
     return order, (starts, ranks, weights)
 
 
-def draw_frozen(
+def render_frozen(
     grid: SphereGrid,
     buffers: tuple[Tensor, ...],
     features: Tensor,

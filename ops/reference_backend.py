@@ -100,7 +100,7 @@ def freeze(plan: Plan, gaussians: Gaussians) -> tuple[Tensor, tuple[Tensor, ...]
 
 
 @full_precision
-def draw_frozen(
+def render_frozen(
     grid: SphereGrid,
     buffers: tuple[Tensor, ...],
     features: Tensor,

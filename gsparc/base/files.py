@@ -81,7 +81,7 @@ def check_line_length(path: str | Path, number: int, line: str) -> str:
     return line
 
 
-def check_fetched(path: Path) -> None:
+def refuse_git_pointer(path: Path) -> None:
     """Raise `DataError` of a file that only says where Git keeps its content."""
     with suppress(OSError), path.open("rb") as file:  # said where it is read
         if file.read(len(POINTER)) == POINTER:

@@ -138,7 +138,7 @@ MOST_GROWTH = 10
 LEAST_NODES = 10_000  # of YAML that are not counted
 
 
-def most_text(packed: int | None = None) -> int:
+def most_text_bytes(packed: int | None = None) -> int:
     """Return how many bytes of text are read from a file;
     from so many `packed` ones of a compressed file.
 

@@ -131,7 +131,7 @@ def _draw_next(
     streets = StreetGraph.from_lines(lines, claim.grid.step / 2) if lines else None
     first = 1 if draws is None else int(draws.tour.max()) + 1
     tours, size = range(first, first + given["tours"]), given["tour"]
-    new, ways = audit.draw_tours(claim, key, ratio, part, tours, size, given["seed"], streets)
+    new, ways = audit.sample_tours(claim, key, ratio, part, tours, size, given["seed"], streets)
     for tour, way in zip(tours, ways, strict=True):
         stops = new[new.tour == tour].to_dict("list")
         write_way(call.folder / f"tour_{tour}.geojson", stops, claim.coordinates(way))

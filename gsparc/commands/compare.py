@@ -17,7 +17,7 @@ from gsparc.evaluation.provenance import provenance
 from gsparc.evaluation.summary import write_summary
 from gsparc.pictures.drawing import PRINTED, save
 from gsparc.pictures.pictures import draw_spectra
-from gsparc.pictures.plots import draw_efforts, draw_splits, draw_sweep
+from gsparc.pictures.plots import draw_accuracy_over_cost, draw_splits, draw_sweep
 from gsparc.runs.experiment.cells import plan_jobs
 from gsparc.runs.experiment.published import beside_published, read_published
 from gsparc.runs.experiment.runner import run_jobs, time_by_dataset
@@ -100,7 +100,7 @@ def write_comparison(
     for dataset, group in rows[rows.draws].groupby("dataset", sort=False):
         draw_splits(group, run_dir / f"{dataset}.png", figures)
     if not rows.draws.all():
-        draw_efforts(rows[~rows.draws], run_dir / "compare.png", ours, figures)
+        draw_accuracy_over_cost(rows[~rows.draws], run_dir / "compare.png", ours, figures)
     # Of a method's efforts the largest.
     most = filled.sort_values("effort", kind="stable").drop_duplicates(
         [*PROBLEM, "method", "seed"], keep="last"

@@ -17,7 +17,7 @@ from gsparc.evaluation.by_part import Drive, describe_parts
 from gsparc.evaluation.results import Run, frame_of_runs
 from gsparc.evaluation.summary import remarks
 from gsparc.pictures.confidence_pictures import PICTURES, draw_confidences
-from gsparc.pictures.parts import draw_parts
+from gsparc.pictures.parts import draw_bias_by_part
 from gsparc.pictures.plots import draw_sweep
 from gsparc.prediction.hearing import read_hearing
 from gsparc.runs.evaluate import Evaluation, evaluate
@@ -122,6 +122,6 @@ def _judge(drive: Drive, title: str, folder: Path) -> tuple[list[str], dict[str,
     """Lines and columns of `by_part.csv`, and the picture."""
     records = drive.judge()
     if records:
-        draw_parts(drive, records, title, folder / "drive.png")
+        draw_bias_by_part(drive, records, title, folder / "drive.png")
     columns = {name: [row[name] for row in records] for name in next(iter(records), ())}
     return describe_parts(records, drive.share), columns

@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from gsparc.apps.link.pictures import STYLES, draw_acceptance, draw_errors, draw_rates
+from gsparc.apps.link.pictures import STYLES, draw_acceptance, draw_block_error_rates, draw_rates
 from gsparc.apps.link.run import LinkStudy
 from gsparc.evaluation.results import facts_under
 from gsparc.evaluation.summary import write_summary
@@ -69,14 +69,14 @@ def task(call: CommandCall) -> Result:
         facts |= results
         write_summary(run_dir / "summary.json", facts)
     if errors:
-        draw_errors(errors, title, run_dir / "bler.png")
+        draw_block_error_rates(errors, title, run_dir / "bler.png")
         draw_acceptance(surest, facts["accepted"], run_dir / "acceptance.png")
     facts["time/total_s"] = time.perf_counter() - started
     parts = tables(facts, title, list(points), settings["mcs"]["snr_db"])
-    return Result(facts, parts, flat_curves(facts, points))
+    return Result(facts, parts, describe_flat_curves(facts, points))
 
 
-def flat_curves(facts: Mapping[str, Any], points: Mapping[str, list[float]]) -> list[str]:
+def describe_flat_curves(facts: Mapping[str, Any], points: Mapping[str, list[float]]) -> list[str]:
     """Say of modulations that no curve of theirs crosses 10 % of failed blocks
     at the Eb/N0 sent.
     """

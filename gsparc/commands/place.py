@@ -78,7 +78,7 @@ def task(call: CommandCall) -> Result:
         if len(low) > 1:
             interval += f", not significantly above {alike} of {len(low) - 1} others"
     lines = [
-        placing.assumption(predictor.site, placement.places[0, 2], where["antenna"]),
+        placing.describe_new_station(predictor.site, placement.places[0, 2], where["antenna"]),
         f"now {placement.before:.1%} of the area, {placement.grid.step:.3g} m squares, with "
         f"{level:g} {unit} or more"
         + (

@@ -70,7 +70,7 @@ def task(call: CommandCall) -> Result | None:
     with locked(out.with_name(out.name + ".parts"), "out"):
         outcome = simulate(campaign(config), out)
     seconds = time.perf_counter() - begin
-    simulated.draw_floor_plan(outcome, call.folder / "floor_plan.png")
+    simulated.draw_power_and_delay_spread(outcome, call.folder / "floor_plan.png")
     triangles = outcome.survey.engine.triangles()
     # The exact shoebox has walls, but no triangles.
     if len(triangles):

@@ -74,7 +74,7 @@ def train(
             )
             contexts = folds.fold_contexts(whole, split, resumes)
             # `Method.fit` of every fold; models/{splat/method,peers/trained}.py call `Trainer.fit`.
-            keep = partial(folds.keep_fold, split, contexts, run_id)
+            keep = partial(folds.save_fold_checkpoint, split, contexts, run_id)
             fits = folds.fit_folds(method, *(learned or (data, split)), contexts, keep=keep)
             unused = options.warn_of_unheeded(config, fits.methods[0], data) if in_full else None
             how: dict[str, Any] = {"eval_on": config.eval_on, "baselines": config.baselines}
@@ -92,12 +92,12 @@ def train(
         return facts, run
 
 
-def train_job(job: Job, left: str | None) -> None:
-    """Train a job into its folder, from what an interrupted try has `left` there."""
+def train_job(job: Job, resume_from: str | None) -> None:
+    """Train a job into its folder, from the checkpoint that an interrupted try left."""
     config = deepcopy(job.config)
     # Solved for another job, they would be missing from this one's processor seconds
     forget_vectors()
-    config.ckpt_path = config.ckpt_path or left  # what the settings name to go on from wins
+    config.ckpt_path = config.ckpt_path or resume_from  # what the settings name to go on from wins
     inputs = replace(read_inputs(config, job.data), split=job.split)
     _, trained_run = train(config, job.folder, inputs, in_full=False)
     for file in () if job.keeps_models else trained_run.checkpoints:

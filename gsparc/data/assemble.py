@@ -76,7 +76,7 @@ def _fact_text(fact: Any) -> str:
     return repr(fact.item() if isinstance(fact, np.generic) else fact)
 
 
-def centre_positions(data: Measurements) -> Measurements:
+def centre_and_hash(data: Measurements) -> Measurements:
     """Return measurements in world coordinates about the middle of their box, with their hash.
 
     Args:

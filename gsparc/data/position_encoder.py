@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.few_rows import sample_row_numbers
 
 # Four deviations of the first coordinate, so that lengths are of the order of metres
 SIZE_M = 100.0
@@ -64,6 +64,6 @@ def features(uplink: np.ndarray) -> np.ndarray:
 def _pairs(antennas: int) -> tuple[np.ndarray, np.ndarray]:
     first, second = np.triu_indices(antennas, 1)
     if len(first) > ANTENNA_PAIRS:
-        keep = draw_rows(len(first), ANTENNA_PAIRS, 0)
+        keep = sample_row_numbers(len(first), ANTENNA_PAIRS, 0)
         first, second = first[keep], second[keep]
     return first, second

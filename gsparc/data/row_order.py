@@ -136,11 +136,11 @@ def content_order(data: Measurements) -> np.ndarray:
     station = np.unique(names, return_inverse=True)[1][data.stations_of()] if several else rows * 0
     among = data.runs_of(rows), station, row
     return np.lexsort(
-        (*among, together[moment], largest, hash_rows(data.moving), along_curve(data.moving))
+        (*among, together[moment], largest, hash_rows(data.moving), morton_codes(data.moving))
     )
 
 
-def along_curve(places: np.ndarray) -> np.ndarray:
+def morton_codes(places: np.ndarray) -> np.ndarray:
     """Return numbers (n,) of places (n, D) along a curve that fills their box:
     bits of axes in turns.
     """

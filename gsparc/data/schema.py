@@ -26,7 +26,7 @@ Places = TypeVar("Places")
 Channels = TypeVar("Channels", np.ndarray, Tensor)
 
 # Channels with unknown factors are compared after alignment, which is another figure.
-Scored = Kind | Literal["aligned csi"]  # by which figures of merit
+Scored = Literal[Kind, "aligned csi"]  # by which figures of merit
 End = Literal["rx", "tx"]
 Chosen = np.ndarray | slice  # of rows
 ENDS_OF_PLACES: tuple[End, ...] = ("tx", "rx")  # in the order of six columns

@@ -100,7 +100,7 @@ class Selection(Checked):
 WHOLE = Selection()
 
 
-def take_selection(settings: dict[str, Any]) -> dict[str, Any]:
+def pop_selection(settings: dict[str, Any]) -> dict[str, Any]:
     """Return the settings of `Selection` out of all of a dataset, which then lack them."""
     return {
         setting_field.name: settings.pop(setting_field.name)

@@ -16,7 +16,7 @@ from gsparc.data.held_out import block_rows, corner_fold, grouped_folds, last_ro
 from gsparc.data.schema import TrainTest
 from gsparc.data.spacing import thin_rows
 from gsparc.data.split_settings import WHOLE, FileSettings, LeaveOut, SplitSettings
-from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.few_rows import sample_row_numbers
 
 LEAST_ROWS = 4  # fewer training rows than this teach nothing
 
@@ -284,7 +284,7 @@ def _finish(
     keep = len(train) if s.train_count is None else s.train_count
     keep = max(min(keep, round(s.thin * len(train))), 1) if len(train) else 0
     # A prefix of one permutation: smaller training sets are subsets of larger ones.
-    train = train[draw_rows(len(train), keep, rng)]
+    train = train[sample_row_numbers(len(train), keep, rng)]
     if len(train) == 0 or (len(test) == 0 and s.name != "none"):
         raise DataError(
             f"split={s.name}: fold {fold} has {len(train)} training and {len(test)} test rows of "

@@ -18,7 +18,7 @@ import numpy as np
 from gsparc.base.errors import DataError, Problems, readable
 from gsparc.base.files import read_yaml
 from gsparc.base.limits import choice, finite_array, or_word, whole
-from gsparc.data.assemble import centre_positions
+from gsparc.data.assemble import centre_and_hash
 from gsparc.data.position_encoder import encode_positions
 from gsparc.data.scale import rounded_rms
 from gsparc.data.schema import Measurements, Site, TrainTest
@@ -101,7 +101,7 @@ def load_argos(
         uplink_hz=frequency[:UPLINK],
         antennas=chosen,
     )
-    return centre_positions(
+    return centre_and_hash(
         Measurements(
             site,
             np.tile(base, (len(csi), 1)),

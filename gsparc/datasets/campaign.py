@@ -19,11 +19,11 @@ from gsparc.base.limits import SettingError
 from gsparc.data.assemble import check_positions
 from gsparc.data.foreign import foreign_warnings
 from gsparc.data.schema import Field, Measurements, TrainTest
-from gsparc.data.selection import Selection, take_selection
+from gsparc.data.selection import Selection, pop_selection
 from gsparc.datasets.datamodule import DataModule
 from gsparc.datasets.public.fetch import fetched_path, fetched_path_or_none
 from gsparc.tables.advice import run_warnings
-from gsparc.tables.arrays import Raw, numbered_rows, rename_arrays
+from gsparc.tables.arrays import Raw, name_rows_by_number, rename_arrays
 from gsparc.tables.checks.conventions import convention_warnings
 from gsparc.tables.checks.level_steps import LevelStep, LinkLevels, find_level_steps, link_levels
 from gsparc.tables.checks.plausibility import sanity_warnings, unit_warnings
@@ -66,7 +66,7 @@ class Campaign(DataModule):
                 f"dataset.file={[*map(str, file)]}: expected one file; join tables first"
             )
         self.file = Path(file)
-        self.settings, self.selection = settings, Selection(**take_selection(settings))
+        self.settings, self.selection = settings, Selection(**pop_selection(settings))
 
     def raw(self) -> Raw:
         """Read the file's arrays, named as in docs/reference/schema.md;
@@ -281,7 +281,7 @@ def check_layout(
             letters = zip(shape, array.shape, strict=True)
             check.sizes |= {letter: size for letter, size in letters if isinstance(letter, str)}
             if name in places:
-                rows = [*numbered_rows(len(array))]
+                rows = [*name_rows_by_number(len(array))]
                 check_positions(check.problems, check.describe_array(name), array, rows)
         elif name not in raw.arrays and field.required == "yes":
             check.refuse(name, f"missing; expected {field.holds} {field.shape}")

@@ -102,7 +102,7 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
     if isinstance(settings, FileSettings):
         split = read_split(settings.path, len(data), data.site.sha256)
         absent = rows_to_leave_out(settings.leave_out, wrong, len(data))
-        return answerable(remove_rows(split, absent) if len(absent) else split, data)
+        return drop_unanswerable_rows(remove_rows(split, absent) if len(absent) else split, data)
     settings = settings.for_moving_end(data.site.moving_end)
     carriers = (
         None if data.carrier_hz is None else np.unique(data.carrier_hz, return_inverse=True)[1]
@@ -119,12 +119,12 @@ def split_for(config: Mapping[str, Any], data: Measurements) -> Split:
     # and would move squares.
     where = data.moving - data.moving.min(axis=0)
     order = content_order(data) if settings.name == "none" else data.sequence
-    return answerable(
+    return drop_unanswerable_rows(
         make_split(where, settings, data.release_split, wrong, place, unit, order), data
     )
 
 
-def answerable(
+def drop_unanswerable_rows(
     split: Split, data: Measurements, learned: tuple[Measurements, Split] | None = None
 ) -> Split:
     """Return the same folds without test rows that plain methods cannot answer.

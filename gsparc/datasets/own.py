@@ -13,7 +13,7 @@ from gsparc.base.errors import DataError, Question
 from gsparc.base.instantiate import from_settings
 from gsparc.base.limits import finite_array, or_null, switch
 from gsparc.data.schema import Measurements
-from gsparc.data.selection import Selection, take_selection
+from gsparc.data.selection import Selection, pop_selection
 from gsparc.datasets.ble import BLE
 from gsparc.datasets.campaign import Campaign
 from gsparc.datasets.cbrs import Cbrs
@@ -177,7 +177,7 @@ def read_any(path: str | Path, **settings: Any) -> Reading:
         DataError: it is none of them, or something in it is wrong.
     """
     path = Path(path)
-    part = from_settings(Selection, take_selection(settings), "dataset")
+    part = from_settings(Selection, pop_selection(settings), "dataset")
     table = {name: settings.pop(name, None) for name in TABLE}
     # Releases before anything else: their folders may hold tables that look like one's own.
     release = dataset_by_path(path)

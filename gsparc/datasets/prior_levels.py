@@ -16,12 +16,12 @@ from gsparc.base.errors import Caution, DataError, list_first
 from gsparc.base.files import Files
 from gsparc.data.schema import Measurements
 from gsparc.data.station_names import site_name
+from gsparc.data.target import MOST_DB
 from gsparc.datasets.own import read_own
 from gsparc.datasets.rasters import BAND, GRIDS, OVERLAY, is_raster, read_raster
 from gsparc.datasets.terrain import terrain_levels
 from gsparc.tables import is_table
-from gsparc.tables.array_checks import MOST_DB
-from gsparc.tables.checks.piles import find_marks
+from gsparc.tables.checks.piles import find_sentinel_levels
 from gsparc.tables.own import interpret
 from gsparc.tables.read import parse_table
 
@@ -192,7 +192,7 @@ def _near_rows(path: Path, data: Measurements, points: np.ndarray, level: np.nda
         )
     points, level = points[near], level[near]
     # A legend states all levels of an overlay, each of which repeats apart from the others.
-    marks = [] if path.suffix.lower() == OVERLAY else find_marks(level)
+    marks = [] if path.suffix.lower() == OVERLAY else find_sentinel_levels(level)
     marked = np.isin(level, marks)
     _say_marks(path, int(marked.sum()), f"exactly {list_first([f'{mark:g}' for mark in marks])}")
     return points[~marked], level[~marked]

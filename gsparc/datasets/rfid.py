@@ -32,7 +32,7 @@ from PIL import Image
 from gsparc.base.errors import DataError, Problems, readable
 from gsparc.base.files import read_text, read_yaml
 from gsparc.base.limits import finite_array, parse_numbers
-from gsparc.data.assemble import centre_positions, check_positions
+from gsparc.data.assemble import centre_and_hash, check_positions
 from gsparc.data.blocks import allocate
 from gsparc.data.schema import LIGHT, End, Measurements, Site, Stations, TrainTest
 from gsparc.data.spacing import number_places
@@ -151,7 +151,7 @@ def load_rfid(
         data = _at_carriers(
             replace(data, site=replace(site, name=info.dataset)), carriers[rows], half
         )
-    return centre_positions(data)
+    return centre_and_hash(data)
 
 
 def _at_carriers(data: Measurements, carrier_hz: np.ndarray, array: np.ndarray) -> Measurements:

@@ -37,13 +37,13 @@ def rmse_after_constants(scores: Scores, station: np.ndarray) -> float | None:
     return float((residual**2).mean() ** 0.5) if residual.notna().any() else None
 
 
-def best_server(scores: Scores, data: Measurements) -> dict[str, float]:
+def score_best_server(scores: Scores, data: Measurements) -> dict[str, float]:
     """Return the share of places, with rows of two stations or more,
     whose measured strongest is predicted.
 
     What was not heard counts as weaker than all that was; in lists of the strongest all that is not
-    listed, see `strongest_told`. Of k stations tied as predicted strongest a right one counts 1 /
-    k. Empty without such places.
+    listed, see `score_strongest_station`. Of k stations tied as predicted strongest a right one
+    counts 1 / k. Empty without such places.
     """
     row, place = scores.row, np.arange(len(data)) if data.place is None else data.place
     if "strongest_told" in scores.samples:

@@ -105,7 +105,7 @@ def last_warnings(file: str = "the log") -> list[str]:
     return [*severe, *([f"{more} more warnings in {file}"] if more else [])]
 
 
-def note_said(folder: Path) -> None:
+def mark_logged_warnings_shown(folder: Path) -> None:
     """Take what the log in a run's folder, or in one above its part's, warned of as said."""
     for file in (file for place in (folder, folder.parent) for file in place.glob("*.log")):
         lines = file.read_text(encoding="utf-8", errors="replace").splitlines()

@@ -9,7 +9,7 @@ import numpy as np
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Split
 from gsparc.data.units import power_in_decibels
-from gsparc.evaluation.by_station import best_server, rmse_after_constants
+from gsparc.evaluation.by_station import rmse_after_constants, score_best_server
 from gsparc.evaluation.metric_formats import CALIBRATION, WITH_SILENT
 from gsparc.evaluation.scores import Scores
 from gsparc.physics.decibels import to_decibels
@@ -18,7 +18,7 @@ from gsparc.processes.uncertainty import coverage_and_width, half_width
 SHARE = 0.9  # of the truth that an interval is to hold
 
 
-def power_intervals(scores: Scores, data: Measurements) -> dict[str, float | None]:
+def score_power_intervals(scores: Scores, data: Measurements) -> dict[str, float | None]:
     """Return figures of predicted normal distributions of decibels;
     empty where the method has no variance.
 
@@ -94,8 +94,8 @@ def rmse_with_silent(scores: Scores, data: Measurements) -> dict[str, float | No
 
 
 def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, float | None]:
-    """Return accuracies and `reduced_chi_squared`; of powers `rmse_with_silent`, `power_intervals`,
-    `best_server`.
+    """Return accuracies and `reduced_chi_squared`; of powers `rmse_with_silent`,
+    `score_power_intervals`, `score_best_server`.
 
     Of stations held out also the errors left after a constant of each.
     """
@@ -105,8 +105,8 @@ def pool_figures(scores: Scores, data: Measurements, split: Split) -> dict[str, 
     else:
         figures |= (
             rmse_with_silent(scores, data)
-            | power_intervals(scores, data)
-            | best_server(scores, data)
+            | score_power_intervals(scores, data)
+            | score_best_server(scores, data)
         )
         if split.name == "stations":
             figures["rmse_db_after_constant"] = rmse_after_constants(scores, data.stations_of())

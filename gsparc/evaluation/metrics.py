@@ -257,18 +257,20 @@ class PowerMetrics(SampleMetric):
         }
 
 
-def power_errors(p: np.ndarray, t: np.ndarray) -> dict[str, np.ndarray]:
+def power_errors(predicted: np.ndarray, target: np.ndarray) -> dict[str, np.ndarray]:
     """Return errors (S,) of linear predictions and targets (S,),
     in decibels and of the linear values.
     """
-    positive = t > 0
+    positive = target > 0
     # A power of 0 or less has no decibels: it counts as the weakest that was measured.
-    floor = t[positive].min() if positive.any() else np.finfo(np.float64).tiny
+    floor = target[positive].min() if positive.any() else np.finfo(np.float64).tiny
     error_db = np.where(
-        positive, _db(np.where(p > 0, p, floor), np.where(positive, t, 1.0)), np.nan
+        positive,
+        _db(np.where(predicted > 0, predicted, floor), np.where(positive, target, 1.0)),
+        np.nan,
     )
-    error = np.where(np.isnan(t), np.nan, (p - t) ** 2)
-    return {"error_db": error_db, "error_power": error, "target_power": t**2, "mse": error}
+    error = np.where(np.isnan(target), np.nan, (predicted - target) ** 2)
+    return {"error_db": error_db, "error_power": error, "target_power": target**2, "mse": error}
 
 
 def _ssim(prediction: np.ndarray, target: np.ndarray, measured: np.ndarray, window: int) -> float:

@@ -278,9 +278,9 @@ def read_columns(path: Path) -> dict[str, np.ndarray]:
     return {} if table.empty else {name: table[name].to_numpy() for name in table}
 
 
-def facts_under(facts: Mapping[str, Any], room: str) -> dict[str, Any]:
+def facts_under(facts: Mapping[str, Any], prefix: str) -> dict[str, Any]:
     """Return the facts whose names begin with `room/`, without it."""
-    stem = f"{room}/"
+    stem = f"{prefix}/"
     return {name[len(stem) :]: value for name, value in facts.items() if name.startswith(stem)}
 
 

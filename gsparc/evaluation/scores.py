@@ -39,8 +39,7 @@ class Scores:
         fold, row: (S,) int64.
         samples: quantities of the metrics of `kind`, (S,) float64 each.
         confidence, variance: (S,) float64, NaN where the method gives none.
-        never_listed: see `gsparc.evaluation.scores.never_listed`; None of other data than
-            lists.
+        never_listed: see `predict_unlisted_stations`; None of other data than lists.
     """
 
     kind: Scored
@@ -223,9 +222,11 @@ def score_methods(
                 level = power_in_decibels(scored["prediction"], variance)
             queries, told = data.subset(rows), silence.without(np.asarray(off, np.int64))
             if told.lists is not None and are_lists:
-                scored["strongest_told"] = strongest_told(method, told.lists, queries)
+                scored["strongest_told"] = score_strongest_station(method, told.lists, queries)
                 missing.append(
-                    never_listed(method, told, data.subset(np.concatenate(scored_rows)), queries)
+                    predict_unlisted_stations(
+                        method, told, data.subset(np.concatenate(scored_rows)), queries
+                    )
                 )
             heard = told.given_heard(
                 method, queries.moving, queries.stations_of(), *level, queries.device
@@ -263,7 +264,7 @@ def names_every_station(data: Measurements, rows: np.ndarray) -> bool:
     return len(links) == len(np.unique(place[rows])) * len(np.unique(data.stations_of()))
 
 
-def never_listed(
+def predict_unlisted_stations(
     method: Method, hearing: Hearing, data: Measurements, asked: Measurements
 ) -> pd.DataFrame:
     """Return how probably lists hold stations that none of them does: columns `station`, `moment`,
@@ -295,7 +296,9 @@ def never_listed(
     return pd.DataFrame(dict(zip(table, columns, strict=True)))
 
 
-def strongest_told(method: Method, lists: StrongestLists, asked: Measurements) -> np.ndarray:
+def score_strongest_station(
+    method: Method, lists: StrongestLists, asked: Measurements
+) -> np.ndarray:
     """Return at rows (n,) of moments whether the measured strongest station is the predicted one of
     all.
 

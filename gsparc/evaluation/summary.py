@@ -144,8 +144,8 @@ def remarks(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     stated = [key.split("/") for key in facts if key.endswith(f"/{CALIBRATION}")]
     chi2 = {key[1]: facts["/".join(key)] for key in stated if key[0] == "baseline"}
     chi2[str(facts.get("model/label"))] = facts.get(f"{prefix}/{CALIBRATION}")
-    wrong = wrong_deviations(chi2, main_figure(facts, prefix))
-    rest = decided_by_a_row(facts, prefix) + better_baseline(facts, prefix) + wrong
+    wrong = describe_wrong_deviations(chi2, main_figure(facts, prefix))
+    rest = describe_dominant_row(facts, prefix) + describe_best_baseline(facts, prefix) + wrong
     if above := facts.get(f"{prefix}/heard_above_db"):
         rest.append(
             f"{GIVEN_HEARD}: these rows do not name every station at each place. Levels as they "
@@ -216,10 +216,10 @@ def run_conditions(facts: Mapping[str, Any]) -> list[str]:
             f"{count} runs were not learned from: scored after the best common phase of each"
         )
     load = facts.get("machine/load")
-    return conditions + busy_machine([] if load is None else [load])
+    return conditions + describe_machine_load([] if load is None else [load])
 
 
-def busy_machine(loads: Sequence[float]) -> list[str]:
+def describe_machine_load(loads: Sequence[float]) -> list[str]:
     """Return that the machine was busy, where one of its 1-minute loads per core (n,) says so."""
     if max(loads, default=0.0) <= BUSY:
         return []
@@ -227,7 +227,7 @@ def busy_machine(loads: Sequence[float]) -> list[str]:
     return [f"the machine was busy (load {ends} per core): times are inflated, ratios less so"]
 
 
-def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
+def describe_dominant_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """Return the row that alone decides sums over all rows, if one does,
     and the median beside them.
     """
@@ -245,11 +245,12 @@ def decided_by_a_row(facts: Mapping[str, Any], prefix: str = "test") -> list[str
     ]
 
 
-def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]:
+def describe_wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]:
     """Return methods whose `std` is wrong by a factor of two or more,
     by their reduced chi-squared, if any.
 
-    >>> wrong_deviations({"gp": 1.2, "field": 25.0, "mean": None}, "nmse")[0].split(": ")[1][:33]
+    >>> wrong = describe_wrong_deviations({"gp": 1.2, "field": 25.0, "mean": None}, "nmse")
+    >>> wrong[0].split(": ")[1][:33]
     'std of field is 5 times too small'
     """
     low, high = RIGHT_CHI2
@@ -269,7 +270,7 @@ def wrong_deviations(chi2: Mapping[str, float | None], figure: str) -> list[str]
     )
 
 
-def better_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
+def describe_best_baseline(facts: Mapping[str, Any], prefix: str = "test") -> list[str]:
     """Return whether the best baseline beats the method, or neither; with silent rows,
     and of heard ones.
 

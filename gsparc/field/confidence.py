@@ -75,7 +75,7 @@ class ErrorModel(nn.Module):
         self.far, self.power = (float(value) for value in state)
 
 
-def fit_level_and_power(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]:
+def fit_error_law(unknown: np.ndarray, error: np.ndarray) -> tuple[float, float]:
     """Return (a, p): the expected squared error of a pixel is about
     `a (unknown + LEAST_UNKNOWN)^p`.
 

@@ -29,7 +29,7 @@ MOST_ROWS, MOST_OF_STATION, LEAST_OF_STATION = 6000, 1000, 60
 SAID, TINY = 12, 1e-12  # stations, whose offsets are listed
 
 
-def take_off_devices(data: Measurements, fold: Fold) -> Measurements:
+def remove_device_offsets(data: Measurements, fold: Fold) -> Measurements:
     """Return levels as the mean device would read them,
     and a site that knows the offset of each device.
 
@@ -64,7 +64,7 @@ def take_off_devices(data: Measurements, fold: Fold) -> Measurements:
     for number in np.unique(station)[:SAID] if len(offset) > 1 else ():
         notes = [f"{names[k]} {v:+.1f} dB" for k, v in zip(heard, offsets[number], strict=True)]
         log.info("devices%s: %s", f" at {shown[number]}" * data.site.several, list_first(notes, 6))
-    return without_devices(data, replace(data.site, device_levels=levels))
+    return subtract_known_device_offsets(data, replace(data.site, device_levels=levels))
 
 
 def _offsets_of_stations(
@@ -98,7 +98,7 @@ def _offsets_of_stations(
     return dict(zip(numbers, moved, strict=True))
 
 
-def without_devices(data: Measurements, site: Site) -> Measurements:
+def subtract_known_device_offsets(data: Measurements, site: Site) -> Measurements:
     """Return rows less the offsets that a site knows, and as its;
     as they are where they name no devices.
     """

@@ -25,9 +25,9 @@ from gsparc.data.splits import Fold, hash_indices
 from gsparc.models import checkpoint
 from gsparc.models.aligned_rows import align_phases
 from gsparc.models.checkpoint import StoredModel
-from gsparc.models.device_offsets import take_off_devices
+from gsparc.models.device_offsets import remove_device_offsets
 from gsparc.models.method import Method, MethodFactory
-from gsparc.models.sanity import judge_fit, make_stored
+from gsparc.models.sanity import create_unfitted, judge_fit
 from gsparc.training.context import FitContext, FitReport
 from gsparc.training.cost import Cost
 from gsparc.training.stopwatch import Stopwatch
@@ -81,7 +81,7 @@ def fit_or_resume(
     watch = Stopwatch()
     # Before the method is made, as another may be called for once rows share a phase.
     ordered, rows = order_rows(data, fold)
-    ordered = take_off_devices(ordered, rows)
+    ordered = remove_device_offsets(ordered, rows)
     if context.datamodule is not None and context.datamodule.measurements is data:
         module = copy.copy(context.datamodule)
         module.measurements = ordered
@@ -151,7 +151,7 @@ def _restore_fit(
 ) -> tuple[Method, FitReport]:
     stored = checkpoint.read(file)
     Origin.from_fit(data, fold, context).require_same(stored)
-    method, extra = make_stored(factory, stored.target), stored.extra
+    method, extra = create_unfitted(factory, stored.target), stored.extra
     method.restore(data.site, stored.state)
     cost = Cost(extra.get("stages", {}), extra.get("unused", {}))
     notes = tuple(extra.get("notes", ()))

@@ -15,7 +15,7 @@ from gsparc.models.gsparc import Gsparc
 from gsparc.models.method import Method, MethodFactory, import_path
 from gsparc.models.per_station import PerStation
 from gsparc.models.registry import all_methods, build
-from gsparc.models.sanity import make_stored
+from gsparc.models.sanity import create_unfitted
 from gsparc.models.splat.method import LearnedField
 from gsparc.models.updated import stored_changes, with_changes
 
@@ -56,7 +56,7 @@ def rebuild_method(factory: MethodFactory, stored: checkpoint.StoredModel) -> Me
     with a stored state.
     """
     several = "per_station" in stored.state
-    method = PerStation(factory) if several else make_stored(factory, stored.target)
+    method = PerStation(factory) if several else create_unfitted(factory, stored.target)
     method.restore(stored.site, stored.state)
     method.name = stored.method
     return method

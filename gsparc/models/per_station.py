@@ -31,7 +31,7 @@ from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
 from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.powers.own_terms import pool_station_weights
-from gsparc.models.sanity import make_stored
+from gsparc.models.sanity import create_unfitted
 from gsparc.models.station_sites import UNHEARD, station_site, stations_of_fold, to_station_query
 from gsparc.models.station_views import OneStationView
 from gsparc.training.context import FitContext, FitReport
@@ -339,7 +339,7 @@ class PerStation(Method):
         """See `Method.restore`."""
         self.site, self._shared = site, bool(state["shared"])
         for number, part in state["per_station"].items():
-            self._copies[int(number)] = copy = make_stored(self.factory, part["target"])
+            self._copies[int(number)] = copy = create_unfitted(self.factory, part["target"])
             copy.name = self.name
             copy.restore(self._site_of_copy(site, int(number)), part["state"])
 

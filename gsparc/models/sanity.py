@@ -80,7 +80,7 @@ def judge_fit(
     return method, replace(report, seconds=report.seconds + watch.seconds, notes=notes, cost=cost)
 
 
-def make_stored(factory: MethodFactory, target: str) -> Method:
+def create_unfitted(factory: MethodFactory, target: str) -> Method:
     """Return an unfitted method of the class that a checkpoint names: of `factory`,
     or what answers for it.
 

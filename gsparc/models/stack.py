@@ -40,20 +40,20 @@ def weigh(
     unit: np.ndarray,
     loss: Loss,
     sure: float = 1.0,
-    dear: Sequence[bool] | None = None,
+    slow: Sequence[bool] | None = None,
     plain: np.ndarray | None = None,
 ) -> np.ndarray:
     """Return weights (K,) of members, of sum one, none below `UNUSED` but 0.
 
     The best alone, unless the mixture of those that cost no more is ahead of it at units that its
-    weights were not learned on; then that, unless a mixture with the `dear` ones is.
+    weights were not learned on; then that, unless a mixture with the `slow` ones is.
 
     Args:
         products: (n, K, K), see `error_products`.
         unit: (n,), rows of one unit are not independent.
         loss: of which the mean over rows is told.
         sure: standard errors of the gain that a mixture must be ahead by.
-        dear: (K,) of members that answer more slowly than the others; None: of none.
+        slow: (K,) of members that answer more slowly than the others; None: of none.
         plain: (n,) squared errors of the plain mean: members of more have no weight.
 
     >>> errors = np.random.default_rng(0).normal(size=(200, 2))
@@ -61,7 +61,7 @@ def weigh(
     [0.5, 0.5]
     """
     losses, count = _losses(np.einsum("nkk->nk", products), loss), products.shape[1]
-    mean, cheap = losses.mean(0), np.full(count, True) if dear is None else ~np.array(dear)
+    mean, cheap = losses.mean(0), np.full(count, True) if slow is None else ~np.array(slow)
     able = np.full(count, True) if plain is None else mean <= _losses(plain, loss).mean()
     able = able if able.any() else mean == mean.min()
     cheap = cheap & able if (cheap & able).any() else able

@@ -115,13 +115,13 @@ class Level:
         return Level(self.mean[chosen], self.doubt[chosen], self.noise[chosen])
 
 
-def map_level(method: Method, said: Prediction, site: Site) -> Level:
+def map_level(method: Method, prediction: Prediction, site: Site) -> Level:
     """Return what a map of powers of a site said,
     its variance told apart into its error and noise.
     """
-    spread = torch.full((len(said.mean),), UNSAID) * said.mean[:, 0].square()
-    spread = spread if said.variance is None else said.variance
-    moments = site.target.moments_in_error_unit(said.mean[:, 0], spread)
+    spread = torch.full((len(prediction.mean),), UNSAID) * prediction.mean[:, 0].square()
+    spread = spread if prediction.variance is None else prediction.variance
+    moments = site.target.moments_in_error_unit(prediction.mean[:, 0], spread)
     mean, variance = (part.detach().double() for part in moments)
     process = method.process() if isinstance(method, HasProcess) else None
     if process is None:
@@ -208,7 +208,7 @@ class Updated(View):
 
 
 @contextmanager
-def sound_updates(path: Path | str = "the checkpoint") -> Iterator[None]:
+def refuse_damaged_updates(path: Path | str = "the checkpoint") -> Iterator[None]:
     """Raise `CheckpointError` in place of what reading damaged later rows of a file raises."""
     try:
         yield
@@ -226,7 +226,7 @@ def stored_changes(extra: Mapping[str, Any], path: Path | str = "the checkpoint"
     Raises:
         CheckpointError: any version of it is damaged.
     """
-    with sound_updates(path):
+    with refuse_damaged_updates(path):
         parts = [version["state"]["changes"] for version in extra.get(STORED, ())]
         if where := find_non_finite(parts, STORED):
             raise ValueError(f"{where} is NaN or infinite")

@@ -8,22 +8,22 @@ import torch
 from torch import Tensor
 
 
-def draw_in_box(low: Tensor, high: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def sample_in_box(low: Tensor, high: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Draw places (count, D), uniform between corners (D,), of their dtype.
 
-    >>> draw_in_box(torch.zeros(3), torch.ones(3), 2, torch.Generator().manual_seed(0)).shape
+    >>> sample_in_box(torch.zeros(3), torch.ones(3), 2, torch.Generator().manual_seed(0)).shape
     torch.Size([2, 3])
     """
     share = torch.rand(count, len(low), generator=generator, dtype=low.dtype)
     return low + (high - low) * share
 
 
-def draw_lengths(
+def sample_log_uniform(
     shortest: float, longest: float, like: Tensor, generator: torch.Generator
 ) -> Tensor:
     """Draw log-uniform lengths of the shape and dtype of `like`, as sizes of things are.
 
-    >>> sides = draw_lengths(0.1, 1.0, torch.zeros(5, 3), torch.Generator())
+    >>> sides = sample_log_uniform(0.1, 1.0, torch.zeros(5, 3), torch.Generator())
     >>> bool((sides >= 0.1).all() and (sides <= 1).all())
     True
     """

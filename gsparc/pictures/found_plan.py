@@ -29,7 +29,7 @@ AROUND, MARGIN = 0.5, 0.06  # of the extent of the places, drawn around them wit
 FARTHEST = 4.0  # extents of the places, at which a wall is on the map
 
 
-def draw_found(
+def draw_site_objects(
     data: Measurements, objects: SiteObjects, path: Path, known: SceneWalls | None = None
 ) -> None:
     """Save a map of mirror planes and boxes over the measured places as PNG.

@@ -17,7 +17,7 @@ LEAST_DB = 3.0  # end of the colours
 LINE = 0.3  # inches of a bar
 
 
-def draw_parts(
+def draw_bias_by_part(
     drive: Drive,
     rows: Sequence[dict[str, Any]],
     title: str,

@@ -24,7 +24,7 @@ from gsparc.models.method import Method
 from gsparc.models.powers.together.field import JointPowerField
 from gsparc.models.powers.together.terms import rows_of_stations
 from gsparc.pictures.drawing import PALETTE, colour_bar, panels, save
-from gsparc.pictures.found_plan import draw_found
+from gsparc.pictures.found_plan import draw_site_objects
 from gsparc.prediction.confidence import Guarantee
 from gsparc.prediction.left_out import Evidence, predict_rows
 from gsparc.prediction.risk import Trial, bounded_loss
@@ -61,7 +61,7 @@ def draw_run(
     tracking.log_table(loggers, "results", *table.texts())
     sources = method.objects()
     if len(sources):
-        draw_found(data, sources, run_dir / "found.png", walls)
+        draw_site_objects(data, sources, run_dir / "found.png", walls)
         tracking.log_picture(loggers, "found", run_dir / "found.png")
 
 

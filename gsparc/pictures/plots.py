@@ -250,7 +250,9 @@ LEAST_S = 1e-3  # faster fits are drawn here
 PANEL = 2.4  # inches
 
 
-def draw_efforts(rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] = ()) -> None:
+def draw_accuracy_over_cost(
+    rows: pd.DataFrame, path: Path, ours: str, also: Sequence[str] = ()
+) -> None:
     """Save accuracy against costs, see `save`: a line joins the efforts; `ours` has a large mark.
 
     `rows` are as of `average_cells`.

@@ -25,7 +25,7 @@ from gsparc.simulate.scenes.shipped import list_shipped_scenes
 CARRIER_HZ = 3.5e9  # for looking at scenes: materials need one
 
 
-def draw_floor_plan(outcome: Outcome, path: Path) -> None:
+def draw_power_and_delay_spread(outcome: Outcome, path: Path) -> None:
     """Draw from above: received power, delay spread and, after `auto`,
     where a dropped effect mattered.
 

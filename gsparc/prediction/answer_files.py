@@ -252,7 +252,7 @@ def predict_places(
         raise DataError(silent[0])
     ends: dict[Any, np.ndarray] = {end: places[row] for end, places in world.items()}
     first = models[0][0].predict(**{end: places[models[0][1][:1]] for end, places in ends.items()})
-    check_fits(path, predictor.site.target, tuple(first.mean.shape[1:]))
+    refuse_wide_csv(path, predictor.site.target, tuple(first.mean.shape[1:]))
     result = ask(models, ends, what="blocks of places")
     for line in silent:
         log.warning(line)
@@ -271,7 +271,7 @@ def _predict_links(
     except ValueError as error:
         stays = f"{ENDS[site.still_end]} (station=NAME, or no columns of its places)"
         raise DataError(f"{queries.source}: {error}; ask about a {stays}") from None
-    check_fits(path, site.target, tuple(result.mean.shape[1:]))
+    refuse_wide_csv(path, site.target, tuple(result.mean.shape[1:]))
     return Answers(rows, np.zeros_like(rows), {}, result)
 
 
@@ -302,7 +302,7 @@ def output_path(out: str | None, places: Path, overwrite: bool) -> Path:
     return path
 
 
-def check_fits(path: Path, target: Target, shape: tuple[int, ...]) -> None:
+def refuse_wide_csv(path: Path, target: Target, shape: tuple[int, ...]) -> None:
     """Refuse what is no table: spectra, and channels of many entries."""
     if path.suffix.lower() == ".npz":
         return

@@ -26,7 +26,7 @@ from gsparc.models.predicting import predict_with_threads
 from gsparc.physics.decibels import from_decibels
 from gsparc.prediction.query import Asked, PlacedQuery
 from gsparc.processes.factor import Factor
-from gsparc.processes.few_rows import covering_rows, draw_rows
+from gsparc.processes.few_rows import covering_rows, sample_row_numbers
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.stored import Stored, from_plain, to_plain
 from gsparc.processes.uncertainty import Threshold
@@ -123,7 +123,9 @@ class Trusted(Stored):
         """
         rows = fold.learned()
         # A fixed seed: a checkpoint has the same rival whenever it is calibrated.
-        kernel = kernel_of_targets(data, rows[draw_rows(len(rows), KERNEL_ROWS, 0)], COMPONENTS)
+        kernel = kernel_of_targets(
+            data, rows[sample_row_numbers(len(rows), KERNEL_ROWS, 0)], COMPONENTS
+        )
         # Stations share places: each is known once
         return Trusted(known=np.unique(data.moving[rows], axis=0), kernel=kernel)
 

@@ -26,10 +26,10 @@ from gsparc.processes.changes import (
     NOISY,
     SAME,
     SHARE,
+    change_log_evidence,
     common_offset,
     correct,
-    evidence,
-    learn,
+    learn_changes,
     main_effect,
 )
 from gsparc.processes.later_rows import LaterRows
@@ -164,7 +164,7 @@ class Watch(Stored):
         run = world[world.number >= self.since[station]]
         near = _nearest(before, new), _nearest(run[:-count], new)
         parts = [near[0].join(new), near[0], near[1].join(new), near[1]]
-        likely = evidence([part.merge(visits=True) for part in parts], extent, 0.0)
+        likely = change_log_evidence([part.merge(visits=True) for part in parts], extent, 0.0)
         density = (likely + NOISY.log()[:, None]).logsumexp(1) + SHARE.log()
         # A map's world ends with a change of it, a changed one with any that its rows do not say.
         changed = self._standing(station) is not None
@@ -195,7 +195,7 @@ class Watch(Stored):
 
 def _told(rows: LaterRows, at: LaterRows, extent: float) -> Tensor:
     """Change (n,) of the map where other rows are [dB], as a station's rows say."""
-    belief = learn({0: rows}, extent, looked=NAMED)
+    belief = learn_changes({0: rows}, extent, looked=NAMED)
     return correct(belief, 0, rows, at.places, at.level, at.doubt).mean - at.level
 
 

@@ -17,12 +17,12 @@ from gsparc.data.ends import stations_at
 from gsparc.data.outliers import are_kilometres, far_from_box
 from gsparc.data.schema import Measurements, Site
 from gsparc.data.units import PowerUnit
-from gsparc.models.device_offsets import without_devices
+from gsparc.models.device_offsets import subtract_known_device_offsets
 from gsparc.ops.transforms import to_numpy
 from gsparc.physics.decibels import to_decibels
 from gsparc.prediction.query import read_places
 from gsparc.processes.powers import PowerRows
-from gsparc.tables.arrays import Raw, numbered_rows
+from gsparc.tables.arrays import Raw, name_rows_by_number
 from gsparc.tables.links.strongest import strongest_lists
 from gsparc.tables.own_checks import Checker
 
@@ -76,7 +76,7 @@ def read_level_rows(data: Measurements, site: Site) -> LevelRows:
             "train on all "
             "drives, gsparc evaluate names cells that are gone"
         )
-    data = without_devices(data, site)
+    data = subtract_known_device_offsets(data, site)
     rows = (
         np.arange(len(data)) if data.sequence is None else np.argsort(data.sequence, kind="stable")
     )
@@ -117,7 +117,7 @@ def read_level_arrays(
         if at.ndim == 1 and arrays[name].ndim < 2:
             arrays[name] = arrays[name].reshape(1, -1)
         at = np.atleast_2d(at)
-        check.row_names = numbered_rows(len(at)).tolist()
+        check.row_names = name_rows_by_number(len(at)).tolist()
         values = check.read_real(name, (len(at), count), *[(len(at),)] * (count == 1))
     if at is not None and values is not None:
         values = values.reshape(len(at), count)

@@ -18,7 +18,7 @@ from gsparc.data.split_settings import SplitSettings
 from gsparc.data.splits import Fold
 from gsparc.models import fitting
 from gsparc.models.abilities import Reconditions
-from gsparc.models.device_offsets import without_devices
+from gsparc.models.device_offsets import subtract_known_device_offsets
 from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.per_station import PerStation, wrap_per_station
 from gsparc.models.predicting import predict_in_batches
@@ -29,11 +29,11 @@ from gsparc.processes.uncertainty import censored_distribution
 from gsparc.training.context import FitContext
 
 
-def forget(method: Method, data: Measurements, rows: np.ndarray) -> Method | None:
+def recondition_on_rows(method: Method, data: Measurements, rows: np.ndarray) -> Method | None:
     """Return a method as it is but for its rows, which are these (n,) alone; None if it cannot."""
     if not isinstance(method, Reconditions):
         return None
-    return method.copy_conditioned(without_devices(data, method.fitted_site), rows)
+    return method.copy_conditioned(subtract_known_device_offsets(data, method.fitted_site), rows)
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class Learned:
         as all are where `anew`.
         """
         if not anew:
-            less = forget(self.method, self.data, np.sort(fold.learned()))
+            less = recondition_on_rows(self.method, self.data, np.sort(fold.learned()))
             if less is not None:
                 return less
         # Nobody goes on from this fit: its checkpoints and curves go with the folder.
@@ -149,17 +149,17 @@ def gather_evidence(
 
 
 def score_answers(
-    said: Prediction, true: Tensor, rows: np.ndarray, places: np.ndarray, rivals: Trusted
+    prediction: Prediction, true: Tensor, rows: np.ndarray, places: np.ndarray, rivals: Trusted
 ) -> Evidence:
     """Return relative errors of predictions of `true` (n, ...) at local places (n, D) [m],
     and their scores.
 
     A method that does not state a kind of score has none of it.
     """
-    miss, power = ((x.abs().square().flatten(1).sum(1)) for x in (said.mean - true, true))
+    miss, power = ((x.abs().square().flatten(1).sum(1)) for x in (prediction.mean - true, true))
     # A silent row has no relative error: any miss of it counts as huge.
     error = (miss / power.clamp_min(1e-30)).double().numpy()
-    score_of = {kind: rivals.score(kind, said, places) for kind in KINDS}
+    score_of = {kind: rivals.score(kind, prediction, places) for kind in KINDS}
     # Scores with a NaN rank nothing.
     scores = {
         kind: score
@@ -221,7 +221,7 @@ class HeldOutLevels:
         return censored_distribution(self.error, self.side)
 
 
-def leave_out(
+def unlearn_and_predict(
     learned: Learned,
     fold: Fold,
     block: np.ndarray,

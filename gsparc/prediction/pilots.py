@@ -61,11 +61,13 @@ class PilotsMixin(Asked):
         values = values if placed.asked is None else values[:, placed.asked]
         values = values if known is None else values[..., torch.from_numpy(known)]
         values = values.reshape(-1, *one)
-        view: Self = self._view(tell(self.method, placed.query, values), None, self.site, None)
+        view: Self = self._view(
+            condition_on_pilots(self.method, placed.query, values), None, self.site, None
+        )
         return view
 
 
-def tell(method: Method, query: Query, values: Tensor, doubt: float = 1.0) -> Method:
+def condition_on_pilots(method: Method, query: Query, values: Tensor, doubt: float = 1.0) -> Method:
     """Return a fitted method that was told of channels (n, A, K), stored units, of one run.
 
     `doubt` is what its variances are multiplied by, see `Mixture`.
@@ -74,11 +76,13 @@ def tell(method: Method, query: Query, values: Tensor, doubt: float = 1.0) -> Me
         ValueError: it is not made of waves that pilots can be added to.
     """
     if isinstance(method, OneStationView):
-        return OneStationView(tell(method.inner, method.of_station(query), values), method.number)
+        return OneStationView(
+            condition_on_pilots(method.inner, method.of_station(query), values), method.number
+        )
     if isinstance(method, PerStation) and (shared := method.shared_copy) is not None:
-        return method.with_shared_copy(tell(shared, query, values))
+        return method.with_shared_copy(condition_on_pilots(shared, query, values))
     if isinstance(method, Mixture) and method.member is not None:
-        return tell(method.member, query, values, method.doubt)
+        return condition_on_pilots(method.member, query, values, method.doubt)
     if isinstance(method, HeardField):
         return HeardField(method.field, query, values, method, method.doubt)
     if isinstance(method, ChannelField):

@@ -157,7 +157,7 @@ def explain_too_few(
     )
 
 
-def explain_none(
+def explain_missing_threshold(
     evidence: Evidence, guarantee: Guarantee, kind: str, spatial: bool, seed: int
 ) -> str:
     """Say why no threshold was found, and the least larger limit [whole dB] that is kept by one.
@@ -199,7 +199,7 @@ def number_patches(position: np.ndarray) -> np.ndarray:
     return np.unique(cell @ np.array([CELLS, 1]), return_inverse=True)[1].ravel()
 
 
-def areas_of_kinds(evidence: Evidence, rows: np.ndarray) -> dict[str, np.ndarray]:
+def risk_coverage_by_kind(evidence: Evidence, rows: np.ndarray) -> dict[str, np.ndarray]:
     """Return what each of `rows` (n,) adds to the area under risk-coverage, (n,)
     by kind of confidence.
     """
@@ -208,7 +208,7 @@ def areas_of_kinds(evidence: Evidence, rows: np.ndarray) -> dict[str, np.ndarray
     return {kind: area_contributions(score[rows], loss) for kind, score in evidence.scores.items()}
 
 
-def best_kind(areas: dict[str, np.ndarray]) -> str:
+def choose_confidence_kind(areas: dict[str, np.ndarray]) -> str:
     """Return the confidence of the smallest area under risk-coverage.
 
     The first, mostly the model's own, stays where another gains no more than the paired standard
@@ -220,8 +220,8 @@ def best_kind(areas: dict[str, np.ndarray]) -> str:
 
 
 def explain_kind(evidence: Evidence, rows: np.ndarray) -> str:
-    """Say on which figures `best_kind` chose on `rows`."""
-    areas = areas_of_kinds(evidence, rows)
+    """Say on which figures `choose_confidence_kind` chose on `rows`."""
+    areas = risk_coverage_by_kind(evidence, rows)
     listed = ", ".join(f"{kind} {area.mean():.3g}" for kind, area in areas.items())
     rule = f"{next(iter(areas))} stays unless one is smaller by more than chance"
     return (
@@ -246,7 +246,11 @@ def calibrate_threshold(
     """
     rng = np.random.default_rng(seed)
     choose_on, calibrate, test = split_choose_calibrate_test(evidence, spatial, rng)
-    used = best_kind(areas_of_kinds(evidence, choose_on)) if kind == "auto" else kind
+    used = (
+        choose_confidence_kind(risk_coverage_by_kind(evidence, choose_on))
+        if kind == "auto"
+        else kind
+    )
     if used not in evidence.scores:
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
     score, bad = evidence.scores[used], guarantee.is_bad(evidence.error)

@@ -30,7 +30,7 @@ from gsparc.models.updated import (
     known_only,
     linked_stations,
     map_level,
-    sound_updates,
+    refuse_damaged_updates,
     stored_changes,
     with_changes,
 )
@@ -43,7 +43,7 @@ from gsparc.prediction.later_rows import (
     read_level_rows,
 )
 from gsparc.prediction.query import Asked
-from gsparc.processes.changes import Belief, correct, learn, refit_scale
+from gsparc.processes.changes import Belief, correct, learn_changes, refit_scale
 from gsparc.processes.later_rows import LaterRows
 from gsparc.processes.stored import Stored, from_plain, to_plain
 
@@ -315,7 +315,7 @@ class UpdateMixin(Asked):
         """Learn from stations' rows together, and answer by it."""
         now = self._current
         changes = changes or now.changes
-        belief = learn(known_only(stations), changes.belief.extent, changes.belief.scale)
+        belief = learn_changes(known_only(stations), changes.belief.extent, changes.belief.scale)
         changes = replace(changes, rows=tuple(sorted(stations.items())), belief=belief)
         told = now.told if key is None else (*now.told, key)[-JOURNAL:]
         version = Version(changes, watch or now.watch, (*now.journal, said)[-JOURNAL:], told)
@@ -417,7 +417,7 @@ def read_versions(extra: Mapping[str, Any]) -> tuple[Version, ...]:
         CheckpointError: they are damaged.
     """
     stored_changes(extra)
-    with sound_updates():
+    with refuse_damaged_updates():
         versions = tuple(map(from_plain, extra.get(STORED, ())))
         if not all(
             isinstance(version, Version) and isinstance(version.watch, Watch)

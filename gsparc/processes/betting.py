@@ -83,11 +83,11 @@ def verdict_of(stands: np.ndarray, falls: np.ndarray, ends: np.ndarray) -> tuple
     return "open", int(ends[-1]) if len(ends) else 0
 
 
-def power_of_rows(count: int, share: float, chance: float = 0.9) -> tuple[float, float]:
+def detectable_shares(count: int, share: float, chance: float = 0.9) -> tuple[float, float]:
     """Return the share below which a claimed share falls with a chance after so many even rows,
     and the one above which it stands; NaN where none does.
 
-    >>> [round(end, 2) for end in power_of_rows(60, 0.95, 0.8)]
+    >>> [round(end, 2) for end in detectable_shares(60, 0.95, 0.8)]
     [0.8, nan]
     """
     value = np.arange(count) >= np.arange(count + 1)[:, None]  # so many fail

@@ -142,7 +142,7 @@ def _values(rows: LaterRows, common: float) -> Tensor:
     return rows.missed + (1 - KEEPS)[:, None] * (rows.level - rows.middle) - common
 
 
-def evidence(
+def change_log_evidence(
     stations: Sequence[LaterRows],
     extent: float,
     common: float,
@@ -183,7 +183,7 @@ def _padded(values: Tensor, length: int, filling: float = 0.0) -> Tensor:
     return torch.cat([values, values.new_full((length - len(values), *values.shape[1:]), filling)])
 
 
-def learn(
+def learn_changes(
     stations: Mapping[int, LaterRows], extent: float, scale: float = 1.0, looked: int = LOOKED
 ) -> Belief:
     """Return what the stations' rows say together: the common offset, the noise,
@@ -198,7 +198,7 @@ def learn(
     if not names:
         return Belief(extent, scale=scale)
     common = common_offset([stations[name] for name in names])
-    log_density = evidence(
+    log_density = change_log_evidence(
         [stations[name].merge() for name in names], extent, common, scale, looked
     )
     share, noisy = SHARE, NOISY
@@ -225,7 +225,10 @@ def refit_scale(stations: Mapping[int, LaterRows], belief: Belief) -> float:
         return belief.scale
     common, before = common_offset(parts), NOISY.log()[:, None] + SHARE.log()
     parts = [rows.merge() for rows in parts]
-    density = [evidence(parts, belief.extent, common, scale, REFITTED) + before for scale in scales]
+    density = [
+        change_log_evidence(parts, belief.extent, common, scale, REFITTED) + before
+        for scale in scales
+    ]
     likely = torch.stack(density).flatten(2).logsumexp(2).sum(1)
     return scales[int((likely - (OCTAVES * torch.tensor(scales).log2()).square() / 2).argmax())]
 
@@ -309,7 +312,7 @@ def main_effect(rows: LaterRows, extent: float) -> tuple[str, float, Tensor]:
     """Return the name of the change that does most to predictions at a station's rows, decibels
     that are added where it is, and shares (n,) of it of these rows' places, merged.
     """
-    belief, rows = learn({0: rows}, extent, looked=NAMED), rows.merge()
+    belief, rows = learn_changes({0: rows}, extent, looked=NAMED), rows.merge()
     weight, added = belief.of(0)
     kinds = torch.arange(len(KINDS))
     mean, _, _ = _solve(

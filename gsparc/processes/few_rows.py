@@ -14,16 +14,16 @@ ENOUGH = 0.8  # of rows that cover a site, one in each cell
 HALVINGS = 40  # of the side of cells, each a look at all rows
 
 
-def draw_rows(count: int, most: int, seed: Seed) -> np.ndarray:
+def sample_row_numbers(count: int, most: int, seed: Seed) -> np.ndarray:
     """Draw at most so many of `count` rows, sorted.
 
-    >>> draw_rows(5, most=9, seed=0)
+    >>> sample_row_numbers(5, most=9, seed=0)
     array([0, 1, 2, 3, 4])
     """
     return np.sort(np.random.default_rng(seed).permutation(count)[:most])
 
 
-def draw_places(places: np.ndarray, most: int, seed: Seed) -> np.ndarray:
+def sample_place_rows(places: np.ndarray, most: int, seed: Seed) -> np.ndarray:
     """Draw at most so many of places (n, D), sorted, see `shuffle_rows`."""
     return np.sort(shuffle_rows(seed, places)[:most])
 

@@ -31,7 +31,7 @@ from gsparc.models.method import Method
 from gsparc.physics.decibels import to_decibels
 from gsparc.prediction import timing
 from gsparc.prediction.hearing import Hearing
-from gsparc.prediction.left_out import forget
+from gsparc.prediction.left_out import recondition_on_rows
 from gsparc.prediction.timing import ClockSettings, query_calls, time_beside_copy, time_interleaved
 from gsparc.runs.baselines import FittedBaseline, baselines_for, fit_baseline
 
@@ -141,7 +141,7 @@ def evaluate(
     if split.name == "none" and eval_on == "test":
         about = _about(methods, seconds, data, split)
         fold, compares = split.folds[0], timed and learned is None and baselines != []
-        less = forget(methods[0], data, fold.train) if compares else None
+        less = recondition_on_rows(methods[0], data, fold.train) if compares else None
         if less is None:
             return Evaluation(about, {})
         told: dict[str, Any] = {

@@ -16,7 +16,7 @@ from gsparc.data.inner_folds import cut_folds
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold, Split, hash_indices
 from gsparc.datasets.datamodule import DataModule
-from gsparc.datasets.load import answerable, datamodule, split_for
+from gsparc.datasets.load import datamodule, drop_unanswerable_rows, split_for
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
 from gsparc.models.registry import build
@@ -84,7 +84,7 @@ class OpenRun:
             level = logging.INFO if learned == 0 else logging.WARNING
             log.log(level, "%s was trained on %s", stored[0].path, foreign)
         if other and trained is not None:
-            chosen = answerable(chosen, data, trained)
+            chosen = drop_unanswerable_rows(chosen, data, trained)
         return Opened(
             **vars(self), data=data, split=chosen, foreign=foreign, learned=learned, trained=trained
         )

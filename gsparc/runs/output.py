@@ -18,7 +18,7 @@ from gsparc.base.files import SUMMARY, write_samples
 from gsparc.base.limits import Limit, check_arguments
 from gsparc.data.splits import Split
 from gsparc.evaluation.by_station import worst_stations
-from gsparc.evaluation.console import last_warnings, note_said, open_console
+from gsparc.evaluation.console import last_warnings, mark_logged_warnings_shown, open_console
 from gsparc.evaluation.provenance import provenance
 from gsparc.evaluation.summary import remarks, results_table, write_summary
 from gsparc.evaluation.table import Table
@@ -107,7 +107,7 @@ def command(**limits: Limit) -> Callable[[Callable[[CommandCall], Any]], Task]:
             call = CommandCall(config, folder or run_directory())
             # What a run warned of is not said again by whoever asks its model.
             for path in call.paths if config.get("ckpt") else ():
-                note_said(Path(path).parent)
+                mark_logged_warnings_shown(Path(path).parent)
             result = work(call)
             return result.show(call.folder) if isinstance(result, Result) else result
 

@@ -105,6 +105,8 @@ class Unseen:
                 f"{self.path}"
             )
             return stored, f"{kind_changed}{from_there}: {of}"
-        return stored, f"{kind_changed}no threshold keeps the promise: " + risk.explain_none(
-            evidence, guarantee, *how
+        return (
+            stored,
+            f"{kind_changed}no threshold keeps the promise: "
+            + risk.explain_missing_threshold(evidence, guarantee, *how),
         )

@@ -110,7 +110,7 @@ class World:
         return np.concatenate(parts)
 
 
-def draw_world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World:
+def simulate_world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World:
     """Draw `count` users whose packets the base station decodes, in open and in blocked streets.
 
     Raises:
@@ -131,7 +131,7 @@ def draw_world(count: int, seed: int = 0, scatterers: int = SCATTERERS) -> World
     return World(users[decoded], rays.select_users(decoded), noise)
 
 
-def draw_snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:
+def simulate_snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:
     """Draw measured channels (S, 64, 52) complex64: truth, offsets, noise."""
     rng = np.random.default_rng([seed, 3])
     count = len(truth.users)
@@ -163,8 +163,8 @@ def draw_snapshots(truth: World, offsets: Offsets, seed: int = 0) -> np.ndarray:
 
 def write_argos_sim(folder: Path, count: int, seed: int, offsets: Offsets, scatterers: int) -> None:
     """Write `count` snapshots in the release's layout; the folder must not exist."""
-    truth = draw_world(count, seed, scatterers)
-    measured = draw_snapshots(truth, offsets, seed)
+    truth = simulate_world(count, seed, scatterers)
+    measured = simulate_snapshots(truth, offsets, seed)
     with whole_folder(folder) as partial:
         np.save(partial / "csidata.npy", measured[:, :SIDE])
         np.save(partial / "csidata-64.npy", measured)

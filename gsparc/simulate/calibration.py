@@ -214,7 +214,7 @@ def _field_arguments(
     return arguments, mi.UInt(buffer.target_indices) + first
 
 
-def calibrate(
+def calibrate_materials(
     replay: Replay,
     start: Mapping[str, Material],
     traced: np.ndarray,

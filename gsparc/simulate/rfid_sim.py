@@ -45,11 +45,11 @@ ROOM = Room(
 )
 
 
-def draw_hand_moved(count: int, seed: int) -> np.ndarray:
+def sample_hand_path(count: int, seed: int) -> np.ndarray:
     """Draw tag positions (count, 3) [m] along smooth curves in the release's box,
     about 1.1 cm apart.
 
-    >>> draw_hand_moved(100, seed=0).shape
+    >>> sample_hand_path(100, seed=0).shape
     (100, 3)
     """
     rng = np.random.default_rng(seed)
@@ -70,7 +70,7 @@ def draw_hand_moved(count: int, seed: int) -> np.ndarray:
 
 def write_rfid_sim(folder: Path, count: int, seed: int) -> None:
     """Write `count` spectra in the release's layout; the folder must not exist."""
-    positions = draw_hand_moved(count, seed)
+    positions = sample_hand_path(count, seed)
     array, frequency = (
         planar_array() @ Rotation.from_quat(ORIENTATION).as_matrix().T,
         LIGHT / WAVELENGTH,

@@ -13,7 +13,7 @@ import numpy as np
 from gsparc.data.georeference import Georeference
 from gsparc.simulate.effects import Effects
 from gsparc.simulate.paths import TracedPaths, join_receivers
-from gsparc.simulate.scenes.receivers import farthest_points
+from gsparc.simulate.scenes.receivers import choose_farthest_rows
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Survey:
     def choose_distant_rows(self, count: int, seed: int) -> np.ndarray:
         """Choose at most `count` rows far apart, transmitters by turns."""
         order, turns = (
-            farthest_points(self.places, min(count, len(self.places)), seed),
+            choose_farthest_rows(self.places, min(count, len(self.places)), seed),
             len(self.engines),
         )
         # Place i with transmitter i, then every place with the next one: all have their turn.

@@ -39,7 +39,7 @@ class Raw:
     heads: tuple[str, ...] = ()
 
 
-def numbered_rows(count: int) -> np.ndarray:
+def name_rows_by_number(count: int) -> np.ndarray:
     """Return what rows (count,) are called that their file does not name."""
     return np.array([f"row {i}" for i in range(count)])
 

@@ -21,8 +21,8 @@ import numpy as np
 import pandas as pd
 
 from gsparc.base.errors import DataError, Problems, absent, list_first, readable
-from gsparc.base.files import check_content, check_depth, check_fetched, refuse_repeated
-from gsparc.base.limits import MOST_VALUES, most_text
+from gsparc.base.files import check_content, check_depth, refuse_git_pointer, refuse_repeated
+from gsparc.base.limits import MOST_VALUES, most_text_bytes
 from gsparc.tables import is_table
 from gsparc.tables.arrays import ARRAY_SUFFIXES
 from gsparc.tables.heads import AXIS_WORDS, LISTS, SHEET, parse_head, words_of
@@ -336,12 +336,12 @@ def read_sheet(path: str | Path, problems: Problems | None = None) -> Sheet:
         )
     if not is_table(path):
         raise DataError(f"{path}: expected a table (csv, parquet, json, ...), no arrays")
-    check_fetched(path)
+    refuse_git_pointer(path)
     with path.open("rb") as file:
         first = b"".join(file.read(PEEKED).removeprefix(codecs.BOM_UTF8).split())
     kind = next((kind for start, kind in STARTS.items() if first.startswith(start)), None)
     kind = "Parquet" if path.suffix.lower() == ".parquet" else kind
     if kind == RECORDS:
-        check_bytes(path, path.stat().st_size, most_text())
+        check_bytes(path, path.stat().st_size, most_text_bytes())
     sheet = unfold_cells(read_text(path) if kind is None else read_frame(path, kind))
     return replace(sheet, problems=Problems(path) if problems is None else problems)

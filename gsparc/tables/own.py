@@ -17,7 +17,7 @@ import numpy as np
 
 from gsparc.base.errors import Caution
 from gsparc.base.limits import number, or_null
-from gsparc.data.assemble import centre_positions, check_positions
+from gsparc.data.assemble import centre_and_hash, check_positions
 from gsparc.data.outliers import check_static_ends
 from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, OTHER, Measurements, Site, StaticEnds
 from gsparc.data.selection import WHOLE, Selection
@@ -244,7 +244,7 @@ def interpret(raw: Raw, source: str | Path, part: Selection = WHOLE) -> Reading:
     # `**` may overflow
     noise = None if noise is None else (noise / (scale * scale)).astype(np.float32)
     site = replace(data.site, target_scale=scale)
-    data = centre_positions(replace(data, site=site, target=target, noise_variance=noise))
+    data = centre_and_hash(replace(data, site=site, target=target, noise_variance=noise))
     file_row = raw.arrays["file_row"]
     return Reading(data, (*check.notes, *raw.explain(data, file_row)), file_row)
 

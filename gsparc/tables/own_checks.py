@@ -18,7 +18,7 @@ from gsparc.data.schema import FIELDS, Stations, TrainTest
 from gsparc.data.target import MEASUREMENTS, TARGETS, Kind
 from gsparc.ops import SphereGrid
 from gsparc.tables.array_checks import ArrayChecker
-from gsparc.tables.arrays import numbered_rows
+from gsparc.tables.arrays import name_rows_by_number
 
 # From long wave (100 kHz) to the far infrared: what lies outside was mostly given in MHz or GHz.
 LOWEST_HZ, HIGHEST_HZ = 1e5, 1e13
@@ -84,7 +84,7 @@ class Checker(ArrayChecker):
 
     def name_rows(self, rows: int, stations: Stations | None) -> list[str]:
         """Return what messages call each row: `row_name`, or its number, with its station."""
-        arrays, named = self.raw.arrays, numbered_rows(rows).tolist()
+        arrays, named = self.raw.arrays, name_rows_by_number(rows).tolist()
         if "row_name" in arrays and self.has_shape("row_name", arrays["row_name"], (rows,)):
             named = [str(name) for name in arrays["row_name"]]
         if stations is not None:  # a place alone would name several rows
@@ -107,7 +107,7 @@ class Checker(ArrayChecker):
         if name == self.unknown:
             return array
         names = (
-            (self.row_names or numbered_rows(len(array)).tolist())
+            (self.row_names or name_rows_by_number(len(array)).tolist())
             if array.ndim == 2
             else ["its value"]
         )

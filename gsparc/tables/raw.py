@@ -24,7 +24,7 @@ from scipy.io import loadmat, netcdf_file
 
 from gsparc.base.archives import hdf5_text_error, is_archive
 from gsparc.base.errors import DataError, absent, explain_error, readable
-from gsparc.base.files import check_fetched, whole_file
+from gsparc.base.files import refuse_git_pointer, whole_file
 from gsparc.data.blocks import is_big, iterate_bytes, map_from_disk
 from gsparc.tables.array_sizes import Stated, check_array_sizes
 from gsparc.tables.arrays import HDF5_SUFFIXES, NETCDF_SUFFIXES, Raw
@@ -66,7 +66,7 @@ def read_raw(path: str | Path) -> Raw:
     if path.suffix.lower() not in readers:
         suffix, endings = path.suffix or "no ending", ", ".join(readers)
         raise DataError(f"{path}: expected a name ending in one of {endings}; found {suffix}")
-    check_fetched(path)
+    refuse_git_pointer(path)
     return readers[path.suffix.lower()](path)
 
 

@@ -14,7 +14,7 @@ import pandas as pd
 
 from gsparc.base.errors import Caution, DataError, Problems, name_row_ranges, readable
 from gsparc.base.files import check_content, check_line_length
-from gsparc.base.limits import LIFTED_BY, MOST_CELLS, MOST_COLUMNS, most_text
+from gsparc.base.limits import LIFTED_BY, MOST_CELLS, MOST_COLUMNS, most_text_bytes
 from gsparc.tables.heads import SHEET, parse_head
 from gsparc.tables.sheet import Sheet
 
@@ -83,7 +83,7 @@ def _decoded(path: Path) -> tuple[str, str]:
     """The text of a file and the name of its encoding."""
     with path.open("rb") as file:
         packed = file.read(len(GZIP)) == GZIP
-    most = most_text(path.stat().st_size if packed else None)
+    most = most_text_bytes(path.stat().st_size if packed else None)
     with (
         readable(
             path, "damaged or not compressed by gzip", (EOFError, zlib.error, gzip.BadGzipFile)

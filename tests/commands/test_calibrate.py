@@ -16,12 +16,12 @@ from gsparc.prediction.confidence import Guarantee, Trusted, as_confidence
 from gsparc.prediction.left_out import Evidence
 from gsparc.prediction.risk import (
     Trial,
-    areas_of_kinds,
-    best_kind,
     calibrate_threshold,
     calibration_facts,
+    choose_confidence_kind,
     explain_too_few,
     number_patches,
+    risk_coverage_by_kind,
     run_trials,
     split_choose_calibrate_test,
 )
@@ -51,10 +51,18 @@ def test_auto_chose_another_confidence_by_chance() -> None:
     noise = np.random.default_rng(1).normal(0, 0.01, len(evidence))
     alike = {"learned": evidence.scores["learned"], "expected": evidence.scores["learned"] + noise}
     rows = np.random.default_rng(2).permutation(len(evidence))[:400].reshape(20, 20)
-    chosen = [best_kind(areas_of_kinds(replace(evidence, scores=alike), some)) for some in rows]
+    chosen = [
+        choose_confidence_kind(risk_coverage_by_kind(replace(evidence, scores=alike), some))
+        for some in rows
+    ]
     assert chosen.count("learned") >= 18  # 12 of 20 had the least area
     worse = {"learned": evidence.scores["distance"], "expected": evidence.scores["learned"]}
-    assert best_kind(areas_of_kinds(replace(evidence, scores=worse), np.arange(200))) == "expected"
+    assert (
+        choose_confidence_kind(
+            risk_coverage_by_kind(replace(evidence, scores=worse), np.arange(200))
+        )
+        == "expected"
+    )
 
 
 def test_few_good_rows_promised_nothing_as_no_level_accepted_enough() -> None:

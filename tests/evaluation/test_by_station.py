@@ -11,10 +11,10 @@ import torch
 
 from gsparc.data.splits import Fold, Split
 from gsparc.evaluation.by_station import (
-    best_server,
     describe_new,
     newly_listed,
     rmse_after_constants,
+    score_best_server,
     worst_stations,
 )
 from gsparc.evaluation.metric_formats import BEST_SERVER, OF_LISTS, WITHOUT_OFF
@@ -151,10 +151,10 @@ def test_the_strongest_is_told_where_it_is_and_equal_answers_tell_nothing(drive)
     would be right by their order.
     """
     truth = drive.target[:, 0].astype(float)
-    assert best_server(scored(drive, truth), drive) == {"best_server": 1.0}
-    assert best_server(scored(drive, -truth), drive) == {"best_server": 0.0}
-    assert best_server(scored(drive, 0 * truth), drive)["best_server"] == pytest.approx(1 / 3)
-    assert best_server(scored(drive, truth), replace(drive, station=None)) == {}
+    assert score_best_server(scored(drive, truth), drive) == {"best_server": 1.0}
+    assert score_best_server(scored(drive, -truth), drive) == {"best_server": 0.0}
+    assert score_best_server(scored(drive, 0 * truth), drive)["best_server"] == pytest.approx(1 / 3)
+    assert score_best_server(scored(drive, truth), replace(drive, station=None)) == {}
     # Each visit to a place names its station again: one right answer, not half of one.
     twice = replace(drive, place=drive.place // 2)
     strongest = np.array(
@@ -163,7 +163,7 @@ def test_the_strongest_is_told_where_it_is_and_equal_answers_tell_nothing(drive)
             for p, t in zip(twice.place, twice.station, strict=True)
         ]
     )
-    assert best_server(scored(twice, strongest), twice) == {"best_server": 1.0}
+    assert score_best_server(scored(twice, strongest), twice) == {"best_server": 1.0}
 
 
 def test_a_saturated_station_was_never_the_strongest():
@@ -179,7 +179,7 @@ def test_a_saturated_station_was_never_the_strongest():
     truth = data.target[:, 0].astype(float)
     scores = scored(data, truth)
     scores.samples["target"] *= np.where(data.censored == 0, data.site.target_scale, np.nan)
-    assert best_server(scores, data) == {"best_server": 1.0}
+    assert score_best_server(scores, data) == {"best_server": 1.0}
 
 
 def test_errors_equal_at_each_station_ended_in_nan(drive):
@@ -236,9 +236,9 @@ def test_the_strongest_at_the_nearest_moment_was_in_no_table():
     asked = listed([9, 9, 1, 1], [0, 1, 0, 1], [-90.0, -76, -71, -95])
     own = Split("asked", (Fold(rows[:0], rows[:0], rows),))
     scores = fit_baseline("nearest", asked, own, learned=(near, split)).scores
-    assert best_server(scores, asked) == {"best_server": 1.0}
+    assert score_best_server(scores, asked) == {"best_server": 1.0}
     del scores.samples["served"]
-    assert best_server(scores, asked) == {"best_server": 0.5}
+    assert score_best_server(scores, asked) == {"best_server": 0.5}
 
 
 MASTS, TRUE_DB = np.array([[100.0 * t, 30.0, 20.0] for t in range(8)]), 4.0

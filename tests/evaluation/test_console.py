@@ -13,7 +13,7 @@ from gsparc.evaluation.console import (
     config_folder,
     error_in_one_line,
     last_warnings,
-    note_said,
+    mark_logged_warnings_shown,
 )
 
 
@@ -115,7 +115,7 @@ def test_what_a_run_warned_of_is_not_said_by_who_asks_its_model(tmp_path, monkey
     (tmp_path / "train.log").write_text(
         "[2026-01-01 10:00:00,000][gsparc.datasets][WARNING] - /data/a.csv: 3 wild rows\n"
     )
-    note_said(tmp_path / "fold0")
+    mark_logged_warnings_shown(tmp_path / "fold0")
     monkeypatch.setattr(logging.getLogger(), "handlers", [ConsoleHandler([], io.StringIO())])
     (screen,) = logging.getLogger().handlers
     log = logging.getLogger("gsparc.datasets.campaign")

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gsparc.evaluation.intervals import power_intervals, reduced_chi_squared, rmse_with_silent
+from gsparc.evaluation.intervals import reduced_chi_squared, rmse_with_silent, score_power_intervals
 from gsparc.evaluation.scores import Scores, errors_with_silent
 from gsparc.models.baselines.kriging import Kriging
 from gsparc.prediction.hearing import Hearing
@@ -52,7 +52,7 @@ def scored(data, mean_db, spread_db):
 
 def test_a_true_law_is_calibrated(drawn):
     data, mean_db = drawn
-    found = power_intervals(scored(data, mean_db, 6.0), data)
+    found = score_power_intervals(scored(data, mean_db, 6.0), data)
     assert found["outage/rate"] == pytest.approx(0.5, abs=0.03)
     assert found["outage/brier"] < 0.8 * found["outage/brier_rate"]
     # Heard rows are the upper part of their laws, by whose moments they are judged.
@@ -140,7 +140,7 @@ def test_rows_of_stations_without_a_level_had_an_outage_of_nan():
     figures = {"interval/coverage_90", "interval/width_db", "reduced_chi2", "heard_above_db"} | {
         "levels_rmse_db"
     }
-    assert set(power_intervals(scores, data)) == figures
+    assert set(score_power_intervals(scores, data)) == figures
 
 
 def test_a_prediction_of_zero_at_a_row_in_saturation_missed_it_by_thousands_of_decibels(drawn):

@@ -11,7 +11,7 @@ from scipy.spatial.distance import cdist
 
 from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
-from gsparc.models.baselines.likeliest import process_and_notes
+from gsparc.models.baselines.likeliest import fit_power_process
 from gsparc.models.registry import build
 from gsparc.models.target_rows import heard_rows
 from gsparc.processes.powers import PowerRows
@@ -153,7 +153,7 @@ def test_silent_rows_alone_do_not_make_powers_spread_beyond_any_site():
     level = float(10 * np.log10(data.target.max()))
     quiet = np.arange(40) > 0
     rows = PowerRows(data.moving, np.where(quiet, level - 20, level), quiet)
-    process, _ = process_and_notes(rows, data.site)
+    process, _ = fit_power_process(rows, data.site)
     assert process.kernel.amplitude < 1001
     assert process.answer(torch.from_numpy(data.moving))[0].min() > level - 100
 

@@ -11,7 +11,7 @@ import torch
 
 import gsparc
 from gsparc.data.splits import Fold
-from gsparc.models.device_offsets import take_off_devices, without_devices
+from gsparc.models.device_offsets import remove_device_offsets, subtract_known_device_offsets
 from gsparc.prediction.answer_files import predict_file
 from gsparc.tables.own import from_arrays
 
@@ -36,7 +36,7 @@ def test_offsets_are_estimated_with_all_stations_on_training_rows_alone():
     spoilt = data.target.copy()
     spoilt[160:] *= 1e3  # what no training row says moves nothing
     fold = Fold(train, np.zeros(0, int), np.arange(160, 240))
-    learned = [take_off_devices(one, fold) for one in (data, replace(data, target=spoilt))]
+    learned = [remove_device_offsets(one, fold) for one in (data, replace(data, target=spoilt))]
     levels = learned[0].site.device_levels[0]
     assert np.array_equal(levels, learned[1].site.device_levels[0]) and learned[0].device is None
     assert data.site.device_names == ("left", "right", "third")
@@ -48,14 +48,14 @@ def test_offsets_are_estimated_with_all_stations_on_training_rows_alone():
     plain = 10 * np.log10(learned[0].target[:, 0] * data.site.target_scale)
     assert np.abs(plain - PLAIN).max() < 0.7
     # Once taken off they are not looked for again, as where every station is learned alone.
-    assert take_off_devices(learned[0], fold) is learned[0]
-    assert without_devices(data, learned[0].site).site.device_levels[0] is not None
+    assert remove_device_offsets(learned[0], fold) is learned[0]
+    assert subtract_known_device_offsets(data, learned[0].site).site.device_levels[0] is not None
 
 
 def test_a_device_without_training_rows_is_the_mean_one():
     data = campaign()
     train = np.flatnonzero(PHONE != "third")
-    levels = take_off_devices(
+    levels = remove_device_offsets(
         data, Fold(train, train[:0], np.flatnonzero(PHONE == "third"))
     ).site.device_levels[0]
     assert levels[2].tolist() == levels[3].tolist() and levels[2, 1] > 40
@@ -128,10 +128,14 @@ def test_a_device_that_differs_at_one_carrier_has_an_offset_there():
     level += rng.normal(0, 1, 600)
     rows = {"rx_position": place, "station_position": post, "station": station, "device": phone}
     every = Fold(np.arange(600), np.zeros(0, int), np.zeros(0, int))
-    levels = take_off_devices(from_arrays({**rows, "rssi_db": level}), every).site.device_levels
+    levels = remove_device_offsets(
+        from_arrays({**rows, "rssi_db": level}), every
+    ).site.device_levels
     np.testing.assert_allclose(levels[:, 1, 0], [1, 1, 5], atol=0.5)
     np.testing.assert_allclose(levels[:, 0, 0], -levels[:, 1, 0])
     # Where stations do not differ beside their errors, all rows tell one offset
     level -= half - np.where(phone == "left", -1, 1)
-    levels = take_off_devices(from_arrays({**rows, "rssi_db": level}), every).site.device_levels
+    levels = remove_device_offsets(
+        from_arrays({**rows, "rssi_db": level}), every
+    ).site.device_levels
     assert np.ptp(levels[:, 1, 0]) < 0.15 and levels[0, 1, 0] == pytest.approx(1, abs=0.25)

@@ -39,7 +39,7 @@ def share(*pairs: tuple[np.ndarray, np.ndarray, np.ndarray]) -> float:
         for *both, last in pairs
     ]
     products = np.concatenate(grams)
-    return float(weigh(products, np.arange(len(products)), "log", dear=(False, True))[1])
+    return float(weigh(products, np.arange(len(products)), "log", slow=(False, True))[1])
 
 
 def test_a_mixture_need_not_be_surely_better_where_that_is_not_asked_for():
@@ -124,7 +124,7 @@ def test_what_answers_slowly_has_to_be_surely_better():
     errors = drawn([1.0, 1.0], 60)
     errors[:, 1] = errors[:, 0] * np.where(np.arange(60) % 2, 1.06, 0.93)
     for dear in (0, 1):
-        weights = weigh(gram_of(errors), np.arange(60), "square", dear=np.arange(2) == dear)
+        weights = weigh(gram_of(errors), np.arange(60), "square", slow=np.arange(2) == dear)
         assert weights[dear] == 0
 
 

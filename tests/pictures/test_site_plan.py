@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.walls import SceneWalls
 from gsparc.pictures import found_plan, site_plan
-from gsparc.pictures.found_plan import draw_found
+from gsparc.pictures.found_plan import draw_site_objects
 from gsparc.pictures.site_plan import draw_site, find_spots
 from gsparc.tables.checks.level_steps import LevelStep, find_level_steps, link_levels
 from gsparc.tables.own import from_arrays
@@ -101,7 +101,7 @@ def room():
 
 
 def drawn(figures, data, objects, known=None) -> Figure:
-    draw_found(data, objects, "unused.png", known)
+    draw_site_objects(data, objects, "unused.png", known)
     figures[0].draw_without_rendering()
     return figures[0]
 

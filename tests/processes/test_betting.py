@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from audit_table import area, audits, levels
 
-from gsparc.processes.betting import ENOUGH, betting_capital, claim_capital, power_of_rows
+from gsparc.processes.betting import ENOUGH, betting_capital, claim_capital, detectable_shares
 
 
 def test_capital_does_not_depend_on_the_order_of_a_tour():
@@ -51,6 +51,6 @@ def test_a_claim_of_levels():
 
 
 def test_few_rows_show_little():
-    below, above = power_of_rows(60, 0.95, 0.8)
+    below, above = detectable_shares(60, 0.95, 0.8)
     assert 0.79 < below < 0.81 and np.isnan(above)
-    assert power_of_rows(400, 0.95)[1] < 0.99
+    assert detectable_shares(400, 0.95)[1] < 0.99

@@ -8,7 +8,7 @@ import torch
 from rooms_later import draw, later_rows
 
 from gsparc.processes import changes
-from gsparc.processes.changes import KINDS, Belief, correct, learn, main_effect
+from gsparc.processes.changes import KINDS, Belief, correct, learn_changes, main_effect
 from gsparc.processes.factor import Factor
 from gsparc.processes.later_rows import LaterRows
 
@@ -23,7 +23,7 @@ def asked(belief, rows, places, level=-60.0):
 
 def test_without_change_the_map_stays():
     rows = later_rows(40, 0)
-    belief = learn({0: rows}, EXTENT)
+    belief = learn_changes({0: rows}, EXTENT)
     assert KINDS[int(belief.of(0)[0].argmax())].name == "none"
     assert (asked(belief, rows, draw(50, 9)).mean + 60).abs().max() < 0.7
 
@@ -31,8 +31,10 @@ def test_without_change_the_map_stays():
 def test_an_offset_reaches_everywhere_and_a_local_change_does_not():
     far = np.array([[19.0, 19.0, 1.5]])
     offset, local = later_rows(40, 1, offset=-10.0), later_rows(80, 2, change=-12.0)
-    assert asked(learn({0: offset}, EXTENT), offset, far).mean[0] == pytest.approx(-70, abs=1)
-    belief = learn({0: local}, EXTENT)
+    assert asked(learn_changes({0: offset}, EXTENT), offset, far).mean[0] == pytest.approx(
+        -70, abs=1
+    )
+    belief = learn_changes({0: local}, EXTENT)
     assert belief.of(0)[0][[k.name == "local" for k in KINDS]].sum() > 0.9
     assert asked(belief, local, far).mean[0] == pytest.approx(-60, abs=1.5)
     assert asked(belief, local, np.array([[5.0, 5.0, 1.5]])).mean[0] < -66
@@ -40,7 +42,7 @@ def test_an_offset_reaches_everywhere_and_a_local_change_does_not():
 
 def test_an_offset_of_all_stations_is_told_of_those_without_rows():
     rows = {station: later_rows(10, station, offset=-4.0) for station in range(12)}
-    belief = learn(rows, EXTENT)
+    belief = learn_changes(rows, EXTENT)
     assert belief.common == pytest.approx(-4, abs=0.8)
     at = torch.zeros(1, 3).double()
     none = correct(belief, 99, LaterRows.empty(), at, at[:, 0] - 60, at[:, 0] + 1)
@@ -56,7 +58,7 @@ def test_a_station_whose_stated_noise_is_too_small_is_not_taken_for_a_local_chan
         noise=0 * rows.noise,
         doubt=0 * rows.doubt,
     )
-    belief = learn({**quiet, 9: loud}, EXTENT)
+    belief = learn_changes({**quiet, 9: loud}, EXTENT)
     weight, added = belief.of(9)
     assert added > 8 and weight[:3].sum() > 0.9
     assert max(belief.of(n)[1] for n in quiet) < 3
@@ -70,8 +72,8 @@ def test_a_common_offset_is_not_believed_where_places_differ():
     rows = [replace(later_rows(5, n), places=torch.from_numpy(places)) for n in range(20)]
     turned = [replace(one, missed=one.missed + torch.from_numpy(at)) for one in rows]
     alike = [replace(one, missed=one.missed - 3) for one in rows]
-    assert abs(learn(dict(enumerate(turned)), EXTENT).common) < 0.6 * 2.5
-    assert learn(dict(enumerate(alike)), EXTENT).common == pytest.approx(-3, abs=0.8)
+    assert abs(learn_changes(dict(enumerate(turned)), EXTENT).common) < 0.6 * 2.5
+    assert learn_changes(dict(enumerate(alike)), EXTENT).common == pytest.approx(-3, abs=0.8)
 
 
 def test_a_lone_station_that_seems_moved_voided_a_quarter_of_the_map():
@@ -89,7 +91,7 @@ def test_no_system_is_larger_than_the_nearest_rows(monkeypatch):
     make = Factor.from_gram
     spied = lambda gram, *rest: sizes.append(gram.shape[-1]) or make(gram, *rest)  # noqa: E731
     monkeypatch.setattr(changes.Factor, "from_gram", spied)
-    belief = learn({0: rows}, EXTENT)
+    belief = learn_changes({0: rows}, EXTENT)
     asked(belief, rows, draw(5, 9))
     assert sizes and max(sizes) <= changes.NEAR
 
@@ -99,7 +101,7 @@ def test_a_walk_elsewhere_is_no_reason_to_forget_a_change():
     far = replace(walk, places=walk.places / 2 + torch.tensor([10.0, 10.0, 0.75]))
     there = np.array([[5.0, 5.0, 1.5], [4.0, 6.0, 1.5]])
     before, after = (
-        asked(learn({0: one}, EXTENT), one, there).mean for one in (rows, rows.join(far))
+        asked(learn_changes({0: one}, EXTENT), one, there).mean for one in (rows, rows.join(far))
     )
     assert (before < -65).all() and after == pytest.approx(before, abs=1)
     assert len(rows.join(far).spread(EXTENT, 40)) == 40

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from gsparc.processes.few_rows import covering_rows, draw_places
+from gsparc.processes.few_rows import covering_rows, sample_place_rows
 from gsparc.processes.powers import PowerRows
 
 
@@ -37,7 +37,7 @@ def test_one_row_less_was_another_sample():
     left = np.sort(rng.permutation(5000)[50:])
     draws = {
         "rows": lambda rows: every.subset(rows).draw_subset(300, 0).places,
-        "places": lambda rows: places[rows][draw_places(places[rows], 300, 0)],
+        "places": lambda rows: places[rows][sample_place_rows(places[rows], 300, 0)],
         "cells": lambda rows: places[rows][covering_rows(places[rows], 300, 0)],
     }
     for name, draw in draws.items():

@@ -7,7 +7,7 @@ import pytest
 
 from gsparc.base.files import write_samples
 from gsparc.evaluation.scores import score_methods
-from gsparc.evaluation.summary import decided_by_a_row, results_table, write_summary
+from gsparc.evaluation.summary import describe_dominant_row, results_table, write_summary
 from gsparc.models.baselines.idw import InverseDistance
 from gsparc.models.baselines.mean import Mean
 from gsparc.prediction.timing import ClockSettings
@@ -114,7 +114,7 @@ def test_one_strong_row_made_most_of_the_figures_of_powers(campaign, folds):
     facts = evaluated(InverseDistance, dataclasses.replace(data, target=target), split).facts
     squares = [facts[f"{one}/rmse_db"] ** 2 for one in ("test", "baseline/nearest")]
     assert facts["test/skill"] == pytest.approx(1 - squares[0] / squares[1])
-    assert not any("decided_by" in key for key in facts) and not decided_by_a_row(facts)
+    assert not any("decided_by" in key for key in facts) and not describe_dominant_row(facts)
     heads, _ = results_table(facts, "idw").texts()
     assert heads == ["method", "rmse_db", "mae_db", "skill", "train s/fold", "query ms p50"]
 
@@ -156,14 +156,14 @@ def test_a_row_that_decides_sums_is_named_beside_a_median(campaign, folds, tmp_p
     data, split = campaign("csi", 60), folds(60)
     methods, seconds = fit_all(InverseDistance, data, split)
     quiet = evaluate(methods, seconds, data, split, baselines=(), clock=QUICK).facts
-    assert not any("decided_by" in key for key in quiet) and not decided_by_a_row(quiet)
+    assert not any("decided_by" in key for key in quiet) and not describe_dominant_row(quiet)
     row, target = int(split.folds[0].test[2]), data.target.copy()
     target[row] *= 1e6
     loud = dataclasses.replace(data, target=target)
     facts = evaluate(methods, seconds, loud, split, baselines=(), clock=QUICK).facts
     assert facts["test/decided_by/row"] == row and facts["test/decided_by/share"] > 0.999
     assert 0 < facts["test/decided_by/nmse_median"] < 3
-    assert decided_by_a_row(facts)[0].startswith(
+    assert describe_dominant_row(facts)[0].startswith(
         f"row {row} alone makes 100.0% of the error or power"
     )
     write_summary(tmp_path / "summary.json", facts)

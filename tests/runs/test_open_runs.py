@@ -11,7 +11,7 @@ import gsparc
 from gsparc.base.errors import DataError
 from gsparc.data.split_settings import SplitSettings
 from gsparc.data.splits import Fold, Split, make_split
-from gsparc.datasets.load import answerable
+from gsparc.datasets.load import drop_unanswerable_rows
 from gsparc.evaluation.scores import score_methods
 from gsparc.models.per_station import wrap_per_station
 from gsparc.models.registry import method_class
@@ -258,7 +258,9 @@ def test_a_second_survey_had_no_table_where_a_station_was_rarely_heard_before(pl
     posts = POSTS if placed else np.full_like(POSTS, np.nan)
     first, second = town(rssi_db=before, station_position=posts), town(station_position=posts)
     learned = Split("none", (Fold(np.arange(len(first)), none, none),))
-    chosen = answerable(Split("whole", (Fold(none, none, every),)), second, (first, learned))
+    chosen = drop_unanswerable_rows(
+        Split("whole", (Fold(none, none, every),)), second, (first, learned)
+    )
     assert set(second.station[chosen.folds[0].test]) == {0, 1}
     assert (
         "test rows are left out, of stations with under 4 training rows; heard now: roof (in 8"

@@ -8,8 +8,8 @@ from gsparc.simulate.argos_sim import (
     SPACING_HZ,
     TONES,
     Offsets,
-    draw_snapshots,
-    draw_world,
+    simulate_snapshots,
+    simulate_world,
 )
 from gsparc.simulate.streets import Streets, trace_streets
 
@@ -61,12 +61,12 @@ def test_building_blocks_and_its_corner_diffracts() -> None:
 
 
 def test_offsets_are_a_switch() -> None:
-    there = draw_world(40, seed=0)
+    there = simulate_world(40, seed=0)
     clean = there.response(CARRIER_HZ + TONES * SPACING_HZ)
-    still = draw_snapshots(there, Offsets(0.0, 0.0, 0.0))
+    still = simulate_snapshots(there, Offsets(0.0, 0.0, 0.0))
     noise = np.abs(still - clean) ** 2
     assert np.isclose(noise.mean(), there.noise_power, rtol=0.02)
-    turned = draw_snapshots(there, Offsets(1.0, 0.0, 0.0))
+    turned = simulate_snapshots(there, Offsets(1.0, 0.0, 0.0))
     angle = np.angle((turned * clean.conj()).sum((1, 2)))
     assert np.ptp(angle) > 3
     assert np.ptp(np.angle((still * clean.conj()).sum((1, 2)))) < 0.1

@@ -15,7 +15,7 @@ from gsparc.commands.check import main as check
 from gsparc.data import blocks
 from gsparc.data.schema import LIGHT
 from gsparc.datasets.load import load
-from gsparc.pictures.simulated import draw_floor_plan
+from gsparc.pictures.simulated import draw_power_and_delay_spread
 from gsparc.simulate import campaign as campaigns
 from gsparc.simulate.auto import AutoSettings
 from gsparc.simulate.campaign import simulate
@@ -206,7 +206,7 @@ def test_transmitters_are_stations_and_every_pair_is_there_once(tmp_path):
     assert data.site.stations.name == ("a", "b") and data.site.static_end == "tx"
     learn, test = (set(data.place[rows]) for rows in data.release_split)
     assert not learn & test
-    draw_floor_plan(outcome, tmp_path / "plan.png")
+    draw_power_and_delay_spread(outcome, tmp_path / "plan.png")
 
 
 def test_parts_of_another_simulation_are_refused(tmp_path):
@@ -240,7 +240,7 @@ def test_auto_decides_verifies_and_is_drawn(tmp_path):
     assert facts["auto/verdict/met"] >= 0.95 and facts["auto/specular/kept"] is True
     assert "requirement met" in describe_choice(choice)
     assert choice_table(choice).row_count == len(choice.table)
-    draw_floor_plan(outcome, tmp_path / "picture.png")
+    draw_power_and_delay_spread(outcome, tmp_path / "picture.png")
     assert (tmp_path / "picture.png").stat().st_size > 10_000
 
 

@@ -12,10 +12,10 @@ from gsparc.data.georeference import Georeference
 from gsparc.data.walls import polygon_area, read_walls
 from gsparc.simulate.raytracer import RayTracer
 from gsparc.simulate.scenes.receivers import (
-    draw_places,
-    farthest_points,
+    choose_farthest_rows,
     nearest_rows,
     place_receivers,
+    sample_positions,
 )
 from gsparc.simulate.scenes.settings import Layout
 from gsparc.simulate.scenes.solid import box, write_walls
@@ -133,10 +133,16 @@ def test_bad_receivers_are_refused(settings, words):
 
 def test_many_places_are_found_where_few_are_allowed():
     """Draws were 204,800 whatever was asked for: 100,000 did not fit where half is built on."""
-    found = draw_places(2_500, AREA, (1.0, 2.0), lambda points: points[:, 0] < 0.2, 0)
+    found = sample_positions(2_500, AREA, (1.0, 2.0), lambda points: points[:, 0] < 0.2, 0)
     assert len(found) == 2_500 and (found[:, 0] < 0.2).all()
     refused(
-        "0 of 20 receivers", draw_places, 20, AREA, (1.0, 2.0), lambda points: points[:, 0] < 0, 0
+        "0 of 20 receivers",
+        sample_positions,
+        20,
+        AREA,
+        (1.0, 2.0),
+        lambda points: points[:, 0] < 0,
+        0,
     )
 
 
@@ -156,7 +162,7 @@ def test_places_that_repeat_were_drawn_again_and_neighbours_of_themselves():
     that their effects were verified on.
     """
     places = np.array([[0.0, 0, 0], [0, 0, 0], [0, 0, 0], [5, 0, 0]])
-    assert sorted(farthest_points(places, 4, seed=0)) == [0, 1, 2, 3]
+    assert sorted(choose_farthest_rows(places, 4, seed=0)) == [0, 1, 2, 3]
     rows = np.arange(3)
     assert (nearest_rows(places, rows) != rows).all()
 

@@ -16,7 +16,7 @@ from gsparc.simulate.raytracer import RayTracer
 from gsparc.simulate.sampling import Sampling, divide_into_calls
 from gsparc.simulate.scenes.build import build_survey
 from gsparc.simulate.scenes.conference import conference_room
-from gsparc.simulate.scenes.receivers import draw_places, stands_clear_of
+from gsparc.simulate.scenes.receivers import make_clearance_test, sample_positions
 from gsparc.simulate.scenes.settings import SceneSettings, from_config
 from gsparc.simulate.scenes.shipped import shipped_scene_settings
 from gsparc.simulate.settings import CampaignSettings
@@ -58,11 +58,11 @@ def room():
 
 @pytest.fixture(scope="module")
 def places():
-    return draw_places(
+    return sample_positions(
         60,
         np.array(CONFERENCE.area_m),
         CONFERENCE.height_m,
-        stands_clear_of(conference_room()),
+        make_clearance_test(conference_room()),
         seed=0,
     )
 

@@ -42,8 +42,8 @@ from gsparc.apps.export.wire import (
     FaultBody,
     PilotsBody,
     RowsBody,
-    draw_page,
     parse,
+    render_api_page,
 )
 from gsparc.base.files import is_out_of_space, list_causes
 from gsparc.base.limits import Checked, SettingError, number, setting, whole
@@ -138,8 +138,8 @@ def build_application(
     predictor: Predictor,
     limits: Limits,
     token: str | None,
-    told: ToldFile | None = None,
-    hears: bool = False,
+    update_file: ToldFile | None = None,
+    accepts_pilots: bool = False,
 ) -> ASGIApp:
     """Return the routes: POST /predict; POST /update or /hear where wanted; GET /healthz, /readyz,
     /metrics, /docs and /openapi.json.
@@ -148,15 +148,15 @@ def build_application(
         predictor: of one end that moves and one station.
         limits: more places or numbers in one request are refused (413).
         token: that a request must bear (401) but for `FREE`; None: none.
-        told: the model's file, for updates; None: there are none.
-        hears: whether channels are told of pilots, until the server stops.
+        update_file: the model's file, for updates; None: there are none.
+        accepts_pilots: whether channels are told of pilots, until the server stops.
 
     Raises:
         SettingError: updates without a token, or more numbers in the answer at one place than
             `limits` allow.
     """
     site, lock, telling, metrics = predictor.site, Lock(), asyncio.Lock(), Metrics()
-    if (told is not None or hears) and token is None:
+    if (update_file is not None or accepts_pilots) and token is None:
         raise SettingError(
             "updates=true: whoever reaches it changes the model; set GSPARC_TOKEN, or say "
             "token=WORD"
@@ -213,7 +213,7 @@ def build_application(
     @app.get("/docs")
     async def docs() -> HTMLResponse:
         """This page."""
-        return HTMLResponse(draw_page(app.openapi()))
+        return HTMLResponse(render_api_page(app.openapi()))
 
     async def read_body(request: Request, raw: bool, lists: int = 1) -> tuple[bytes, int]:
         body, count = bytearray(), 0
@@ -236,8 +236,8 @@ def build_application(
     def add_rows(body: bytes) -> dict[str, Any]:
         rows = parse(body, RowsBody)
         where: dict[str, Any] = site.name_moving(rows.places)
-        assert told is not None
-        found = told.tell(predictor, lock, FILE_S, **where, rssi=rows.levels, key=rows.key)
+        assert update_file is not None
+        found = update_file.tell(predictor, lock, FILE_S, **where, rssi=rows.levels, key=rows.key)
         return {
             "rows": found.rows.tolist(),
             "skipped": found.skipped,
@@ -284,11 +284,11 @@ def build_application(
         except ValueError as error:
             raise HTTPException(422, str(error)) from error
 
-    if hears:
+    if accepts_pilots:
         app.post("/hear", openapi_extra={"requestBody": {"content": HEAR_BODY, "required": True}})(
             hear
         )
-    if told is not None:
+    if update_file is not None:
         app.post(
             "/update",
             openapi_extra={"requestBody": {"content": UPDATE_BODY, "required": True}},

@@ -132,7 +132,7 @@ QUERY_BODY = {
 }
 
 
-def draw_page(openapi: Mapping[str, Any]) -> str:
+def render_api_page(openapi: Mapping[str, Any]) -> str:
     """Return a page about all routes that needs nothing else."""
     page = f"<!doctype html><meta charset=utf-8><title>gsparc</title><h1>{openapi['info']['title']}"
     page += f"</h1><p>{html.escape(openapi['info']['description'])}"

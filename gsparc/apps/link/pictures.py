@@ -32,7 +32,9 @@ RATES = {
 }
 
 
-def draw_errors(rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, path: Path) -> None:
+def draw_block_error_rates(
+    rates: Mapping[str, Mapping[str, pd.DataFrame]], title: str, path: Path
+) -> None:
     """Draw BLER above, BER below, a column a modulation, with 95 % intervals.
 
     Triangles are their ends where no block failed.

@@ -30,7 +30,7 @@ from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred_grid, inte
 from gsparc.prediction.confidence import Guarantee, Trusted, as_confidence, confidence_threshold
 from gsparc.prediction.left_out import Evidence, score_answers
 from gsparc.prediction.risk import calibrate_threshold
-from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.few_rows import sample_row_numbers
 from gsparc.runs.open_runs import Opened
 
 if TYPE_CHECKING:
@@ -142,9 +142,9 @@ def band_evidence(band: BandChannels, data: Measurements, fold: Fold, rows: np.n
 
 @lru_cache(maxsize=1)
 def _streets(*facts: int) -> World:
-    from gsparc.simulate.argos_sim import draw_world
+    from gsparc.simulate.argos_sim import simulate_world
 
-    return draw_world(*facts)
+    return simulate_world(*facts)
 
 
 def _of_streets(data: Measurements, rows: np.ndarray, frequency_hz: np.ndarray) -> Tensor:
@@ -280,7 +280,9 @@ class LinkStudy:
         if self.data.target.shape[1] == 1:
             return {}
         entries = self.data.target.shape[1] * len(self.tones)
-        some = draw_rows(len(self.fold.test), max(BEAM_ENTRIES // entries, 1), self.facts["seed"])
+        some = sample_row_numbers(
+            len(self.fold.test), max(BEAM_ENTRIES // entries, 1), self.facts["seed"]
+        )
         if len(some) < len(self.fold.test):
             log.info("beams of %d drawn test positions: the channels of all fill memory", len(some))
         channels = predict_channels(self.method, self.data, self.fold.test[some], self.tones)

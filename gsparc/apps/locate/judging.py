@@ -35,7 +35,7 @@ from gsparc.evaluation.table import Column, Table
 from gsparc.models import checkpoint
 from gsparc.pictures.drawing import PALETTE, panels, save
 from gsparc.prediction.predictor import Predictor
-from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.few_rows import sample_row_numbers
 from gsparc.runs.open_runs import Opened, open_run, read_like_stored
 
 log = logging.getLogger(__name__)
@@ -245,7 +245,7 @@ def sample_rows(config: DictConfig, count: int) -> np.ndarray:
     if not count:
         raise ValueError("there is nothing to be located")
     # Sorted, since rows of a track must stay in the order of time.
-    return draw_rows(count, config.rows, int(config.seed))
+    return sample_row_numbers(count, config.rows, int(config.seed))
 
 
 def draw_posteriors(

@@ -206,14 +206,16 @@ class PlaceSearch:
         return PlacePosterior(self.cells, self.log_density(trust), trust.spread)
 
 
-def compute_misfit(heard: Scans, there: HeardMoments, unknown: Nuisances) -> Misfit:
+def compute_misfit(heard: Scans, moments: HeardMoments, unknown: Nuisances) -> Misfit:
     """Return the misfit of snapshots at places."""
     facts = TARGETS[heard.kind]
     if facts.is_image:
-        return spectrum_misfit(heard.values, there.mean, there.variance)
+        return spectrum_misfit(heard.values, moments.mean, moments.variance)
     if facts.is_complex:
-        return channel_misfit(heard.values, there.mean, there.variance, unknown.phase_known)
-    return level_misfit(heard.values, there.mean, there.variance, unknown.offset_db, heard.floor)
+        return channel_misfit(heard.values, moments.mean, moments.variance, unknown.phase_known)
+    return level_misfit(
+        heard.values, moments.mean, moments.variance, unknown.offset_db, heard.floor
+    )
 
 
 # Bounds of the search, within which `decode_trust` clips the simplex.

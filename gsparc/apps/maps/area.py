@@ -233,7 +233,7 @@ def lay_grid(
     inside = np.array([np.ones(nx, bool) if contains is None else contains(row) for row in rows])
     within = np.zeros_like(inside)
     if buildings is not None:
-        is_built = draw_within(about, buildings, "buildings")[1]
+        is_built = bounds_and_inside_test(about, buildings, "buildings")[1]
         within = np.array([is_built(row) for row in rows])
     inside &= indoors | ~within
     if not inside.any():
@@ -250,7 +250,7 @@ def _outline(
     box = None if site is None else site.moving_box
     width = 0.0 if box is None else float(np.ptp(box[:, -3:-1], axis=0).max())
     if is_drawn(area):
-        (low, high), contains = draw_within(about, area, "area", width)
+        (low, high), contains = bounds_and_inside_test(about, area, "area", width)
         return low, high, contains
     if area is not None:
         low, high = _rectangle(area)
@@ -272,7 +272,7 @@ def _outline(
     return low - margin, high + margin, None
 
 
-def draw_within(
+def bounds_and_inside_test(
     origin: Georeference | None, path: Any, key: str, width: float = 0.0
 ) -> tuple[np.ndarray, Any]:
     """Return corners (2, 2) of polygons, and what says which places (n, 2 or more) are inside;

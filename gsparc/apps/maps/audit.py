@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from gsparc.apps.maps.claim import Claim
 from gsparc.apps.maps.streets import StreetGraph, Tour, Ways
 from gsparc.base.errors import DataError, explain_error
-from gsparc.processes.betting import claim_capital, power_of_rows, verdict_of
+from gsparc.processes.betting import claim_capital, detectable_shares, verdict_of
 
 CLIP_DB = 20.0  # errors of levels beyond count as this much
 PARTS = np.array([0.0, 0.25, 0.5])  # of a tour that is drawn where the model doubts
@@ -87,7 +87,7 @@ class Demand:
         """Say what so many rows can show at all."""
         if self.threshold_db is None:
             return f"what {count} rows show of levels depends on their scatter: docs/audit.md"
-        below, above = power_of_rows(count, self.share, OFTEN)
+        below, above = detectable_shares(count, self.share, OFTEN)
         fall = "none" if np.isnan(below) else f"only a share below {below:.2f}"
         stand = "none" if np.isnan(above) else f"only one above {above:.4f}"
         return f"with {count} rows {fall} can fall, {stand} can stand ({OFTEN:.0%} of the times)"
@@ -124,7 +124,7 @@ def doubt_part(
     return float(PARTS[costs.argmin()])
 
 
-def draw_tours(
+def sample_tours(
     claim: Claim,
     audit: str,
     doubt: np.ndarray,
@@ -247,10 +247,10 @@ def judge(
     table = table[table.tour <= table.tour[reached].max()]
     low, high, most = (end.to_numpy() for end in (table.low, table.high, 1 / (1 - table.part)))
     stands, falls = claim_capital(low, high, demand.ends, table.weight.to_numpy(), most)
-    verdict, count = verdict_of(stands, falls, ends_of(table))
+    verdict, count = verdict_of(stands, falls, count_draws_by_tour_end(table))
     return verdict, count, table.assign(stands=stands, falls=falls)
 
 
-def ends_of(table: pd.DataFrame) -> np.ndarray:
+def count_draws_by_tour_end(table: pd.DataFrame) -> np.ndarray:
     """Return how many draws (T,) there are at the end of each tour."""
     return np.flatnonzero(np.diff(table.tour, append=np.inf)) + 1

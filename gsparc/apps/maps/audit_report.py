@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from gsparc.apps.maps.against_rows import drive_of
-from gsparc.apps.maps.audit import DriveRows, ends_of
+from gsparc.apps.maps.audit import DriveRows, count_draws_by_tour_end
 from gsparc.apps.maps.claim import Claim
 from gsparc.apps.maps.geotiff import raster_profile
 from gsparc.base.files import whole_file, write_whole
@@ -19,8 +19,8 @@ from gsparc.data.schema import Measurements
 from gsparc.evaluation.by_part import describe_parts
 from gsparc.evaluation.table import Column, Table
 from gsparc.pictures.drawing import panels
-from gsparc.pictures.parts import draw_parts
-from gsparc.pictures.report.page import Section, encode_picture, render_html
+from gsparc.pictures.parts import draw_bias_by_part
+from gsparc.pictures.report.page import Section, render_html, thumbnail_base64
 from gsparc.processes.betting import ENOUGH
 
 WIDE = "Intervals are wide enough for all parts at once."
@@ -53,7 +53,7 @@ def find_errors(
     if not parts:
         return [], []
     words = "claim and drive", folder / "drive.png", "claimed less measured"
-    draw_parts(drive, parts, *words)
+    draw_bias_by_part(drive, parts, *words)
     lines = [line.replace("predicted", "claimed") for line in describe_parts(parts, 0.9)]
     varied = claimed - claimed.mean()
     slope = float(varied @ rows.level) / max(float(varied @ varied), 1e-9)
@@ -63,7 +63,7 @@ def find_errors(
 def draw_capital(table: pd.DataFrame) -> Figure:
     """Return the capitals of `judge` over drawn places, with the ends of tours."""
     figure, axes = panels(7.0, 3.6)
-    axis, ends = axes[0, 0], ends_of(table)
+    axis, ends = axes[0, 0], count_draws_by_tour_end(table)
     for name, capital in (("for", table.stands), ("against", table.falls)):
         axis.plot(np.r_[1.0, capital], "-o", markevery=list(ends), label=f"{name} the claim")
     axis.axhline(ENOUGH, color="black", linestyle="--", linewidth=0.8, label="enough")
@@ -98,6 +98,6 @@ def write_page(
     heads = [Column(name, ".3g", of=name) for name in next(iter(parts), ())]
     tables = [Table.from_rows("Where it is wrong", heads, parts, note=WIDE)]
     file = folder / "drive.png"
-    pictures = [("claimed less measured", encode_picture(file))] if file.is_file() else []
+    pictures = [("claimed less measured", thumbnail_base64(file))] if file.is_file() else []
     section = Section(title, pd.DataFrame(), list(lines), tables, list(figures), pictures)
     write_whole(folder / "audit.html", render_html("Audit of a map", note, [section]))

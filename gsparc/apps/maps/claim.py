@@ -13,10 +13,11 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.special import ndtr
 
-from gsparc.apps.maps.area import Grid, draw_within, lay_grid
+from gsparc.apps.maps.area import Grid, bounds_and_inside_test, lay_grid
 from gsparc.apps.maps.geojson import is_drawn, middle_of
 from gsparc.base.errors import DataError, list_first
 from gsparc.data.georeference import Georeference
+from gsparc.data.target import MOST_DB
 from gsparc.datasets.prior_levels import settings_of
 from gsparc.datasets.rasters import BAND, LOCAL, read_raster
 from gsparc.processes.few_rows import covering_rows
@@ -24,7 +25,6 @@ from gsparc.processes.level_field import fit_level_field
 from gsparc.processes.posterior import Exact
 from gsparc.processes.prior import Prior
 from gsparc.processes.uncertainty import central_interval
-from gsparc.tables.array_checks import MOST_DB
 
 MOST_SQUARES = 250_000  # of a claim: finer ones are taken together
 LEARNED_ON, SAMPLED = 600, 600  # rows, and places that a share is drawn over
@@ -114,7 +114,9 @@ def read_claim(
         grid, level = _read_squares(path, given, station, step_m)
     places, inside = grid.places(np.arange(grid.inside.size)), grid.inside.ravel()
     if area is not None:
-        inside = inside & draw_within(grid.origin, area, "area", float(np.ptp(places)))[1](places)
+        inside = inside & bounds_and_inside_test(grid.origin, area, "area", float(np.ptp(places)))[
+            1
+        ](places)
     level = np.where(inside & (np.abs(level) <= MOST_DB), level, np.nan)
     if not np.isfinite(level).any():
         raise DataError(f"claim={name}: no level is known in the area")

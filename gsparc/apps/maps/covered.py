@@ -20,7 +20,9 @@ SQUARES, STRONGEST, DRAWS = 300, 4, 400  # drawn together: squares, stations in 
 SHARE = 0.9
 
 
-def covered_between(field: FieldMap, predictor: Predictor, promise: Promise) -> tuple[float, float]:
+def estimate_covered_share(
+    field: FieldMap, predictor: Predictor, promise: Promise
+) -> tuple[float, float]:
     """Return the ends of the 90 % interval of the share of predicted squares
     that some station covers.
 
@@ -28,19 +30,19 @@ def covered_between(field: FieldMap, predictor: Predictor, promise: Promise) -> 
         field: a map with `threshold_db`.
         predictor, promise: that it was made with, see `predict_map`.
     """
-    _, best = draw_strongest(field, predictor, promise)
+    _, best = sample_strongest_levels(field, predictor, promise)
     return share_between((best >= field.threshold_db).mean(0), 1 - np.nanmean(field.outage))
 
 
-def draw_strongest(
+def sample_strongest_levels(
     field: FieldMap, predictor: Predictor, promise: Promise | None
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return squares (n,) of a thinned grid, and the strongest station's level there,
     drawn (n, DRAWS) [dB].
 
     Errors of the strongest stations are drawn together, by the model's own covariance and what
-    regions share (`RegionErrors`), each as large as held-out rows say. See `covered_between`;
-    without a promise only each square's own spread is right.
+    regions share (`RegionErrors`), each as large as held-out rows say. See
+    `estimate_covered_share`; without a promise only each square's own spread is right.
     """
     level, error = (
         layer.reshape(len(layer), -1) for layer in (field.power_db, field.expected_error_db)
@@ -54,13 +56,15 @@ def draw_strongest(
     places, spread = field.grid.places(square)[at], error[station, square[at]]
     # The mean of all errors is known no better than the blocks tell it:
     # the correlations hold none of it.
-    block_m, common = (1.0, 0.0) if promise is None else (promise.block_m, mean_error(promise) ** 2)
+    block_m, common = (
+        (1.0, 0.0) if promise is None else (promise.block_m, standard_error_of_bias(promise) ** 2)
+    )
     number, region = field.number[station], RegionErrors.from_promise(promise)
     alike = model_correlations(predictor, places, number, block_m)
     if promise is not None:
         far = promise.distances(to_local(predictor.site, places, None), number)
         alike = region.correlations(alike, places, number, far)
-    errors = draw_errors(np.outer(spread, spread) * alike + common)
+    errors = sample_errors(np.outer(spread, spread) * alike + common)
     if region.quarters:  # few of them tell how large a region's error is
         loose = np.random.default_rng(1).chisquare(region.quarters, DRAWS)
         errors = errors * np.sqrt(region.quarters / loose)
@@ -70,7 +74,7 @@ def draw_strongest(
     return square, best
 
 
-def draw_errors(covariance: np.ndarray, seed: int = 0) -> np.ndarray:
+def sample_errors(covariance: np.ndarray, seed: int = 0) -> np.ndarray:
     """Return normal errors (n, DRAWS) of a covariance (n, n),
     whose diagonal may be short of rounding.
     """
@@ -87,7 +91,7 @@ def share_between(drawn: np.ndarray, expected: float) -> tuple[float, float]:
     return max(low, 0.0), min(high, 1.0)
 
 
-def mean_error(promise: Promise) -> float:
+def standard_error_of_bias(promise: Promise) -> float:
     """Return the standard error of the mean error of measured rows, over held-out blocks [dB]."""
     heard = promise.evidence.subset(promise.evidence.heard)
     return standard_error(heard.level_db - heard.mean_db, heard.block)

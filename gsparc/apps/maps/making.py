@@ -114,7 +114,7 @@ def predict_map(
         first = np.zeros_like(grid.inside)
         first.reshape(-1)[np.flatnonzero(grid.inside)[0]] = True
         grid, promise = replace(grid, inside=first), None
-    calibration = uncalibrated(share) if promise is None else promise.calibration(share)
+    calibration = make_stated_scales(share) if promise is None else promise.calibration(share)
     notes += _notes_of_threshold(threshold_db, promise, level)
     values: dict[str, Any] = field_map.empty_layers(len(names), grid.inside.shape)
     inside = np.flatnonzero(grid.inside)
@@ -137,7 +137,7 @@ def predict_map(
         )
     bands = about["bands"]
     score = partial(
-        strongest.score_squares,
+        strongest.compute_map_layers,
         calibration,
         numbers=numbers,
         load=load_of,
@@ -262,7 +262,7 @@ def _fill_levels(
     return alike, computed
 
 
-def uncalibrated(share: float) -> IntervalScales:
+def make_stated_scales(share: float) -> IntervalScales:
     """Return intervals and errors as the model states them, everywhere."""
     return IntervalScales(
         share, np.zeros(1), np.array([half_width(share)]), np.ones(1), None, np.inf, np.zeros(0)

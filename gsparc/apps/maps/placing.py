@@ -16,8 +16,8 @@ from gsparc.apps.maps.area import Grid
 from gsparc.apps.maps.covered import (
     DRAWS,
     SHARE,
-    draw_errors,
-    draw_strongest,
+    sample_errors,
+    sample_strongest_levels,
     share_between,
 )
 from gsparc.apps.maps.geojson import draws_shapes
@@ -40,7 +40,7 @@ from gsparc.base.limits import (
 from gsparc.data.schema import Site, Stations
 from gsparc.data.splits import Fold
 from gsparc.models.powers.together.network import ONE_BAND, number_sites
-from gsparc.prediction.left_out import HeldOutLevels, Learned, leave_out
+from gsparc.prediction.left_out import HeldOutLevels, Learned, unlearn_and_predict
 from gsparc.prediction.levels import predict_levels
 from gsparc.prediction.placing import to_world
 from gsparc.prediction.predictor import Predictor
@@ -214,14 +214,14 @@ def place_station(
             "area: all of it is too far from what was measured; map nearer, or promised=false"
         )
     now = replace(now, power_db=np.where(mask, now.power_db, np.nan))
-    square, best = draw_strongest(now, predictor, promise)
+    square, best = sample_strongest_levels(now, predictor, promise)
     old, cells, before = (
         best >= threshold_db,
         grid.places(square),
         1 - float(now.outage[mask].mean()),
     )
     alike = shadowing(cells, 1.0 if promise is None else promise.block_m)
-    errors = error.within * draw_errors(alike, seed=1)  # errors of a new station are its own
+    errors = error.within * sample_errors(alike, seed=1)  # errors of a new station are its own
     # Student's t, as few stations tell the deviation: the normal's ends held too little.
     offset = error.offset_db * t.rvs(max(error.stations, 1), size=DRAWS, random_state=2)
 
@@ -317,7 +317,7 @@ def new_station_error(learned: Learned, most: int = 4) -> NewStationError:
     for site_number in chosen:
         at_site = site == site_number
         inner = Fold(rows[~at_site], rows[:0], rows[at_site])
-        parts.append(leave_out(learned, inner, np.full(int(at_site.sum()), site_number)))
+        parts.append(unlearn_and_predict(learned, inner, np.full(int(at_site.sum()), site_number)))
     parts = [part for part in parts if part.heard.any()]  # of silent rows alone no error is known
     return NewStationError.from_evidence(parts) if parts else NewStationError()
 
@@ -361,7 +361,7 @@ def _new(predictor: Predictor, place: np.ndarray, cells: np.ndarray, antenna: Ne
     return np.nan_to_num(level + antenna.power_db, nan=-np.inf), np.nan_to_num(spread, nan=1.0)
 
 
-def assumption(site: Site, height: float, antenna: NewAntenna) -> str:
+def describe_new_station(site: Site, height: float, antenna: NewAntenna) -> str:
     """Return in words what a new station is taken to be, `height` [m] high."""
     carrier = site.every_station.carrier_hz
     # The first band is the lowest: see `gsparc.processes.sectors.Sectors.add_sectors`.

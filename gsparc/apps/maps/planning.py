@@ -157,9 +157,9 @@ def plan_measurements(
     ways = Ways.between(np.concatenate([places[first:, :2], begin]), streets)
     tour = Tour(ways.length, len(places) - first if len(begin) else None, route_m)
     wanted = np.arange(len(places)) < len(targets)
-    before = mean_error(unknown)
+    before = root_mean_variance(unknown)
     before_db = float(np.sqrt(np.mean(before[wanted] ** 2)))
-    too_near = find_neighbours(places[first:, :2], count)
+    too_near = pairs_too_near(places[first:, :2], count)
     chosen, expected, stopped = choose_greedily(
         unknown, first, wanted, count, least_gain_db, tour, before_db, too_near
     )
@@ -180,7 +180,7 @@ def plan_measurements(
         float(tour.metres[-1:].sum()),
         grid,
         before[wanted],
-        mean_error(unknown)[wanted],
+        root_mean_variance(unknown)[wanted],
         places[wanted],
         scatter,
         tour.metres if route else np.zeros(0),
@@ -251,7 +251,7 @@ def walkable_places(
 
 
 def choose_greedily(
-    unknown: list[ErrorCovariance],
+    covariances: list[ErrorCovariance],
     first: int,
     wanted: np.ndarray,
     count: int,
@@ -272,7 +272,7 @@ def choose_greedily(
     while len(chosen) < count:
         # Sums of variances taken away over stations: one walk measures all of them.
         gains = np.sum(
-            [covariance.variance_reductions(wanted)[first:] for covariance in unknown], axis=0
+            [covariance.variance_reductions(wanted)[first:] for covariance in covariances], axis=0
         )
         possible = free & tour.reachable()[: len(free)]
         apart = possible & ~too_near[chosen].any(axis=0)
@@ -282,14 +282,16 @@ def choose_greedily(
             return chosen, expected, f"{why} after {len(chosen)} places"
         best = int(np.where(possible, gains, -np.inf).argmax())
         # Mean square errors subtract, roots do not.
-        error_after = float(np.sqrt(max(error**2 - gains[best] / (len(unknown) * wanted.sum()), 0)))
+        error_after = float(
+            np.sqrt(max(error**2 - gains[best] / (len(covariances) * wanted.sum()), 0))
+        )
         if (gain := error - error_after) < least_gain_db:
             return (
                 chosen,
                 expected,
                 (f"the next place gains {gain:.2g} dB, less than {least_gain_db:g} dB"),
             )
-        for covariance in unknown:
+        for covariance in covariances:
             covariance.condition_on(first + best)
         error = error_after
         chosen.append(best)
@@ -299,7 +301,7 @@ def choose_greedily(
     return chosen, expected, ""
 
 
-def find_neighbours(places: np.ndarray, count: int) -> np.ndarray:
+def pairs_too_near(places: np.ndarray, count: int) -> np.ndarray:
     """Return which of places (C, 2) are too near to be measured both, (C, C) bool: nearer than half
     of what as many places, evenly spread, are apart.
     """
@@ -312,6 +314,6 @@ def find_neighbours(places: np.ndarray, count: int) -> np.ndarray:
     return distance < far.max() / 2
 
 
-def mean_error(unknown: list[ErrorCovariance]) -> np.ndarray:
+def root_mean_variance(unknown: list[ErrorCovariance]) -> np.ndarray:
     """Return the root of the mean variance over stations at each place (S,) [dB]."""
     return np.sqrt(np.mean([covariance.variances() for covariance in unknown], axis=0))

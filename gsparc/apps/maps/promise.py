@@ -21,7 +21,12 @@ from gsparc.base.limits import POSITIVE, SHARE, Checked, or_null, setting, whole
 from gsparc.data.split_settings import SplitSettings
 from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
-from gsparc.prediction.left_out import HeldOutLevels, Learned, leave_out, nearest_distances
+from gsparc.prediction.left_out import (
+    HeldOutLevels,
+    Learned,
+    nearest_distances,
+    unlearn_and_predict,
+)
 from gsparc.processes.uncertainty import coverage_and_width
 from gsparc.runs.open_runs import OpenRun
 
@@ -165,7 +170,7 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
         rows = np.sort(rng.permutation(inner.test)[: settings.rows])
         # Blocks of two folds are never one, though they may hold the same rows.
         unit = cut.unit[rows] + number * (len(data) + 1)
-        return leave_out(learned, replace(inner, test=rows), unit, split)
+        return unlearn_and_predict(learned, replace(inner, test=rows), unit, split)
 
     def evidence_of_quarter(number: int) -> HeldOutLevels:
         quarter = number_quarters(places, turned=number >= QUARTERS)
@@ -175,7 +180,9 @@ def gather_promise(learned: Learned, settings: PromiseSettings) -> Promise:
         rng = np.random.default_rng([settings.seed, number, 1])
         rows = np.sort(rng.permutation(inner.test)[: settings.rows])
         # Settings are learned anew: those of all rows would know the quarter's trend.
-        return leave_out(learned, replace(inner, test=rows), np.full(len(rows), number), anew=True)
+        return unlearn_and_predict(
+            learned, replace(inner, test=rows), np.full(len(rows), number), anew=True
+        )
 
     folds = range(max(settings.folds, int(np.ceil(ROWS_OUT / SHARE_OUT / len(learned.rows)))))
     parts = run_all(evidence_without, folds, "fits without blocks of places")
@@ -269,7 +276,7 @@ def map_notes(
     covered: tuple[float, float] | None = None,
     promise: Promise | None = None,
 ) -> list[str]:
-    """Return what a reader of the map must know; `covered` is of `covered_between`."""
+    """Return what a reader of the map must know; `covered` is of `estimate_covered_share`."""
     notes = [*field.notes]
     figures = field.summarise()
     if figures["map/server_unsure"] and len(field.stations) > 1:

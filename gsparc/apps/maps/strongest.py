@@ -197,7 +197,7 @@ def read_loads(
     return np.broadcast_to(values, (len(stations),))
 
 
-def score_squares(
+def compute_map_layers(
     scales: IntervalScales,
     mean: np.ndarray,
     spread: np.ndarray,

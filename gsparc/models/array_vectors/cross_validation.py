@@ -18,7 +18,7 @@ from scipy.spatial.distance import cdist
 from gsparc.models.array_vectors.vector_gp import align_along_tree, refine_alignment
 from gsparc.models.splat.left_out_images import LeftOut, mean_log_error, means_and_variances
 from gsparc.processes.factor import Factor
-from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.few_rows import sample_row_numbers
 from gsparc.processes.kernel import Kernel, SmoothRough
 
 GAPS = (0.0, 0.1, 0.2, 0.4)  # wavelengths: spacings that queries have to the nearest sample
@@ -80,7 +80,7 @@ def choose_kernel(
         images=images[:, pixels].astype(np.float64),
         matrix=matrix[:, pixels].conj(),
         background=background[pixels] ** 2,
-        centres=draw_rows(len(positions), CENTRES, rng),
+        centres=sample_row_numbers(len(positions), CENTRES, rng),
         gaps=np.array(GAPS) * wavelength,
         distance=cdist(positions, positions),
     )

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.field.confidence import fit_level_and_power
+from gsparc.field.confidence import fit_error_law
 from gsparc.field.encoding import Smoothness
 from gsparc.field.frozen import gaussian_vectors
 from gsparc.field.initial import InitTask, Start
@@ -155,7 +155,7 @@ def learn_vector_process(
         ),
         features.weigh.to(torch.complex128) @ torch.from_numpy(vectors),
         torch.from_numpy(images.mean(0)).view(grid.height, grid.width),
-        fit_level_and_power(tuned.unknown, tuned.error),
+        fit_error_law(tuned.unknown, tuned.error),
         tuned.left_out,
     )
 

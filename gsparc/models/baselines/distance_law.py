@@ -24,7 +24,7 @@ from gsparc.data.schema import ENDS, Site
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.method import Prediction
 from gsparc.physics.decibels import RELATIVE_DB, to_decibels
-from gsparc.processes.few_rows import draw_places
+from gsparc.processes.few_rows import sample_place_rows
 from gsparc.processes.places import has_both_ends
 from gsparc.processes.powers import PowerRows
 from gsparc.processes.trend import TINY_M, Law
@@ -166,7 +166,7 @@ def locate_still_end(rows: PowerRows, seed: int = 0) -> np.ndarray:
     """
     rng = np.random.default_rng(seed)
     if len(rows.places) > LOOKED_AT:
-        rows = rows.subset(draw_places(rows.places, LOOKED_AT, rng))
+        rows = rows.subset(sample_place_rows(rows.places, LOOKED_AT, rng))
     low, high = rows.places.min(0), rows.places.max(0)
     size = max(float(np.linalg.norm(high - low)), TINY_M)
     bounds = np.stack([low - size, high + size], 1)

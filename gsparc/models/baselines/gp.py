@@ -19,14 +19,14 @@ from gsparc.data.query import Query
 from gsparc.data.schema import Measurements
 from gsparc.data.target import Target
 from gsparc.models.baselines.interpolation import Differentiable
-from gsparc.models.baselines.likeliest import CHOSEN_ON, MEANS, MeanName, process_and_notes
+from gsparc.models.baselines.likeliest import CHOSEN_ON, MEANS, MeanName, fit_power_process
 from gsparc.models.closed_form import ClosedForm
 from gsparc.models.method import Method, Prediction
 from gsparc.models.reduced import Interpolated, MeanOnly, Settings
 from gsparc.models.target_rows import power_rows, training_targets
 from gsparc.physics.separable import Separable, separate_axes
 from gsparc.processes.density import TINY
-from gsparc.processes.few_rows import covering_rows, draw_rows
+from gsparc.processes.few_rows import covering_rows, sample_row_numbers
 from gsparc.processes.fit_kernel import choose_left_out_kernel
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import PlaceValues, choose_kernel_by_nearest, condition_on_nearest
@@ -140,7 +140,7 @@ class GaussianProcess(Differentiable, ClosedForm):
             return self._learn_many(positions, targets)
         self.powers = None
         parts = principal_components(targets, self.target, self.limit)
-        looked_at = draw_rows(len(targets), CHOSEN_ON, 0)
+        looked_at = sample_row_numbers(len(targets), CHOSEN_ON, 0)
         kernel = choose_left_out_kernel(
             positions[looked_at], parts.scores[looked_at], len(parts.mean)
         )
@@ -180,7 +180,7 @@ class GaussianProcess(Differentiable, ClosedForm):
         return tuple(f"gp: {note}" for note in (kernel.description, fit_note, scheme, basis))
 
     def _learn_powers(self, rows: PowerRows) -> tuple[str, ...]:
-        self.powers, notes = process_and_notes(rows, self.fitted_site, self.about)
+        self.powers, notes = fit_power_process(rows, self.fitted_site, self.about)
         return tuple(f"gp: {note}" for note in notes)
 
     @property

@@ -48,7 +48,7 @@ REFINED = 8  # looks at all rows after such at few
 EVIDENCE_LOOKS = 30
 
 
-def process_and_notes(
+def fit_power_process(
     rows: PowerRows, site: Site, mean: MeanName = "auto", seed: int = 0
 ) -> tuple[PowerProcess, tuple[str, ...]]:
     """Return a process of largest leave-one-out likelihood, and what must be said of it.
@@ -70,7 +70,7 @@ def process_and_notes(
 def likeliest_candidate(
     rows: PowerRows, site: Site, mean: MeanName = "auto", seed: int = 0
 ) -> KernelCandidate:
-    """Return what `process_and_notes` conditions on rows."""
+    """Return what `fit_power_process` conditions on rows."""
     return choose_candidate(rows, _candidate_laws(rows, site, mean), seed, CHOSEN_ON)
 
 

@@ -67,7 +67,7 @@ class SharedPaths(Stored):
         """Return directions (n, K + 1, 3) of arrival, receiver frame, and distances (n, K + 1)
         [m].
         """
-        return ways(places, self.planes, self.receiver, self.rotation)
+        return directions_and_distances(places, self.planes, self.receiver, self.rotation)
 
     def powers(self, places: Tensor) -> Tensor:
         """Return what paths carry to places (n, 3), (n, K + 1), of sum 1;
@@ -84,7 +84,7 @@ class SharedPaths(Stored):
         return normalize(shares / self.ways(places)[1].square(), p=1, dim=1)
 
 
-def ways(
+def directions_and_distances(
     places: Tensor, planes: Tensor, receiver: Tensor, rotation: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return directions (n, K + 1, 3) of places (n, 3) and their images, receiver frame;
@@ -104,7 +104,7 @@ def find_paths(
     target, ends = seen.double() @ metric, torch.cat([places, receiver[None]])
 
     def looks(planes: Tensor) -> Tensor:
-        directions = ways(places, planes, receiver, rotation)[0]
+        directions = directions_and_distances(places, planes, receiver, rotation)[0]
         return lags.plane_wave_lags(directions.float()).double() @ metric
 
     # Walls stand at right angles to each other:
@@ -118,7 +118,7 @@ def find_paths(
     errors[0] *= NEARLY  # along the axes, where that is nearly as good
     turn = torch.tensor(TURN_STEP * int(errors.argmin())).deg2rad()
     planes, powers, _ = _choose_planes(looks, _planes_to_try(ends, turn, STEP), target)
-    distance = ways(places, planes, receiver, rotation)[1]
+    distance = directions_and_distances(places, planes, receiver, rotation)[1]
     return SharedPaths(
         planes, receiver, rotation, places, normalize(powers * distance.square(), p=1, dim=1)
     )

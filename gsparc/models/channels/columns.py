@@ -23,7 +23,7 @@ from gsparc.physics.waves import NEAR_M
 from gsparc.processes.conditioned import Conditioned
 from gsparc.processes.density import TINY
 from gsparc.processes.factor import Factor
-from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.few_rows import sample_row_numbers
 from gsparc.processes.places import ORIGIN, UNKNOWN
 
 # Tones whose phases turn no more than this against each other over all places are one band
@@ -119,7 +119,7 @@ class Group(SlotPlaces):
         """Return at most so many rows, drawn evenly."""
         # One seed for all: groups with equal places keep equal ones,
         # whose matrices are computed once.
-        return self.select_rows(torch.from_numpy(draw_rows(len(self), limit, 0)))
+        return self.select_rows(torch.from_numpy(sample_row_numbers(len(self), limit, 0)))
 
     def _tensors(self) -> dict[str, Tensor]:
         return {name: part for name, part in vars(self).items() if isinstance(part, Tensor)}

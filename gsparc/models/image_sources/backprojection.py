@@ -21,7 +21,7 @@ from gsparc.models.apart import keep_apart
 from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import BETAS, spherical_waves
-from gsparc.physics.draws import draw_in_box
+from gsparc.physics.draws import sample_in_box
 from gsparc.physics.waves import LIGHT, NEAR_M
 from gsparc.processes.worker import raise_if_cancelled
 
@@ -35,7 +35,7 @@ STEPS, STEP_M = 25, 0.02  # of the ascent
 ImagesOfAntennas = Callable[[Tensor], Tensor]
 
 
-def gains_and_amplitudes(posterior: GainPosterior, candidates: Tensor) -> tuple[Tensor, Tensor]:
+def score_candidates(posterior: GainPosterior, candidates: Tensor) -> tuple[Tensor, Tensor]:
     """Score (m,) of candidate positions (m, 3) float64 [m], and the amplitude (m,) each would have.
 
     Where the static end has E antennas, candidates are the images of each, (E, m, 3).
@@ -98,11 +98,11 @@ def find_sources_in_box(
     `images` gives the images of the static end's antennas, as `likelihood_gain` takes them.
     """
     low, high = box
-    candidates = draw_in_box(low, high, CANDIDATES, generator)
+    candidates = sample_in_box(low, high, CANDIDATES, generator)
     rough = rough_gains(posterior.rows, images(candidates), posterior.conditioned.weights)
     candidates = candidates[rough.topk(min(EXACT, len(rough))).indices]
     exact = torch.cat(
-        [gains_and_amplitudes(posterior, images(part))[0] for part in candidates.split(BLOCK)]
+        [score_candidates(posterior, images(part))[0] for part in candidates.split(BLOCK)]
     )
     best = candidates[exact.topk(min(POLISHED, len(exact))).indices]
     polished = best.clone().requires_grad_()
@@ -111,10 +111,10 @@ def find_sources_in_box(
         raise_if_cancelled()
         optimizer.param_groups[0]["lr"] = STEP_M * (1 - 0.8 * step / STEPS)
         optimizer.zero_grad()
-        (-gains_and_amplitudes(posterior, images(polished))[0].log().sum()).backward()
+        (-score_candidates(posterior, images(polished))[0].log().sum()).backward()
         optimizer.step()
     polished = polished.detach()
-    scores, amplitude = gains_and_amplitudes(posterior, images(polished))
+    scores, amplitude = score_candidates(posterior, images(polished))
     chosen = select_separated(polished, scores, min_distance, limit)
     return list(zip(polished[chosen], scores[chosen], amplitude[chosen], strict=True))
 

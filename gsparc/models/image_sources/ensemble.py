@@ -13,7 +13,7 @@ from itertools import takewhile
 import torch
 from torch import Tensor
 
-from gsparc.models.image_sources.clutter.search import find_clutter
+from gsparc.models.image_sources.clutter.search import add_clutter
 from gsparc.models.image_sources.gp_likelihood import GainPosterior, estimate_phases
 from gsparc.models.image_sources.refine import POLISHING_STEPS, learn_visibility, refine_scene
 from gsparc.models.image_sources.rows import Rows
@@ -112,7 +112,7 @@ def run_searches(
         error = left_out_nmse(rows, scene)
         hidden = scene.quadrature == 1 or reached_noise_floor([error], noise_floor, 1)
         if settings.clutter and not hidden and occludes_antennas_alike(rows):
-            scene = find_clutter(rows, scene, torch.Generator().manual_seed(settings.seed + number))
+            scene = add_clutter(rows, scene, torch.Generator().manual_seed(settings.seed + number))
             error = left_out_nmse(rows, scene)
         return Member(scene, error, number)
 

@@ -127,7 +127,7 @@ def rows_of_measurements(data: Measurements, index: np.ndarray, limit: int, seed
     antennas, tones = data.target.shape[1:]
     frequency, array = data.site.tones(), static_array(data.site, antennas)
     if len(index) > limit:
-        index = index[few_rows.draw_rows(len(index), limit, rng)]
+        index = index[few_rows.sample_row_numbers(len(index), limit, rng)]
     places = measured_places(data, index).numpy()
     per = places.shape[1]
     # Antennas first, tones from what is left of the limit.
@@ -137,7 +137,7 @@ def rows_of_measurements(data: Measurements, index: np.ndarray, limit: int, seed
     for row, place in zip(index, places, strict=True):
         values = data.target[row].astype(np.complex64)  # (A, K)
         measured = np.ones((antennas, tones), bool) if data.mask is None else data.mask[row]
-        for e in few_rows.draw_rows(per, most, rng) if most < per else range(per):
+        for e in few_rows.sample_row_numbers(per, most, rng) if most < per else range(per):
             # Antennas of unknown places are outputs of one row,
             # so that a tone must be measured at all.
             bins = np.flatnonzero(measured[e] if per > 1 else measured.all(0))

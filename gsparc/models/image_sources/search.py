@@ -20,7 +20,7 @@ from gsparc.field.initial import InitSettings, Snapshot
 from gsparc.models.image_sources import reflection_orders as orders
 from gsparc.models.image_sources.backprojection import (
     find_sources_in_box,
-    gains_and_amplitudes,
+    score_candidates,
     select_separated,
 )
 from gsparc.models.image_sources.gp_likelihood import GainPosterior
@@ -185,7 +185,7 @@ class Search:
         more = scene.replace_sequences(scene.longer_sequences(self.settings.order))
         if not more.sequences:
             return 0
-        scores, amplitude = gains_and_amplitudes(
+        scores, amplitude = score_candidates(
             GainPosterior(self.rows, scene), more.images(self.rows)
         )
         spacing = 0.5 * self.wavelength
@@ -265,7 +265,7 @@ class Search:
         )
         sources = torch.cat([scene.sources, position[None]])
         new = torch.cdist(flat, sources).amin(1) > 0.5 * self.wavelength
-        scores = gains_and_amplitudes(posterior, candidates)[0].reshape(mirrored.shape[:2])
+        scores = score_candidates(posterior, candidates)[0].reshape(mirrored.shape[:2])
         order = torch.tensor([len(scene.sequences[i]) for i in able])
         gain = (scores * new.view_as(scores) - 6).clamp_min(0).sum(1) - 1.5 * order
         if self.rows.array is not None:  # parents differ in how they turn the antennas

@@ -17,7 +17,7 @@ from gsparc.data.schema import Measurements
 from gsparc.models.apart import keep_apart
 from gsparc.models.terms import array_obstacle
 from gsparc.ops import SphereGrid
-from gsparc.physics.draws import draw_in_box
+from gsparc.physics.draws import sample_in_box
 from gsparc.physics.lags import SpectrumLags
 
 SWEEPS = 20  # of coordinate descent: powers are then within 1 % of the optimum
@@ -123,7 +123,7 @@ def find_sources(
     positions, residual = anchors, residual_lags(lags, receivers, anchors) if len(anchors) else lags
     energy = float(residual.square().sum())
     while len(positions) < settings.sources:
-        candidates = draw_in_box(low, high, settings.candidates, generator)
+        candidates = sample_in_box(low, high, settings.candidates, generator)
         # Amplitudes: with powers the nearest receiver would decide alone.
         amplitude = space.spectrum(residual).sqrt_().reshape(len(residual), -1)
         new = _best_separated(candidates, amplitude, receivers, rotation, grid, settings)

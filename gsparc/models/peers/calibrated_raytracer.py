@@ -28,7 +28,7 @@ from gsparc.simulate.calibration import (
     Replay,
     RoomCalibration,
     apply_materials,
-    calibrate,
+    calibrate_materials,
     used_materials,
 )
 from gsparc.simulate.effects import Effects
@@ -116,7 +116,7 @@ class CalibratedRayTracer(Checked, Method):
             raise ValueError(
                 f"{self.name}: paths reach {reached.sum()} training rows; is this the scene?"
             )
-        self.learned = calibrate(replay, start, traced, measured, self.steps)
+        self.learned = calibrate_materials(replay, start, traced, measured, self.steps)
         # Without paths in training, what is weakest there is the best guess of what lies deeper.
         self._silent_db = float(
             np.median(measured[~reached]) if not reached.all() else measured.min()

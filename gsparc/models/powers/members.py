@@ -22,7 +22,7 @@ from gsparc.models.powers.known_numbers import known_numbers
 from gsparc.models.powers.own_terms import UserTerm, add_terms_to_trend, subtract_means
 from gsparc.models.powers.prior_map import PriorMap
 from gsparc.models.stack import shrunk_weights
-from gsparc.processes.few_rows import draw_places
+from gsparc.processes.few_rows import sample_place_rows
 from gsparc.processes.fit_kernel import LOOKS, NumberPrior, fit_kernel_by_evidence
 from gsparc.processes.kernel import ExponentialShadowing, Kernel, Shadowing
 from gsparc.processes.nearest import Nearest, choose_kernel_by_nearest, condition_on_nearest
@@ -126,13 +126,13 @@ def learn_members(
             members += [
                 PowerMember(trend, belief * weight, kernel, notes) for kernel, weight in shapes
             ]
-    members = [learn_numbers(few, member, known, extent, LOOKS) for member in members]
+    members = [fit_member_kernel(few, member, known, extent, LOOKS) for member in members]
     if len(rows.places) >= FREE_FROM and not (rows.silent.any() or terms or walls):
         members.append(_likeliest(few, site, seed))
     if rows.silent.any() and not rows.silent.all():
         part = rows.draw_subset(most, seed)
         doubtful = rows_in_doubt(part, members[0].prior)
-        members = [learn_numbers(doubtful, member, known, extent, WALKED) for member in members]
+        members = [fit_member_kernel(doubtful, member, known, extent, WALKED) for member in members]
     return members
 
 
@@ -198,7 +198,7 @@ def means(rows: PowerRows, site: Site, walls: tuple[Columns, ...]) -> list[Level
     return [LevelMean(trend, belief, notes), none]
 
 
-def learn_numbers(
+def fit_member_kernel(
     rows: PowerRows, member: PowerMember, known: NumberPrior, extent: float, looks: int
 ) -> PowerMember:
     """Return the member with its likeliest numbers, beginning at its own.
@@ -283,7 +283,7 @@ def _by_nearest(
     and shares of the least error at places predicted from these.
     """
     result, values = [], rows.means_at_places()
-    some = torch.from_numpy(draw_places(values.places, JUDGED_ON, seed))
+    some = torch.from_numpy(sample_place_rows(values.places, JUDGED_ON, seed))
     errors = []
     for trend in {id(member.trend): member.trend for _, member in weighed}.values():
         alike = [(share, member) for share, member in weighed if member.trend is trend]

@@ -18,7 +18,7 @@ from scipy.spatial.distance import cdist
 from torch import Tensor
 
 from gsparc.data.schema import Measurements
-from gsparc.field.confidence import fit_level_and_power
+from gsparc.field.confidence import fit_error_law
 from gsparc.field.encoding import Smoothness
 from gsparc.field.initial import InitTask, Start
 from gsparc.field.model import GaussianModel
@@ -31,7 +31,7 @@ from gsparc.ops import Pose
 from gsparc.ops.transforms import full_precision
 from gsparc.processes.factor import Factor
 from gsparc.processes.features import Features, whitened_features
-from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.few_rows import sample_row_numbers
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.left_out import left_out_residuals
 
@@ -199,7 +199,7 @@ def _error_law(
     unknown = (variance - noise).clamp(0, 1)
     images = [seen.render(seen.outputs - residual), seen.render(mean.expand_as(seen.outputs))]
     error = torch.cat([(image - seen.images).square().mean(1) for image in images])
-    return fit_level_and_power(
+    return fit_error_law(
         torch.cat([unknown, torch.ones_like(unknown)]).numpy(), error.double().numpy()
     )
 
@@ -212,8 +212,8 @@ def _leave_out(
     if count < LEAST_HELD:
         return None
     draws = np.random.default_rng(0)
-    pixels = torch.from_numpy(draw_rows(seen.images.shape[1], PIXELS, draws))
-    centres = draw_rows(count, CENTRES, draws)
+    pixels = torch.from_numpy(sample_row_numbers(seen.images.shape[1], PIXELS, draws))
+    centres = sample_row_numbers(count, CENTRES, draws)
     distance = cdist(places, places)
     spacing = np.median(np.where(np.eye(count, dtype=bool), np.inf, distance).min(1))
     gaps = np.array(GAPS) * spacing

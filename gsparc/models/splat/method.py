@@ -20,7 +20,7 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import GaussianCloud
 from gsparc.data.splits import Fold
 from gsparc.field import edit
-from gsparc.field.confidence import ConfidenceSettings, fit_level_and_power
+from gsparc.field.confidence import ConfidenceSettings, fit_error_law
 from gsparc.field.emission import EmissionSettings
 from gsparc.field.encoding import Smoothness
 from gsparc.field.frozen import FrozenArray, FrozenView, freeze_view
@@ -430,7 +430,7 @@ class LearnedField(Method):
             assert result.unknown is not None
             error = squared_error(result.mean.clamp(0, 1), batch, model.site.target)
             model.error.set_error_law(
-                *fit_level_and_power(result.unknown.numpy(), error.double().numpy())
+                *fit_error_law(result.unknown.numpy(), error.double().numpy())
             )
 
     # -- answering ---------------------------------------------------------------------------------

@@ -82,7 +82,7 @@ def make_sections(
         examples = join_examples(study)
         named = [] if examples else [("test.png", "")]
         pictures = [
-            (f"{setting}{suffix}", encode_picture(run.folder / name))
+            (f"{setting}{suffix}", thumbnail_base64(run.folder / name))
             for setting, run in zip(firsts.setting[:MOST_PICTURES], firsts.run, strict=False)
             for name, suffix in (*named, ("sectors.png", ": sectors"))
             if (run.folder / name).is_file()
@@ -116,12 +116,12 @@ def warnings(rows: pd.DataFrame) -> list[str]:
                 name = max(leads, key=lambda one: leads[one].ahead_db)
                 remarks += summary.judge_baseline(name, best, figure, leads[name], ahead == LISTED)
     elif len(scored):  # a baseline must beat the best run of the page
-        remarks += summary.better_baseline(scored.run[score.idxmax()].facts)
+        remarks += summary.describe_best_baseline(scored.run[score.idxmax()].facts)
     loads = fits.load.dropna().astype(float).tolist()
-    return list(dict.fromkeys(remarks + summary.busy_machine(loads)))
+    return list(dict.fromkeys(remarks + summary.describe_machine_load(loads)))
 
 
-def encode_picture(path: Path) -> str:
+def thumbnail_base64(path: Path) -> str:
     """Return a picture's file as a page holds it: small, PNG in base64."""
     with Image.open(path) as image:
         small = image.convert("RGB")

@@ -133,7 +133,7 @@ def checkpoints(contexts: Sequence[FitContext]) -> tuple[Path, ...]:
     return tuple(context.run_dir / checkpoint.MODEL for context in contexts)
 
 
-def keep_fold(
+def save_fold_checkpoint(
     split: Split,
     contexts: Sequence[FitContext],
     run_id: str,

@@ -101,7 +101,7 @@ Piece = TypeVar("Piece")
 Made = TypeVar("Made")
 
 
-def run_list(
+def run_skipping_failures(
     make: Callable[[Piece], Made],
     pieces: Sequence[Piece],
     what: str,
@@ -187,7 +187,7 @@ def run_jobs(
 
     waiting, refused = missing if train else [], list[str]()
     try:
-        for job, _ in run_list(
+        for job, _ in run_skipping_failures(
             lambda job: run_once(job.folder, job.state, partial(fit, job), reuse=job.reuse),
             waiting,
             "cells",

@@ -21,7 +21,7 @@ from gsparc.evaluation.metric_formats import (
 )
 from gsparc.evaluation.paired import lead_over_runs
 from gsparc.evaluation.results import PROBLEM, average, score_db
-from gsparc.evaluation.summary import busy_machine, wrong_deviations
+from gsparc.evaluation.summary import describe_machine_load, describe_wrong_deviations
 from gsparc.evaluation.table import (
     CPU,
     P50,
@@ -293,11 +293,11 @@ def remarks(block: pd.DataFrame, ours: str) -> list[str]:
         lines.append(f"{near}: {quick.method}, {quick.query_ms:.3g} ms a query")
     if inputs := "; ".join(f"{row.method}: {row.given}" for row in rows if row.given):
         lines.append(f"given more than places: {inputs}")
-    lines += wrong_deviations({row.method: row.chi2 for row in rows}, first.figure)
+    lines += describe_wrong_deviations({row.method: row.chi2 for row in rows}, first.figure)
     if old := ", ".join(f"{row.method} ({row.earlier})" for row in rows if row.earlier):
         lines.append(f"measured with another commit of this program: {old}")
     lines += [GIVEN_HEARD] * bool(block.outage.notna().any())
-    return lines + busy_machine(block.load[block.effort.notna()].dropna().tolist())
+    return lines + describe_machine_load(block.load[block.effort.notna()].dropna().tolist())
 
 
 def table_of(block: pd.DataFrame, ours: str) -> Table:

@@ -24,7 +24,7 @@ from gsparc.prediction.operating_point import defined_figure, describe_point, pa
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import FACTS, ClockSettings, time_beside_copy
 from gsparc.runs.baselines import fit_baseline
-from gsparc.runs.experiment.runner import run_list
+from gsparc.runs.experiment.runner import run_skipping_failures
 
 POINT = (  # columns of the table of points
     Column("not beaten", "", of="label"),
@@ -74,7 +74,9 @@ def measure_points(
     results, whole = _score(candidates[0][1], *how)
     figure, ways = deciding_figure(results, data.site.scored), list[dict[str, Any]]()
     first = candidates[0], results | {"closeness_db": closeness_db(whole, whole)}
-    others = run_list(score, candidates[1:], "points", name=lambda one: describe_point(one[0]))
+    others = run_skipping_failures(
+        score, candidates[1:], "points", name=lambda one: describe_point(one[0])
+    )
     for (settings, method), results in chain([first], others):
         knobs = {
             f"set/{knob}": "+".join(map(str, v)) if isinstance(v, (list, tuple)) else v
@@ -91,7 +93,9 @@ def measure_points(
             row = {"label": label, **dict.fromkeys(FACTS.values()), **results, **sizes, **knobs}
             ways.append(row | {"method": method})
     count = len(ways)
-    for name, fitted in run_list(lambda one: fit_baseline(one, *how), baselines, "baselines"):
+    for name, fitted in run_skipping_failures(
+        lambda one: fit_baseline(one, *how), baselines, "baselines"
+    ):
         results = pool_figures(fitted.scores, data, split)
         if results[figure] is not None:
             ways.append({**results, "label": name, "threads": 1, "method": fitted.methods[0]})

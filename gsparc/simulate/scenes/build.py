@@ -18,7 +18,7 @@ from gsparc.data.walls import SIZE, RoomSettings
 from gsparc.simulate.raytracer import RayTracer
 from gsparc.simulate.sampling import Sampling
 from gsparc.simulate.scenes.osm import Town, read_town
-from gsparc.simulate.scenes.receivers import Ground, place_receivers, stands_clear_of
+from gsparc.simulate.scenes.receivers import Ground, make_clearance_test, place_receivers
 from gsparc.simulate.scenes.settings import (
     BUILDERS,
     MIN_RECEIVERS,
@@ -177,7 +177,7 @@ def _load(
     elif scene.builder is not None:
         source = BUILDERS[scene.builder](scene.seed)
         # Rooms of ours know their boxes; of other scenes rays have to tell where something stands.
-        allowed = stands_clear_of(source)
+        allowed = make_clearance_test(source)
     if moves:
         if isinstance(source, str | Path):
             raise ValueError(
@@ -185,7 +185,7 @@ def _load(
                 "move"
             )
         source, changed = move_solids(source, moves)
-        allowed = stands_clear_of(changed)
+        allowed = make_clearance_test(changed)
     # At the origin for the time being: `with_transmitter` puts a copy at each transmitter.
     return (
         RayTracer(source, np.zeros(3), scene.carrier_hz, sampling, scene.scattering),

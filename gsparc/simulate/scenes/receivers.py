@@ -72,7 +72,9 @@ def place_receivers(
             return ground.allowed(ground.lift(points))
 
         # Drawn with heights above the ground, tested and returned in the world.
-        return Placed(ground.lift(draw_places(scene.num_receivers, area, height, allowed, seed)))
+        return Placed(
+            ground.lift(sample_positions(scene.num_receivers, area, height, allowed, seed))
+        )
     if how.kind == "file":
         flat, time_s = _of_file(how, town, float(np.mean(height)))
         names = [f"row {i}" for i in range(len(flat))]
@@ -161,7 +163,7 @@ TRIES = 200  # draws for each place, of which one is to be allowed
 DRAWN = 1024  # at a time
 
 
-def draw_places(
+def sample_positions(
     count: int,
     area: np.ndarray,
     height: Sequence[float],
@@ -173,7 +175,7 @@ def draw_places(
     A larger count begins with the positions of a smaller one.
 
     >>> area = np.array([[0.0, 0.0], [9.0, 9.0]])
-    >>> draw_places(5, area, (1.2, 1.8), lambda points: points[:, 0] > 3, seed=0).shape
+    >>> sample_positions(5, area, (1.2, 1.8), lambda points: points[:, 0] > 3, seed=0).shape
     (5, 3)
 
     Args:
@@ -201,7 +203,7 @@ def draw_places(
     raise ValueError(f"scene: {fit}; is that area inside a building?")
 
 
-def stands_clear_of(
+def make_clearance_test(
     solids: Sequence[Solid], margin: float = 0.05
 ) -> Callable[[np.ndarray], np.ndarray]:
     """Return a test: which places (n, 3) [m] stand `margin` [m] away from boxes and off sheets."""
@@ -225,10 +227,10 @@ def stands_clear_of(
     return allowed
 
 
-def farthest_points(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
+def choose_farthest_rows(positions: np.ndarray, count: int, seed: int) -> np.ndarray:
     """Choose rows (count,) of positions far apart: farthest-point order from a seeded start.
 
-    >>> farthest_points(np.array([[0.0], [0.1], [9.0], [9.1]]), count=2, seed=0).shape
+    >>> choose_farthest_rows(np.array([[0.0], [0.1], [9.0], [9.1]]), count=2, seed=0).shape
     (2,)
     """
     count = min(count, len(positions))

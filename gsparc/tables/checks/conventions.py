@@ -20,7 +20,7 @@ import numpy as np
 from gsparc.data.blocks import rows_by
 from gsparc.data.moments import Snapshots
 from gsparc.data.schema import LIGHT, Measurements
-from gsparc.processes.few_rows import draw_rows
+from gsparc.processes.few_rows import sample_row_numbers
 from gsparc.processes.level_field import fit_level_field
 from gsparc.tables.advice import LevelsAtPlaces
 from gsparc.tables.conventions import CONVENTIONS, convert_conventions, known_array, traits
@@ -181,7 +181,7 @@ def _rivals_of_places(data: Measurements) -> list[str]:
     )
     if data.site.paired or len(candidates) < FEWEST["spectrum"]:
         return []
-    drawn = candidates[draw_rows(len(candidates), ROWS, 0)]
+    drawn = candidates[sample_row_numbers(len(candidates), ROWS, 0)]
     data, links = data.subset(rows[drawn]), links.take(drawn)
 
     def score(placed: Measurements, least: float = 10 * EXPONENTS[0]) -> float:

@@ -16,7 +16,7 @@ REPEATS = 3  # of a mark
 NOISE_DB, PILED = 4.0, 1 / 3
 
 
-def find_noise(station: np.ndarray, level_db: np.ndarray) -> dict[int, tuple[float, float]]:
+def find_floor_piles(station: np.ndarray, level_db: np.ndarray) -> dict[int, tuple[float, float]]:
     """Return `find_floor_pile` of stations (n,) whose levels (n,) [dB] have one,
     else that of all under -1.
 
@@ -68,7 +68,7 @@ def find_saturation(values: np.ndarray) -> float | None:
     return float(different[-1]) if piled else None
 
 
-def find_marks(values: np.ndarray) -> list[float]:
+def find_sentinel_levels(values: np.ndarray) -> list[float]:
     """Return levels [dB] among (n,) that repeat exactly, apart from all others: marks, not levels.
 
     At either end more than 20 dB apart, and far beside the spread of the rest; at the upper end, as

@@ -20,7 +20,7 @@ from scipy.spatial.distance import cdist
 
 from gsparc.base.errors import Severe, list_first
 from gsparc.data.outliers import find_gap
-from gsparc.data.row_order import along_curve
+from gsparc.data.row_order import morton_codes
 from gsparc.data.schema import Measurements
 from gsparc.processes.level_field import fit_level_field
 from gsparc.tables.checks.level_steps import LevelStep, LinkLevels, step_warnings
@@ -232,7 +232,7 @@ def find_outlier_rows(levels: LinkLevels) -> list[tuple[int, np.ndarray, float]]
     for t, used in levels.heard():
         if len(used) < 4 * NEIGHBOURS:
             continue
-        used = used if levels.ordered else used[np.argsort(along_curve(levels.position[used]))]
+        used = used if levels.ordered else used[np.argsort(morton_codes(levels.position[used]))]
         level = levels.level_db[used]
         difference = np.abs(level - median_filter(level, 2 * NEIGHBOURS + 1, mode="mirror"))
         wild = difference > max(OUTLIER_DB, SPREADS * 1.4826 * float(np.median(difference)))

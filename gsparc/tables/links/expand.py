@@ -18,10 +18,10 @@ from gsparc.data.schema import OTHER, End, StaticEnds, Stations
 from gsparc.data.selection import Selection, select, take_rows
 from gsparc.data.spacing import number_places
 from gsparc.data.target import MEASUREMENTS
-from gsparc.tables.arrays import Raw, numbered_rows
-from gsparc.tables.checks.piles import find_marks
-from gsparc.tables.links.hearing import POWERS, censor_rows, check_said, forget_unknown
-from gsparc.tables.links.positions import positions_in_metres
+from gsparc.tables.arrays import Raw, name_rows_by_number
+from gsparc.tables.checks.piles import find_sentinel_levels
+from gsparc.tables.links.hearing import POWERS, blank_ambiguous_marks, censor_rows, check_said
+from gsparc.tables.links.positions import convert_positions
 from gsparc.tables.links.stations import (
     SECTOR,
     find_static_end,
@@ -36,7 +36,7 @@ LEAST_LISTED = 3  # stations, for a floor
 UNLISTED_EACH = 2  # rows of what is not listed for one that is
 
 
-def add_absent(check: Checker, measured: str, count: int) -> None:
+def add_silent_links(check: Checker, measured: str, count: int) -> None:
     """Say that each of `count` stations without a level at a place
     where others have one was not heard.
     """
@@ -93,7 +93,9 @@ def add_unlisted(
     )
     strongest = lists.are_strongest()
     # What is known not to be heard, of marks or a stated sensitivity, needs no guess.
-    limit_known = floor is not None or np.isneginf(levels).any() or bool(find_marks(levels[heard]))
+    limit_known = (
+        floor is not None or np.isneginf(levels).any() or bool(find_sentinel_levels(levels[heard]))
+    )
     no_floor = strongest or limit_known or absent == "silent" or count < LEAST_LISTED
     bound = None if no_floor else lists.below_floor()
     if not strongest and bound is None:
@@ -185,9 +187,9 @@ def expand_links(check: Checker, measured: str, part: Selection) -> StaticEnds |
     check.raw = replace(check.raw, arrays=dict(check.raw.arrays))
     # Numbers of the file: rows are repeated and left out below
     rows = len(check.raw.arrays[measured])
-    check.raw.arrays.setdefault("row_name", numbered_rows(rows))
+    check.raw.arrays.setdefault("row_name", name_rows_by_number(rows))
     check.raw.arrays["file_row"] = np.arange(rows)
-    well, origin = positions_in_metres(check, measured)
+    well, origin = convert_positions(check, measured)
     if not well:
         return None
     read = _with_table if "station_position" in check.raw.arrays else _without_table
@@ -307,12 +309,14 @@ def _with_table(check: Checker, measured: str, part: Selection) -> StaticEnds | 
     stations = _selected(check, measured, stations, part) or stations
     stations = split_by_carrier(check, stations, measured in POWERS)
     if measured == "rssi_db":
-        forget_unknown(check, ends[0])  # before lists are looked for, in which they would be strong
+        blank_ambiguous_marks(
+            check, ends[0]
+        )  # before lists are looked for, in which they would be strong
     absent = check.raw.attributes.get("absent", "auto")
     levels, listened = measured == "rssi_db", not long
     unlisted = add_unlisted(check, stations, static, absent, listened) if levels else 0
     if absent == "silent":
-        add_absent(check, measured, len(stations))
+        add_silent_links(check, measured, len(stations))
     return censor_rows(check, measured, StaticEnds(static, stations), unlisted)
 
 

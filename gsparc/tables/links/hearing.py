@@ -16,7 +16,7 @@ from gsparc.data.schema import OTHER, StaticEnds
 from gsparc.data.selection import take_rows
 from gsparc.data.target import MOST_DB
 from gsparc.physics.decibels import to_decibels
-from gsparc.tables.checks.piles import APART_DB, find_marks, find_saturation
+from gsparc.tables.checks.piles import APART_DB, find_saturation, find_sentinel_levels
 from gsparc.tables.own_checks import Checker
 
 POWERS = ("rssi", "rssi_db")
@@ -60,7 +60,7 @@ def censor_rows(
         unlisted: rows that lists of the strongest leave out.
     """
     if measured == "rssi_db" and links.static_end is not None:
-        forget_unknown(check, f"{OTHER[links.static_end]}_position")
+        blank_ambiguous_marks(check, f"{OTHER[links.static_end]}_position")
     values, arrays, before = check.raw.arrays[measured], check.raw.arrays, len(check.problems)
     floor = _stated_floor(check, measured, values)
     if len(check.problems) > before:
@@ -158,7 +158,7 @@ def _below_floor(
     return below
 
 
-def forget_unknown(check: Checker, moving: str) -> None:
+def blank_ambiguous_marks(check: Checker, moving: str) -> None:
     """Make marks that lie beside strong levels as well as beside weak ones NaN: no value,
     and not unheard.
 
@@ -174,7 +174,7 @@ def forget_unknown(check: Checker, moving: str) -> None:
     ):
         return
     station = check.raw.arrays.get("station", np.zeros(len(values), np.int64))
-    marks, rest = find_marks(values), values[np.isfinite(values) & (values != 0)]
+    marks, rest = find_sentinel_levels(values), values[np.isfinite(values) & (values != 0)]
     # However few, 0 beside levels far below is what a receiver says that knows none.
     alone = 0 < (values == 0).sum() < LEAST_MARKS and rest.max(initial=-np.inf) < -APART_DB
     marks += [0.0] if alone and 0.0 not in marks and len(rest) >= LEAST_MARKS else []
@@ -214,7 +214,7 @@ def _without_marks(check: Checker, values: np.ndarray, level: np.ndarray | None)
     """
     setting = check.raw.attributes.get("not_heard")
     marks = (
-        find_marks(values)
+        find_sentinel_levels(values)
         if setting is None
         else np.atleast_1d(np.asarray(setting, np.float64)).tolist()
     )

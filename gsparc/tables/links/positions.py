@@ -11,7 +11,7 @@ from gsparc.data.assemble import FARTHEST
 from gsparc.data.georeference import ON_EARTH, Georeference, find_invalid_coordinate
 from gsparc.data.outliers import FEW
 from gsparc.data.selection import take_rows
-from gsparc.tables.arrays import numbered_rows
+from gsparc.tables.arrays import name_rows_by_number
 from gsparc.tables.checks.plausibility import degree_warnings
 from gsparc.tables.own_checks import Checker
 
@@ -19,7 +19,7 @@ DIGITS = 2  # of an origin's degrees, 1.1 km: drives with a few rows more or les
 NO_FIX_DEG, NO_FIX_M = 1.0, 1e4  # from 0, 0 to the median of all other rows, at least
 
 
-def positions_in_metres(check: Checker, measured: str) -> tuple[bool, Georeference | None]:
+def convert_positions(check: Checker, measured: str) -> tuple[bool, Georeference | None]:
     """Replace positions in `check.raw` by (n, 3) [m]; whether all went well,
     and the origin of degrees.
 
@@ -196,6 +196,6 @@ def _read(check: Checker, prefix: str) -> tuple[np.ndarray, np.ndarray]:
     # Zeros stand in for places that nobody knows, which would be refused as no degrees.
     fault = find_invalid_coordinate(*np.where(absent, 0, (latitude, longitude)))
     if fault:
-        called = numbered_rows(len(latitude)) if prefix else check.raw.arrays["row_name"]
+        called = name_rows_by_number(len(latitude)) if prefix else check.raw.arrays["row_name"]
         check.refuse(f"{prefix}latitude", f"{called[fault[0]]}: {fault[1]}")
     return latitude, longitude

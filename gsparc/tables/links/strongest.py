@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from gsparc.base.hashes import hash_rows
-from gsparc.data.row_order import along_curve
+from gsparc.data.row_order import morton_codes
 from gsparc.physics.decibels import to_decibels
 from gsparc.processes.stored import Stored, from_plain, to_plain
 
@@ -100,7 +100,9 @@ class StrongestLists(Stored):
         table = np.full((len(number), count), np.nan)
         table[which.reshape(-1), who] = level
         # By what they hold: the file's order is chance, and draws are by number.
-        order = np.lexsort((hash_rows(np.nan_to_num(table)), along_curve(np.nan_to_num(at[first]))))
+        order = np.lexsort(
+            (hash_rows(np.nan_to_num(table)), morton_codes(np.nan_to_num(at[first])))
+        )
         sizes = np.isfinite(table).sum(1)
         length = 1 if np.mean(sizes == 1) >= ALONE else int(sizes.max())
         return cls(length, first[order], table[order], at[first[order]])

@@ -58,9 +58,9 @@ def ask_http(port, method, path, body, headers):
 
 
 class Served:
-    def __init__(self, predictor, token=None, told=None, hears=False, **limits):
+    def __init__(self, predictor, token=None, update_file=None, accepts_pilots=False, **limits):
         limits = Limits(**{"most": 64, **limits})
-        app = build_application(predictor, limits, token, told, hears)
+        app = build_application(predictor, limits, token, update_file, accepts_pilots)
         self.server = make_server(app, limits, port=0)
         self.thread = threading.Thread(target=self.server.run, daemon=True)
 
@@ -200,7 +200,7 @@ def test_channels_of_all_stations_hear_pilots_of_a_run():
     model = gsparc.fit(tx=places[:40], csi=heard[:40], **known)
     limits = Limits()
     refused_as(
-        SettingError, "whoever reaches it", build_application, model, limits, None, hears=True
+        SettingError, "reaches it", build_application, model, limits, None, accepts_pilots=True
     )
     turned = 2j * heard[40:, :]
     parts = np.stack([turned.real, turned.imag], -1).reshape(20, -1).tolist()
@@ -208,7 +208,7 @@ def test_channels_of_all_stations_hear_pilots_of_a_run():
     pilots = json.dumps({"places": places[40:].tolist(), "csi": parts})
     query = json.dumps({"places": places[40:].tolist()})
     head = {"authorization": "Bearer word"}
-    with Served(model, "word", hears=True) as served:
+    with Served(model, "word", accepts_pilots=True) as served:
         before = json.loads(ask_http(served.port, "POST", "/predict", query, head)[1])
         assert before["shape"] == [20, 3, 1, 1, 2]
         status, body, _ = ask_http(served.port, "POST", "/hear", pilots, head)

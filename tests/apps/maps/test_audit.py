@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from gsparc.apps.maps.audit import Demand, DriveRows, digest_of, draw_tours, judge, read_draws
+from gsparc.apps.maps.audit import Demand, DriveRows, digest_of, judge, read_draws, sample_tours
 from gsparc.apps.maps.claim import ClaimErrors, read_claim
 from gsparc.apps.maps.streets import StreetGraph
 from gsparc.base.errors import DataError
@@ -101,12 +101,12 @@ def drawn(raster):
     key = digest_of(claim, SERVED)
     doubt = np.where(claim.place[:, 0] > 0, 1.9, 0.1)
     doubt /= doubt.mean()
-    return claim, *draw_tours(claim, key, doubt, 0.5, (1, 2, 3), 10, 7), key, doubt
+    return claim, *sample_tours(claim, key, doubt, 0.5, (1, 2, 3), 10, 7), key, doubt
 
 
 def test_draws_are_repeated_by_their_seed_and_known_again(drawn, tmp_path):
     claim, draws, ways, key, doubt = drawn
-    again, _ = draw_tours(claim, key, doubt, 0.5, (2,), 10, 7)
+    again, _ = sample_tours(claim, key, doubt, 0.5, (2,), 10, 7)
     second = draws[draws.tour == 2]
     assert (again.place.to_numpy() == second.place.to_numpy()).all()
     assert len(ways) == 3 and (draws.groupby("tour").stop.max() == 10).all()
@@ -119,7 +119,7 @@ def test_draws_are_repeated_by_their_seed_and_known_again(drawn, tmp_path):
 
 def test_places_are_drawn_where_the_claim_is_in_doubt_and_weighed(drawn):
     claim, _, _, key, doubt = drawn
-    many, _ = draw_tours(claim, key, doubt, 0.5, range(40), 25, 1)
+    many, _ = sample_tours(claim, key, doubt, 0.5, range(40), 25, 1)
     weight = 1 / (1 - many.part + many.part * many.ratio)
     east = claim.place[many.place, 0] > 0
     assert east.mean() > 0.6 and weight.max() <= 2
@@ -132,7 +132,7 @@ def test_a_way_goes_along_streets(raster):
 
     claim = read_claim(raster, -110.0)
     streets = StreetGraph.from_lines([LineString([(-200, 0), (200, 0)])], 5.0)
-    _, (way,) = draw_tours(claim, "", np.ones(len(claim.place)), 0.0, (1,), 5, 0, streets)
+    _, (way,) = sample_tours(claim, "", np.ones(len(claim.place)), 0.0, (1,), 5, 0, streets)
     assert len(way) >= 5
 
 

@@ -12,13 +12,13 @@ from refusals import refused
 from towns import MASTS, town_file, town_model
 
 import gsparc
-from gsparc.apps.maps.covered import covered_between
+from gsparc.apps.maps.covered import estimate_covered_share
 from gsparc.apps.maps.geojson import draws_shapes
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.placing import (
     NewAntenna,
     NewStationError,
-    assumption,
+    describe_new_station,
     lay_candidates,
     new_station_error,
     place_station,
@@ -83,7 +83,7 @@ def test_the_share_as_it_is_was_taken_as_exact(together, promise):
     left, right, low, high = found.grid.extent
     square = {"height_m": found.grid.height, "step_m": found.grid.step}
     field = predict_map(predictor, [left, low, right, high], **square, **how)
-    now = covered_between(field, predictor, promise)
+    now = estimate_covered_share(field, predictor, promise)
     width, gained = (np.ptp(part, axis=1) for part in np.split(found.between, 2, axis=1))
     assert (width > 0.02).all() and (width < 1.1 * np.ptp(now)).all() and (gained > 0).all()
 
@@ -96,7 +96,7 @@ def test_any_fault_of_a_covariance_was_taken_for_a_model_without_one(
         Predictor, "covariance", lambda *_, **__: pytest.fail("nothing is asked and dropped")
     )
     field = predict_map(predictor, step_m=4.0, threshold_db=-75.0, promise=promise)
-    low, high = covered_between(field, predictor, promise)
+    low, high = estimate_covered_share(field, predictor, promise)
     assert low < 1 - np.nanmean(field.outage) < high
 
 
@@ -122,7 +122,7 @@ def test_sectors_left_out_one_by_one_were_told_by_others_of_their_site(together,
         side, level = (~heard).astype(np.int8), np.where(heard, error, 3.0)
         return HeldOutLevels(level, nothing, nothing + 6, nothing, nothing, nothing, side)
 
-    monkeypatch.setattr("gsparc.apps.maps.placing.leave_out", evidence)
+    monkeypatch.setattr("gsparc.apps.maps.placing.unlearn_and_predict", evidence)
     monkeypatch.setattr("gsparc.apps.maps.placing.LEAST_STATIONS", 2)
     fold = Fold(rows, rows[:0], rows[:1])
     found = new_station_error(
@@ -210,14 +210,14 @@ def test_two_stations_leave_none_out(together):
 
 def test_a_new_station_among_bands_was_put_in_one_that_nobody_named(together):
     site = gsparc.load(together[2]).site
-    assert "band" not in assumption(site, 8.0, NewAntenna())
+    assert "band" not in describe_new_station(site, 8.0, NewAntenna())
     two = replace(site, stations=replace(site.stations, carrier_hz=np.array([2.6e9, 1.8e9])))
-    assert assumption(two, 8.0, NewAntenna([0, 120])).startswith(
+    assert describe_new_station(two, 8.0, NewAntenna([0, 120])).startswith(
         "assumed: 8 m high in the band of 1800 MHz, sect"
     )
     named = NewAntenna(carrier_hz=2.65e9)  # within a tenth of 2.6 GHz
     assert named.find_alike(two.stations) == 0 and NewAntenna().find_alike(two.stations) is None
-    assert "in the band of 2650 MHz" in assumption(two, 8.0, named)
+    assert "in the band of 2650 MHz" in describe_new_station(two, 8.0, named)
     refused(
         "no station's band; there are 1800, 2600 MHz",
         NewAntenna(carrier_hz=8e8).find_alike,

@@ -9,7 +9,7 @@ from towns import town_model
 
 import gsparc
 from gsparc.apps.maps.covariance import ErrorCovariance, error_covariances, weigh_goal
-from gsparc.apps.maps.planning import find_neighbours, plan_measurements
+from gsparc.apps.maps.planning import pairs_too_near, plan_measurements
 from gsparc.apps.maps.promise import Promise
 from gsparc.apps.maps.streets import StreetGraph, Tour, Ways
 from gsparc.models.abilities import JointLevels
@@ -82,7 +82,7 @@ def test_places_of_a_plan_were_two_lumps(predictor):
     apart = cKDTree(places).query(places, k=2)[0][:, 1]
     assert apart.min() > 0.25 * np.sqrt(120 * 60 / 12)
     corners = np.array([[0.0, 0], [1, 0], [10, 0], [11, 0]])
-    near = find_neighbours(corners, 2)
+    near = pairs_too_near(corners, 2)
     assert near[0].tolist() == [True, True, False, False]
 
 

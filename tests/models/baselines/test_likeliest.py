@@ -9,7 +9,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.baselines.kriging import Kriging
-from gsparc.models.baselines.likeliest import process_and_notes
+from gsparc.models.baselines.likeliest import fit_power_process
 from gsparc.models.reduced import with_reduction
 from gsparc.models.target_rows import power_rows
 from gsparc.tables.own import from_arrays
@@ -51,7 +51,7 @@ def test_few_rows_do_not_choose_a_process_that_varies_far_more_than_they_do():
         number = stored["station"].tolist().index("law73-nuc2-b210")
     data = station(number, 97, 9)
     rows = power_rows(data, np.arange(97))
-    process, _ = process_and_notes(rows, data.site)
+    process, _ = fit_power_process(rows, data.site)
     assert process.kernel.amplitude < 3 * rows.decibels.var()  # 6.6 times without the bound
 
 
@@ -111,7 +111,7 @@ def test_a_constant_was_taken_where_a_distance_law_was_there_to_be_had():
     )
     arrays = {"rx_position": places, "tx_position": station, "rssi_db": decibels}
     data = from_arrays(arrays, {"name": "street"})
-    process, notes = process_and_notes(power_rows(data, np.arange(80)), data.site)
+    process, notes = fit_power_process(power_rows(data, np.arange(80)), data.site)
     assert process.trend.law is not None and "a distance law" in notes[0]
     near, far = np.array([[0.0, 400.0, 1.5], [0.0, 2400.0, 1.5]]) - data.site.origin
     mean, *_ = process.answer(torch.from_numpy(np.stack([near, far])))
@@ -130,7 +130,7 @@ def test_rows_within_centimetres_said_infinite_powers_a_kilometre_away():
         {"rx_position": places, "tx_position": still, "rssi_db": decibels}, {"name": "shelf"}
     )
     for mean in ("auto", "distance"):
-        process, _ = process_and_notes(power_rows(data, np.arange(8)), data.site, mean=mean)
+        process, _ = fit_power_process(power_rows(data, np.arange(8)), data.site, mean=mean)
         far = torch.eye(3, dtype=torch.float64) * 1000.0
         found, *_ = process.answer(far)
         assert (found + 67.5).abs().max() < 150, (mean, found)

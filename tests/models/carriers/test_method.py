@@ -17,7 +17,7 @@ from gsparc.data.splits import Fold
 from gsparc.models.baselines.gp import GaussianProcess
 from gsparc.models.carriers.alone import CarriersAlone
 from gsparc.models.carriers.array import carriers_obstacle
-from gsparc.models.carriers.geometry import STEP, find_paths, ways
+from gsparc.models.carriers.geometry import STEP, directions_and_distances, find_paths
 from gsparc.models.carriers.method import CarrierField
 from gsparc.models.carriers.plain import DirectBeam, OtherCarriers
 from gsparc.models.gsparc import Gsparc
@@ -85,7 +85,7 @@ def test_mirrors_were_found_beyond_their_places_where_beams_overlap(turn):
     mirrors = torch.tensor([[-across, along, 0, WALL], [0, 0, 1, CEILING]]).double()
     places[:, :2] = places[:, :2] @ torch.tensor([[along, across], [-across, along]])
     receiver = torch.tensor([0, 0, 1.0])
-    directions, distance = ways(places, mirrors, receiver.double(), turned)
+    directions, distance = directions_and_distances(places, mirrors, receiver.double(), turned)
     power = torch.tensor([1, 0.64, 0.49]) / distance.square()
     seen = (power[..., None] * lags.plane_wave_lags(directions.float())).sum(1)
     found = find_paths(lags, seen, places, receiver.double(), turned).planes

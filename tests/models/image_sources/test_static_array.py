@@ -12,7 +12,7 @@ import torch
 from gains import fitted, phased
 from scenes import error, fold_of
 
-from gsparc.models.image_sources.backprojection import gains_and_amplitudes, rough_gains
+from gsparc.models.image_sources.backprojection import rough_gains, score_candidates
 from gsparc.models.image_sources.clutter.residual import ClutterLikelihood, _nll
 from gsparc.models.image_sources.gp_likelihood import GainPosterior
 from gsparc.models.image_sources.method import ImageSourceGP
@@ -132,7 +132,7 @@ def test_quick_scores_of_an_array_are_those_without_a_covariance():
     waves = spherical_waves(rows, spread)
     slow = (waves.mH @ rows.target).abs().square().sum(1) / waves.abs().square().sum(0)
     torch.testing.assert_close(rough_gains(rows, spread, rows.target), slow, rtol=1e-2, atol=1e-2)
-    assert gains_and_amplitudes(GainPosterior(rows, scene), spread)[0].shape == (300,)
+    assert score_candidates(GainPosterior(rows, scene), spread)[0].shape == (300,)
     with pytest.raises(ValueError, match="images of each"):
         spherical_waves(rows, points)
 

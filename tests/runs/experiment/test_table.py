@@ -8,7 +8,7 @@ from compared import averages, drawn, filled, said_of
 from gsparc.evaluation.metric_formats import is_root, main_figure, sample_column, score_of
 from gsparc.evaluation.paired import lead_over_rows
 from gsparc.pictures import plots
-from gsparc.pictures.plots import draw_efforts
+from gsparc.pictures.plots import draw_accuracy_over_cost
 from gsparc.runs.experiment import runner
 from gsparc.runs.experiment.table import (
     columns_of_csv,
@@ -71,7 +71,7 @@ def test_marks_of_the_legend_were_others_than_those_of_the_points(tmp_path, monk
     """The legend drew every mark with an error bar, also of points without one."""
     figures = []
     monkeypatch.setattr(plots, "save", lambda figure, path, also: figures.append(figure))
-    draw_efforts(averages(FOUND, TIMED), tmp_path / "compare.png", "gsparc")
+    draw_accuracy_over_cost(averages(FOUND, TIMED), tmp_path / "compare.png", "gsparc")
     (legend,) = figures[0].legends
     marks = {
         text.get_text(): line.get_marker()
@@ -122,7 +122,7 @@ def test_a_comparison_of_lists_ended_in_a_key_error(tmp_path):
         and ("gp, RMSE dB, silent too 4.20") in page
     )
     assert "std of gp is 5 times too small" in page and "gsparc map" in page
-    draw_efforts(found, tmp_path / "compare.png", "gsparc")
+    draw_accuracy_over_cost(found, tmp_path / "compare.png", "gsparc")
 
 
 def test_the_first_was_named_without_saying_how_sure_that_is(tmp_path):
@@ -166,7 +166,7 @@ def test_axes_of_a_comparison_had_one_label_and_two_panels_one_title(tmp_path, m
     figures = []
     monkeypatch.setattr(plots, "save", lambda figure, path, also: figures.append(figure))
     near = [filled("gp", 30.0), filled("gsparc", 29.0, **{"time/train_cpu_s": 4.0})]
-    draw_efforts(averages(near, TIMED), tmp_path / "compare.png", "gsparc")
+    draw_accuracy_over_cost(averages(near, TIMED), tmp_path / "compare.png", "gsparc")
     figures[0].canvas.draw()
     axes = figures[0].axes[:2]
     assert [axis.get_title() for axis in axes] == ["rfid, random", "rfid, queries"]

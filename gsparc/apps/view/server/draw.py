@@ -20,7 +20,7 @@ def draw_scene(api: Any, scene: DrawnScene, before: Mapping[str, Any]) -> dict[s
     return {part.name: part.draw(api, scene.frame) for part in scene.parts}
 
 
-def draw_floor(api: Any, scene: DrawnScene) -> float:
+def draw_ground_grid(api: Any, scene: DrawnScene) -> float:
     """Draw a grid beneath the scene; returns the side of its cells [m]."""
     frame = scene.frame
     wide = EXTENT / frame.scale

@@ -18,7 +18,7 @@ from gsparc.apps.view.answer import predict_answer
 from gsparc.apps.view.building import PATHS, SPHERE, draw_rays
 from gsparc.apps.view.reasons import legend_html, panel_image, summarise_answer
 from gsparc.apps.view.scene import EXTENT, DrawnScene, Part, PlacedPicture, Points
-from gsparc.apps.view.server.draw import draw_floor, draw_scene, set_first_view
+from gsparc.apps.view.server.draw import draw_ground_grid, draw_scene, set_first_view
 from gsparc.apps.view.site_view import SiteView, plane_sheet, walk_places
 from gsparc.data.schema import ENDS
 
@@ -59,7 +59,7 @@ def _recorded(server: Any, view: SiteView, steps: int) -> tuple[str, str]:
     api.set_up_direction("+z")
     set_first_view(server.initial_camera, 0.0, UP)
     scene, moving = view.station(names[0]).scene, viewed.moving[-1]
-    side = draw_floor(api, scene)
+    side = draw_ground_grid(api, scene)
     nodes, legends = _still(api, view, names[0], {})
     recorder = server.get_scene_serializer()
     dot = api.add_icosphere("/end", radius=0.016 * EXTENT, color=(214, 39, 40))

@@ -23,7 +23,7 @@ from gsparc.apps.view.building import GAUSSIANS, PATHS, RAYS, SPHERE, VALUES, dr
 from gsparc.apps.view.latest_job import LatestJobQueue
 from gsparc.apps.view.reasons import answer_markdown, explain_level, legend_html, panel_image
 from gsparc.apps.view.scene import EXTENT, Points
-from gsparc.apps.view.server.draw import draw_floor, draw_scene, set_first_view
+from gsparc.apps.view.server.draw import draw_ground_grid, draw_scene, set_first_view
 from gsparc.apps.view.site_view import Plane, SiteView, plane_sheet, refine_plane, weakest_place
 from gsparc.base.errors import DataError
 from gsparc.data.schema import ENDS
@@ -68,7 +68,7 @@ class Session:
         api = self.client.scene
         api.set_up_direction("+z")
         self.nodes = draw_scene(api, self.scene, self.nodes)
-        self.cell = draw_floor(api, self.scene)
+        self.cell = draw_ground_grid(api, self.scene)
         # About the middle of the frame, moved to the receiver with every answer
         if self.sphere is not None:
             around = self.scene.frame.middle + self.sphere.offsets

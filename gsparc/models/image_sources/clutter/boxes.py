@@ -11,7 +11,7 @@ from torch import Tensor
 
 from gsparc.models.image_sources.clutter.blocking import MARGIN, share_past_boxes
 from gsparc.models.image_sources.clutter.residual import UnexplainedRows
-from gsparc.physics.draws import draw_in_box, draw_lengths
+from gsparc.physics.draws import sample_in_box, sample_log_uniform
 
 THINNEST = MARGIN  # [m]: thinner ones block nothing
 SMALLEST, LARGEST = 0.15, 2.0  # [m] sides of random boxes
@@ -88,9 +88,9 @@ def clip_boxes(boxes: Tensor, room: Tensor) -> Tensor:
 
 def _draw_boxes(count: int, room: Tensor, generator: torch.Generator) -> Tensor:
     lowest, highest = room
-    middle = draw_in_box(lowest, highest, count, generator)
+    middle = sample_in_box(lowest, highest, count, generator)
     kind = torch.rand(count, generator=generator)
-    size = draw_lengths(SMALLEST, LARGEST, middle, generator)
+    size = sample_log_uniform(SMALLEST, LARGEST, middle, generator)
     size[kind < TABLES, 2] = 2 * THINNEST
     low, high = middle - size / 2, middle + size / 2
     low[kind > FLOOR, 2] = room[0, 2]

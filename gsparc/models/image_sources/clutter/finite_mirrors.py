@@ -20,7 +20,7 @@ from gsparc.models.image_sources.clutter.boxes import maximise_by_evolution
 from gsparc.models.image_sources.clutter.residual import UnexplainedRows
 from gsparc.models.image_sources.rows import Rows
 from gsparc.models.image_sources.scene import spherical_waves
-from gsparc.physics.draws import draw_in_box, draw_lengths
+from gsparc.physics.draws import sample_in_box, sample_log_uniform
 from gsparc.physics.mirror_planes import hesse_form, reflect
 from gsparc.physics.waves import LIGHT
 from gsparc.processes.worker import raise_if_cancelled
@@ -65,8 +65,8 @@ def find_patch(unexplained: UnexplainedRows, plane: int) -> tuple[Tensor, float]
         lower = torch.minimum(lower, upper - MIN_SIDE)
         return torch.cat([torch.maximum(lower, low), torch.minimum(upper, high)], 1)
 
-    middle = draw_in_box(low, high, DRAWS, unexplained.generator)
-    side = draw_lengths(SMALLEST, LARGEST, middle, unexplained.generator)
+    middle = sample_in_box(low, high, DRAWS, unexplained.generator)
+    side = sample_log_uniform(SMALLEST, LARGEST, middle, unexplained.generator)
     starts = repair(torch.cat([middle - side / 2, middle + side / 2], 1))
     starts = starts[gain_of_patches(starts).topk(8).indices]
     return maximise_by_evolution(starts, gain_of_patches, repair, unexplained.generator, rounds=10)

@@ -43,7 +43,7 @@ BOXES, MIRRORS, SEQUENCES = 4, 5, 6  # most new ones in an epoch
 BEYOND = 0.15  # [m] margin of clutter around the receivers' box
 
 
-def find_clutter(rows: Rows, scene: SourceScene, generator: torch.Generator) -> SourceScene:
+def add_clutter(rows: Rows, scene: SourceScene, generator: torch.Generator) -> SourceScene:
     """Return the scene with clutter, or unchanged when the likelihood gains too little.
 
     A piece must gain half the logarithm of the number of real observations per parameter:

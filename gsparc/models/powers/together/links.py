@@ -23,7 +23,7 @@ from gsparc.models.powers.together.learning import ERRORS, LeftOutStations
 from gsparc.models.powers.together.terms import StationRows
 from gsparc.models.target_rows import linear_moments
 from gsparc.processes.averages import MeanVariance
-from gsparc.processes.few_rows import draw_places
+from gsparc.processes.few_rows import sample_place_rows
 from gsparc.processes.fit_kernel import SETTLED, fit_kernel
 from gsparc.processes.kernel import Kernel, Stationary, WhiteNoise, distances, to_number
 from gsparc.processes.nearest import (
@@ -240,7 +240,7 @@ def _learn_others(
     """The likeliest kernel of links given those of other stations, and errors (m,) [dB] of the
     chosen rows (m,), each predicted from these.
     """
-    values, looked_at = link_values(rows, law), draw_places(rows.places, LOOKED_AT, seed)
+    values, looked_at = link_values(rows, law), sample_place_rows(rows.places, LOOKED_AT, seed)
     near = np.c_[looked_at, links_of_others(rows, values.places, looked_at, LOOKED_BY)]
     places = torch.from_numpy(values.places[near])
     kernel = _likeliest(start, NeighbourSample(places, values.values[near], values.count[near]))

@@ -25,7 +25,7 @@ from gsparc.models.powers.together.terms import StationRows, places_and_notes, r
 from gsparc.processes.censored import PseudoValues
 from gsparc.processes.density import NegativeLogEvidence
 from gsparc.processes.factor import Factor
-from gsparc.processes.few_rows import draw_places
+from gsparc.processes.few_rows import sample_place_rows
 from gsparc.processes.fit_kernel import SETTLED, minimise
 from gsparc.processes.kernel import Kernel, WhiteNoise, distances
 from gsparc.processes.places import first_end, horizontal, other_end
@@ -43,7 +43,7 @@ from gsparc.processes.sectors import (
     sector_table,
 )
 from gsparc.processes.trend import LEAST_SPREAD
-from gsparc.tables.checks.piles import find_noise
+from gsparc.tables.checks.piles import find_floor_piles
 
 SAME_SITE_M = 5.0  # stations closer than this are of one site
 SAME_NAME_M = 100.0  # the same of those whose names differ in their last part alone
@@ -172,7 +172,7 @@ def _fit_azimuths(
     rows: StationRows, network: Sectors, names: tuple[str, ...], seed: int
 ) -> tuple[Sectors, Tensor, float, list[str]]:
     """What `_fit_rough` returns, with azimuths that rows do not contradict, and notes on these."""
-    few = _without_foreign(rows.subset(draw_places(rows.places, ROUGH_ON, seed)))
+    few = _without_foreign(rows.subset(sample_place_rows(rows.places, ROUGH_ON, seed)))
     law = replace(fit_law(few, None), level=0.0, exponent=0.0)
     loud = few.heard_rows
     decades = law.decades(torch.from_numpy(loud.places))
@@ -186,7 +186,7 @@ def _fit_azimuths(
         ),
     )
     # A receiver's noise is no level of a sector: no azimuth is doubted by it.
-    piles = find_noise(sector_of(loud.places), loud.decibels).values()
+    piles = find_floor_piles(sector_of(loud.places), loud.decibels).values()
     top = max((top for top, _ in piles), default=-math.inf)
     quiet = replace(
         few, decibels=few.decibels.clip(top), side=np.where(few.decibels < top, 1, few.side)

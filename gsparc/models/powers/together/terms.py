@@ -21,7 +21,7 @@ from gsparc.data.schema import Measurements
 from gsparc.models.baselines.distance_law import locate_still_end, say_estimated
 from gsparc.models.target_rows import power_rows
 from gsparc.processes.factor import Factor
-from gsparc.processes.few_rows import draw_places, first_rows
+from gsparc.processes.few_rows import first_rows, sample_place_rows
 from gsparc.processes.kernel import distances
 from gsparc.processes.matern import matern32
 from gsparc.processes.nearest import JITTER
@@ -159,7 +159,7 @@ class SharedTerms(Columns):
     def set_inducing(self, rows: StationRows, limit: int, seed: int) -> SharedTerms:
         """Return the same with g known at so many places of rows, drawn evenly."""
         ends = np.unique(first_end(rows.places), axis=0)
-        return replace(self, inducing=torch.from_numpy(ends[draw_places(ends, limit, seed)]))
+        return replace(self, inducing=torch.from_numpy(ends[sample_place_rows(ends, limit, seed)]))
 
     def columns(self, places: Tensor) -> Tensor:
         """Return (n, P) [units] at places of both ends (n, 6) [m], or of sectors (n, 7)."""
