@@ -14,6 +14,7 @@ from gsparc.processes.few_rows import evenly_spaced
 # Rows form a path while their median step is below this many nearest-neighbour distances.
 PATH_STEP_RATIO = 4.0
 NEAR = 0.01  # of the usual step: places nearer than this are visits of one
+ONE_PLACE_M = 1e-6  # side of squares where all places are one
 FEWEST_PLACES, SAMPLE = 10, 10_000  # that tell a usual step; more tell nothing more
 # Large odd factors: cells become numbers, which sort much faster than rows.
 _ODD = [0x1E3779B97F4A7C15, 0x2545F4914F6CDD1D, 0x3C6EF372FE94F82B, 7919, 104729**3, 3**38]
@@ -116,6 +117,17 @@ def number_squares(floor: np.ndarray, side: float) -> np.ndarray:
     """
     # Counted from zero, which `split_for` puts at the lowest place of the whole campaign.
     return np.unique(np.floor(floor / side + EDGE), axis=0, return_inverse=True)[1].reshape(-1)
+
+
+def squares_of_extent(floor: np.ndarray, across: int = 10) -> np.ndarray:
+    """Return the number (n,) of the square that each place (n, 2) [m] is in, of which `across` hold
+    the longer side.
+
+    >>> squares_of_extent(np.array([[0.0, 0.0], [0.5, 0.0], [9.9, 0.0]]))
+    array([0, 0, 1])
+    """
+    side = max(tenth_of_extent(floor), ONE_PLACE_M) * 10 / across
+    return number_squares(floor - floor.min(0), side)
 
 
 def path_order(positions: np.ndarray) -> np.ndarray:

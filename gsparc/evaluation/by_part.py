@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.models.powers.groups import number_squares
+from gsparc.data.spacing import squares_of_extent
 from gsparc.processes.uncertainty import half_width, standard_error
 
 ALL_HOLD = 0.9
@@ -76,7 +76,7 @@ class Drive:
         """
         if not len(self.place):
             return []
-        square = number_squares(np.pad(self.place, ((0, 0), (0, 1))), SQUARES)
+        square = squares_of_extent(self.place, SQUARES)
         parts = [
             part
             for part in self.parts()

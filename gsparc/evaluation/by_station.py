@@ -10,10 +10,10 @@ import pandas as pd
 from scipy.spatial import cKDTree
 
 from gsparc.data.schema import Measurements, show_names
+from gsparc.data.spacing import squares_of_extent
 from gsparc.evaluation.metric_formats import BEST_SERVER, number_format
 from gsparc.evaluation.scores import FEW, Scores
 from gsparc.evaluation.table import Column, Table
-from gsparc.models.powers.groups import number_squares
 from gsparc.tables.links.strongest import strongest_lists
 
 WORST = 3  # stations shown; the file has all
@@ -86,7 +86,7 @@ def unlisted_stations(scores: Scores, data: Measurements) -> pd.DataFrame:
         return pd.DataFrame(columns=["moments", "expected", "chance"])
     assert data.place is not None
     moments, first = np.unique(data.place, return_index=True)
-    square = number_squares(data.moving[first])[np.searchsorted(moments, shares.moment)]
+    square = squares_of_extent(data.moving[first, :2])[np.searchsorted(moments, shares.moment)]
     missed = 1 - shares.groupby(["station", square]).share.max().clip(upper=SURE)
     table = shares.groupby("station").agg(moments=("share", "size"), expected=("share", "sum"))
     table["chance"] = missed.groupby("station").prod()
@@ -122,7 +122,7 @@ def newly_listed(old: Measurements, new: Measurements) -> pd.DataFrame:
     share = np.where(listed[later], again[rank], 0.0)[:, fresh]
     missed = np.ones((0, len(fresh)))
     if len(pairs):
-        squares = number_squares(before.place[pairs])
+        squares = squares_of_extent(before.place[pairs, :2])
         missed = 1 - pd.DataFrame(share).groupby(squares).max().clip(upper=SURE).to_numpy()
     figures = {"lists": listed[:, fresh].sum(0), "expected": share.sum(0), "chance": missed.prod(0)}
     return pd.DataFrame(figures, index=fresh)

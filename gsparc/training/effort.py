@@ -26,7 +26,6 @@ class Effort:
             covariance.
         term_rows: rows that powers of the terms of a channel field are learned on.
         evaluations: of a search for sources: factors of covariances and blocks of candidates.
-        fringes: coherent solutions of powers.
         restarts: of spectra that no neighbour solves, times the starts of each.
         steps, steps_after_solving: of gradient, where neither model nor Trainer is given a number;
             after a start in closed form.
@@ -36,7 +35,6 @@ class Effort:
     chosen_on: int = 1_000
     term_rows: int = 400
     evaluations: int = 3_000
-    fringes: int = 20
     restarts: int = 100_000
     steps: int = 400
     steps_after_solving: int = 60

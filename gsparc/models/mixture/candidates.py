@@ -46,13 +46,13 @@ def make_scene(init: InitSettings, clutter: bool, context: FitContext) -> Closed
 
 
 def make_powers(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:
-    """Make coherent waves, or losses in walls of a file (`init=scene`), and a process of the rest.
+    """Make losses in walls of a file (`init=scene`), and a process of the rest.
 
     Raises:
         DataError: `init=scene` without a file, or walls that cannot be.
     """
     walls = read_walls(init.file) if init.name == "scene" else None
-    return PowerField(init.name != "diffuse", context.seed, walls, context.terms)
+    return PowerField(context.seed, walls, context.terms)
 
 
 def make_joint_powers(init: InitSettings, clutter: bool, context: FitContext) -> ClosedForm:

@@ -271,9 +271,7 @@ class Mixture(LearnsTogether, ClosedForm):
         self.weights = tuple((weights / weights.sum()).tolist())
 
     def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
-        """See `Reconditions`; of fields whose parameters are few,
-        such as those of powers without fringes.
-        """
+        """See `Reconditions`; of fields whose parameters are few, such as those of powers."""
         if not all(member.forgets for member in self.members):
             return None
         # Deep, as members are conditioned in place and those of this method must stay as they are.

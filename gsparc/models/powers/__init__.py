@@ -1,3 +1,1 @@
-"""Received powers as a field: Gaussians that shadow the path, fringes of coherent sources,
-and a process.
-"""
+"""Received powers as a field: losses in known walls, and a process of the rest."""

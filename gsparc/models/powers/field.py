@@ -2,8 +2,7 @@
 
 In decibels: a constant or a distance law, uncertain; a loss for each known wall on the straight
 path between the ends; one or two Matern-3/2 of place; noise. Of many rows the mean of such
-processes is taken, by what squares left out say. Where a wavelength is sampled powers interfere:
-there coherent waves stand beside one process.
+processes is taken, by what squares left out say.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from typing import Any
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from gsparc.base.errors import Caution
 from gsparc.data.query import Query
@@ -24,12 +22,10 @@ from gsparc.data.walls import SceneWalls
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
 from gsparc.models.image_sources.known.images import walls_in_frame
 from gsparc.models.method import Prediction
-from gsparc.models.powers.fringes import Fringes, fit_fringes, resolves_wavelength
 from gsparc.models.powers.members import learn_members, weigh_members
 from gsparc.models.powers.own_terms import UserTerm, describe_weights
 from gsparc.models.powers.prior_map import PriorMap
 from gsparc.models.target_rows import linear_moments, power_rows
-from gsparc.physics.decibels import from_decibels
 from gsparc.processes.nearest import Nearest
 from gsparc.processes.posterior import Exact, approximation_label
 from gsparc.processes.powers import PowerProcess, PowerRows, condition_on_powers
@@ -50,26 +46,23 @@ class PowerField(ClosedForm):
     """Powers of one station, (1,) linear, by settings of the largest left-out likelihood.
 
     Args:
-        waves: whether coherent ones are sought where neighbours are closer than half a wavelength.
-        seed: of rows and waves that are drawn.
-        walls: that are known, in the coordinates of the measurements; no waves are sought beside
-            them.
+        seed: of rows that are drawn.
+        walls: that are known, in the coordinates of the measurements.
         terms: further columns of the mean, in the coordinates of the measurements.
     """
 
     name = "process of powers"
+    forgets = True
     site: Site
     priors: tuple[tuple[float, Prior], ...]  # with shares of the mean, the largest first
 
     def __init__(
         self,
-        waves: bool = True,
         seed: int = 0,
         walls: SceneWalls | None = None,
         terms: tuple[Columns, ...] = (),
     ) -> None:
-        self.waves, self.seed, self.walls, self.own_terms = waves, seed, walls, terms
-        self.fringes: Fringes | None = None  # of coherent waves, beside the process
+        self.seed, self.walls, self.own_terms = seed, walls, terms
         self.powers: PowerProcess | None = None
         self.known = np.zeros(0, np.int64)
         # Places of the process that known rows are of, where rows share them
@@ -85,7 +78,7 @@ class PowerField(ClosedForm):
         watch, rows = Stopwatch(), fold.learned()
         if not len(rows):
             raise ValueError("a process of powers needs at least one row")
-        self.site, self.fringes = data.site, None
+        self.site = data.site
         notes = (
             *self._choose_priors(data, rows, context.counts),
             *self._judge_maps(power_rows(data, rows)),
@@ -99,42 +92,21 @@ class PowerField(ClosedForm):
     def _choose_priors(
         self, data: Measurements, rows: np.ndarray, effort: Effort
     ) -> tuple[str, ...]:
-        """Set the priors and waves; what must be said of them."""
+        """Set the priors; what must be said of them."""
         seen, site, chosen_on = power_rows(data, rows), data.site, effort.chosen_on // 2
         # Checked once: a query has no time for it, nor has `torch.func`.
         terms = tuple(
             UserTerm.from_site(t, site).centre(torch.from_numpy(seen.places))
             for t in self.own_terms
         )
-        walls, remarks, about = tuple[Columns, ...](), list[str](), list[str]()
+        walls, about = tuple[Columns, ...](), list[str]()
         if self.walls is not None:
             known = walls_in_frame(self.walls, site.origin, site.static_position)
             walls = (replace(known, loss_db=WALL_DB),)
             about.append(f"losses in {len(known.sizes)} known walls and floors")
         members = learn_members(seen, site, self.seed, chosen_on, terms, walls)
         self.priors, notes = weigh_members(seen, members, self.seed, chosen_on)
-        # A level that silent rows are below is no power that waves could be fitted to.
-        if (
-            self.waves
-            and not walls
-            and not seen.silent.any()
-            and resolves_wavelength(seen.places, site.wavelength)
-        ):
-            # `Fringes.rows` is searched by bisection, and must ascend.
-            order = np.argsort(rows)
-            assert site.wavelength is not None
-            self.fringes, note = fit_fringes(
-                seen.subset(order),
-                rows[order],
-                self.priors[0][1],
-                site.wavelength,
-                self.seed,
-                effort.fringes,
-            )
-            remarks.append(note)
-            if self.fringes is not None:  # their share was learned beside this process
-                self.priors = ((1.0, self.priors[0][1]),)
-        return (*about, *notes, *remarks)
+        return (*about, *notes)
 
     def _used_maps(self) -> list[PriorMap]:
         """Maps from before that the mean has a share of."""
@@ -171,26 +143,10 @@ class PowerField(ClosedForm):
         """See `HasProcess`."""
         return self.powers
 
-    def count_components(self) -> int:
-        """See `ClosedForm.count_gaussians`; coherent waves count as Gaussians of no extent,
-        far away.
-        """
-        return 0 if self.fringes is None else len(self.fringes.weights)
-
-    @property
-    def forgets(self) -> bool:  # type: ignore[override]
-        """See `ClosedForm`; coherent waves keep what they were fitted to."""
-        return self.fringes is None
-
     @property
     def terms(self) -> tuple[str, ...]:
-        """`power` where walls are known, `phase` where coherent waves are, `residual` always."""
-        named = {
-            "power": bool(self.trend.more),
-            "phase": self.fringes is not None,
-            "residual": True,
-        }
-        return tuple(name for name, there in named.items() if there)
+        """`power` where walls are known, `residual` always."""
+        return ("power", "residual") if self.trend.more else ("residual",)
 
     def condition(self, data: Measurements, rows: np.ndarray) -> None:
         """See `ClosedForm`; what rows say where nothing was heard is
@@ -215,11 +171,10 @@ class PowerField(ClosedForm):
             ValueError: before `condition`.
         """
         process, places = self.require_fitted(self.powers), query.places(self.site)
-        parts = [self._decibel_moments(process, part) for part in places.split(QUERIES)]
+        parts = [process.answer(part) for part in places.split(QUERIES)]
         joined = (torch.cat(part).to(query.tx.dtype) for part in zip(*parts, strict=True))
-        mean, spread, share, explained = joined
-        explained_power = from_decibels(explained[:, None]) if self.count_components() else None
-        return Prediction(*linear_moments(mean, spread), share, explained_power)
+        mean, spread, share = joined
+        return Prediction(*linear_moments(mean, spread), share)
 
     def left_out(self, rows: np.ndarray | None = None) -> LeftOutRows:
         """See `ClosedForm`; of rows where something was heard.
@@ -233,16 +188,6 @@ class PowerField(ClosedForm):
         some = None if rows is None else np.flatnonzero(np.isin(self.known, rows))
         decibels, spread = process.left_out(self.at, some)
         known = self.known if some is None else self.known[some]
-        if self.fringes is not None:
-            posterior = process.posterior
-            loud = (posterior.extra == 0).numpy() if isinstance(posterior, Exact) else self.at
-            places = process.places[loud]
-            asked = places if some is None else places[some]
-            nearest = torch.from_numpy(cKDTree(places).query(asked, k=2)[0][:, 1])
-            decibels, factor = self.fringes.blend_blind_solutions(
-                decibels, torch.from_numpy(asked), nearest, known
-            )
-            spread = spread * factor
         return LeftOutRows(known, *linear_moments(decibels.float(), spread.float()))
 
     def state(self) -> dict[str, Any]:
@@ -253,27 +198,17 @@ class PowerField(ClosedForm):
             "known": torch.from_numpy(self.known),
             "at": torch.from_numpy(self.at),
             "decibels": torch.from_numpy(self.decibels),
-            "fringes": to_plain(self.fringes),
             "process": to_plain(self.powers),
         }
 
     def restore(self, site: Site, state: dict[str, Any]) -> None:
         """See `Method.restore`."""
         self.site, self.seed = site, int(state["seed"])
-        parts = (from_plain(state[name]) for name in ("priors", "process", "fringes"))
-        self.priors, self.powers, self.fringes = parts
+        if state.get("fringes") is not None:
+            raise ValueError(
+                "a model of powers with coherent waves is of an older program: train again"
+            )
+        self.priors, self.powers = (from_plain(state[name]) for name in ("priors", "process"))
         self.known, self.decibels, self.at = (
             state[name].numpy() for name in ("known", "decibels", "at")
         )
-
-    def _decibel_moments(self, process: PowerProcess, places: Tensor) -> tuple[Tensor, ...]:
-        """Mean [dB], variance [dB^2], unknown share, and what coherent waves explain [dB], (b,)
-        each.
-        """
-        mean, spread, share = process.answer(places)
-        if self.fringes is None:
-            return mean, spread, share, mean
-        mean, factor = self.fringes.blend_solutions(
-            mean, places, process.posterior.nearest_distance(places)
-        )
-        return mean, spread * factor, share, self.fringes.solution_powers(places).mean(1)

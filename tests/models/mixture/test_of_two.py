@@ -28,7 +28,7 @@ def mixed(mixture: Mixture, members: Sequence[ClosedForm], data: Measurements) -
 def test_a_mixture_of_two_was_fitted_anew_where_each_member_forgets():
     data = plane(80)
     some, less = np.arange(60), np.arange(30)
-    pair = [fitted_to(PowerField(False, seed), data, some)[0] for seed in (0, 1)]
+    pair = [fitted_to(PowerField(seed), data, some)[0] for seed in (0, 1)]
     both = mixed(Powers(), pair, data)
     both.condition(data, some)
     batch = data.batch(np.arange(60, 80))

@@ -143,7 +143,7 @@ def compile_exactly(method: Method, site: Site) -> Form | None:
         whole = len(known) == len(forms)
         return compile_mean(known, method.weights, method.doubt) if whole else None
     if isinstance(method, PowerField):
-        if method.powers is None or method.fringes is not None:
+        if method.powers is None:
             return None
         return compile_powers(method.powers, site.target_scale)
     if isinstance(method, ImageProcess) and method._average is not None:
