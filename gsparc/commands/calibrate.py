@@ -1,4 +1,4 @@
-"""`gsparc calibrate ckpt=FILE`: compare confidences, promise an error, check the promise."""
+"""`gsparc calibrate ckpt=FILE`: a confidence, what it promises, and a check of the promise."""
 
 from __future__ import annotations
 
@@ -68,7 +68,6 @@ def calibration_tables(facts: dict[str, Any]) -> list[Table]:
     curves = [
         Column("confidence", "", of="kind"),
         Column("area under risk-coverage", of="area"),
-        Column("less than of distance", ".0%", of="area_below_distance"),
         Column("mean error of the surest 70 %", of="risk_at_70"),
         Column("rank correlation", ".2f", of="rank_correlation"),
     ]

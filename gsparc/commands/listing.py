@@ -67,7 +67,7 @@ COMMANDS = {
         Command("study", "variants of one model: kind=effects, positions or measurements"),
         Command("tradeoff", "accuracy against latency of one model: ckpt=FILE"),
         Command("compare", "every method under the same data, metrics and clock"),
-        Command("calibrate", "compare confidences; a threshold with a bounded risk: ckpt=FILE"),
+        Command("calibrate", "a confidence, and a threshold with a bounded risk: ckpt=FILE"),
         Command("link", "rates and block errors with predicted channels: ckpt=FILE"),
         Command(
             "update", "a model with rows that came later, and what changed: ckpt=FILE data=FILE"

@@ -220,12 +220,7 @@ def draw_spectra(examples: Examples, title: str) -> Figure:
 
 MANY = 5  # rows of one place and station, which are named
 CELLS = 40  # along each side of a scatter, in which points are counted
-NAMES = {
-    "learned": "learned",
-    "expected": "expected error",
-    "distance": "distance to the nearest",
-    "gp_variance": "GP variance",
-}
+NAMES = {"expected": "expected error", "learned": "learned"}
 
 
 def draw_calibration(

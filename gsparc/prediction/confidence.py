@@ -1,6 +1,4 @@
-"""How sure predictions are: several confidences, which one a model is trusted with,
-and from when on.
-"""
+"""How sure predictions are, and from when on a model is trusted."""
 
 from __future__ import annotations
 
@@ -12,32 +10,20 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 from gsparc.base.limits import SHARE, Checked, setting
-from gsparc.data.query import Query
-from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold
 from gsparc.models import checkpoint
-from gsparc.models.baselines.gp import kernel_of_targets
 from gsparc.models.method import Prediction
 from gsparc.models.predicting import predict_with_threads
 from gsparc.physics.decibels import from_decibels
 from gsparc.prediction.query import Asked, PlacedQuery
-from gsparc.processes.factor import Factor
-from gsparc.processes.few_rows import covering_rows, sample_row_numbers
-from gsparc.processes.kernel import Kernel
-from gsparc.processes.stored import Stored, from_plain, to_plain
+from gsparc.processes.stored import Stored, to_plain
 from gsparc.processes.uncertainty import Threshold
 
 log = logging.getLogger(__name__)
 
-RIVALS = ("distance", "gp_variance")
-KINDS = ("learned", "expected", *RIVALS)
-# That length and noise are chosen on; the variance rests on all rows
-KERNEL_ROWS, COMPONENTS = 600, 64
-MOST_PLACES = 2_000  # that a rival's process knows: its matrix has their square
+KINDS = ("expected", "learned")  # the first that a method states orders its errors best
 MARGIN = 0.1  # of the longest side, around the places that a threshold is for
 
 
@@ -54,19 +40,8 @@ def calibrated_box(*places: np.ndarray) -> np.ndarray:
     return np.stack([joined.min(axis=0) - margin, joined.max(axis=0) + margin])
 
 
-def process_variance(kernel: Kernel, known: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Return what a process of positions `known` (n, 3) leaves unknown of (B, 3),
-    share of the prior; of at most `MOST_PLACES` that cover them.
-    """
-    rows = torch.from_numpy(known[covering_rows(known, MOST_PLACES, 0)])
-    factor = Factor.from_gram(kernel.gram(rows))
-    # Predictive variance by the whitened covariances (Rasmussen and Williams 2006, eq. 2.26).
-    parts = torch.from_numpy(places).split(MOST_PLACES)
-    removed = [factor.whiten(kernel.correlations(rows, at)).square().sum(0) for at in parts]
-    return (1 + kernel.noise - torch.cat(removed)).numpy()
-
-
 KEY = "confidence"
+GONE = "known", "kernel"  # that older checkpoints hold
 
 
 @dataclass(frozen=True)
@@ -93,14 +68,12 @@ class Guarantee(Stored, Checked):
 
 @dataclass(frozen=True)
 class Trusted(Stored):
-    """The confidence that was best on positions set aside, and a threshold that promises something.
+    """The confidence that positions are ordered by, and a threshold that promises something.
 
     Attributes:
         kind: one of `KINDS`; None: whatever the method says itself.
         threshold: accept confidences of at least this; infinite where nothing can be promised.
         promise: what the threshold promises; None where none was asked for.
-        known: (n, 3) local positions of the moving end that the method learned from [m].
-        kernel: of the process whose variance is a rival; None where no rival was stored.
         box: `calibrated_box` of local places that the threshold is for; None (older files): not
             known.
         failed: share of trials whose threshold accepted some, and failed, where that is surely more
@@ -110,24 +83,8 @@ class Trusted(Stored):
     kind: str | None = None
     threshold: float = float("inf")
     promise: Guarantee | None = None
-    known: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)), repr=False)
-    kernel: Kernel | None = field(default=None, repr=False)
     box: np.ndarray | None = field(default=None, repr=False)
     failed: float | None = field(default=None, repr=False)
-
-    @staticmethod
-    def from_fold(data: Measurements, fold: Fold) -> Trusted:
-        """Return the rivals of a method's own confidence, by what it may have learned from.
-
-        Length and noise of the kernel are chosen by likelihood on a few known rows.
-        """
-        rows = fold.learned()
-        # A fixed seed: a checkpoint has the same rival whenever it is calibrated.
-        kernel = kernel_of_targets(
-            data, rows[sample_row_numbers(len(rows), KERNEL_ROWS, 0)], COMPONENTS
-        )
-        # Stations share places: each is known once
-        return Trusted(known=np.unique(data.moving[rows], axis=0), kernel=kernel)
 
     def covers(self, places: np.ndarray) -> np.ndarray:
         """Tell whether local places (B, 3) [m] lie in the box, (B,) bool;
@@ -137,68 +94,51 @@ class Trusted(Stored):
             return np.ones(len(places), bool)
         return np.all((places >= self.box[0]) & (places <= self.box[1]), axis=1)
 
-    def confidence(
-        self, prediction: Prediction, places: np.ndarray | None, kind: str | None = None
-    ) -> np.ndarray:
-        """Return confidences (B,) float32 in [0, 1] at local `places` (B, 3) [m] (None: unknown).
+    def confidence(self, prediction: Prediction, kind: str | None = None) -> np.ndarray:
+        """Return confidences (B,) float32 in [0, 1].
 
         Raises:
-            ValueError: the method, or the checkpoint, does not have what `kind` needs.
+            ValueError: the method does not have what `kind` needs.
         """
-        # What is asked for, then what calibration found best, then the method's own.
+        # What is asked for, then what was calibrated, then the method's own.
         kind = kind or self.kind or "learned"
-        self.check_kind(kind)
-        if kind in RIVALS and places is None:
-            raise ValueError(f"confidence={kind}: needs a position, and an uplink has none")
-        if (score := self.score(kind, prediction, places)) is None:
-            fault = (
-                "has no confidence of its own"
-                if kind == "learned"
-                else ("states no error variance")
-            )
+        check_kind(kind)
+        if (score := score_prediction(kind, prediction)) is None:
+            own = "has no confidence of its own"
+            fault = own if kind == "learned" else "states no error variance"
             raise ValueError(f"confidence={kind}: this model {fault}")
         return as_confidence(kind, score).astype(np.float32)
 
-    def score(self, kind: str, said: Prediction, places: np.ndarray | None) -> np.ndarray | None:
-        """Return the scores (B,) of a kind, larger is surer; None where the method states none.
 
-        `learned` is the method's own confidence, `expected` minus its error variance over the power
-        it predicts (in a fade the same variance is a larger relative error), `distance` minus that
-        of places (B, 3) to the nearest of those `known` [m],
-        `gp_variance` minus `process_variance`.
-        """
-        if kind == "distance":
-            return -cKDTree(self.known).query(places)[0]
-        if kind == "gp_variance" and self.kernel is not None and places is not None:
-            return -process_variance(self.kernel, self.known, places)
-        scores = said.confidence
-        if kind == "expected" and (scores := said.variance) is not None:
-            # A predicted silence counts as -300 dB, as a power
-            # of 0 would make every score of it infinite.
-            scores = -scores / said.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
-        return None if scores is None else scores.double().numpy()
+def score_prediction(kind: str, prediction: Prediction) -> np.ndarray | None:
+    """Return the scores (B,) of a kind, larger is surer; None where the method states none.
 
-    def check_kind(self, kind: str) -> None:
-        """Refuse a kind that there is not, or that needs what was never stored: `ValueError`."""
-        if kind not in KINDS:
-            raise ValueError(f"confidence={kind}: expected one of {', '.join(KINDS)}")
-        if kind in RIVALS and self.kernel is None:
-            raise ValueError(
-                f"confidence={kind}: the checkpoint does not say where was measured; "
-                "gsparc calibrate ckpt=FILE stores it"
-            )
+    `learned` is the method's own confidence, `expected` minus its error variance over the power it
+    predicts (in a fade the same variance is a larger relative error).
+    """
+    scores = prediction.confidence
+    if kind == "expected" and (scores := prediction.variance) is not None:
+        # A predicted silence counts as -300 dB, as a power
+        # of 0 would make every score of it infinite.
+        scores = -scores / prediction.mean.abs().square().flatten(1).mean(1).clamp_min(1e-30)
+    return None if scores is None else scores.double().numpy()
+
+
+def check_kind(kind: str) -> None:
+    """Refuse a kind that there is not: `ValueError`."""
+    if kind not in KINDS:
+        raise ValueError(f"confidence={kind}: expected one of {', '.join(KINDS)}")
 
 
 def as_confidence(kind: str, score: np.ndarray) -> np.ndarray:
     """Return scores (n,) of `Evidence` as confidences (n,) in [0, 1] in the same order.
 
-    >>> as_confidence("distance", np.array([0.0, -1.0, -9.0]))  # minus the distance [m]
+    >>> as_confidence("expected", np.array([0.0, -1.0, -9.0]))  # minus the relative error
     array([1. , 0.5, 0.1])
     """
     if kind == "learned":
         return score
-    # An expected error, a variance in the prior's, or a distance in metres,
-    # of 1 is a confidence of a half.
+    # An expected error of 1 is a confidence of a half.
     return 1 / (1 - np.minimum(score, 0))
 
 
@@ -213,7 +153,14 @@ def read_trusted(extra: Mapping[str, Any]) -> Trusted:
     """Return what a checkpoint's `extra` holds;
     the method's own confidence where it was never calibrated.
     """
-    return from_plain(extra[KEY]) if KEY in extra else Trusted()
+    if KEY not in extra:
+        return Trusted()
+    state = {name: part for name, part in extra[KEY]["state"].items() if name not in GONE}
+    if state.get("kind") not in (None, *KINDS):
+        text = "confidence=%s and its threshold are of an older program: gsparc calibrate ckpt=FILE"
+        log.warning(text, state["kind"])
+        return Trusted()
+    return Trusted.read(state)
 
 
 def confidence_threshold(kind: str, threshold: Threshold) -> float:
@@ -235,7 +182,7 @@ class ConfidenceMixin(Asked):
         stations.
 
         Of the kind that `gsparc.load(confidence=...)` was asked for, else the one that
-        `gsparc calibrate` found best, else the model's own.
+        `gsparc calibrate` stored, else the model's own.
 
         >>> near, far = predictor.confidence(rx=[[2.0, 1.0, 1.5], [900.0, 1.0, 1.5]])
         >>> bool(near > far)  # 900 m away from everything measured
@@ -295,20 +242,19 @@ class ConfidenceMixin(Asked):
 
             query = channels.uplink_query(self.method, self.site, uplink)
             placed = PlacedQuery(query, np.ndim(uplink) == 2, isinstance(uplink, Tensor))
-            sure = self._method_confidence(self.method.predict(query), None)
+            sure = self._method_confidence(self.method.predict(query))
         else:
             placed = self.queries.query(tx, rx)
             prediction = predict_with_threads(self._whole, placed.query)
-            sure = self._method_confidence(prediction, placed.query)
+            sure = self._method_confidence(prediction)
         if sure is None:
             raise ValueError(f"{self.method.name} has no confidence")
         return placed, sure
 
-    def _method_confidence(self, prediction: Prediction, query: Query | None) -> Tensor | None:
+    def _method_confidence(self, prediction: Prediction) -> Tensor | None:
         """Of the method's own predictions (B,), of the kind that is wanted;
         None where it has none.
         """
         if prediction.confidence is None and (self.kind or self.trusted.kind) in (None, "learned"):
             return None
-        places = None if query is None else query.places(self.site).numpy()
-        return torch.from_numpy(self.trusted.confidence(prediction, places, self.kind))
+        return torch.from_numpy(self.trusted.confidence(prediction, self.kind))

@@ -23,7 +23,7 @@ from gsparc.models.method import Method, MethodFactory, Prediction
 from gsparc.models.per_station import PerStation, wrap_per_station
 from gsparc.models.predicting import predict_in_batches
 from gsparc.models.station_sites import stations_of_fold
-from gsparc.prediction.confidence import KINDS, Trusted
+from gsparc.prediction.confidence import KINDS, score_prediction
 from gsparc.prediction.levels import measured_levels, predicted_levels
 from gsparc.processes.uncertainty import censored_distribution
 from gsparc.training.context import FitContext
@@ -137,19 +137,15 @@ def predict_rows(method: Method, data: Measurements, rows: np.ndarray) -> Predic
     return Prediction.joined(answers, torch.from_numpy(np.argsort(np.concatenate(order))))
 
 
-def gather_evidence(
-    method: Method, data: Measurements, rows: np.ndarray, rivals: Trusted
-) -> Evidence:
-    """Return the errors of what `method` predicts of rows (n,),
-    its confidence and those of rivals.
-    """
+def gather_evidence(method: Method, data: Measurements, rows: np.ndarray) -> Evidence:
+    """Return the errors of what `method` predicts of rows (n,), and its confidences."""
     return score_answers(
-        predict_rows(method, data, rows), data.targets(rows), rows, data.moving[rows], rivals
+        predict_rows(method, data, rows), data.targets(rows), rows, data.moving[rows]
     )
 
 
 def score_answers(
-    prediction: Prediction, true: Tensor, rows: np.ndarray, places: np.ndarray, rivals: Trusted
+    prediction: Prediction, true: Tensor, rows: np.ndarray, places: np.ndarray
 ) -> Evidence:
     """Return relative errors of predictions of `true` (n, ...) at local places (n, D) [m],
     and their scores.
@@ -159,7 +155,7 @@ def score_answers(
     miss, power = ((x.abs().square().flatten(1).sum(1)) for x in (prediction.mean - true, true))
     # A silent row has no relative error: any miss of it counts as huge.
     error = (miss / power.clamp_min(1e-30)).double().numpy()
-    score_of = {kind: rivals.score(kind, prediction, places) for kind in KINDS}
+    score_of = {kind: score_prediction(kind, prediction) for kind in KINDS}
     # Scores with a NaN rank nothing.
     scores = {
         kind: score

@@ -16,7 +16,7 @@ import torch
 from gsparc.models import checkpoint, loading
 from gsparc.models.method import Method
 from gsparc.models.reduced import ReductionInputs, Settings, with_reduction
-from gsparc.prediction.confidence import read_trusted
+from gsparc.prediction.confidence import check_kind, read_trusted
 from gsparc.prediction.predictor import Predictor
 from gsparc.prediction.timing import BLOCKS, time_interleaved
 from gsparc.processes.stored import Stored, from_plain, to_plain
@@ -188,9 +188,8 @@ def load(
         budget_ms: what one query may take on this machine, end to end [ms]. The operating points
             that `gsparc tradeoff` stored with the model are timed here (a few seconds), the most
             accurate that fits answers, and torch's number of threads becomes that point's.
-        confidence: `learned`, `expected`, `distance` or `gp_variance`; None takes the one that
-            `gsparc calibrate` found best on positions set aside and stored with the model, and
-            the model's own where it was never calibrated.
+        confidence: `expected` or `learned`; None takes the one that `gsparc calibrate` stored with
+            the model, and the model's own where it was never calibrated.
         unit: of powers, like `dBm` or `mW`; None: that of the measurements.
 
     Raises:
@@ -201,7 +200,7 @@ def load(
     method, stored = loading.load(path)
     trusted = read_trusted(stored.extra)
     if confidence is not None:
-        trusted.check_kind(confidence)
+        check_kind(confidence)
     chosen, point = (
         (method, None) if budget_ms is None else choose_within_budget(method, stored, budget_ms)
     )

@@ -292,7 +292,7 @@ class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin, PilotsMi
             return said.map(placed.by_station)
         wanted, placed = self._answer_unit(unit), self.queries.query(tx, rx)
         stored = predict_with_threads(self._whole, placed.query)
-        sure = self._method_confidence(stored, placed.query)
+        sure = self._method_confidence(stored)
         said = self._in_unit(stored, wanted, placed.query)
         return replace(said, unknown=None if sure is None else 1 - sure).map(placed.by_station)
 

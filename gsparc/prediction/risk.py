@@ -19,19 +19,17 @@ from gsparc.prediction.confidence import Guarantee
 from gsparc.prediction.left_out import Evidence
 from gsparc.processes.uncertainty import (
     Threshold,
-    area_contributions,
     binomial_interval,
     binomial_tail,
     choose_threshold,
     design_effect,
-    is_surely_above,
     least_accepted,
     rank_correlation,
     risk_coverage,
     threshold_levels,
 )
 
-# Of the positions that choose kind and levels, and that calibrate where the rest tests
+# Of the positions that choose levels, and that calibrate where the rest tests
 SHARES = (0.2, 0.4)
 MOST_CALIBRATED = 10_000  # positions that a message may ask for
 MOST_LAX_DB = 6  # limit of an error that a hint may name: twice as large as what is predicted
@@ -92,14 +90,12 @@ class Trial:
 
 
 class CalibratedThreshold(NamedTuple):
-    """Kind of confidence, its threshold, rows that neither saw,
-    and rows that the kind is chosen on.
-    """
+    """Kind of confidence, its threshold, rows that neither saw, rows that chose its levels."""
 
     kind: str
     threshold: Threshold
     test: np.ndarray
-    choose_on: np.ndarray
+    aside: np.ndarray
 
 
 def split_choose_calibrate_test(
@@ -199,36 +195,6 @@ def number_patches(position: np.ndarray) -> np.ndarray:
     return np.unique(cell @ np.array([CELLS, 1]), return_inverse=True)[1].ravel()
 
 
-def risk_coverage_by_kind(evidence: Evidence, rows: np.ndarray) -> dict[str, np.ndarray]:
-    """Return what each of `rows` (n,) adds to the area under risk-coverage, (n,)
-    by kind of confidence.
-    """
-    # Bounded, so that a few fades do not decide which kind is the best.
-    loss = bounded_loss(evidence.error[rows])
-    return {kind: area_contributions(score[rows], loss) for kind, score in evidence.scores.items()}
-
-
-def choose_confidence_kind(areas: dict[str, np.ndarray]) -> str:
-    """Return the confidence of the smallest area under risk-coverage.
-
-    The first, mostly the model's own, stays where another gains no more than the paired standard
-    error (the one-standard-error rule of Breiman, Friedman, Olshen and Stone 1984).
-    """
-    default, best = next(iter(areas)), min(areas, key=lambda kind: areas[kind].mean())
-    # Both are of the same rows: their difference scatters less than either.
-    return best if is_surely_above(areas[default] - areas[best], 1.0) else default
-
-
-def explain_kind(evidence: Evidence, rows: np.ndarray) -> str:
-    """Say on which figures `choose_confidence_kind` chose on `rows`."""
-    areas = risk_coverage_by_kind(evidence, rows)
-    listed = ", ".join(f"{kind} {area.mean():.3g}" for kind, area in areas.items())
-    rule = f"{next(iter(areas))} stays unless one is smaller by more than chance"
-    return (
-        f"chosen by the mean error of the surest 1, 2, ... of {len(rows)} rows: {listed} ({rule})"
-    )
-
-
 def calibrate_threshold(
     evidence: Evidence,
     guarantee: Guarantee,
@@ -242,15 +208,13 @@ def calibrate_threshold(
     Unless `tested`, the unseen positions calibrate, too: a threshold that nobody tries needs none.
 
     Raises:
-        ValueError: `kind` is no confidence of this evidence.
+        ValueError: `kind` is no confidence of this evidence, or it has none.
     """
     rng = np.random.default_rng(seed)
     choose_on, calibrate, test = split_choose_calibrate_test(evidence, spatial, rng)
-    used = (
-        choose_confidence_kind(risk_coverage_by_kind(evidence, choose_on))
-        if kind == "auto"
-        else kind
-    )
+    if not evidence.scores:
+        raise ValueError("the model states neither an error variance nor a confidence")
+    used = next(iter(evidence.scores)) if kind == "auto" else kind
     if used not in evidence.scores:
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
     score, bad = evidence.scores[used], guarantee.is_bad(evidence.error)
@@ -279,7 +243,7 @@ def run_trials(
         guarantee: what every threshold promises.
         spatial: see `split_choose_calibrate_test`.
         draws: calibration sets.
-        kind: a confidence, or `auto`: the best on the positions set aside for choosing.
+        kind: a confidence, or `auto`: the expected error where the method states one.
         seed: of the draws.
     """
     realised, coverage, kinds = [], [], []
@@ -304,14 +268,12 @@ def calibration_facts(
     perfect = risk_coverage(-loss, loss).mean()
     facts: dict[str, Any] = {"positions": len(evidence), "confidence/perfect/area": float(perfect)}
     risks = {kind: risk_coverage(score, loss) for kind, score in evidence.scores.items()}
-    bar = float(risks["distance"].mean())
     for kind, risk in risks.items():
         area = float(risk.mean())
         figures = {
             "area": area,
             "risk_at_70": float(risk[max(round(0.7 * len(risk)), 1) - 1]),
             "rank_correlation": rank_correlation(evidence.scores[kind], -loss),
-            "area_below_distance": 1 - area / bar if bar > 0 else None,  # nothing to save
         }
         facts |= {f"confidence/{kind}/{name}": value for name, value in figures.items()}
     facts |= {f"promise/{name}": value for name, value in vars(guarantee).items()}

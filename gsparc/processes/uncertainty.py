@@ -263,22 +263,6 @@ def risk_coverage(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
     return np.cumsum(shared) / np.arange(1, len(score) + 1)
 
 
-def area_contributions(score: np.ndarray, loss: np.ndarray) -> np.ndarray:
-    """Return what each of n samples adds to the area under risk-coverage, (n,),
-    whose mean is the area.
-
-    >>> score, loss = np.array([0.9, 0.1, 0.5]), np.array([0.0, 1.0, 0.5])
-    >>> bool(np.isclose(area_contributions(score, loss).mean(), risk_coverage(score, loss).mean()))
-    True
-    """
-    # The sample at rank r is in the means of r, r + 1, ..., n samples;
-    # equal scores share their ranks.
-    weight = np.cumsum(1 / np.arange(len(score), 0, -1))[::-1]
-    order, group = np.argsort(-score, kind="stable"), np.unique(-score, return_inverse=True)[1]
-    shared = np.bincount(group[order], weight) / np.bincount(group)
-    return loss * shared[group]
-
-
 def rank_correlation(one: np.ndarray, other: np.ndarray) -> float | None:
     """Return Spearman's correlation of values (n,) and others (n,);
     None where one of them is constant.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,14 +31,14 @@ class Unseen:
         path: of the file.
         facts: see `Opened.facts`.
         earlier: what the file holds of its confidence.
-        rivals: by what the model learned from.
+        known: (n, D) local places that the model learned from [m].
         evidence: of the test rows.
     """
 
     path: str
     facts: dict[str, Any]
     earlier: Trusted
-    rivals: Trusted
+    known: np.ndarray
     evidence: Evidence
 
     @staticmethod
@@ -53,10 +53,10 @@ class Unseen:
             advice = "calibrate with the data and split of its training"
             raise ValueError(f"{path} was trained on {run.foreign}; {advice}")
         learned_data, before = run.trained or (run.data, run.split)
-        rivals = Trusted.from_fold(learned_data, before.folds[0])
+        known = learned_data.moving[before.folds[0].learned()]
         rows = rows_to_score(run.split.folds[0], "test")
-        evidence = gather_evidence(run.methods[0], run.data, rows, rivals)
-        return Unseen(path, run.facts(), read_trusted(run.stored[0].extra), rivals, evidence)
+        evidence = gather_evidence(run.methods[0], run.data, rows)
+        return Unseen(path, run.facts(), read_trusted(run.stored[0].extra), known, evidence)
 
     def calibrate_and_store(
         self, guarantee: Guarantee, kind: str, spatial: bool, seed: int, failed: float | None = None
@@ -65,23 +65,13 @@ class Unseen:
         return them and how it went; `failed` as in `Trusted`.
         """
         evidence, how = self.evidence, (kind, spatial, seed)
-        kind_used, choice, _, choose_on = risk.calibrate_threshold(
-            evidence, guarantee, *how, tested=False
-        )
+        kind_used, choice, *_ = risk.calibrate_threshold(evidence, guarantee, *how, tested=False)
         threshold = confidence_threshold(kind_used, choice)
-        box = calibrated_box(self.rivals.known, evidence.position)
-        stored = replace(
-            self.rivals,
-            kind=kind_used,
-            threshold=threshold,
-            promise=guarantee,
-            box=box,
-            failed=failed,
-        )
+        box = calibrated_box(self.known, evidence.position)
+        stored = Trusted(kind_used, threshold, guarantee, box, failed)
         before = self.earlier.kind or "the model's own"
         # Programs that read confidences get another number from now on: it is said.
-        why = f", {risk.explain_kind(evidence, choose_on)}" if kind == "auto" else ""
-        kind_changed = f"confidence={kind_used}{why}, before: {before}; "
+        kind_changed = f"confidence={kind_used}, before: {before}; "
         if kind == "auto" and not np.isfinite(threshold):
             # Without a promise a choice by chance would replace what falls away
             # from the measurements.

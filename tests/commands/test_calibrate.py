@@ -18,10 +18,8 @@ from gsparc.prediction.risk import (
     Trial,
     calibrate_threshold,
     calibration_facts,
-    choose_confidence_kind,
     explain_too_few,
     number_patches,
-    risk_coverage_by_kind,
     run_trials,
     split_choose_calibrate_test,
 )
@@ -30,39 +28,17 @@ from gsparc.runs.unseen import Unseen
 
 
 def _evidence(count: int = 900, seed: int = 0) -> Evidence:
-    """Errors grow with the distance from the middle; `learned` knows it up to noise,
-    `distance` does not.
+    """Errors grow with the distance from the middle; `expected` knows it up to noise,
+    `learned` does not.
     """
     rng = np.random.default_rng(seed)
     position = rng.uniform(-1, 1, (count, 3))
     error = 10 ** (-2 + 2 * np.linalg.norm(position[:, :2], axis=1) + rng.normal(0, 0.3, count))
     scores = {
-        "learned": -np.linalg.norm(position[:, :2], axis=1) + rng.normal(0, 0.1, count),
-        "distance": rng.normal(size=count),
+        "expected": -np.linalg.norm(position[:, :2], axis=1) + rng.normal(0, 0.1, count),
+        "learned": rng.normal(size=count),
     }
     return Evidence(np.arange(count), position, error, scores)
-
-
-def test_auto_chose_another_confidence_by_chance() -> None:
-    """Of thirteen rows the least area is mostly luck:
-    a gain within the paired standard error is none.
-    """
-    evidence = _evidence()
-    noise = np.random.default_rng(1).normal(0, 0.01, len(evidence))
-    alike = {"learned": evidence.scores["learned"], "expected": evidence.scores["learned"] + noise}
-    rows = np.random.default_rng(2).permutation(len(evidence))[:400].reshape(20, 20)
-    chosen = [
-        choose_confidence_kind(risk_coverage_by_kind(replace(evidence, scores=alike), some))
-        for some in rows
-    ]
-    assert chosen.count("learned") >= 18  # 12 of 20 had the least area
-    worse = {"learned": evidence.scores["distance"], "expected": evidence.scores["learned"]}
-    assert (
-        choose_confidence_kind(
-            risk_coverage_by_kind(replace(evidence, scores=worse), np.arange(200))
-        )
-        == "expected"
-    )
 
 
 def test_few_good_rows_promised_nothing_as_no_level_accepted_enough() -> None:
@@ -84,7 +60,7 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
     monkeypatch.setattr("gsparc.runs.unseen.store_trusted", lambda *stored: kept.append(stored))
     how, unseen = (
         ("auto", False, 0),
-        Unseen("a.ckpt", {}, Trusted(), Trusted(known=evidence.position), evidence),
+        Unseen("a.ckpt", {}, Trusted(), evidence.position, evidence),
     )
     stored, said = unseen.calibrate_and_store(Guarantee(-40.0), *how)
     # A choice among confidences replaced the model's own though nothing was promised.
@@ -93,10 +69,7 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
     better = float(re.search(r"limit_db=(\S+) would be kept", said)[1])
     assert -25 < better < 0
     stored, said = unseen.calibrate_and_store(Guarantee(better), *how)
-    assert (
-        f"confidence={stored.kind}, chosen by the mean error of the surest 1, 2, ... of 180 rows: "
-    ) in said
-    assert "before: the model's own; accepted from" in said and len(kept) == 1
+    assert "confidence=expected, before: the model's own; accepted from" in said and len(kept) == 1
     assert re.search(
         r"accepted from \S+, \d+% of 900 test positions: at most 10% of the accepted are", said
     )
@@ -108,7 +81,7 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
     said = unseen.calibrate_and_store(Guarantee(alpha=0.144), "auto", False, 2)[1]
     assert "too few rows to show that at most alpha=0.144 are" in said
     evidence.error[:] = np.where(number_patches(evidence.position) % 8 == 0, 10.0, 0.01)
-    said = unseen.calibrate_and_store(Guarantee(alpha=0.2), "distance", True, 0)[1]
+    said = unseen.calibrate_and_store(Guarantee(alpha=0.2), "learned", True, 0)[1]
     assert "as neighbours err alike" in said
     evidence.error[:] = 10.0
     assert "no limit_db= up to 6 is kept" in unseen.calibrate_and_store(Guarantee(), *how)[1]
@@ -120,7 +93,7 @@ def test_promise_holds_over_two_hundred_calibration_sets(how) -> None:
         _evidence(), Guarantee(limit_db=-5, alpha=0.2, delta=0.1), how == "spatial", 200
     )
     facts = trial.summarise()
-    assert trial.kind == "learned" and trial.coverage.mean() > 0.2
+    assert trial.kind == "expected" and trial.coverage.mean() > 0.2
     # Resampled from one pool: the share itself scatters by about 0.02.
     # Test cells are few and unlike: what is realised in them scatters more
     # than the promise's own doubt.
@@ -150,17 +123,24 @@ def test_few_positions_or_patches_are_refused_in_words() -> None:
     refused("2 positions cannot be parted", split_choose_calibrate_test, _evidence(2), False, rng)
 
 
+def test_a_model_without_variance_or_confidence_is_refused(tmp_path) -> None:
+    data = spectra(tmp_path / "own.npz")
+    path = train(plain(data, "mean"), tmp_path / "run")[1].checkpoints[0]
+    how = Guarantee(), "auto", False, 0
+    unseen = Unseen.open(str(path), {}, {})
+    refused("neither an error variance nor a confidence", unseen.calibrate_and_store, *how)
+
+
 def test_positions_on_a_plumb_line_have_patches() -> None:
     upright = _evidence(60)
     upright.position[:, :2] = 1.0
     assert len(np.unique(number_patches(upright.position))) == 6
 
 
-def test_a_confidence_that_cannot_save_anything_has_no_saving() -> None:
+def test_predictions_without_any_error_have_no_correlation() -> None:
     """Predictions without any error: 0 / 0 ended the command."""
     exact = replace(_evidence(30), error=np.zeros(30))
     facts = calibration_facts(exact, [], Guarantee())
-    assert facts["confidence/learned/area_below_distance"] is None
     assert facts["confidence/learned/rank_correlation"] is None
     assert len(calibration_tables(facts | {"dataset/name": "d", "model/name": "m"})[0].rows) == 2
 
@@ -180,8 +160,8 @@ def test_trials_beside_a_promise_of_other_trials_read_as_a_broken_one() -> None:
 
 
 def _trained(folder, *more: str, run: str = "run"):
-    """The nearest neighbour of forty spectra."""
-    return train(plain(spectra(folder / "own.npz"), "nearest", *more), folder / run)[1]
+    """A process of forty spectra."""
+    return train(plain(spectra(folder / "own.npz"), "gp", *more), folder / run)[1]
 
 
 @pytest.mark.slow
@@ -241,7 +221,7 @@ def test_the_same_campaign_in_another_file_calibrates_nothing_that_was_learned(t
         Unseen.open(path, elsewhere, {})
 
 
-def test_another_file_was_calibrated_on_a_fifth_and_by_distances_to_its_own_rest(tmp_path) -> None:
+def test_another_file_was_calibrated_on_a_fifth(tmp_path) -> None:
     path = str(_trained(tmp_path).checkpoints[0])
     with np.load(tmp_path / "own.npz") as stored:
         arrays = dict(stored)
@@ -252,17 +232,18 @@ def test_another_file_was_calibrated_on_a_fifth_and_by_distances_to_its_own_rest
     evidence, facts = unseen.evidence, unseen.facts
     assert len(evidence) == len(arrays["tx_position"]) and facts["split/name"] == "whole"
     assert facts["split/foreign"] is None  # nothing of it was learned from
-    trusted, _ = unseen.calibrate_and_store(Guarantee(), "distance", False, 0)
-    assert len(trusted.known) == 32 and trusted.covers(evidence.position).all()
+    assert len(unseen.known) == 32
+    trusted, _ = unseen.calibrate_and_store(Guarantee(), "expected", False, 0)
+    assert trusted.covers(evidence.position).all()
 
 
-def test_a_threshold_of_distances_accepted_none_of_the_test_positions(tmp_path) -> None:
-    """`accepted from 0.9933, 0% of 64`: minus metres were compared with a confidence."""
+def test_a_threshold_of_expected_errors_accepted_none_of_the_test_positions(tmp_path) -> None:
+    """`accepted from 0.9933, 0% of 64`: scores were compared with a confidence."""
     path = str(_trained(tmp_path).checkpoints[0])
     unseen = Unseen.open(path, {}, {})
     evidence = unseen.evidence
-    trusted, said = unseen.calibrate_and_store(Guarantee(60, 0.4, 0.4), "distance", False, 0)
-    accepted = np.mean(as_confidence("distance", evidence.scores["distance"]) >= trusted.threshold)
+    trusted, said = unseen.calibrate_and_store(Guarantee(60, 0.4, 0.4), "expected", False, 0)
+    accepted = np.mean(as_confidence("expected", evidence.scores["expected"]) >= trusted.threshold)
     assert accepted > 0 and f", {accepted:.0%} of {len(evidence)} test positions" in said
 
 

@@ -19,7 +19,6 @@ from gsparc.prediction.confidence import (
     store_trusted,
 )
 from gsparc.prediction.left_out import gather_evidence
-from gsparc.processes.kernel import WhiteNoise
 from gsparc.runs.unseen import Unseen
 from gsparc.training.context import FitContext
 
@@ -37,22 +36,20 @@ def site(campaign, folds, tmp_path):
 def test_every_kind_orders_positions_as_the_evidence_does(site) -> None:
     data, fold, file = site
     method, _ = loading.load(file)
-    rivals = Trusted.from_fold(data, fold)
-    evidence = gather_evidence(method, data, fold.test, rivals)
-    store_trusted(file, replace(rivals, kind="distance", threshold=0.2, promise=Guarantee()))
+    evidence = gather_evidence(method, data, fold.test)
+    store_trusted(file, Trusted("expected", 0.2, Guarantee()))
     world = data.tx[fold.test] + data.site.origin
     for kind, score in evidence.scores.items():
         answered = gsparc.load(file, confidence=kind).confidence(tx=world)
         assert answered.dtype == np.float32 and ((answered >= 0) & (answered <= 1)).all()
         assert np.allclose(answered, as_confidence(kind, score), atol=1e-3)
     plain = gsparc.load(file)
-    assert np.allclose(
-        plain.confidence(tx=world), as_confidence("distance", evidence.scores["distance"])
-    )
+    expected = as_confidence("expected", evidence.scores["expected"])
+    assert np.allclose(plain.confidence(tx=world), expected, atol=1e-3)
     assert np.array_equal(plain.accepts(tx=world), plain.confidence(tx=world) >= 0.2)
     assert isinstance(plain.accepts(tx=world[0]), bool)
     # It listed every place that was learned from.
-    said = r"Trusted\(kind='distance', threshold=0.2, promise=Guarantee\([^()]+\)\)"
+    said = r"Trusted\(kind='expected', threshold=0.2, promise=Guarantee\([^()]+\)\)"
     assert re.fullmatch(said, repr(plain.trusted))
 
 
@@ -79,48 +76,43 @@ def test_what_was_never_stored_is_said(site) -> None:
     data, fold, file = site
     world = data.tx[fold.test[:2]] + data.site.origin
     refused("no threshold is stored", gsparc.load(file).accepts, tx=world)
-    refused(r"gsparc calibrate ckpt=FILE stores it", gsparc.load, file, confidence="distance")
-    refused("expected one of learned", gsparc.load, file, confidence="hope")
-    own = replace(Trusted.from_fold(data, fold), kind="learned", threshold=0.5, promise=Guarantee())
-    store_trusted(file, own)
+    refused("expected one of expected, learned", gsparc.load, file, confidence="hope")
+    store_trusted(file, Trusted("learned", 0.5, Guarantee()))
     with pytest.raises(ValueError, match="threshold is one of confidence=learned"):
-        gsparc.load(file, confidence="distance").accepts(tx=world)
+        gsparc.load(file, confidence="expected").accepts(tx=world)
 
 
-@pytest.mark.parametrize("kind", ["gp_variance", "distance"])
-def test_a_place_far_from_all_measurements_is_never_accepted(site, kind) -> None:
-    """Variances above 1 were cut off: a threshold there accepted a place 900 km away."""
-    data, fold, file = site
-    rivals = Trusted.from_fold(data, fold)
-    kernel = replace(rivals.kernel, terms=(*rivals.kernel.terms[:-1], WhiteNoise(0.5)))
-    laxest = as_confidence(kind, np.array(-1.49 if kind == "gp_variance" else -100.0))
-    store_trusted(file, Trusted(kind, float(laxest), Guarantee(), rivals.known, kernel))
-    near, far = (
-        data.tx[fold.train[:1]] + data.site.origin,
-        data.site.origin + np.array([[9e5, 0, 0]]),
-    )
-    assert gsparc.load(file).accepts(tx=near).all() and not gsparc.load(file).accepts(tx=far).any()
+def test_a_confidence_of_before_is_the_models_own_and_said(site, caplog) -> None:
+    """Checkpoints held distances, and the places that these are from."""
+    data, _, file = site
+    store_trusted(file, Trusted("expected", 0.2, Guarantee()))
+    extra = checkpoint.read(file).extra
+    extra["confidence"]["state"] |= {"kind": "distance", "known": [], "kernel": None}
+    checkpoint.update_extra(file, extra)
+    predictor = gsparc.load(file)
+    assert "confidence=distance" in caplog.text and "gsparc calibrate" in caplog.text
+    refused("no threshold is stored", predictor.accepts, tx=data.tx[:1] + data.site.origin)
+    extra["confidence"]["state"]["kind"] = "expected"
+    checkpoint.update_extra(file, extra)
+    assert gsparc.load(file).trusted == Trusted("expected", 0.2, Guarantee())
 
 
 def test_a_place_outside_of_all_measurements_was_accepted(site) -> None:
     """A model that found sources is sure 30 m beyond its room."""
     data, fold, file = site
-    trusted = replace(
-        Trusted.from_fold(data, fold), kind="learned", threshold=0.0, promise=Guarantee()
-    )
+    trusted = Trusted("learned", 0.0, Guarantee())
     near = data.tx[fold.train[:2]] + data.site.origin
     places = np.concatenate([near, near + np.array([30.0, 0, 0])])
     store_trusted(file, trusted)
     assert gsparc.load(file).accepts(tx=places).all()  # as files of before
-    store_trusted(file, replace(trusted, box=calibrated_box(trusted.known)))
+    store_trusted(file, replace(trusted, box=calibrated_box(data.moving[fold.learned()])))
     assert gsparc.load(file).accepts(tx=places).tolist() == [True, True, False, False]
 
 
 def test_thresholds_that_failed_in_trials_were_accepted_without_a_word(site, caplog) -> None:
     """The console said `no promise`, and a program that asked `accepts` never heard of it."""
     data, fold, file = site
-    trusted = replace(Trusted.from_fold(data, fold), kind="learned", threshold=0.0)
-    store_trusted(file, replace(trusted, promise=Guarantee(), failed=0.26))
+    store_trusted(file, Trusted("learned", 0.0, Guarantee(), failed=0.26))
     predictor = gsparc.load(file)
     for _ in range(2):
         predictor.accepts(tx=data.tx[fold.train[:2]] + data.site.origin)

@@ -21,13 +21,12 @@ from gsparc.apps.link.adaptation import RULES, Band, Rates
 from gsparc.apps.link.pusch import NEEDED, RECEIVERS, Pusch, frequency_correlation
 from gsparc.base.limits import SHARE, or_null
 from gsparc.data.schema import Measurements
-from gsparc.data.splits import Fold
 from gsparc.datasets.argos import FACTS
 from gsparc.models.method import Method, Prediction
 from gsparc.models.uplink.interface import SeparatesPaths, UplinkMethod
 from gsparc.physics.row_factors import align_factors
 from gsparc.prediction.channels import SUBCARRIERS_PER_BLOCK, centred_grid, interpolate_tones
-from gsparc.prediction.confidence import Guarantee, Trusted, as_confidence, confidence_threshold
+from gsparc.prediction.confidence import Guarantee, as_confidence, confidence_threshold
 from gsparc.prediction.left_out import Evidence, score_answers
 from gsparc.prediction.risk import calibrate_threshold
 from gsparc.processes.few_rows import sample_row_numbers
@@ -130,14 +129,12 @@ def true_channels(
     )
 
 
-def band_evidence(band: BandChannels, data: Measurements, fold: Fold, rows: np.ndarray) -> Evidence:
+def band_evidence(band: BandChannels, data: Measurements, rows: np.ndarray) -> Evidence:
     """Return evidence of `rows`, whose channels `band` holds:
     a fade of this band is no fade of another.
     """
     prediction = Prediction(band.predicted, band.variance, 1 - band.confidence)
-    return score_answers(
-        prediction, band.true, rows, data.moving[rows], Trusted.from_fold(data, fold)
-    )
+    return score_answers(prediction, band.true, rows, data.moving[rows])
 
 
 @lru_cache(maxsize=1)
@@ -229,7 +226,7 @@ class LinkStudy:
         # The PUSCH grid around the measured band's middle, whatever tones were measured.
         frequency_hz = centred_grid(float(self.tones.mean()), self.spacing_hz, self.count)
         grid = predict_channels(self.method, self.data, self.fold.test, frequency_hz, self.one)
-        evidence = band_evidence(grid, self.data, self.fold, self.fold.test)
+        evidence = band_evidence(grid, self.data, self.fold.test)
         promise = Guarantee(**settings["promise"])
         kind, threshold, self.test, aside = calibrate_threshold(
             evidence, promise, settings["confidence"], settings["spatial"], int(settings["seed"])
