@@ -3,23 +3,11 @@
 import numpy as np
 import torch
 
-from gsparc.prediction.confidence import process_variance
 from gsparc.processes.averages import mixture_moments
 from gsparc.processes.kernel import Kernel
 from gsparc.processes.nearest import EXCESS, NeighbourSample, nearest_density
 
 KERNEL = Kernel.from_lengths((1.2, 6.0), (0.4, 0.6), 0.08)
-
-
-def test_variance_of_places_is_what_known_ones_leave():
-    rng = np.random.default_rng(0)
-    known, places = rng.uniform(0, 9, (30, 3)), rng.uniform(0, 9, (7, 3))
-    between = KERNEL.correlations(torch.from_numpy(known), torch.from_numpy(places)).numpy()
-    gram = KERNEL.correlations(
-        torch.from_numpy(known), torch.from_numpy(known)
-    ).numpy() + 0.08 * np.eye(30)
-    wanted = 1.08 - np.diag(between.T @ np.linalg.solve(gram, between))
-    np.testing.assert_allclose(process_variance(KERNEL, known, places), wanted, rtol=1e-9)
 
 
 def test_density_of_rows_given_their_neighbours():
