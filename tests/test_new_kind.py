@@ -12,7 +12,7 @@ from torch import Tensor
 
 import gsparc
 from gsparc.__main__ import main
-from gsparc.data import schema, target
+from gsparc.data import fields, target
 from gsparc.data.target import Target
 from gsparc.evaluation import metric_formats
 from gsparc.evaluation.metrics import SampleMetric
@@ -69,10 +69,10 @@ def angles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A file of angles of four paths, which the program has been told of."""
     monkeypatch.chdir(tmp_path)
     kind, figures = Angles(), ("error_deg",)
-    field = replace(schema.FIELDS["csi"], name="angles", shape="(S, P)", unit="rad", also="")
+    field = replace(fields.FIELDS["csi"], name="angles", shape="(S, P)", unit="rad", also="")
     monkeypatch.setitem(target.TARGETS, kind.kind, kind)
     monkeypatch.setitem(target.MEASUREMENTS, "angles", kind)
-    monkeypatch.setitem(schema.FIELDS, "angles", replace(field, holds="real numbers"))
+    monkeypatch.setitem(fields.FIELDS, "angles", replace(field, holds="real numbers"))
     shown = metric_formats.KindFigures(
         AngleMetrics, figures, "error_deg", "error_deg", figures, figures, figures
     )

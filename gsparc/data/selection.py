@@ -20,8 +20,9 @@ from gsparc.base.hashes import hash_rows
 from gsparc.base.limits import Checked, Limit, choice, number, or_null, setting, whole
 from gsparc.data.assemble import FARTHEST
 from gsparc.data.blocks import take
+from gsparc.data.fields import FIELDS, list_arrays_with_axis
 from gsparc.data.row_order import find_copies, merge_fixes
-from gsparc.data.schema import FIELDS, Stations, list_arrays_with_axis
+from gsparc.data.schema import Stations
 from gsparc.data.spacing import group_visits
 from gsparc.data.station_names import find_station
 from gsparc.physics.decibels import from_decibels, to_decibels

@@ -17,8 +17,9 @@ from gsparc.base.errors import Caution, DataError, Problems, Severe
 from gsparc.base.files import read_shipped_table, read_text
 from gsparc.base.limits import SettingError
 from gsparc.data.assemble import check_positions
+from gsparc.data.fields import Field
 from gsparc.data.foreign import foreign_warnings
-from gsparc.data.schema import Field, Measurements, TrainTest
+from gsparc.data.schema import Measurements, TrainTest
 from gsparc.data.selection import Selection, pop_selection
 from gsparc.datasets.datamodule import DataModule
 from gsparc.datasets.public.fetch import fetched_path, fetched_path_or_none

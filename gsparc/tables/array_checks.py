@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from gsparc.base.errors import Problems
-from gsparc.data.schema import FIELDS, HOLDS, POWER
+from gsparc.data.fields import FIELDS, HOLDS, POWER
 from gsparc.tables.arrays import Raw
 
 Shape = tuple[int | str | None, ...]

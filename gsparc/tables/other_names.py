@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from gsparc.base.errors import Caution
-from gsparc.data.schema import FIELDS
+from gsparc.data.fields import FIELDS
 from gsparc.data.units import UNITS, Unit
 from gsparc.tables.arrays import Raw, rename_arrays
 from gsparc.tables.heads import CHANNELS, LISTS, PARTS, POLAR, words_of

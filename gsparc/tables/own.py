@@ -18,8 +18,9 @@ import numpy as np
 from gsparc.base.errors import Caution
 from gsparc.base.limits import number, or_null
 from gsparc.data.assemble import centre_and_hash, check_positions
+from gsparc.data.fields import FIELDS, NORMALISATIONS
 from gsparc.data.outliers import check_static_ends
-from gsparc.data.schema import FIELDS, LIGHT, NORMALISATIONS, OTHER, Measurements, Site, StaticEnds
+from gsparc.data.schema import LIGHT, OTHER, Measurements, Site, StaticEnds
 from gsparc.data.selection import WHOLE, Selection
 from gsparc.data.target import TARGETS
 from gsparc.data.units import LINEAR, PowerUnit

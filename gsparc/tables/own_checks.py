@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 from gsparc.base.errors import list_first, suggest_name
 from gsparc.data.assemble import check_positions
 from gsparc.data.blocks import row_blocks
-from gsparc.data.schema import FIELDS, Stations, TrainTest
+from gsparc.data.fields import FIELDS
+from gsparc.data.schema import Stations, TrainTest
 from gsparc.data.target import MEASUREMENTS, TARGETS, Kind
 from gsparc.ops import SphereGrid
 from gsparc.tables.array_checks import ArrayChecker

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from gsparc.data.blocks import is_big, write_blocks
-from gsparc.data.schema import FIELDS
+from gsparc.data.fields import FIELDS
 from gsparc.data.target import MEASUREMENTS, Kind
 from gsparc.tables.own_checks import Checker
 

@@ -11,7 +11,7 @@ import pytest
 from doors import knock
 
 from gsparc.commands.check import main as check
-from gsparc.data.schema import FIELDS
+from gsparc.data.fields import FIELDS
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE = (DOCS / "own-data.md").read_text(encoding="utf-8")
