@@ -100,11 +100,11 @@ class Query:
             still = stations.position[station.numpy()]
             turned = turned if stations.rotation is None else stations.rotation[station.numpy()]
         end, turn = (torch.from_numpy(value).to(places.dtype) for value in (still, turned))
-        if site.static_end == "rx" and end.ndim == 1:
-            return Query(places, Pose(end, turn), station)
-        ends = (places, end.expand(count, 3))
-        tx, rx = ends if site.static_end == "rx" else ends[::-1]
-        return Query(tx, Pose(rx, turn.expand(count, 3, 3)), station)
+        turns = turn.expand(count, 3, 3)
+        if site.static_end != "rx":
+            return Query(end.expand(count, 3), Pose(places, turns), station)
+        receiver = Pose(end, turn) if end.ndim == 1 else Pose(end.expand(count, 3), turns)
+        return Query(places, receiver, station)
 
     def _with(self, change: Callable[[Any], Any]) -> Self:
         each = {

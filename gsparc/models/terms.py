@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from gsparc.base.limits import Checked, setting, switch
-from gsparc.data.schema import Measurements, Site
+from gsparc.data.schema import End, Measurements, Site
 from gsparc.field.initial import InitSettings
 
 Switch = bool | Literal["auto"]
@@ -138,11 +138,11 @@ def _refuse_scene(
         raise ValueError(f"init=scene is not possible: {why}")
 
 
-def array_obstacle(site: Site, static_end: str, wrong_end_message: str) -> str | None:
+def array_obstacle(site: Site, still: End, wrong_end_message: str) -> str | None:
     """Say why spectra arise in no array of a receiver that stands (`rx`) or moves (`tx` stands)."""
     if not site.target.is_image:
         return f"the target is {site.kind}, not a spectrum"
-    if site.static_end != static_end:
+    if site.static_end != still:
         return wrong_end_message
     # One antenna tells no directions, nor does any array without a wavelength.
     if site.array is None or len(site.array) < 2 or site.wavelength is None:

@@ -177,7 +177,7 @@ class Queries:
                 raise ValueError(
                     f"use select_station(name): one of {', '.join(self.site.stations.shown)}"
                 )
-            if self.site.kind in ("rssi", "csi"):  # learned without its transmitter's place
+            if not self.site.target.is_image:  # learned without its transmitter's place
                 return np.full(3, np.nan)
             raise ValueError(f"{end}= is needed: the model does not say where its static end stood")
         if place is not None and (np.linalg.norm(place - position, axis=-1) > SAME_PLACE_M).any():

@@ -164,9 +164,9 @@ class UpdateMixin(Asked):
         if key in version.told:
             raise ToldBefore(f"update: {key} was told before")
         if rows is None:
-            places = tx if self.site.moving_end == "tx" else rx
-            still = (rx if self.site.moving_end == "tx" else tx) if self.site.several else None
-            levels = self.site, places, rssi, self._answer_unit(unit), still
+            places, still = (tx, rx) if self.site.moving_end == "tx" else (rx, tx)
+            known = still if self.site.several else None
+            levels = self.site, places, rssi, self._answer_unit(unit), known
             rows, silent = read_level_arrays(*levels)
         rows = read_level_rows(rows, self.site) if isinstance(rows, Measurements) else rows
         rows, changes = self._number_new(rows, version.changes)

@@ -194,8 +194,8 @@ class Mirrors:
         return visible_share(self.paths(sequences, *ends[:2]), self.clutter, self.planes).mean(1)
 
 
-def walls_in_frame(walls: SceneWalls, origin: np.ndarray, static_end: np.ndarray | None) -> Walls:
-    """Return walls and boxes of a file for paths to the end that stands (3,) local [m]; None:
+def walls_in_frame(walls: SceneWalls, origin: np.ndarray, still: np.ndarray | None) -> Walls:
+    """Return walls and boxes of a file for paths to an end that is `still` (3,), local [m]; None:
     both move.
     """
     faces = [face for low, high in walls.boxes for face in box_faces(low, high)]
@@ -204,7 +204,7 @@ def walls_in_frame(walls: SceneWalls, origin: np.ndarray, static_end: np.ndarray
     normal, offset = hesse_form(planes)
     axes = torch.cat([normal[None], plane_tangents(planes).double()]).movedim(0, 1)
     corners = torch.cat([offset, patches.chunk(2, 1)[0]], 1)
-    end = torch.from_numpy(np.zeros(0) if static_end is None else static_end).double()
+    end = torch.from_numpy(np.zeros(0) if still is None else still).double()
     return Walls(axes, corners, _side_lengths(patches), end)
 
 
