@@ -90,7 +90,7 @@ def angles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_fourth_kind_is_read_learned_scored_and_asked(angles: Path, tmp_path: Path) -> None:
-    """No room takes it for the kind that an else-branch meant."""
+    """No part of the program takes it for another kind."""
 
     def say(*words: str) -> list[str]:
         answer = knock(main, "gsparc", words)

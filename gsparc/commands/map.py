@@ -6,7 +6,7 @@ from fnmatch import fnmatch
 from typing import Any
 
 from gsparc.apps.maps.area import read_plan_settings
-from gsparc.apps.maps.covered import estimate_covered_share
+from gsparc.apps.maps.covered import covered_share_interval
 from gsparc.apps.maps.field_map import FieldMap
 from gsparc.apps.maps.geojson import read_outlines
 from gsparc.apps.maps.geotiff import check_geotiff, write_classes, write_geotiff, write_kmz
@@ -92,7 +92,7 @@ def task(call: CommandCall) -> Result:
     promise = None if anywhere else read_or_gather(run, call.given, renew=config.renew)
     field = add_changes(predict_map(predictor, promise=promise, **query), predictor)
     coverage = None if promise is None else cross_validate(promise.evidence, how.share)
-    ends = None if promise is None else estimate_covered_share(field, predictor, promise)
+    ends = None if promise is None else covered_share_interval(field, predictor, promise)
     lines = map_notes(field, coverage, ends, promise)
     size = f"height {field.grid.height:g} m, squares of {field.grid.step:.3g} m"
     layers = _layers(field)

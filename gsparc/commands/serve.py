@@ -77,12 +77,16 @@ def make_application(given: Mapping[str, Any], threads: int) -> tuple[Predictor,
     site, powers = predictor.site, predictor.site.target.is_level
     if site.paired:
         raise DataError("serve: one end that stands still is needed")
-    told = ToldFile(stored, as_stored) if given["updates"] and powers else None
-    hears = given["updates"] and site.kind == "csi"
-    if given["updates"] and not hears and (told is None or given["station"] is not None):
+    update_file = ToldFile(stored, as_stored) if given["updates"] and powers else None
+    accepts_pilots = given["updates"] and site.kind == "csi"
+    if (
+        given["updates"]
+        and not accepts_pilots
+        and (update_file is None or given["station"] is not None)
+    ):
         raise DataError("updates=true: is of channels, or powers of all stations of the model")
     limits = Limits(**{field.name: given[field.name] for field in fields(Limits)})
-    app = build_application(predictor, limits, given["token"], told, hears)
+    app = build_application(predictor, limits, given["token"], update_file, accepts_pilots)
     gc.freeze()  # going through all that was loaded held up answers by half a second
     return predictor, app, limits
 

@@ -279,7 +279,7 @@ def read_columns(path: Path) -> dict[str, np.ndarray]:
 
 
 def facts_under(facts: Mapping[str, Any], prefix: str) -> dict[str, Any]:
-    """Return the facts whose names begin with `room/`, without it."""
+    """Return the facts whose names begin with `prefix/`, without it."""
     stem = f"{prefix}/"
     return {name[len(stem) :]: value for name, value in facts.items() if name.startswith(stem)}
 

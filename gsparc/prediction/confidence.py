@@ -157,7 +157,10 @@ def read_trusted(extra: Mapping[str, Any]) -> Trusted:
         return Trusted()
     state = {name: part for name, part in extra[KEY]["state"].items() if name not in GONE}
     if state.get("kind") not in (None, *KINDS):
-        text = "confidence=%s and its threshold are of an older program: gsparc calibrate ckpt=FILE"
+        text = (
+            "confidence=%s and its threshold are of an older program and left out: "
+            "gsparc calibrate ckpt=FILE confidence=expected"
+        )
         log.warning(text, state["kind"])
         return Trusted()
     return Trusted.read(state)

@@ -203,20 +203,20 @@ def calibrate_threshold(
     seed: int | list[int],
     tested: bool = True,
 ) -> CalibratedThreshold:
-    """Choose a confidence and its threshold.
+    """Return the threshold of a confidence, `kind` or the first of the evidence.
 
     Unless `tested`, the unseen positions calibrate, too: a threshold that nobody tries needs none.
 
     Raises:
         ValueError: `kind` is no confidence of this evidence, or it has none.
     """
-    rng = np.random.default_rng(seed)
-    choose_on, calibrate, test = split_choose_calibrate_test(evidence, spatial, rng)
     if not evidence.scores:
         raise ValueError("the model states neither an error variance nor a confidence")
     used = next(iter(evidence.scores)) if kind == "auto" else kind
     if used not in evidence.scores:
         raise ValueError(f"confidence={used}: expected auto or {', '.join(evidence.scores)}")
+    rng = np.random.default_rng(seed)
+    choose_on, calibrate, test = split_choose_calibrate_test(evidence, spatial, rng)
     score, bad = evidence.scores[used], guarantee.is_bad(evidence.error)
     if not tested:
         calibrate, test = np.concatenate([calibrate, test]), test[:0]
@@ -246,18 +246,17 @@ def run_trials(
         kind: a confidence, or `auto`: the expected error where the method states one.
         seed: of the draws.
     """
-    realised, coverage, kinds = [], [], []
+    realised, coverage, used = [], [], kind
     bad = guarantee.is_bad(evidence.error)
     for draw in range(draws):
         used, threshold, test, _ = calibrate_threshold(
             evidence, guarantee, kind, spatial, [seed, draw]
         )
         accepted = test[evidence.scores[used][test] >= threshold.value]
-        kinds.append(used)
         realised.append(bad[accepted].mean() if len(accepted) else np.nan)
         coverage.append(len(accepted) / max(len(test), 1))
-    most, how = max(set(kinds), key=kinds.count), "spatial" if spatial else "random"
-    return Trial(most, how, np.array(realised), np.array(coverage), guarantee.alpha)
+    how = "spatial" if spatial else "random"
+    return Trial(used, how, np.array(realised), np.array(coverage), guarantee.alpha)
 
 
 def calibration_facts(

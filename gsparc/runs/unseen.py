@@ -73,8 +73,7 @@ class Unseen:
         # Programs that read confidences get another number from now on: it is said.
         kind_changed = f"confidence={kind_used}, before: {before}; "
         if kind == "auto" and not np.isfinite(threshold):
-            # Without a promise a choice by chance would replace what falls away
-            # from the measurements.
+            # Without a promise the model's own is as good, and programs know it.
             stored, kind_changed = (
                 self.earlier,
                 (f"confidence stays {before}, the checkpoint is unchanged; "),

@@ -63,7 +63,7 @@ def test_a_bound_that_no_threshold_keeps_came_without_a_hint(monkeypatch) -> Non
         Unseen("a.ckpt", {}, Trusted(), evidence.position, evidence),
     )
     stored, said = unseen.calibrate_and_store(Guarantee(-40.0), *how)
-    # A choice among confidences replaced the model's own though nothing was promised.
+    # Another confidence replaced the model's own though nothing was promised.
     assert "confidence stays the model's own, the checkpoint is unchanged; " in said and not kept
     assert stored.threshold == np.inf and "100% of 900 test positions are worse than -40 dB" in said
     better = float(re.search(r"limit_db=(\S+) would be kept", said)[1])

@@ -123,9 +123,9 @@ def test_what_answers_slowly_has_to_be_surely_better():
     """Searches for .2 % of the error took four fifths of the seconds."""
     errors = drawn([1.0, 1.0], 60)
     errors[:, 1] = errors[:, 0] * np.where(np.arange(60) % 2, 1.06, 0.93)
-    for dear in (0, 1):
-        weights = weigh(gram_of(errors), np.arange(60), "square", slow=np.arange(2) == dear)
-        assert weights[dear] == 0
+    for slow in (0, 1):
+        weights = weigh(gram_of(errors), np.arange(60), "square", slow=np.arange(2) == slow)
+        assert weights[slow] == 0
 
 
 def test_weights_of_few_units_were_learned_by_chance():

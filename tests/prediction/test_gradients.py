@@ -13,7 +13,6 @@ import torch
 from campaigns import RENDERED, compose, spectra
 from closed import fitted_to
 from contexts import short
-from interference import plane
 from refusals import refused
 from rooms import directed, shoebox
 from torch.autograd import forward_ad
@@ -145,7 +144,6 @@ CASES = {
     "gp, powers, nearest rows": Case(method_class("gp"), kinds.received, thin=True),
     "gp, powers of both ends": Case(method_class("gp"), lambda _: both_ends("rssi")),
     "gsparc, powers": Case(planned(), kinds.received),
-    "gsparc, powers that interfere": Case(planned(), lambda _: plane(300)),
     "gsparc, powers of stations": Case(planned(), kinds.several, "0"),
 }
 REFUSED = {

@@ -213,6 +213,8 @@ def compute_misfit(heard: Scans, moments: HeardMoments, unknown: Nuisances) -> M
         return spectrum_misfit(heard.values, moments.mean, moments.variance)
     if facts.is_complex:
         return channel_misfit(heard.values, moments.mean, moments.variance, unknown.phase_known)
+    if not facts.is_level:
+        raise ValueError(f"{facts.called} are not located")
     return level_misfit(
         heard.values, moments.mean, moments.variance, unknown.offset_db, heard.floor
     )

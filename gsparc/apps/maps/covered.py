@@ -20,7 +20,7 @@ SQUARES, STRONGEST, DRAWS = 300, 4, 400  # drawn together: squares, stations in 
 SHARE = 0.9
 
 
-def estimate_covered_share(
+def covered_share_interval(
     field: FieldMap, predictor: Predictor, promise: Promise
 ) -> tuple[float, float]:
     """Return the ends of the 90 % interval of the share of predicted squares
@@ -42,7 +42,7 @@ def sample_strongest_levels(
 
     Errors of the strongest stations are drawn together, by the model's own covariance and what
     regions share (`RegionErrors`), each as large as held-out rows say. See
-    `estimate_covered_share`; without a promise only each square's own spread is right.
+    `covered_share_interval`; without a promise only each square's own spread is right.
     """
     level, error = (
         layer.reshape(len(layer), -1) for layer in (field.power_db, field.expected_error_db)

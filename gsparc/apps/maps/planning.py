@@ -147,21 +147,21 @@ def plan_measurements(
         places, first = np.concatenate([targets, allowed]), len(targets)
     # Before anything is measured only the distance over which powers are alike is known.
     if predictor is None:
-        unknown = prior_covariances(places, length_m)
+        covariances = prior_covariances(places, length_m)
     else:
         names, _ = choose_stations(predictor, stations)
-        unknown = error_covariances(
+        covariances = error_covariances(
             predictor, places, names, promise, other_end, goal, threshold_db
         )
     begin = np.zeros((0, 2)) if start is None else read_place("start", start, 2)[None, :2]
     ways = Ways.between(np.concatenate([places[first:, :2], begin]), streets)
     tour = Tour(ways.length, len(places) - first if len(begin) else None, route_m)
     wanted = np.arange(len(places)) < len(targets)
-    before = root_mean_variance(unknown)
+    before = root_mean_variance(covariances)
     before_db = float(np.sqrt(np.mean(before[wanted] ** 2)))
     too_near = pairs_too_near(places[first:, :2], count)
     chosen, expected, stopped = choose_greedily(
-        unknown, first, wanted, count, least_gain_db, tour, before_db, too_near
+        covariances, first, wanted, count, least_gain_db, tour, before_db, too_near
     )
     order = np.array(
         [chosen.index(cell) for cell in (tour.walk[1:-1] if route else chosen)], np.int64
@@ -169,7 +169,9 @@ def plan_measurements(
     path = ways.path_through(tour.walk[0 if len(begin) else 1 : -1]) if route else np.zeros((0, 2))
     scatter = float(
         np.sqrt(
-            np.mean([covariance.noise * covariance.weight[wanted].mean() for covariance in unknown])
+            np.mean(
+                [covariance.noise * covariance.weight[wanted].mean() for covariance in covariances]
+            )
         )
     )
     return MeasurementPlan(
@@ -180,7 +182,7 @@ def plan_measurements(
         float(tour.metres[-1:].sum()),
         grid,
         before[wanted],
-        root_mean_variance(unknown)[wanted],
+        root_mean_variance(covariances)[wanted],
         places[wanted],
         scatter,
         tour.metres if route else np.zeros(0),
@@ -314,6 +316,6 @@ def pairs_too_near(places: np.ndarray, count: int) -> np.ndarray:
     return distance < far.max() / 2
 
 
-def root_mean_variance(unknown: list[ErrorCovariance]) -> np.ndarray:
+def root_mean_variance(covariances: list[ErrorCovariance]) -> np.ndarray:
     """Return the root of the mean variance over stations at each place (S,) [dB]."""
-    return np.sqrt(np.mean([covariance.variances() for covariance in unknown], axis=0))
+    return np.sqrt(np.mean([covariance.variances() for covariance in covariances], axis=0))

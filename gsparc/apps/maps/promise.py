@@ -276,7 +276,7 @@ def map_notes(
     covered: tuple[float, float] | None = None,
     promise: Promise | None = None,
 ) -> list[str]:
-    """Return what a reader of the map must know; `covered` is of `estimate_covered_share`."""
+    """Return what a reader of the map must know; `covered` is of `covered_share_interval`."""
     notes = [*field.notes]
     figures = field.summarise()
     if figures["map/server_unsure"] and len(field.stations) > 1:

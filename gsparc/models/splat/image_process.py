@@ -133,8 +133,8 @@ class ImageProcess(LearnedField):
         self.explained = explained_variance(prediction, target, not data.site.target.is_complex)
         products = np.concatenate([error_products(both, target) for *both, target in triples])
         # Any gain counts: few rows, whose process is quick to ask, tell none surely.
-        loss, dear = data.site.target.loss, (False, True)
-        weight = float(weigh(products, np.arange(len(products)), loss, sure=0, slow=dear)[1])
+        loss, slow = data.site.target.loss, (False, True)
+        weight = float(weigh(products, np.arange(len(products)), loss, sure=0, slow=slow)[1])
         log.info(
             "%d held-out rows, %d training rows without their neighbours: weight of a Gaussian "
             "process %.2f",

@@ -74,8 +74,10 @@ def convention_warnings(data: Measurements) -> list[str]:
     and what mends it.
     """
     facts = data.site.target
-    if facts.kind not in FEWEST:
+    if facts.is_level:
         return _rivals_of_places(data)
+    if facts.kind not in FEWEST:
+        return []
     whole, labels = _arrayed(data)
     rows = _drawn(whole)
     few, drawn, labels = data.subset(rows[:1]), whole.subset(rows), labels[rows]

@@ -12,7 +12,7 @@ from refusals import refused
 from towns import MASTS, town_file, town_model
 
 import gsparc
-from gsparc.apps.maps.covered import estimate_covered_share
+from gsparc.apps.maps.covered import covered_share_interval
 from gsparc.apps.maps.geojson import draws_shapes
 from gsparc.apps.maps.making import predict_map
 from gsparc.apps.maps.placing import (
@@ -83,7 +83,7 @@ def test_the_share_as_it_is_was_taken_as_exact(together, promise):
     left, right, low, high = found.grid.extent
     square = {"height_m": found.grid.height, "step_m": found.grid.step}
     field = predict_map(predictor, [left, low, right, high], **square, **how)
-    now = estimate_covered_share(field, predictor, promise)
+    now = covered_share_interval(field, predictor, promise)
     width, gained = (np.ptp(part, axis=1) for part in np.split(found.between, 2, axis=1))
     assert (width > 0.02).all() and (width < 1.1 * np.ptp(now)).all() and (gained > 0).all()
 
@@ -96,7 +96,7 @@ def test_any_fault_of_a_covariance_was_taken_for_a_model_without_one(
         Predictor, "covariance", lambda *_, **__: pytest.fail("nothing is asked and dropped")
     )
     field = predict_map(predictor, step_m=4.0, threshold_db=-75.0, promise=promise)
-    low, high = estimate_covered_share(field, predictor, promise)
+    low, high = covered_share_interval(field, predictor, promise)
     assert low < 1 - np.nanmean(field.outage) < high
 
 
