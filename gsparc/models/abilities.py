@@ -13,20 +13,7 @@ from gsparc.data.schema import Measurements
 from gsparc.data.site_objects import GaussianCloud
 
 if TYPE_CHECKING:
-    from gsparc.models.method import Method
     from gsparc.processes.powers import PowerProcess, PowerRows
-
-
-@runtime_checkable
-class Reconditions(Protocol):
-    """Learns from other rows with its settings as they are:
-    what is left out is forgotten but by these.
-    """
-
-    def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
-        """Return a method of rows (n,) alone; None where more
-        than settings would remember the others.
-        """
 
 
 @runtime_checkable

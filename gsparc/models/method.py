@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -354,3 +354,15 @@ class Method(MethodFactory):
             "model/variance_explained": None,
             "time/init_s": None,
         }
+
+
+@runtime_checkable
+class Reconditions(Protocol):
+    """Learns from other rows with its settings as they are:
+    what is left out is forgotten but by these.
+    """
+
+    def copy_conditioned(self, data: Measurements, rows: np.ndarray) -> Method | None:
+        """Return a method of rows (n,) alone; None where more
+        than settings would remember the others.
+        """

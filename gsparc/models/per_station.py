@@ -26,10 +26,10 @@ from gsparc.data.schema import Measurements, Site
 from gsparc.data.site_objects import SiteObjects
 from gsparc.data.splits import LEAST_ROWS, Fold
 from gsparc.models import checkpoint, fitting
-from gsparc.models.abilities import AddsCarriers, HasJoint, Reconditions
+from gsparc.models.abilities import AddsCarriers, HasJoint
 from gsparc.models.closed_form import method_state
 from gsparc.models.fitting import common_label
-from gsparc.models.method import Method, MethodFactory, Prediction
+from gsparc.models.method import Method, MethodFactory, Prediction, Reconditions
 from gsparc.models.powers.own_terms import pool_station_weights
 from gsparc.models.sanity import create_unfitted
 from gsparc.models.station_sites import UNHEARD, station_site, stations_of_fold, to_station_query

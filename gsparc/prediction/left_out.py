@@ -17,9 +17,8 @@ from gsparc.data.schema import Measurements
 from gsparc.data.split_settings import SplitSettings
 from gsparc.data.splits import Fold
 from gsparc.models import fitting
-from gsparc.models.abilities import Reconditions
 from gsparc.models.device_offsets import subtract_known_device_offsets
-from gsparc.models.method import Method, MethodFactory, Prediction
+from gsparc.models.method import Method, MethodFactory, Prediction, Reconditions
 from gsparc.models.per_station import PerStation, wrap_per_station
 from gsparc.models.predicting import predict_in_batches
 from gsparc.models.station_sites import stations_of_fold

@@ -6,7 +6,7 @@ import logging
 import math
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,9 @@ from gsparc.models.method import Method
 from gsparc.models.reduced import ReductionInputs, Settings, with_reduction
 from gsparc.prediction.confidence import check_kind, read_trusted
 from gsparc.prediction.predictor import Predictor
+from gsparc.prediction.stored_point import Operating
 from gsparc.prediction.timing import BLOCKS, time_interleaved
-from gsparc.processes.stored import Stored, from_plain, to_plain
+from gsparc.processes.stored import from_plain, to_plain
 
 WORDS = {
     "keep": lambda value: f"{value:.0%} kept",
@@ -71,27 +72,6 @@ def pareto_front(latency: Sequence[float], score: Sequence[float]) -> list[int]:
 
 
 KEY = "operating"
-
-
-@dataclass(frozen=True)
-class Operating(Stored):
-    """One stored way of answering.
-
-    Attributes:
-        label: in words.
-        settings: what is spared.
-        threads: CPU threads.
-        score: larger is better: how near its answers are to the full model's [dB].
-        figure: name and value of the accuracy that was shown with it.
-        p50_ms: median latency where it was measured [ms]; this machine times anew.
-    """
-
-    label: str
-    settings: Settings
-    threads: int
-    score: float
-    figure: tuple[str, float]
-    p50_ms: float
 
 
 def store_points(path: Path, points: Sequence[Mapping[str, Any]], inputs: ReductionInputs) -> None:

@@ -37,7 +37,7 @@ from gsparc.prediction.updating import UpdateMixin, read_versions
 if TYPE_CHECKING:
     from gsparc.data.site_objects import GaussianCloud
     from gsparc.prediction.channels import Paths
-    from gsparc.prediction.operating_point import Operating
+    from gsparc.prediction.stored_point import Operating
 
 
 class Predictor(DegreesMixin, JointMixin, ConfidenceMixin, UpdateMixin, PilotsMixin):

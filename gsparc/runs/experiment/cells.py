@@ -18,20 +18,18 @@ from omegaconf import DictConfig, OmegaConf
 
 from gsparc.base.instantiate import from_settings
 from gsparc.base.limits import POSITIVE
-from gsparc.data.schema import Measurements, Scored
-from gsparc.data.splits import Split
+from gsparc.data.schema import Measurements
 from gsparc.datasets.load import load, split_for
 from gsparc.datasets.public.fetch import fetched_path_or_none
 from gsparc.evaluation.console import to_dict
-from gsparc.models.powers.together.network import find_sectors
 from gsparc.models.registry import (
     fill_defaults,
 )
 from gsparc.runs.experiment.contenders import Contender, unlisted_contenders
 from gsparc.runs.experiment.options import REDRAW
+from gsparc.runs.experiment.problem import Problem
 from gsparc.runs.experiment.runner import Job
 from gsparc.runs.ledger import measurements_hash
-from gsparc.simulate.scenes.build import has_known_scene
 
 log = logging.getLogger(__name__)
 
@@ -65,53 +63,6 @@ class SplitChoice:
     def numbers(self) -> tuple[int | None, ...]:
         """Every draw, or None for the only one."""
         return tuple(range(self.draws)) or (None,)
-
-
-@dataclass(frozen=True)
-class Problem:
-    """One dataset under one draw of a split.
-
-    Attributes:
-        dataset, split: names.
-        chosen: overrides of train.yaml for dataset and split, but for the draw.
-        data: measurements.
-        folds: which rows learn and which test.
-        content: hash of the measurements, see `measurements_hash`.
-        draw: number of the split's draw; None where it is not drawn again.
-    """
-
-    dataset: str
-    split: str
-    chosen: tuple[str, ...]
-    data: Measurements
-    folds: Split
-    content: str = ""
-    draw: int | None = None
-
-    @property
-    def name(self) -> str:
-        """dataset/split."""
-        return f"{self.dataset}/{self.split}"
-
-    @property
-    def kind(self) -> Scored:
-        """Of the measurements."""
-        return self.data.site.scored
-
-    @property
-    def stations(self) -> bool:
-        """Whether there are several, of which rows of each are learned from."""
-        return self.data.site.stations is not None and self.folds.name != "stations"
-
-    @property
-    def network(self) -> bool:
-        """Whether stations are sectors of a network, which `gsparc` learns together in any case."""
-        return self.data.site.target.is_level and find_sectors(self.data) is not None
-
-    @property
-    def scene(self) -> bool:
-        """Whether the measurements name a scene that a ray tracer loads."""
-        return has_known_scene(self.data.provenance)
 
 
 def read_entries(group: str, of: type[Entry], config: Mapping[str, Any]) -> dict[str, Entry]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from typing import TYPE_CHECKING
 
 from gsparc.base.files import load_yaml
 from gsparc.base.instantiate import import_target
@@ -16,9 +15,7 @@ from gsparc.models.registry import (
     method_class,
     plain_methods,
 )
-
-if TYPE_CHECKING:
-    from gsparc.runs.experiment.cells import Problem
+from gsparc.runs.experiment.problem import Problem
 
 
 @dataclass(frozen=True)

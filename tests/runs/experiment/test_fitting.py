@@ -9,8 +9,9 @@ from hydra import initialize_config_module
 from gsparc.evaluation.results import Run, as_frame
 from gsparc.evaluation.summary import write_summary
 from gsparc.models.checkpoint_content import CheckpointError
-from gsparc.runs.experiment.cells import Cell, Problem, _may_match, job_of_cell
+from gsparc.runs.experiment.cells import Cell, _may_match, job_of_cell
 from gsparc.runs.experiment.contenders import Contender
+from gsparc.runs.experiment.problem import Problem
 from gsparc.runs.experiment.runner import run_jobs, time_by_dataset
 from gsparc.runs.ledger import run_once
 
