@@ -7,6 +7,7 @@ residual goes to a Gaussian process on images.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,11 +20,11 @@ from gsparc.data.schema import Measurements
 from gsparc.data.splits import Fold
 from gsparc.models.baselines.interpolation import Differentiable
 from gsparc.models.closed_form import ClosedForm, LeftOutRows
-from gsparc.models.method import Prediction
+from gsparc.models.method import Method, Prediction
 from gsparc.models.moving_array.error_regression import fit_errors, image_features
 from gsparc.models.moving_array.power_gp import PowerTrend, TrendSettings, fit_trend
-from gsparc.models.moving_array.query import ImageRenderer, ReceivingArray, reduce_moving_array
-from gsparc.models.moving_array.residual import error_and_likeliest_kernel, fit_residual
+from gsparc.models.moving_array.query import ImageRenderer, ReceivingArray, ReducedMean
+from gsparc.models.moving_array.residual import Residual, error_and_likeliest_kernel, fit_residual
 from gsparc.models.moving_array.triangulate import (
     MAX_UNEXPLAINED,
     SearchSettings,
@@ -32,6 +33,7 @@ from gsparc.models.moving_array.triangulate import (
     site_problem,
 )
 from gsparc.models.predicting import to_double
+from gsparc.models.reduced import Interpolated, Settings
 from gsparc.models.target_rows import heard_rows, training_targets
 from gsparc.physics.lags import BLOCK, SpectrumLags, pixel_exponent
 from gsparc.physics.separable import Separable, fit_separable
@@ -125,7 +127,24 @@ class MovingArrayField(Differentiable, ClosedForm):
         """See `Method.reduce`."""
         return ("keep", "stride", "confidence")
 
-    reduce = reduce_moving_array
+    def reduce(self, settings: Settings, measured: dict[str, Tensor]) -> Method:
+        """See `Method.reduce`: the mean with the strongest components of the residual (`keep`).
+
+        On fewer pixels (`stride`) and without its variance.
+
+        Raises:
+            ValueError: a stride that does not divide the columns.
+        """
+        assert self.site is not None and self.site.grid is not None
+        if set(settings) <= {"confidence"} and settings.get("confidence", True):
+            return self
+        stride, grid = int(settings.get("stride", 1)), self.site.grid
+        if grid.width % stride:
+            message = f"stride={stride} does not divide the {grid.width} columns of the grid"
+            raise ValueError(message)
+        count = math.ceil(float(settings.get("keep", 1.0)) * len(self.residual.axes))
+        lean = ReducedMean(self, self._make_renderer(self.residual.keep_axes(count), stride), count)
+        return Interpolated(lean, grid, stride) if stride > 1 else lean
 
     # -- learning ----------------------------------------------------------------------------------
 
@@ -316,11 +335,14 @@ class MovingArrayField(Differentiable, ClosedForm):
     def renderer(self) -> ImageRenderer:
         """Return answers with all that was found, made once."""
         if self._query is None:
-            places = torch.from_numpy(self.positions)
-            self._query = ImageRenderer(
-                self.receiving_array(), self.basis, self.found, self.residual, places
-            )
+            self._query = self._make_renderer(self.residual, 1)
         return self._query
+
+    def _make_renderer(self, residual: Residual, stride: int) -> ImageRenderer:
+        """Answers with a residual, on every `stride`-th pixel."""
+        basis = self.basis if stride == 1 else self.basis.subsample_pixels(stride)
+        places = torch.from_numpy(self.positions)
+        return ImageRenderer(self.receiving_array(stride), basis, self.found, residual, places)
 
     def count_components(self) -> int:
         """Return the number of sources."""

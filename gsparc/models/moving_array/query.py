@@ -6,9 +6,8 @@ reduced: a quarter of 48 saves 0.02 ms.
 
 from __future__ import annotations
 
-import math
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,14 +18,11 @@ from gsparc.models.moving_array.power_gp import PowerTrend
 from gsparc.models.moving_array.residual import Residual
 from gsparc.models.moving_array.triangulate import bearings, sum_lags
 from gsparc.models.predicting import to_double
-from gsparc.models.reduced import Interpolated, Settings, View
+from gsparc.models.reduced import View
 from gsparc.ops.transforms import is_differentiated
 from gsparc.physics.lags import SpectrumLags
 from gsparc.physics.separable import Separable
 from gsparc.processes.kernel import distances
-
-if TYPE_CHECKING:
-    from gsparc.models.moving_array.method import MovingArrayField
 
 
 class ReceivingArray:
@@ -115,45 +111,18 @@ class ImageRenderer:
         return to_double(self)
 
 
-def reduce_moving_array(
-    method: MovingArrayField, settings: Settings, measured: dict[str, Tensor]
-) -> Method:
-    """Return the mean with the strongest components of the residual (`keep`).
-
-    On fewer pixels (`stride`) and without its variance.
-
-    Raises:
-        ValueError: a stride that does not divide the columns.
-    """
-    assert method.site is not None and method.site.grid is not None
-    if set(settings) <= {"confidence"} and settings.get("confidence", True):
-        return method
-    stride, grid = int(settings.get("stride", 1)), method.site.grid
-    if grid.width % stride:
-        raise ValueError(f"stride={stride} does not divide the {grid.width} columns of the grid")
-    count = math.ceil(float(settings.get("keep", 1.0)) * len(method.residual.axes))
-    lean = ReducedMean(method, count, stride)
-    return Interpolated(lean, grid, stride) if stride > 1 else lean
-
-
 class ReducedMean(View):
     """The mean of a moving-array model on every `stride`-th pixel.
 
     Args:
         inner: fitted.
+        renderer: of these pixels.
         count: of the residual's components.
-        stride: of the pixels.
     """
 
-    def __init__(self, inner: MovingArrayField, count: int, stride: int) -> None:
+    def __init__(self, inner: Method, renderer: ImageRenderer, count: int) -> None:
         super().__init__(inner)
-        basis = inner.basis if stride == 1 else inner.basis.subsample_pixels(stride)
-        residual = inner.residual.keep_axes(count)
-        places = torch.from_numpy(inner.positions)
-        self._query = ImageRenderer(
-            inner.receiving_array(stride), basis, inner.found, residual, places
-        )
-        self._count = count
+        self._query, self._count = renderer, count
 
     @torch.no_grad()
     def predict(self, query: Query) -> Prediction:
