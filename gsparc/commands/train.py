@@ -17,7 +17,7 @@ from gsparc.data.split_files import write_split
 from gsparc.evaluation.provenance import new_run_id, provenance
 from gsparc.evaluation.summary import write_summary
 from gsparc.models.array_vectors.vector_cache import forget_vectors
-from gsparc.pictures.pictures import draw_run
+from gsparc.pictures.pictures import draw_and_log_run
 from gsparc.runs.baselines import same_as_baseline
 from gsparc.runs.evaluate import TrainedRun, evaluate
 from gsparc.runs.experiment import folds, options
@@ -86,7 +86,7 @@ def train(
             facts |= {"seed": int(config.seed), "options/unused": unused}
             run = TrainedRun(fits.methods, folds.checkpoints(contexts), data, split, evaluation)
             if in_full:
-                draw_run(run, inputs.walls, facts, config.eval_on, run_dir, loggers)
+                draw_and_log_run(run, inputs.walls, facts, config.eval_on, run_dir, loggers)
         evaluation.write(run_dir, run_id=run_id)
         write_summary(run_dir / SUMMARY, facts)
         return facts, run

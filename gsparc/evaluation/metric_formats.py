@@ -221,7 +221,7 @@ def score_heading(name: str) -> str:
     >>> score_heading("nmse"), score_heading("psnr_db")
     ('NMSE dB (less is better)', 'PSNR dB')
     """
-    ratio = " dB" if is_ratio(name) else ""
+    ratio = " dB" if is_power_ratio(name) else ""
     return f"{heading_of(name)}{ratio}{' (less is better)' if lower_is_better(name) else ''}"
 
 
@@ -235,7 +235,7 @@ def is_root(name: str) -> bool:
     return _look_up(name).root
 
 
-def is_ratio(name: str) -> bool:
+def is_power_ratio(name: str) -> bool:
     """Return whether a figure is a ratio of powers, which spans decades."""
     return _look_up(name).better == "ratio"
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from gsparc.evaluation.metric_formats import is_ratio, is_root, lower_is_better, sample_column
+from gsparc.evaluation.metric_formats import is_power_ratio, is_root, lower_is_better, sample_column
 from gsparc.evaluation.results import score_db
 from gsparc.evaluation.table import Row
 from gsparc.processes.uncertainty import half_width, standard_error
@@ -122,7 +122,7 @@ def gains_of_rows(
     a, b = a + 0 * b, b + 0 * a  # NaN in one is NaN in both: the means are of the same rows
     if np.isfinite(a).sum() < 2:
         return None
-    if is_ratio(figure):
+    if is_power_ratio(figure):
         # The difference of logarithms, and to first order what each row adds to it.
         low, high = (max(float(np.nanmean(x)), np.finfo(float).tiny) for x in (a, b))
         return 10 / np.log(10) * (np.log(high / low) + b / high - a / low)

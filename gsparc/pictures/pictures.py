@@ -34,7 +34,7 @@ from gsparc.runs.evaluate import TrainedRun
 from gsparc.training import tracking
 
 
-def draw_run(
+def draw_and_log_run(
     run: TrainedRun,
     walls: SceneWalls | None,
     facts: Mapping[str, Any],

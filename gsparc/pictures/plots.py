@@ -21,7 +21,7 @@ from gsparc.evaluation.metric_formats import (
     OF_KIND,
     axis_of,
     heading_of,
-    is_ratio,
+    is_power_ratio,
     lower_is_better,
     score_heading,
     score_of,
@@ -134,7 +134,7 @@ def draw_distributions(
         axes.set_xlabel(
             "one query, alone [ms]" if name == TIMES else f"{heading_of(name)} of a test sample"
         )
-        if name == TIMES or is_ratio(name):
+        if name == TIMES or is_power_ratio(name):
             set_log_axis(axes, np.inf if name == TIMES else 0.0)
     line[0].set_ylabel("share of samples")
     handles, texts = line[0].get_legend_handles_labels()

@@ -30,7 +30,7 @@ from gsparc.evaluation.provenance import provenance, run_git
 from gsparc.evaluation.results import read_summary
 from gsparc.models.checkpoint import MODEL
 from gsparc.models.fitting import LAST, dotted_settings
-from gsparc.tables.said_columns import edited_beside
+from gsparc.tables.said_columns import columns_file_beside
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +90,7 @@ class FitInputs:
         whole: Any = OmegaConf.to_container(subset, resolve=True)  # what is missing is `???`
         named = dict(dotted_settings(whole))
         where = {name: named.pop(name) for name in OF_DATA if name in named}
-        about = edited_beside(str(where.get("dataset.file")))
+        about = columns_file_beside(str(where.get("dataset.file")))
         where |= {"dataset.file (columns)": str(about)} if about else {}
         settings = json.loads(json.dumps(named, default=str))
         return cls(settings, _hashes(named), data, split, {} if data else _hashes(where))

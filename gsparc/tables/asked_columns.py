@@ -97,7 +97,7 @@ def ask_ranks(sheet: Sheet, role: str, columns: Sequence[Column]) -> bool:
     return True
 
 
-def ask_phase(sheet: Sheet, chosen: Chosen) -> None:
+def ask_amplitude_beside_phase(sheet: Sheet, chosen: Chosen) -> None:
     """Ask whether a level beside a phase is the amplitude of a channel."""
     levels = chosen.get("rssi_db", ())
     rest = [head for head in sheet.heads if head not in used_heads(chosen)]

@@ -15,8 +15,8 @@ from gsparc.tables import heads
 from gsparc.tables.asked_columns import (
     MEASURED,
     STATION,
+    ask_amplitude_beside_phase,
     ask_floor,
-    ask_phase,
     ask_ranks,
     ask_which,
     is_rank,
@@ -165,7 +165,7 @@ def choose_columns(
     _one_unit(sheet, chosen)
     if only is None and not sheet.asked:
         take_wide_levels(sheet, chosen)
-        ask_phase(sheet, chosen)
+        ask_amplitude_beside_phase(sheet, chosen)
         if not {"z", "rx_z", "tx_z"} & {*chosen, *settled}:
             ask_floor(sheet, chosen)
     if (

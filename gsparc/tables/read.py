@@ -16,7 +16,7 @@ from gsparc.tables.builder import Builder
 from gsparc.tables.columns import choose_columns, list_roles
 from gsparc.tables.opening import read_sheet
 from gsparc.tables.raw import Raw
-from gsparc.tables.said_columns import edited_beside, read_columns
+from gsparc.tables.said_columns import columns_file_beside, read_columns
 from gsparc.tables.sheet import Role, Said, Sheet, settle
 from gsparc.tables.slots import unfold_slots, unfold_tones
 from gsparc.tables.station_list import StationList, read_stations
@@ -60,7 +60,7 @@ def parse_table(
         return raw, asked, tuple(fresh.problems)
 
     said: dict[str, object] = {}
-    about = edited_beside(path) if columns_file is None else Path(columns_file)
+    about = columns_file_beside(path) if columns_file is None else Path(columns_file)
     if about is not None:
         said |= read_columns(about, sheet.heads)
         sheet.notes.append(f"columns are what {about} says")

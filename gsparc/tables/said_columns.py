@@ -42,7 +42,7 @@ def beside(path: str | Path) -> Path:
     return Path(f"{path}.columns.yaml")
 
 
-def edited_beside(path: str | Path) -> Path | None:
+def columns_file_beside(path: str | Path) -> Path | None:
     """Return the file about a table's columns beside it, where somebody edited it: it is taken."""
     return about if (about := beside(path)).is_file() and is_edited(about) else None
 
@@ -57,7 +57,7 @@ def write_columns(path: str | Path, roles: Sequence[Role], heads: Sequence[str])
     return one line that says so.
     """
     to = beside(path)
-    if edited_beside(path):
+    if columns_file_beside(path):
         return f"{to} was edited, and is taken"
     asked = {name: role for role in roles for answer in role.readings for name in answer.said}
     lines = []
