@@ -16,7 +16,6 @@ from gsparc.physics.decibels import RELATIVE_DB, TINY_POWER, finite_decibels, fr
 Kind = Literal["spectrum", "csi", "rssi"]
 Values = TypeVar("Values", np.ndarray, Tensor)
 MOST_DB = 400  # of any level
-NEGATIVE = "linear power, at least 0 (is it in dB?"
 
 
 class Target(ABC):
@@ -119,7 +118,8 @@ class Spectrum(Target):
 
     def fault(self, array: str) -> tuple[Callable[[np.ndarray], np.ndarray], str] | None:
         """See `Target.fault`."""
-        return lambda part: part < 0, f"{NEGATIVE}; then dataset.decibels=true)"
+        wanted = "linear power, at least 0 (is it in dB?; then dataset.decibels=true)"
+        return lambda part: part < 0, wanted
 
     def scale(self, values: np.ndarray, mask: np.ndarray | None) -> float:
         """Return the largest but for outliers; 1 where that is about 1; see `Target.scale`."""
@@ -184,7 +184,7 @@ class Power(Target):
         """See `Target.fault`."""
         if array == "rssi_db":
             return lambda part: np.abs(part) > MOST_DB, f"dB between -{MOST_DB} and {MOST_DB}"
-        return lambda part: part < 0, f"{NEGATIVE})"
+        return lambda part: part < 0, "linear power, at least 0 (is it in dB?)"
 
     def linear(self, array: str, values: np.ndarray) -> np.ndarray:
         """See `Target.linear`."""

@@ -159,7 +159,7 @@ def read_trusted(extra: Mapping[str, Any]) -> Trusted:
     if state.get("kind") not in (None, *KINDS):
         text = (
             "confidence=%s and its threshold are of an older program and left out: "
-            "gsparc calibrate ckpt=FILE confidence=expected"
+            "gsparc calibrate ckpt=FILE confidence=expected, or learned, stores another"
         )
         log.warning(text, state["kind"])
         return Trusted()
